@@ -219,7 +219,7 @@ class Session:
         """Return the stages that the problem has what it takes for."""
         stages = ["fit"] if self.problem.table.experiment else []
         if self.problem.spec is not None:
-            stages += ["tune"] if self.problem.designs_on_response else ["tune", "certify"]
+            stages += ["tune", "certify"]
         if not stages:
             raise ProblemError(
                 f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them (a whole file is "
@@ -230,8 +230,6 @@ class Session:
     def explain_left_out(self, stages: list[str]) -> list[str]:
         """Return what the file, or the fit, gives reason to expect of a whole run and does not get, and why."""
         source, table = self.problem.source, self.problem.table
-        if self.problem.designs_on_response and "tune" in stages:
-            return [f"certifying: it takes a model, and [controller] is designed on {self.problem.response_names[0]}"]
         if table.robustness is not None and table.controller is None:
             return [f"tuning and certifying: {source} has [robustness] but no [controller]; add one"]
         if table.controller is not None and "tune" not in stages:
@@ -477,11 +475,11 @@ class Session:
     def _sweep(self, tell: Progress) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
-        _, robust_to = list_plants(self.problem, self.parameters())
-        if self.problem.designs_on_response:
+        design, robust_to = list_plants(self.problem, self.parameters())
+        if self.free_law and self.problem.designs_on_response:
             raise ProblemError(
-                f"{self.problem.source}: a sweep takes a model, and [controller] is designed on "
-                f"{self.problem.response_names[0]}; name a plant there, and the response in robust_to"
+                f"{self.problem.source}: --free-law takes a model, and [controller] is designed on "
+                f"{self.problem.response_names[0]}; leave --free-law out, or name a plant there"
             )
         draws = self.problem.draws(self.parameters())
         result = sweep(
@@ -507,11 +505,12 @@ class Session:
         results: list[Any] = []
         if self.problem.table.experiment:
             fitted = self.parameters()
-            if isinstance(fitted, Fit) and not fitted.experiments:
-                self.results["fit"] = fitted = replace(
-                    fitted, experiments=self.problem.choose_fitted(self.experiments())
-                )
-            results.append(fitted)
+            if isinstance(fitted, Fit):  # a design on measured points needs none
+                if not fitted.experiments:
+                    self.results["fit"] = fitted = replace(
+                        fitted, experiments=self.problem.choose_fitted(self.experiments())
+                    )
+                results.append(fitted)
         if self.problem.spec is not None and ("tune" in self.results or (self.folder / FILES["tune"]).exists()):
             results.append(self.controller())
             if "certify" not in self.results and (self.folder / FILES["certify"]).exists():

@@ -108,7 +108,7 @@ def show_controller(console: Terminal, controller: Controller) -> None:
 
 def show_certificate(console: Terminal, certificate: Certificate) -> None:
     """Print the margins of each plant, nominal and in the worst case, and what was simulated."""
-    heading(console, "Certificate", str(certificate.monte_carlo).split(":")[0])
+    heading(console, "Certificate", certificate.draws.split(":")[0])
     rows: list[tuple[str, ...]] = []
     for name, figures in certificate.plants.items():
         worst, margins = certificate.worst[name], certificate.margins[name]

@@ -204,13 +204,15 @@ class Problem:
         return _make_sensors(self.robustness.sensors)
 
     def certified_plants(self) -> dict[str, Plant]:
-        """Return the design plant and those of [robustness], by name."""
+        """Return the design plant and those of [robustness], by name; none where all is measured."""
         if self.table.controller is None:
             raise ProblemError(self._ask_for_controller())
         names = [self.table.controller.plant, *self.table.controller.robust_to]
         names = [name for name in names if not name.startswith(RESPONSE)]
         names += [] if self.table.impedance is None else [self.table.impedance.plant]
-        return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
+        if not self.designs_on_response or self.table.robustness is not None:
+            names += self.robustness.plants
+        return {name: self.plants[name] for name in dict.fromkeys(names)}
 
     def remarks(self, parameters: ParameterSet) -> list[str]:
         """Return remarks on ranges that are valid but may not be meant, at nominal parameters."""

@@ -218,19 +218,15 @@ def certify_problem(
         As in `seaopt.certify`.
 
     """
-    table = problem.robustness
+    table, measured = problem.robustness, problem.measure_responses(source)
     if problem.designs_on_response:
-        raise ProblemError(
-            f"{problem.source}: a certificate takes a model, and [controller] is designed on "
-            f"{problem.response_names[0]}, where the controller's own verdict is the one on its points; to certify, "
-            "name a plant there, and the response in robust_to"
-        )
+        return certify(controller, problem.certified_plants(), source, seed=table.seed, measured=measured)
     return certify(
         controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
         samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
         max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
         sensors=problem.sensors, current_step_A=table.step, progress=progress,
-        measured=problem.measure_responses(source),
+        measured=measured,
     )  # fmt: skip
 
 
@@ -291,7 +287,7 @@ class Stages:
         return tuned.controller if isinstance(tuned, JointTuning) else tuned
 
     def _certify(self) -> Certificate | None:
-        if self.controller is None or self.problem.designs_on_response:
+        if self.controller is None:
             return None
         return certify_problem(self.problem, self.controller, self.fit or self.problem.parameters)
 

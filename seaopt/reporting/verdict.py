@@ -14,6 +14,7 @@ from seaopt.estimation.result.findings import FitFinding
 from seaopt.formatting import format_count, format_number
 from seaopt.records import record
 from seaopt.robustness import Certificate
+from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.failures import Failure, group_failures
 from seaopt.robustness.verification.verification import Verification
 
@@ -226,6 +227,8 @@ def judge_certificate(certificate: Certificate, again: str = "", sweep: str = ""
     draws = certificate.monte_carlo
     if certificate.passed:
         runs = "" if certificate.runs is None else f", {len(certificate.runs.rows)} simulated runs passed"
+        if not certificate.models:
+            return StageVerdict(met=True, text=f"Certificate: passed, {NO_MODEL}")
         if not draws.samples:
             text = f"Certificate: passed, nothing was uncertain, so that nothing was drawn{runs}"
             return StageVerdict(met=True, text=text, next=_advise_ranges(certificate) if again else ())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from typer.testing import CliRunner
 
 import seaopt as so
 from seaopt.cli.main import app
-from seaopt.errors import ProblemError
+from seaopt.errors import ControlError, ProblemError
 from seaopt.problem.stages import list_plants, tune_problem
 
 FILE = """
@@ -59,15 +60,50 @@ def test_a_response_is_read_with_the_delay_that_its_experiment_has(write):
     assert certificate.passed
 
 
-def test_without_a_model_no_fit_is_needed_and_none_is_certified(write, tmp_path):
-    path = write("frf:chirp", "")
-    result = CliRunner().invoke(app, ["tune", str(path), "-o", str(tmp_path / "out")])
+def test_without_a_model_no_fit_is_needed_and_points_are_certified(write, tmp_path):
+    path = write("frf:chirp", "").rename(tmp_path / "points.toml")
+    path.write_text(path.read_text().split("[robustness]")[0])
+    out, run = tmp_path / "out", CliRunner()
+    result = run.invoke(app, ["tune", str(path), "-o", str(out)])
     assert result.exit_code == 0 and "every limit met on measured points" in result.stdout
-    stored = json.loads((tmp_path / "out" / "controller.json").read_text())
+    stored = json.loads((out / "controller.json").read_text())
     assert stored["measured_responses"][0]["stable"] and stored["fit_met"]
     assert stored["achieved"]["bandwidth_hz"] == 30.0
-    certified = CliRunner().invoke(app, ["certify", str(path), "-o", str(tmp_path / "out")])
-    assert isinstance(certified.exception, ProblemError) and "takes a model" in str(certified.exception)
+    certified = run.invoke(app, ["certify", str(path), "-o", str(out)])
+    assert certified.exit_code == 0 and "without a model" in " ".join(certified.stdout.split())
+    robustness = json.loads((out / "robustness.json").read_text())
+    names = {row["name"]: row for row in robustness["requirements"]}
+    assert {"max_sensitivity", "bandwidth_hz", "max_noise_gain", "spectral_radius"} <= set(names)
+    assert robustness["plants"] == {} and robustness["monte_carlo"]["samples"] == 0
+    assert names["max_sensitivity"]["value"] == pytest.approx(stored["achieved"]["ms"], rel=1e-9)
+    page = run.invoke(app, ["report", str(path), "-o", str(out)])
+    assert page.exit_code == 0 and "without a model" in (out / "report.html").read_text()
+    swept = run.invoke(app, ["tune", str(path), "-o", str(out), "--sweep", "25:30:5"])
+    assert swept.exit_code == 0
+    assert [row["feasible"] for row in json.loads((out / "frontier.json").read_text())["rows"]] == [True, True]
+
+
+def test_a_law_that_breaks_limits_fails_on_points_and_models_are_refused(write):
+    problem = so.read_problem(write("frf:chirp", ""))
+    controller = tune_problem(problem, problem.parameters)
+    measured = problem.measure_responses(problem.parameters)
+    params, points = problem.parameters, {"frf:chirp": measured["frf:chirp"]}
+    assert so.certify(controller, {}, params, measured=points).passed
+    hot = replace(controller, law=controller.law.scaled(1.6))
+    failed = so.certify(hot, {}, params, measured=points)
+    broken = {row.name for row in failed.requirements if not row.met}
+    assert not failed.passed and "max_sensitivity" in broken and "NOT MET: max_sensitivity" in repr(failed)
+    # The truth is the stand: what the discs call broken is so on the plant that made the log.
+    assert hot.close(problem.plants["stand"], problem.values(params)).figures().ms > 1.7
+    with pytest.raises(ControlError, match="designed on a measured response"):
+        so.certify(controller, {"stand": problem.plants["stand"]}, params, measured=points)
+    with pytest.raises(ControlError, match="measured="):
+        so.certify(controller, {}, params)
+
+
+def test_a_fit_in_which_nothing_is_free_is_diagnosed(write):
+    problem = so.read_problem(write("frf:chirp", ""))
+    assert "chirp" in repr(so.diagnose(so.fit(problem.experiments(), problem.parameters)))
 
 
 @pytest.mark.parametrize(

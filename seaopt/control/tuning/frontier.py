@@ -15,7 +15,7 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.free_law import FreeLaw, bound_free_law
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
-from seaopt.control.tuning.tuner import RobustTo, disturbance, make_controller, make_task
+from seaopt.control.tuning.tuner import RobustTo, disturbance, make_controller, make_task, name_design
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_table
@@ -23,7 +23,6 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
-from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import PlotAccessor, record
 from seaopt.units import LINEAR, Mechanics
@@ -155,7 +154,7 @@ class Frontier:
 
 
 def sweep(
-    plant: Plant,
+    plant: Plant | MeasuredResponse,
     params: Fit | ParameterSet,
     spec: ControllerSpec,
     bandwidths_hz: Sequence[float],
@@ -175,7 +174,7 @@ def sweep(
         In the specification's range.
     free_law : bool
         Also compute, for each bandwidth, the best that any linear law could do on the design plant under these limits
-        (`seaopt.control.bound_free_law`), which takes about two seconds.
+        (`seaopt.control.bound_free_law`), which takes about two seconds; not where the design plant is measured.
     progress : callable, optional
         Called with the bandwidth that is tuned and the share of all that is done (`seaopt.progress.Progress`).
 
@@ -195,11 +194,11 @@ def sweep(
 
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
-    require_plant(plant, "plant", ControlError)
+    design = name_design(plant)
     require_type(bandwidths_hz, Collection, "bandwidths_hz", "give a sequence of frequencies in Hz", ControlError)
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
         raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
-    spec = settle_delay(spec, plant, params)
+    spec = settle_delay(spec, design, params)
     params = params.parameters if isinstance(params, Fit) else params
     # What is wrong with any row is said before the first is tuned.
     specs = [replace(spec, bandwidth_hz=require_number(f, "bandwidths_hz", ControlError)) for f in bandwidths_hz]
@@ -227,7 +226,7 @@ def sweep(
 
 
 def _make_sliding_task(
-    plant: Plant, params: ParameterSet, spec: ControllerSpec,
+    plant: Plant | MeasuredResponse, params: ParameterSet, spec: ControllerSpec,
     robust_to: RobustTo, draws: Sequence[Mapping[str, float]],
 ) -> Task:  # fmt: skip
     """Return the task on the sliding plants alone; measured ones are what they are."""
@@ -238,7 +237,8 @@ def _make_sliding_task(
             continue
         model, values = one if isinstance(one, tuple) else (one, params)
         sliding[name] = (take_sliding(model, model.complete(values)), values)
-    return make_task(take_sliding(plant, plant.complete(params)), params, spec, sliding, draws)
+    design = plant if isinstance(plant, MeasuredResponse) else take_sliding(plant, plant.complete(params))
+    return make_task(design, params, spec, sliding, draws)
 
 
 def _tune_sliding(task: Task, start: LawNumbers, progress: Progress) -> SlidingAlone:

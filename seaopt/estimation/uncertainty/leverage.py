@@ -32,8 +32,10 @@ class Leverage:
 
 
 def measure_leverage(minimum: Minimum) -> dict[str, Leverage]:
-    """Return the share of each experiment, and of the priors where there are some."""
+    """Return the share of each experiment, and of the priors where there are some; nothing where nothing is free."""
     problem, unknowns, p = minimum.problem, minimum.problem.unknowns, minimum.problem.unknowns.shared
+    if not p:
+        return {}
     parts = {experiment.name: _compute_information(minimum, experiment) for experiment in problem.experiments}
     prior = unknowns.precision[:p]
     if np.any(prior > 0.0):

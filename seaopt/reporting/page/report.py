@@ -218,7 +218,7 @@ def list_plates(material: Material) -> list[Plate]:
 
 def _plates_of_controller(material: Material) -> list[Plate]:
     controller, certificate = material.controller, material.certificate
-    if controller is None or (controller.design is None and certificate is None):
+    if controller is None or (controller.design is None and (certificate is None or not certificate.models)):
         return []
     plants = certificates.plants_of(certificate) if certificate is not None else None
     names = ("step", "bode", "tracking", "sensitivity", "nyquist", "noise")
@@ -263,7 +263,7 @@ def _plates_of_certificate(material: Material) -> list[Plate]:
     certificate = material.certificate
     if certificate is None:
         return []
-    panels = [certificates.worst_panel(certificate)]
+    panels = [certificates.worst_panel(certificate)] if certificate.models else []
     if certificate.drawn_ms:
         panels.append(certificates.draws_panel(certificate))
     panels.append(certificates.requirements_panel(certificate))
@@ -388,7 +388,7 @@ def list_figures(material: Material) -> list[tuple[str, str, str]]:
             ("phase margin", format_figure(a.phase_margin_deg, "deg", 3), "design plant"),
             ("noise gain", format_figure(a.noise_gain, controller.command.gain_unit, 3), "design plant"),
         ]
-    if certificate is not None:
+    if certificate is not None and certificate.models:
         worst = max(certificate.worst.values(), key=lambda one: one.ms)
         level = certificate.controller.spec.level("max_sensitivity")
         allowed = "" if level is None else f", at most {level:g}"

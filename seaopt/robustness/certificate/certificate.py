@@ -14,7 +14,7 @@ from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import BY_NAME, BY_REQUIREMENT
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.margins import Margins, margins, nu_gap
-from seaopt.errors import FileError, SeaoptError
+from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
 from seaopt.formatting import (
     MISSING,
@@ -53,6 +53,7 @@ ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
 MIN_FRICTION_MARGIN = "min_friction_margin"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 LIMIT_CYCLE = "limit_cycle"
+NO_MODEL = "nothing drawn or simulated: measured points alone, without a model"
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
@@ -195,7 +196,8 @@ class Certificate:
     simulated : Simulated or None
         The results of `with_simulation`; None where `certify` was told to leave them out.
     steps : Verification, str or None
-        The simulated steps that every plant is judged by; the reason where they cannot be simulated.
+        The simulated steps that every plant is judged by; the reason where they cannot be simulated, or need not be,
+        as there is no model.
     cycles : mapping of name to tuple of FoundCycle
         Of each model whose friction is not shown to be harmless, or whose play makes some: limit cycles predicted and
         simulated.
@@ -276,6 +278,8 @@ class Certificate:
         (True, 7)
 
         """
+        if not self.models:
+            raise ControlError("nothing can be simulated without a model; design the controller on one")
         simulations = self._simulate(sensors, current_step_A, seed, progress)
         runs = simulations.verification or simulations.left_out["simulation"]
         others = (row for row in self.requirements if row.name not in (SIMULATION_FAILURES, *NAMED_FAULTS.values()))
@@ -294,6 +298,11 @@ class Certificate:
         return replace(played, requirements=requirements, passed=all(row.met for row in requirements))
 
     @property
+    def draws(self) -> str:
+        """What draws showed, in one sentence."""
+        return str(self.monte_carlo) if self.models else NO_MODEL
+
+    @property
     def runs(self) -> Verification | None:
         """What was simulated on the nonlinear plants: every scenario after `with_simulation`, else the steps."""
         if self.simulated is not None:
@@ -302,6 +311,8 @@ class Certificate:
 
     def play_steps(self, progress: Progress = ignore) -> Certificate:
         """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
+        if not self.models:
+            return replace(self, steps=NO_MODEL)
         steps = simulate_steps(self.controller, self.models, self.parameters, self._draws(), progress)
         cycles: dict[str, tuple[FoundCycle, ...]] = {}
         for name, model in self.models.items():
@@ -456,7 +467,11 @@ class Certificate:
         friction = [f"{name}: {self._describe_margin(name)}{self._describe_draws(name)}" for name in self._frictions]
         peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
         lifted = self.controller.lifted_notes
-        lifted += () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
+        lifted += (
+            ()
+            if peak or not self.models
+            else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
+        )
         return (
             *self.remarks, *warn_unidentified(self.parameters, used), *friction, *self._ideal_notes(), *outside,
             *little, *lifted,
@@ -532,7 +547,7 @@ class Certificate:
             lines += self._plant_lines(name)
         if self.varied:
             lines.append(f"  varied: {'; '.join(map(str, self.varied))}")
-        lines.append(f"  {self.monte_carlo}")
+        lines.append(f"  {self.draws}")
         lines += [f"  {line}" for line in (self.runs.describe_steps() if self.runs is not None else [])]
         lines += [f"  {line}" for line in (self.simulated.lines() if self.simulated is not None else [])]
         lines += [f"  impedance: {line}" for line in (self.impedance.lines() if self.impedance is not None else [])]
@@ -612,7 +627,7 @@ def format_certificate(certificate: Certificate) -> str:
         + html_list(certificate.notes)
         + plants
         + varied
-        + format_draws(certificate.monte_carlo)
+        + (format_draws(certificate.monte_carlo) if certificate.models else html_paragraph(NO_MODEL))
         + required
         + simulated
     )

@@ -37,6 +37,7 @@ from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.certificate.certificate import (
     DESIGN_NAMES,
     MIN_FRICTION_MARGIN,
+    NO_MODEL,
     Certificate,
     MonteCarlo,
     Requirement,
@@ -49,6 +50,7 @@ from seaopt.robustness.certificate.requirements import (
     draw_requirements,
     friction_requirements,
     impedance_requirements,
+    measured_design_requirements,
     measured_requirements,
     plant_requirements,
 )
@@ -135,6 +137,7 @@ def certify(
     plants : mapping of name to Plant
         Plants on which it must pass. The design plant is certified too, as "design" where it is not among them. One
         with friction is certified twice: sliding, where its friction is flattest, and stuck, where it is steepest.
+        Empty for a controller designed on a measured response, which is certified on `measured` alone.
     parameters : Fit or ParameterSet
         A fit's joint distribution, truncated to the bounds; or values, with the prior_std of those that have one.
     ranges : mapping of name to (low, high), optional
@@ -166,7 +169,8 @@ def certify(
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     measured : mapping of name to MeasuredResponse, optional
         Measured frequency responses on which stability, Ms, Mt and disk margin are required too, of every response in
-        the discs. Draws and simulations are of the models.
+        the discs. Draws and simulations are of the models. Of a controller designed on a measured response the first
+        is that one, on which all limits are required; nothing is drawn or simulated.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
@@ -179,7 +183,7 @@ def certify(
     ------
     ControlError
         There is no plant, a plant lacks the measured output, a range is empty, or the fit does not identify a
-        parameter.
+        parameter; or a controller designed on a measured response is given models, or no measured response.
 
     Examples
     --------
@@ -196,6 +200,8 @@ def certify(
     """
     _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability, min_friction_margin)
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
+    if controller.design is None:
+        return _certify_points(controller, plants, parameters, measured or {}, seed=seed, confidence=confidence)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
     require_type(simulations, bool, "simulations", "give True or False", ControlError)
@@ -328,7 +334,7 @@ def _check_arguments(
     require_type(controller, Controller, "controller", "give a Controller", ControlError)
     if not isinstance(plants, Mapping):
         raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
-    if not plants:
+    if not plants and controller.design is not None:
         raise ControlError("certify needs at least one plant; give {name: plant}")
     for name, plant in plants.items():
         require_plant(plant, f"plants: {name}", ControlError)
@@ -350,10 +356,36 @@ def _check_arguments(
         raise ControlError(
             f"max_failure_probability = {max_failure_probability:g} is not a probability; give 0.01, say"
         )
-    if controller.design is None:
+
+
+def _certify_points(
+    controller: Controller, plants: Mapping[str, Plant], parameters: Fit | ParameterSet,
+    measured: Mapping[str, MeasuredResponse], *, seed: int, confidence: float,
+) -> Certificate:  # fmt: skip
+    """Certify a controller that was designed on a measured response: on measured points, without any model."""
+    if plants:
         raise ControlError(
-            "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
+            f"the controller was designed on a measured response, and plants names {', '.join(plants)}; "
+            "to certify it on models design it on one: robust_to then takes the response"
         )
+    if not measured:
+        raise ControlError(
+            "the controller was designed on a measured response, or does not know its design plant; give the response "
+            'it was designed on first: measured={"frf:chirp": response}'
+        )
+    requirements = (
+        *measured_design_requirements(controller, *next(iter(measured.items()))),
+        *(row for name, one in measured.items() for row in measured_requirements(controller, name, one)),
+    )
+    nothing_drawn = MonteCarlo(
+        samples=0, failures=0, seed=seed, confidence=confidence, failure_probability_bound=1.0
+    )  # fmt: skip
+    return Certificate(
+        passed=all(row.met for row in requirements), requirements=requirements, plants={}, margins={}, worst={},
+        monte_carlo=nothing_drawn, controller=controller, models={},
+        parameters=parameters.parameters if isinstance(parameters, Fit) else parameters, steps=NO_MODEL,
+        remarks=_remark_measured(controller, measured),
+    )  # fmt: skip
 
 
 def _with_design(

@@ -58,10 +58,22 @@ def plant_requirements(controller: Controller, name: str, figures: LoopFigures) 
 
 def measured_requirements(controller: Controller, name: str, measured: MeasuredResponse) -> list[Requirement]:
     """Return what is required on a measured response: the limits of every plant, of every response in the discs."""
+    return plant_requirements(controller, *_measure_discs(controller, name, measured))
+
+
+def measured_design_requirements(controller: Controller, name: str, measured: MeasuredResponse) -> list[Requirement]:
+    """Return what is required on the measured response that a controller was designed on, of the design plant alone."""
+    on, figures = _measure_discs(controller, name, measured)
+    return [
+        _make_requirement(verdict, "")
+        for verdict in judge(controller.spec, controller.measure(on, figures), "design plant")
+    ]
+
+
+def _measure_discs(controller: Controller, name: str, measured: MeasuredResponse) -> tuple[str, LoopFigures]:
     plant = controller.spec.see_response(measured, controller.command)
     figures = DiscLoop(plant=plant, law=controller.law).figures(controller.spec.bandwidth_hz)
-    on = f"{name} (on measured points, at {100 * measured.confidence:.4g} %)"
-    return plant_requirements(controller, on, figures)
+    return f"{name} (on measured points, at {100 * measured.confidence:.4g} %)", figures
 
 
 def _make_requirement(verdict: Verdict, remark: str) -> Requirement:
