@@ -31,6 +31,8 @@ REMEDIES = {
     "steady_error": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
     "sustained_oscillation": "a lower bandwidth_hz, or min_friction_margin in [controller]",
     "impedance_stable": "less stiffness, or more damping, in [impedance]",
+    "impedance_rest": "less stiffness, or more damping, in [impedance]",
+    "impedance_draws": "less stiffness, or more damping, in [impedance]",
     "impedance_damper": "other stiffness, damping or velocity_filter_s in [impedance], inside the region of the report",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }

@@ -33,7 +33,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
-from seaopt.robustness.certificate.impedance import CertifiedImpedance, certify_impedance
+from seaopt.robustness.certificate.impedance import CertifiedImpedance, ImpedanceDraws, certify_impedance
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
@@ -385,6 +385,7 @@ class Certificate:
         for name in stored.plants:
             if name not in known:
                 raise FileError(f'robustness.json: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
+        drawn = None if stored.impedance is None else stored.impedance.draws
         try:
             linear = {name: known[name] for name in stored.plants}
             requirements = tuple(Requirement(**row.model_dump()) for row in stored.requirements)
@@ -412,7 +413,12 @@ class Certificate:
                     for name, one in stored.friction.items()
                     if one.draws is not None
                 },
-                impedance=certify_impedance(controller, models, parameters),
+                impedance=certify_impedance(
+                    controller,
+                    models,
+                    parameters,
+                    None if drawn is None else ImpedanceDraws(**drawn.model_dump()),
+                ),
                 remarks=tuple(stored.remarks),
             )
             certificate = certificate.play_steps()

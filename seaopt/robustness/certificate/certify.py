@@ -8,7 +8,7 @@ and with failures the bound is Clopper's and Pearson's. Draws are made and measu
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from types import NoneType
 
@@ -44,7 +44,7 @@ from seaopt.robustness.certificate.certificate import (
     plant_margins,
 )
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
-from seaopt.robustness.certificate.impedance import certify_impedance
+from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
 from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
@@ -68,7 +68,7 @@ DRAWS_KEPT = 5000  # of which Ms is kept, to be drawn
 MOST_DELAY_SAMPLES = 20  # samples
 WORST_KEPT = 64  # worst draws kept of each plant
 # Seconds that a part takes as a rule: of each draw and plant, or of each plant.
-DRAW, SEARCH, BOUND, FRICTION, STEPS, SIMULATIONS = 1.5e-4, 0.3, 0.4, 0.3, 1.0, 3.5
+DRAW, SEARCH, BOUND, FRICTION, IMPEDANCE, STEPS, SIMULATIONS = 1.5e-4, 0.3, 0.4, 0.3, 0.05, 1.0, 3.5
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
 
 
@@ -221,9 +221,10 @@ def certify(
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
-    drawing, searching, bounding, rubbing, stepping, simulating = divide(
+    drawing, searching, bounding, rubbing, rendering, stepping, simulating = divide(
         progress, DRAW * samples * len(plants), SEARCH * len(plants), BOUND * len(plants) * (bounds is not None),
-        FRICTION * len(plants), STEPS * len(models), SIMULATIONS * len(models) * simulations,
+        FRICTION * len(plants), IMPEDANCE * min(samples, IMPEDANCE_DRAWS) * (controller.outer is not None),
+        STEPS * len(models), SIMULATIONS * len(models) * simulations,
     )  # fmt: skip
     failures, drawn, drawn_ms = _measure_draws(controller, plants, unknown, samples, rng, drawing)
     worst = {
@@ -246,11 +247,13 @@ def certify(
         unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
     )  # fmt: skip
     rubbing("friction at the draws", 0.0)
-    impedance = certify_impedance(controller, models, nominal)
     friction = find_nominal_margins(controller, models, nominal)
     friction_draws = find_margins_at_draws(
         controller, models, unknown, friction, samples, rng, required=min_friction_margin
     )
+    impedance = certify_impedance(controller, models, nominal)
+    if impedance is not None and impedance.safe:
+        impedance = replace(impedance, draws=draw_impedance(controller, models, unknown, samples, rng, rendering))
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),

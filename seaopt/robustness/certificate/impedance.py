@@ -3,13 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
-from seaopt.control import Controller, ImpedanceRegion, Rendering, passive_region, render
+import numpy as np
+
+from seaopt.control import Controller, Impedance, ImpedanceRegion, Rendering, passive_region, render
+from seaopt.control.impedance.link import find_link
+from seaopt.control.impedance.moving_loop import close_link
+from seaopt.control.impedance.sampled_port import SampledPort
+from seaopt.control.loops.loop import GROWING
 from seaopt.errors import ControlError, suggestion
+from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import split_friction
+from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
+from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.uncertainty.worst import place_values
+from seaopt.robustness.verification.impedance_steps import ImpedanceStep, play_impedance_steps
+
+IMPEDANCE_DRAWS = 100  # at most so many are looked at
+
+
+@record
+class ImpedanceDraws:
+    """For how many draws the link is stable by itself, and passive with its own damper.
+
+    A draw of a plant with friction counts where it is so sliding and stuck.
+
+    Parameters
+    ----------
+    samples, stable, passive : int
+        Draws looked at, and those for which it is.
+    margin : float
+        The least of the passivity condition over the draws, as a share: above zero it is kept.
+    parameters : mapping
+        That draw.
+
+    """
+
+    samples: int
+    stable: int
+    passive: int
+    margin: float
+    parameters: dict[str, float]
+
+    def __str__(self) -> str:
+        at = f", least so at {format_values(self.parameters)}" if self.parameters else ""
+        return f"over draws, stable in {self.stable} of {self.samples} and passive in {self.passive}{at}"
 
 
 @record(eq=False)
@@ -21,31 +64,57 @@ class CertifiedImpedance:
     plant : str
         Whose link it is.
     rendering : Rendering
-        The pair that is asked for.
+        The pair that is asked for, with friction sliding.
     region : ImpedanceRegion
         Every pair with the same filter.
+    stuck : Rendering or None
+        The same pair with friction stuck, of a plant that has some.
+    draws : ImpedanceDraws or None
+        The pair over draws of the parameters; None where nothing is uncertain, or it fails without draws.
+    steps : tuple of ImpedanceStep
+        Steps of x_0 simulated on the nonlinear plant.
 
     """
 
     plant: str
     rendering: Rendering
     region: ImpedanceRegion
+    stuck: Rendering | None = None
+    draws: ImpedanceDraws | None = None
+    steps: tuple[ImpedanceStep, ...] = ()
+
+    @property
+    def safe(self) -> bool:
+        """The link rests by itself and is passive, with friction sliding and stuck, at the nominal parameters."""
+        return all(one.stable and one.passive for one in (self.rendering, self.stuck) if one is not None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return both, for robustness.json."""
-        return {"plant": self.plant} | self.rendering.to_dict() | {"region": self.region.to_dict()}
+        """Return all of it, for robustness.json."""
+        return {"plant": self.plant} | self.rendering.to_dict() | {
+            "region": self.region.to_dict(),
+            "stuck": None if self.stuck is None else self.stuck.to_dict(),
+            "draws": None if self.draws is None else asdict(self.draws),
+            "steps": [asdict(step) for step in self.steps],
+        }  # fmt: skip
 
     def lines(self) -> list[str]:
         """Return the findings, one line each."""
         asked, called = self.rendering.impedance, self.rendering.called
         head = f"{asked.stiffness:.4g} {called.stiffness} and {asked.damping:.4g} {called.damping} at the link of "
-        return [f"{head}{self.plant}: {'; '.join(self.rendering.describe())}", *self.region.describe()]
+        stuck = [] if self.stuck is None else [f"with its friction stuck: {self.stuck.describe()[0]}"]
+        drawn = [] if self.draws is None else [str(self.draws)]
+        return [
+            f"{head}{self.plant}: {'; '.join(self.rendering.describe())}", *stuck, *drawn,
+            *(step.describe(self.rendering.outer.place_unit) for step in self.steps), *self.region.describe(),
+        ]  # fmt: skip
 
 
 def certify_impedance(
-    controller: Controller, models: Mapping[str, Plant], parameters: ParameterSet
+    controller: Controller, models: Mapping[str, Plant], parameters: ParameterSet, draws: ImpedanceDraws | None = None
 ) -> CertifiedImpedance | None:
     """Measure the impedance of a controller's outer loop at the nominal parameters; None where it has none.
+
+    `draws` is what `draw_impedance` found.
 
     Raises
     ------
@@ -56,17 +125,62 @@ def certify_impedance(
     outer = controller.outer
     if outer is None:
         return None
+    name = _find_plant(controller, models)
+    impedance, model = outer.impedance, models[name]
+    sliding, *others = split_friction({name: model}, parameters).values()
+    return CertifiedImpedance(
+        plant=name, rendering=render(controller, sliding, parameters, impedance),
+        region=passive_region(controller, sliding, parameters, velocity_filter_s=impedance.velocity_filter_s),
+        stuck=render(controller, others[0], parameters, impedance) if others else None, draws=draws,
+        steps=play_impedance_steps(controller, model, parameters),
+    )  # fmt: skip
+
+
+def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
+    """Return the name of the model at whose link the controller's outer loop renders its impedance."""
+    assert controller.outer is not None
     moving = [name for name, plant in models.items() if plant.port is not None and plant.port.motion is not None]
-    name = outer.plant or next(iter(moving), "")
+    name = controller.outer.plant or next(iter(moving), "")
     if name not in moving:
         raise ControlError(
             f'the impedance is rendered at the link of plant "{name}", which is not one of the certified plants whose '
             f"link moves; {suggestion(name, moving)}"
         )
-    impedance = outer.impedance
-    return CertifiedImpedance(
-        plant=name, rendering=render(controller, models[name], parameters, impedance),
-        region=passive_region(
-            controller, models[name], parameters, velocity_filter_s=impedance.velocity_filter_s
-        ),
-    )  # fmt: skip
+    return name
+
+
+def draw_impedance(
+    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
+    progress: Progress = ignore,
+) -> ImpedanceDraws | None:  # fmt: skip
+    """Judge the impedance of a controller's outer loop at draws; None where it has none, or nothing is drawn."""
+    count = min(samples, IMPEDANCE_DRAWS)
+    if controller.outer is None or not count:
+        return None
+    name = _find_plant(controller, models)
+    values = unknown.values(unknown.draw(count, rng))
+    states = split_friction({name: models[name]}, unknown.nominal, [row.name for row in unknown.varied()]).values()
+    stable = passive = 0
+    least, worst = np.inf, dict[str, float]()
+    for k in count_off(range(count), "impedance, draw", progress):
+        draw = {key: float(column[k]) for key, column in values.items()}
+        judged = [
+            _judge(controller, state, place_values(state, unknown.nominal, draw), controller.outer.impedance)
+            for state in states
+        ]
+        stable += all(rests for rests, _ in judged)
+        margin = min(margin for _, margin in judged)
+        passive += margin > 0.0
+        if margin < least:
+            least, worst = margin, {key: value for key, value in draw.items() if key in models[name].parameters}
+    return ImpedanceDraws(samples=count, stable=stable, passive=passive, margin=float(least), parameters=worst)
+
+
+def _judge(controller: Controller, plant: Plant, params: ParameterSet, impedance: Impedance) -> tuple[bool, float]:
+    """Return whether the link rests by itself, and the margin of the passivity condition with its own damper."""
+    link = find_link(controller, plant, params)
+    outer = link.outer(impedance)
+    port = SampledPort(link=link, velocity_filter_s=outer.velocity_filter_s)
+    margin, _ = port.worst(impedance, link.load.damping, port.angles())
+    radius = close_link(link, outer.velocity_filter_s).radius(impedance.stiffness, impedance.damping)
+    return float(radius) <= GROWING, float(margin) if port.held_stable() else -np.inf

@@ -23,6 +23,7 @@ from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
+from seaopt.robustness.verification.impedance_steps import AT_REST
 
 NO_FRICTION = "no friction: any margin holds"
 WITNESS_REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
@@ -142,22 +143,47 @@ def friction_requirements(
 
 
 def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
-    """Return that the link is stable by itself under the impedance asked for, and that no environment changes that."""
+    """Return what is required of an impedance: the link is stable by itself, and no environment changes that.
+
+    Both hold with friction sliding and stuck, and at the draws, and simulated steps come to rest.
+    """
     if impedance is None:
         return []
-    found, where = impedance.rendering, f"{impedance.plant}: link"
-    unit = found.called.damping
-    breaking = "" if found.breaking is None else f"; {found.breaking.describe(found.called)}"
-    return [
-        Requirement(
-            name="impedance_stable", limit=1.0, value=found.spectral_radius, met=found.stable,
-            where=f"{where} with nothing on it",
-        ),
-        Requirement(
-            name="impedance_damper", limit=found.link_damping, value=found.needed_damper, met=found.passive,
-            where=f"{where}, {unit} that make it passive, and its own{breaking}",
-        ),
-    ]  # fmt: skip
+    called, unit = impedance.rendering.called, impedance.rendering.outer.place_unit
+    link = f"{impedance.plant}: link"
+    rows: list[Requirement] = []
+    for state, rendered in (("", impedance.rendering), (", friction stuck", impedance.stuck)):
+        if rendered is None:
+            continue
+        breaking = "" if rendered.breaking is None else f"; {rendered.breaking.describe(called)}"
+        rows += [
+            Requirement(
+                name="impedance_stable", limit=1.0, value=rendered.spectral_radius, met=rendered.stable,
+                where=f"{link} with nothing on it{state}",
+            ),
+            Requirement(
+                name="impedance_damper", limit=rendered.link_damping, value=rendered.needed_damper,
+                met=rendered.passive,
+                where=f"{link}, {called.damping} that make it passive, and its own{state}{breaking}",
+            ),
+        ]  # fmt: skip
+    if impedance.draws is not None:
+        drawn = impedance.draws
+        failed = drawn.samples - min(drawn.stable, drawn.passive)
+        rows.append(
+            Requirement(
+                name="impedance_draws", limit=0.0, value=float(failed), met=not failed,
+                where=f"{link}: {drawn}",
+            )
+        )  # fmt: skip
+    for step in impedance.steps:
+        rows.append(
+            Requirement(
+                name="impedance_rest", limit=AT_REST, value=step.moving, met=step.rests,
+                where=f"{link}: {step.describe(unit)}",
+            )
+        )  # fmt: skip
+    return rows
 
 
 def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:

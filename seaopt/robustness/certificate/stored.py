@@ -118,6 +118,22 @@ class StoredFriction(ResultTable):
     draws: StoredFrictionDraws | None = None
 
 
+class StoredImpedanceDraws(ResultTable):
+    """For how many draws an impedance is stable and passive, and where it is least so."""
+
+    samples: Whole
+    stable: Whole
+    passive: Whole
+    margin: NullIsMinusInfinite
+    parameters: dict[str, Number]
+
+
+class StoredImpedance(ResultTable):
+    """What is rendered at the link, of which all but the draws is found again."""
+
+    draws: StoredImpedanceDraws | None = None
+
+
 class StoredCertificate(ResultTable):
     """A robustness.json."""
 
@@ -128,6 +144,7 @@ class StoredCertificate(ResultTable):
     simulation: StoredSimulation | None = None
     remarks: list[str] = []
     friction: dict[str, StoredFriction] = {}
+    impedance: StoredImpedance | None = None
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:

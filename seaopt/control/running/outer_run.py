@@ -1,0 +1,55 @@
+r"""An impedance's outer loop and the force law behind it as one law, so that what runs a law runs both.
+
+With :math:`s` the state of the outer loop's filtered speed (`seaopt.control.loops.outer_loop`), the force law's
+reference is :math:`\sigma K_v x_0 - \sigma (K_v + D_v \rho) x - \sigma D_v s`, :math:`\rho` the filter's rate. Put into
+the force law it gives a law of the reference x_0 and of two measured signals, the force and the link's position. The
+integrators, the limit of the command and its anti-windup are the force law's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.control.loops.outer_loop import OuterLoop
+
+
+def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
+    """Return the law of x_0, and of force and link position measured, that a force law and an outer loop make.
+
+    Parameters
+    ----------
+    law : RunnableLaw
+        Of one measured signal.
+    outer : OuterLoop
+        Before it, at the same rate.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control import Impedance, add_impedance
+    >>> from seaopt.control.laws.realisation import runnable
+    >>> knee, values = so.plants.rotary(), so.plants.rotary().defaults.update(N=50.0, k_s=300.0, d_l=1.0)
+    >>> force = so.tune(so.plants.rotary("locked"), values, so.ControllerSpec(measured="tau_s", bandwidth_hz=20))
+    >>> whole = add_impedance(force, knee, values, Impedance(stiffness=40.0, damping=2.0))
+    >>> enclose_law(runnable(whole), whole.outer).measured
+    2
+
+    """
+    n = law.c.size
+    by_position = outer.direction * (outer.stiffness + outer.damping * outer.rate)
+    by_speed = -outer.direction * outer.damping
+    a = np.zeros((n + 1, n + 1))
+    a[:n, :n], a[:n, n], a[n, n] = law.a, law.b_reference * by_speed, outer.pole
+    measured = np.zeros((n + 1, 2))
+    measured[:n, 0], measured[:n, 1] = law.b_measurement, law.b_reference * by_position
+    measured[n, 1] = (1.0 - outer.pole) * outer.rate
+    by_reference = outer.direction * outer.stiffness
+    return replace(
+        law, a=a, b_measurement=measured, c=np.append(law.c, law.d_reference * by_speed),
+        b_reference=np.append(law.b_reference * by_reference, 0.0), d_reference=law.d_reference * by_reference,
+        d_measurement=np.array([float(law.d_measurement), law.d_reference * by_position]),
+        anti_windup=np.append(law.anti_windup, 0.0),
+    )  # fmt: skip
