@@ -61,6 +61,17 @@ class Assembly:
             chain=chain, a=a, b=np.vstack([self.b, other.b]), c=np.concatenate([self.c, other.c]), d=self.d + other.d
         )  # fmt: skip
 
+    def scaled(self, factor: float) -> Assembly:
+        """Return this times a factor."""
+        return Assembly(chain=self.chain * factor, a=self.a, b=self.b, c=self.c * factor, d=self.d * factor)
+
+    def widened(self, count: int) -> Assembly:
+        """Return this on so many inputs, of which it does not read the last."""
+        more = ((0, 0), (0, count - self.d.size))
+        return Assembly(
+            chain=np.pad(self.chain, more), a=self.a, b=np.pad(self.b, more), c=self.c, d=np.pad(self.d, more[1])
+        )  # fmt: skip
+
     def through(self, part: TransferFunction) -> Assembly:
         """Return this in series with a stable part."""
         a, b, c, d = part.state_space()
@@ -88,14 +99,15 @@ class Assembly:
         )  # fmt: skip
 
     def law(self, sample_time_s: float) -> Law:
-        """Return the law of a reference and a measurement, where the inputs are reference - measurement, reference."""
+        """Return the law of reference and measured signals, the inputs being error, reference and further signals."""
         m = len(self.chain)
         while m and not np.any(self.chain[m - 1]):
             m -= 1
-        chain, d = np.zeros((m, 2)), self.d.copy()
+        chain, d = np.zeros((m, self.d.size)), self.d.copy()
         for power, row in enumerate(self.chain[:m], start=1):
             d += row
             for j in range(1, power + 1):
                 chain[j - 1] += math.comb(power, j) * row
-        turn = np.array([[1.0, -1.0], [1.0, 0.0]])  # inputs (error, reference) from (reference, measurement)
+        turn = np.eye(self.d.size)  # inputs (error, reference, ...) from (reference, measurement, ...)
+        turn[:2, :2] = [[1.0, -1.0], [1.0, 0.0]]
         return Law(**build_chain(chain @ turn, self.a, self.b @ turn, self.c), d=d @ turn, sample_time_s=sample_time_s)

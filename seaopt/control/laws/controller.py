@@ -11,7 +11,7 @@ import numpy as np
 from seaopt.control.laws.command import Command, actuation_notes, limit_notes
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
-from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
+from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, SpeedLoop
 from seaopt.control.laws.verdict import (
     DesignFigure,
     PossibleBandwidths,
@@ -71,7 +71,7 @@ class Controller:
     Parameters
     ----------
     structure : str
-        "pd", "pid", "pid_dob"; or "custom", of a law that was given (`seaopt.assess`).
+        "pd", "pid", "pid_dob", "cascade"; or "custom", of a law that was given (`seaopt.assess`).
     gains : mapping
         For reading; what counts is `law`. Empty of a custom law.
     sample_time_s : float
@@ -140,6 +140,11 @@ class Controller:
         return self.reads or list_names(self.spec.measured)
 
     @property
+    def speed_loop(self) -> SpeedLoop | None:
+        """What the speed loop of a cascade reads; None of another structure."""
+        return self.spec.find_speed_loop(self.signals)
+
+    @property
     def design_loop(self) -> MeasuredLoop:
         """The design plant's loop, as limits are judged on it."""
         return self._add_friction(self.measure("design plant", self.achieved))
@@ -150,9 +155,10 @@ class Controller:
         Filter and integral are those of the gains where they make the law; of another law they are read off the law.
         """
         gains, law, ts = self.gains, self.law, self.sample_time_s
-        if set(LAW_GAINS) <= set(gains) and Gains.from_names(gains, self.observer).makes(law, self.spec.structure):
-            filter_samples = gains["T_f"] / ts if gains["k_d"] else np.inf
-            integral = gains["k_i"] / (1.0 + gains["k_p"]) if self.structure != "pd" and gains["k_i"] else np.inf
+        made = Gains.from_names(gains, self.observer, self.speed_loop) if set(LAW_GAINS) <= set(gains) else None
+        if made is not None and made.makes(law, self.spec.structure):
+            filter_samples = made.T_f / ts if made.k_d else np.inf
+            integral = made.integral_rad_s if self.structure != "pd" and made.k_i else np.inf
         else:
             filter_samples, integral = count_filter_samples(law), find_integral_rate(law)
         return MeasuredLoop(

@@ -1,10 +1,10 @@
 r"""The limits that a controller can be asked to keep, one row each, for tuner, certificate, problem file and report.
 
 A limit has a *figure* of one closed loop, and is kept where that figure is at most, at least or equal to what the
-specification allows. While tuning, most limits are also a *curve*: with :math:`L = P C_y`, at every frequency from
-`from_hz` to `until_hz`,
+specification allows. While tuning, most limits are also a *curve*: with L the loop gain, broken at the command, at
+every frequency from `from_hz` to `until_hz`,
 
-.. math:: |X| \le m\,|1 + L| \quad (\text{or} \ge), \qquad X \in \{1,\, L,\, 1 - L,\, C_y,\, P C_r\},
+.. math:: |X| \le m\,|1 + L| \quad (\text{or} \ge), \qquad X \in \{1,\, L,\, 1 - L,\, C_y,\, C_v,\, P C_r\},
 
 which is affine in the gains between the absolute values. Scan, quadratic programs and interior point need no more than
 X and m, and the certificate no more than the figure.
@@ -116,7 +116,7 @@ class LimitCurve:
 
     """
 
-    of: Literal["1", "L", "1 - L", "C_y", "P C_r"]
+    of: Literal["1", "L", "1 - L", "C_y", "C_v", "P C_r"]
     level: Callable[[float], float] = float
     from_hz: Callable[[float, float], float] | None = None
     until_hz: Callable[[float, float], float] | None = None
@@ -124,7 +124,7 @@ class LimitCurve:
     fall: float = 0.0
     symbol: str = ""
 
-    def numerator(self, p: Any, c_y: Any, c_r: Any, open_loop: Any) -> Any:
+    def numerator(self, p: Any, c_y: Any, c_r: Any, open_loop: Any, c_v: Any = 0.0) -> Any:
         """Return X of responses, which may be arrays or a solver's expressions."""
         match self.of:
             case "1":
@@ -135,12 +135,14 @@ class LimitCurve:
                 return 1.0 - open_loop
             case "C_y":
                 return c_y
+            case "C_v":
+                return c_v
             case "P C_r":
                 return p * c_r
 
-    def change(self, p: Any, by_y: Any, by_r: Any, by_loop: Any) -> Any:
-        """Return the change of X with changes of C_y, C_r and L: X is affine in them."""
-        return {"1": 0.0, "L": by_loop, "1 - L": -by_loop, "C_y": by_y, "P C_r": p * by_r}[self.of]
+    def change(self, p: Any, by_y: Any, by_r: Any, by_loop: Any, by_v: Any = 0.0) -> Any:
+        """Return the change of X with changes of C_y, C_r, C_v and L: X is affine in them."""
+        return {"1": 0.0, "L": by_loop, "1 - L": -by_loop, "C_y": by_y, "C_v": by_v, "P C_r": p * by_r}[self.of]
 
 
 @record(eq=False)

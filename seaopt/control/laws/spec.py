@@ -8,7 +8,16 @@ from typing import Any, Literal
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.limits import BY_NAME, FIELDS, GIVEN_LAW_LIMITS, LIMITS, Limit
-from seaopt.control.laws.structures import CUSTOM, REFERENCE_WEIGHTS, STRUCTURES, Notch, ReferenceWeights, Structure
+from seaopt.control.laws.structures import (
+    CASCADE,
+    CUSTOM,
+    REFERENCE_WEIGHTS,
+    STRUCTURES,
+    Notch,
+    ReferenceWeights,
+    SpeedLoop,
+    Structure,
+)
 from seaopt.control.loops.measured.plant import MeasuredPlant, sample_measured
 from seaopt.control.loops.sampled_plant import Measured, list_names
 from seaopt.errors import ControlError, suggestion
@@ -35,8 +44,9 @@ class ControllerSpec:
         Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
     bandwidth_range_hz : (low, high)
         Allowed range of bandwidth_hz; 15 to 60 if left out.
-    structure : {"pd", "pid", "pid_dob", "custom"}
-        A pid_dob has a disturbance observer whose nominal plant is the design plant; custom is a law that is given
+    structure : {"pd", "pid", "pid_dob", "cascade", "custom"}
+        A pid_dob has a disturbance observer whose nominal plant is the design plant; a cascade closes a loop on the
+        motor's speed, the second of `measured`, inside the force loop; custom is a law that is given
         (`seaopt.assess`), which may have more than bandwidth_hz.
     notch : Notch, optional
         A notch in series; fields that are None are tuned.
@@ -158,6 +168,11 @@ class ControllerSpec:
                 f'measured = {measured!r} is not an output, nor several; give a name such as "F1", or a tuple of '
                 "different ones, the regulated first"
             )
+        if self.structure == CASCADE and len(names) != 2:
+            raise ControlError(
+                f'measured = {list(names)}: structure = "cascade" reads the regulated output and the motor\'s speed; '
+                f'give both: measured = ["{names[0]}", "thetad_m"]'
+            )
 
     def _check_types(self) -> None:
         if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int | None):
@@ -213,6 +228,10 @@ class ControllerSpec:
     def regulated(self) -> str:
         """The output that is regulated, the first of what is measured."""
         return list_names(self.measured)[0]
+
+    def find_speed_loop(self, reads: tuple[str, ...]) -> SpeedLoop | None:
+        """Return what the speed loop of a cascade reads, of the outputs that its law reads; None without one."""
+        return SpeedLoop(differenced=reads != list_names(self.measured)) if self.structure == CASCADE else None
 
     @property
     def loop_delay_samples(self) -> int:

@@ -15,6 +15,7 @@ from seaopt.control.laws.structures import (
     AGREES,
     COMPARED,
     CUSTOM,
+    INNER_GAINS,
     LAW_GAINS,
     DisturbanceObserver,
     Gains,
@@ -245,7 +246,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     outer = None if table.impedance is None else OuterLoop(**table.impedance.model_dump())
     if outer is not None and not abs(outer.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
         raise _contradict("impedance.sample_time_s", f"is {outer.sample_time_s:g}, and the law has another")
-    _check_gains(table.gains, observer, spec, law)
+    _check_gains(table.gains, observer, spec, law, reads)
     for name, stated in table.engineering.items():
         expected = table.command.per_effort * table.gains.get(name, np.nan)
         if not abs(stated.value - expected) <= AGREES * abs(expected):
@@ -300,20 +301,28 @@ def _check_gains(
     observer: DisturbanceObserver | None,
     spec: ControllerSpec,
     law: Law,
+    reads: tuple[str, ...],
 ) -> None:
     """Refuse gains that do not give the law."""
     if spec.structure == CUSTOM:
         if gains:
             raise _contradict("gains", f"has {', '.join(sorted(gains))}, and a custom law has none")
         return
-    needed = {*LAW_GAINS, *(NOTCH_GAINS if "notch_depth" in gains else ()), *(("T_q",) if observer is not None else ())}
+    speed = spec.find_speed_loop(reads or list_names(spec.measured))
+    inner = () if speed is None else (*INNER_GAINS, *(("T_v",) if "T_v" in gains else ()))
+    needed = {
+        *LAW_GAINS,
+        *inner,
+        *(NOTCH_GAINS if "notch_depth" in gains else ()),
+        *(("T_q",) if observer is not None else ()),
+    }
     if set(gains) != needed:
         raise _contradict("gains", f"has {', '.join(sorted(gains))} where the law has {', '.join(sorted(needed))}")
     if (observer is not None) != (spec.structure == "pid_dob") or (
         observer is not None and gains["T_q"] != observer.T_q
     ):
         raise _contradict("observer", "is not that of structure and gains")
-    if not Gains.from_names(gains, observer).makes(law, spec.structure):
+    if not Gains.from_names(gains, observer, speed).makes(law, spec.structure):
         raise _contradict("law", "is not what gains, observer and spec give")
 
 

@@ -42,10 +42,22 @@ the integrator comes out by hand, and so does what is left:
 `Gains.law` puts the parts together so (`seaopt.control.laws.assembly`): in the inputs error and reference, where what
 stands on the reference alone has one integrator less, so that the loop rests at its reference to the last bit.
 
+**Cascade** (`cascade`). A speed loop of the motor, P or PI, inside the force loop:
+
+.. math::
+    F_m = \frac{F_\mathrm{ref}}{P(0)} + k_v \Big(1 + \frac{I}{T_v}\Big) (v_\mathrm{ref} - \Delta y_v), \qquad
+    k_v v_\mathrm{ref} = k_r F_\mathrm{ref} - k_p F_\mathrm{meas} + k_i I (F_\mathrm{ref} - F_\mathrm{meas})
+    + k_d D (c F_\mathrm{ref} - F_\mathrm{meas}),
+
+:math:`I = \frac{T_s}{2}\frac{1+q}{1-q}`. :math:`y_v` is the motor's speed and :math:`\Delta = 1`, or the position that
+an encoder reads and :math:`\Delta = (1 - q)/T_s`. Gains of the force loop are of effort, as everywhere: a drive's
+(speed per force) are these over :math:`k_v`. So :math:`k_v = 0` is a pid, and all is affine in :math:`k_v` too.
+The feedforward acts beside the speed loop, whose integral would otherwise sum it up.
+
 **Notch**, in series with all of it: a biquad :math:`(s^2 + 2 g \zeta \omega s + \omega^2)/(s^2 + 2 \zeta \omega s +
 \omega^2)` by Tustin's rule, prewarped to be exact at :math:`\omega`; :math:`\zeta` is its width, g its depth.
 
-At fixed T_f, T_q and notch, C_r and C_y are affine in (k_p, k_i, k_d, k_r, c k_d).
+At fixed T_f, T_q, T_v and notch, C_r, C_y and what feeds the speed back are affine in (k_p, k_i, k_d, k_r, c k_d, k_v).
 """
 
 from __future__ import annotations
@@ -66,14 +78,16 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
-Structure = Literal["pd", "pid", "pid_dob", "custom"]
+Structure = Literal["pd", "pid", "pid_dob", "cascade", "custom"]
 ReferenceWeights = Literal["tuned", "error", "measurement"]
 REFERENCE_WEIGHTS: tuple[ReferenceWeights, ...] = ("tuned", "error", "measurement")
-TUNED: tuple[Structure, ...] = ("pd", "pid", "pid_dob")
+CASCADE: Structure = "cascade"
+TUNED: tuple[Structure, ...] = ("pd", "pid", "pid_dob", CASCADE)
 CUSTOM: Structure = "custom"  # a law that is given, and that no gains describe
 STRUCTURES = (*TUNED, CUSTOM)
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
 LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
+INNER_GAINS = ("k_v", "k_ff")  # of a cascade besides; and T_v where its speed loop integrates
 SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms
 AGREES = 1e-6  # numbers for reading give the law's response to this share
 COMPARED = np.geomspace(1e-4, 0.49, 60)  # frequencies at which it is compared, of the sample rate
@@ -211,6 +225,67 @@ class DisturbanceObserver:
 
 
 @record
+class SpeedLoop:
+    """What the speed loop of a cascade reads: the motor's speed, or its encoder.
+
+    Parameters
+    ----------
+    differenced : bool
+        It is an encoder's position, and the law takes the difference over one sample.
+
+    """
+
+    differenced: bool
+
+    def sense(self, q: Complex[np.ndarray, " m"], sample_time_s: float) -> Complex[np.ndarray, " m"]:
+        """Return the speed per what is read, at q = exp(-j omega T_s)."""
+        return (1.0 - q) / sample_time_s if self.differenced else np.ones_like(q)
+
+
+@record
+class InnerLoop:
+    """The speed loop of a cascade.
+
+    Parameters
+    ----------
+    k_v : float
+        Effort per motor speed, N s/m or N m s/rad.
+    T_v : float
+        Seconds: its integral time; infinite for none.
+    k_ff : float
+        Effort per reference besides, 1/P(0).
+    speed : SpeedLoop
+        What it reads.
+
+    """
+
+    k_v: float
+    T_v: float
+    k_ff: float
+    speed: SpeedLoop
+
+    @property
+    def integrates(self) -> bool:
+        """Whether it is a PI."""
+        return math.isfinite(self.T_v)
+
+    def close(self, law: Assembly, sample_time_s: float) -> Assembly:
+        """Return the law around which this loop is closed, of the inputs error, reference and what is read.
+
+        `law` is k_v v_ref, of error and reference.
+        """
+        read = Assembly.of_gains(np.array([0.0, 0.0, -self.k_v]))
+        if self.speed.differenced:
+            read = read.through(TransferFunction(num=np.array([1.0, -1.0]) / sample_time_s, den=np.ones(1)))
+        whole = law.widened(3).plus(read)
+        if self.integrates:  # 1 + I/T_v = 1 - h + 2 h/delta with h = T_s/(2 T_v), as of k_i
+            static = whole.static * np.array([1.0, 1.0, 0.0 if self.speed.differenced else 1.0])
+            half = 0.5 * sample_time_s / self.T_v
+            whole = whole.scaled(1.0 - half).plus(whole.integrated(static).scaled(2.0 * half))
+        return whole.plus(Assembly.of_gains(np.array([0.0, self.k_ff, 0.0])))
+
+
+@record
 class Gains:
     """The numbers of a law.
 
@@ -225,13 +300,15 @@ class Gains:
     T_f : float
         Seconds: time constant of the derivative's filter.
     k_r : float
-        N/N: weight of the reference.
+        N/N: weight of the reference; in a cascade besides its k_ff, and negative down to it.
     c : float
         Weight of the reference in what is differentiated.
     observer : DisturbanceObserver, optional
         Of a pid_dob.
     notch : Notch, optional
         With a value in every field.
+    inner : InnerLoop, optional
+        Of a cascade.
 
     """
 
@@ -243,23 +320,40 @@ class Gains:
     c: float = 1.0
     observer: DisturbanceObserver | None = None
     notch: Notch | None = None
+    inner: InnerLoop | None = None
+
+    @property
+    def integral_rad_s(self) -> float:
+        """How fast the integral takes an error away, rad/s; of two integrals the ratio of their gains."""
+        if self.inner is not None and self.inner.integrates:
+            return self.k_i / (self.k_p + self.k_i * self.inner.T_v)
+        return self.k_i / (1.0 + self.k_p)
 
     def by_name(self) -> dict[str, float]:
         """Return the numbers by name, those of observer and notch too."""
         out = {name: getattr(self, name) for name in LAW_GAINS}
         if self.observer is not None:
             out["T_q"] = self.observer.T_q
+        if self.inner is not None:
+            out |= {name: getattr(self.inner, name) for name in INNER_GAINS}
+            out |= {"T_v": self.inner.T_v} if self.inner.integrates else {}
         if self.notch is not None:
             out |= {f"notch_{name}": value for name, value in asdict(self.notch).items()}
         return out
 
     @classmethod
-    def from_names(cls, numbers: Mapping[str, float], observer: DisturbanceObserver | None = None) -> Gains:
-        """Return the gains of `by_name`; those of an observer are its own."""
-        notch = None
+    def from_names(
+        cls, numbers: Mapping[str, float], observer: DisturbanceObserver | None = None, speed: SpeedLoop | None = None
+    ) -> Gains:
+        """Return the gains of `by_name`; those of an observer are its own, and what a speed loop reads is given."""
+        notch = inner = None
+        if speed is not None:
+            inner = InnerLoop(
+                k_v=numbers["k_v"], k_ff=numbers["k_ff"], T_v=numbers.get("T_v", math.inf), speed=speed
+            )  # fmt: skip
         if "notch_depth" in numbers:
             notch = Notch(**{field.name: numbers[f"notch_{field.name}"] for field in fields(Notch)})
-        return cls(**{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch)
+        return cls(**{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch, inner=inner)
 
     def makes(self, law: Law, structure: Structure) -> bool:
         """Tell whether these gains make a law: its responses, to a millionth, and its integrators."""
@@ -269,7 +363,7 @@ class Gains:
         return made.integrators == law.integrators and bool(np.all(near))
 
     def law(self, structure: Structure, sample_time_s: float) -> Law:
-        """Return the law as a state space from reference and measurement; `Law.balanced` is what runs."""
+        """Return the law as a state space from reference and what is measured; `Law.balanced` is what runs."""
         alone = self.k_r - self.k_p  # the two inputs are the error and the reference, on which these act alone
         short = sample_time_s / (self.T_f + sample_time_s)
         lag = TransferFunction(num=np.array([1.0, -1.0]), den=np.array([1.0, -self.T_f / (self.T_f + sample_time_s)]))
@@ -284,6 +378,8 @@ class Gains:
             surplus = alone - inverse
             rounding = SURPLUS_ROUNDING * (abs(self.k_p) + abs(alone) + abs(inverse))
             law = self.observer.correct(law, surplus if abs(surplus) > rounding else 0.0, sample_time_s)
+        if self.inner is not None:
+            law = self.inner.close(law, sample_time_s)
         if self.notch is not None:
             over, under = self.notch.biquad(sample_time_s)
             law = law.through(TransferFunction(num=over / under[0], den=under / under[0]))
@@ -303,17 +399,22 @@ def _or_one(polynomial: Float[np.ndarray, " n"] | None) -> Float[np.ndarray, " m
 
 
 class LawTerms(NamedTuple):
-    """What a law is made of at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer)."""
+    """What a law is made of at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer).
+
+    `ahead` is in series with feedforward: `series` but for the integral of a speed loop.
+    """
 
     series: Any
     integral: Any
     rate: Any
     observer: Any
+    ahead: Any
 
 
 def evaluate_terms(
-    q: Any, ts: Any, T_f: Any, observer: tuple[Any, Any, Any] | None = None, notch: tuple[Any, Any, Any] | None = None
-) -> LawTerms:
+    q: Any, ts: Any, T_f: Any, observer: tuple[Any, Any, Any] | None = None,
+    notch: tuple[Any, Any, Any] | None = None, speed_rate: Any = 0.0,
+) -> LawTerms:  # fmt: skip
     """Return the terms of a law at q, for numbers that may be arrays or symbols.
 
     Parameters
@@ -326,6 +427,8 @@ def evaluate_terms(
         The time constant, and the two parts of the nominal plant at q.
     notch : (w, width, depth), optional
         w = tan(pi f T_s) of its frequency.
+    speed_rate
+        1/T_v of a speed loop, rad/s; 0 where it does not integrate.
 
     """
     series: Any = 1.0
@@ -339,4 +442,6 @@ def evaluate_terms(
         s = (1.0 - q) / (1.0 + q)
         series = series * (s * s + s * (2.0 * depth * width * w) + w * w) / (s * s + s * (2.0 * width * w) + w * w)
     rate = (1.0 - q) / (T_f + ts - q * T_f)
-    return LawTerms(series=series, integral=(1.0 + q) / (1.0 - q) * (ts / 2), rate=rate, observer=more)
+    integral = (1.0 + q) / (1.0 - q) * (ts / 2)
+    inside = series if isinstance(speed_rate, float) and not speed_rate else series * (integral * speed_rate + 1.0)
+    return LawTerms(series=inside, integral=integral, rate=rate, observer=more, ahead=series)

@@ -279,6 +279,15 @@ class Law:
         d[column] /= ts
         return Law.from_state_space(a, b, np.append(self.c, -self.d[column] / ts), d, ts)
 
+    def reading(self, feedback: TransferFunction) -> Law:
+        """Return the law u - C(q) y that reads one signal more, in a last column of b."""
+        a, b, c, d = feedback.state_space()
+        n, more, inputs = self.c.size, c.size, self.d.size
+        whole, into = np.zeros((n + more, n + more)), np.zeros((n + more, inputs + 1))
+        whole[:n, :n], whole[n:, n:] = self.a, a
+        into[:n, :inputs], into[n:, inputs] = self.b, b
+        return replace(self, a=whole, b=into, c=np.concatenate([self.c, -c]), d=np.append(self.d, -d))
+
     def scaled(self, factor: float) -> Law:
         """Return the law with its output times a factor; the chain is read as before."""
         return replace(self, b=self.b * factor, d=self.d * factor)

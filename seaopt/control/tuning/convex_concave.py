@@ -1,8 +1,8 @@
 r"""Improve a law's gains by successive quadratic programs, the convex-concave procedure, for the tuner's second step.
 
 At fixed filters C_r and C_y, and with them every :math:`L_m = P_m C_y`, are affine in the gains
-:math:`\theta = (k_p, k_i, k_d, w_r, w_c)`, the last two the weights of the reference. At the last iterate let
-:math:`\alpha_m = \arg(1 + L_m)`. Then
+:math:`\theta = (k_p, k_i, k_d, w_r, w_c)`, the last two the weights of the reference, and k_v of a cascade. At the last
+iterate let :math:`\alpha_m = \arg(1 + L_m)`. Then
 
 .. math:: |1 + L_m(\theta)| \ge \rho_m(\theta) = \mathrm{Re}\, e^{-j\alpha_m} (1 + L_m(\theta)),
 
@@ -38,12 +38,13 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     FRICTION,
-    GAINS,
     K_D,
     K_P,
+    K_V,
     PASSIVE,
     Grid,
     LawNumbers,
+    LawResponse,
     Task,
     choose_prominent,
     use_disc,
@@ -64,21 +65,25 @@ class _LinearLimits:
     """Rows value + slope dtheta - slack <= 1, gathered one kind at a time."""
 
     value: list[Float[np.ndarray, " n"]] = field(default_factory=list)
-    slope: list[Float[np.ndarray, "n 5"]] = field(default_factory=list)
+    slope: list[Float[np.ndarray, "n g"]] = field(default_factory=list)
 
-    def add(self, value: Float[np.ndarray, " n"], slope: Float[np.ndarray, "n 5"]) -> None:
+    def add(self, value: Float[np.ndarray, " n"], slope: Float[np.ndarray, "n g"]) -> None:
         self.value.append(value)
         self.slope.append(slope)
 
 
 @record(eq=False)
 class _Affine:
-    """C_y and C_r at the iterate, and their derivatives by the gains, shape (5, m)."""
+    """The law at the iterate, and the derivatives of C_y, C_r and C_v by the g gains.
 
-    c_y: Complex[np.ndarray, " m"]
-    c_r: Complex[np.ndarray, " m"]
-    by_y: Complex[np.ndarray, "5 m"]
-    by_r: Complex[np.ndarray, "5 m"]
+    `by_speed` is that of C_v per unit of what senses the speed: times the plant's speed, that of B.
+    """
+
+    law: LawResponse
+    by_y: Complex[np.ndarray, "g m"]
+    by_r: Complex[np.ndarray, "g m"]
+    by_v: Complex[np.ndarray, "g m"]
+    by_speed: Complex[np.ndarray, "g m"]
 
 
 def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAMS) -> tuple[float, LawNumbers]:
@@ -90,7 +95,7 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
         What is to be tuned.
     grid : Grid
         Frequencies that the limits are looked at on.
-    start : array, shape (10,)
+    start : array, shape (12,)
         Stable.
     steps : int
         Programs solved at most.
@@ -105,7 +110,7 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
         if step is None:
             break
         trial = x.copy()
-        trial[GAINS] += step
+        trial[task.gains_tuned] += step
         trial = task.tidy(trial)
         trial_merit = _measure_merit(task, grid, trial)
         if trial_merit < merit and task.is_stable(trial):
@@ -121,16 +126,21 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
     return merit, x
 
 
-def _choose_least_gains(task: Task, grid: Grid) -> Float[np.ndarray, " 5"]:
+def _choose_least_gains(task: Task, grid: Grid) -> Float[np.ndarray, " g"]:
     """Return gains that make a difference: a tenth of the inverse plant's at the bandwidth."""
     w_b = 2 * np.pi * task.spec.bandwidth_hz
-    inverse = 1.0 / abs(np.interp(task.spec.bandwidth_hz, grid.f, np.abs(grid.p[0])))
-    return 0.1 * inverse * np.array([1.0, 0.1 * w_b, 1.0 / w_b, 1.0, 1.0 / w_b])
+    inverse, of_speed = (
+        1.0 / (float(np.interp(task.spec.bandwidth_hz, grid.f, np.abs(row))) or 1.0)
+        for row in (grid.p[0], grid.speed[0])
+    )
+    least = 0.1 * np.array([inverse, 0.1 * w_b * inverse, inverse / w_b, inverse, inverse / w_b, of_speed])
+    return least[task.gains_tuned]
 
 
-def _scale_gains(task: Task, x: LawNumbers, least: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " 5"]:
+def _scale_gains(task: Task, x: LawNumbers, least: Float[np.ndarray, " g"]) -> Float[np.ndarray, " g"]:
     """Return the size that a change of each gain is compared with: a weight's is that of what it weights."""
-    return np.maximum([*np.abs(x[: K_D + 1]), task.k_ff + x[K_P], x[K_D]], least)
+    sizes = np.array([*np.abs(x[: K_D + 1]), task.k_ff + x[K_P], x[K_D], x[K_V]])
+    return np.maximum(sizes[task.gains_tuned], least)
 
 
 def _measure_merit(task: Task, grid: Grid, x: LawNumbers) -> float:
@@ -143,15 +153,16 @@ def _measure_merit(task: Task, grid: Grid, x: LawNumbers) -> float:
 
 def linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     """Return the law on a grid with its derivatives by the gains."""
-    series, integral, rate, _ = task.terms(grid, x)
-    c_r, c_y = task.law(grid, x)
-    one, none = np.ones_like(grid.q), np.zeros_like(grid.q)
-    by_y = series * np.array([one, integral, rate, none, none])
-    by_r = series * np.array([one, integral, rate, -one, -rate])
-    return _Affine(c_y=c_y, c_r=c_r, by_y=by_y, by_r=by_r)
+    series, integral, rate, _, _ = task.terms(grid, x)
+    one, none, gains = np.ones_like(grid.q), np.zeros_like(grid.q), task.gains_tuned
+    by_y = series * np.array([one, integral, rate, none, none, none])[gains]
+    by_r = series * np.array([one, integral, rate, -one, -rate, none])[gains]
+    by_speed = series * np.array([none, none, none, none, none, one])[gains]
+    sensing = none if task.speed_loop is None else task.speed_loop.sense(grid.q, task.spec.sample_time_s)
+    return _Affine(law=task.respond(grid, x), by_y=by_y, by_r=by_r, by_v=by_speed * sensing, by_speed=by_speed)
 
 
-def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "5 n"]) -> Float[np.ndarray, "n 5"]:
+def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "g n"]) -> Float[np.ndarray, "n g"]:
     """Return the derivative of abs(value): the part of `by` along it."""
     size = np.maximum(np.abs(value), 1e-300)
     return np.real(np.conj(value) / size * by).T
@@ -159,42 +170,52 @@ def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray
 
 def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _LinearLimits:
     """Return the linearised limits at the frequencies and plants where they matter."""
-    rows, m = _LinearLimits(), grid.f.size
-    usage = task.usage(grid, x)
-
-    def chosen(name: str, plants: Complex[np.ndarray, "k m"] = grid.p) -> tuple[Any, Any, Any, Any]:
-        """Return usage, plant response, law's columns, and 1 + L of the points that matter."""
-        index = choose_near(usage[name])
-        p, column = plants.ravel()[index], index % m
-        return usage[name].ravel()[index], p, column, 1.0 + p * law.c_y[column]
-
+    rows, usage = _LinearLimits(), task.usage(grid, x)
     measured = bool(np.any(grid.discs))
-    for name, curve in CURVES.items():
-        used, p, column, one = chosen(name)
+    for name in task.curve_names:
+        index = choose_near(usage[name])
+        used, near_limit = usage[name].ravel()[index], CURVES[name].of == "1"  # the limit is on abs(1 + L) itself
         if measured:
-            slope = _differentiate_usage(task, grid, law, name, choose_near(usage[name]))
-            near_limit = curve.of == "1"
+            slope = _differentiate_usage(task, grid, law, name, index)
             rows.add(2.0 - 1.0 / used if near_limit else used, slope / used[:, None] ** 2 if near_limit else slope)
             continue
-        c_y, c_r, by_y, by_r = law.c_y[column], law.c_r[column], law.by_y[:, column], law.by_r[:, column]
-        near = _differentiate_size(one, p * by_y) / np.abs(one)[:, None]
-        if curve.of == "1":  # the limit is on abs(1 + L) itself
+        near, relative = _differentiate_curve(grid, law, name, index)
+        if near_limit:
             rows.add(2.0 - 1.0 / used, -near / used[:, None])
             continue
-        value, change = curve.numerator(p, c_y, c_r, p * c_y), curve.change(p, by_y, by_r, p * by_y)
-        relative = _differentiate_size(value, change) / np.abs(value)[:, None]
-        rows.add(used, used[:, None] * ((near - relative) if curve.floor else (relative - near)))
+        rows.add(used, used[:, None] * ((near - relative) if CURVES[name].floor else (relative - near)))
     if task.port is not None:
-        used, _, column, _ = chosen(PASSIVE)
-        turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
-        rows.add(used, -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * size[:, None]))
+        index = choose_near(usage[PASSIVE])
+        used, column = usage[PASSIVE].ravel()[index], index % grid.f.size
+        turned, one = np.conj(grid.unit[column]) * grid.port[column], 1.0 + grid.port[column] * law.law.c_y[column]
+        slope = -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * np.abs(one)[:, None])
+        rows.add(used, slope)
     if FRICTION in usage:
-        used, p, column, one = chosen(FRICTION, grid.friction_plant)
-        c_y, by_y = law.c_y[column], law.by_y[:, column]
+        index = choose_near(usage[FRICTION])
+        used, column, p = usage[FRICTION].ravel()[index], index % grid.f.size, grid.friction_plant.ravel()[index]
+        c_y, by_y = law.law.c_y[column], law.by_y[:, column]
+        one = 1.0 + p * c_y
         near = _differentiate_size(one, p * by_y) / np.abs(one)[:, None]
         rows.add(used, used[:, None] * (_differentiate_size(c_y, by_y) / np.abs(c_y)[:, None] - near))
     _add_bandwidth(task, grid, x, law, rows)
     return rows
+
+
+def _differentiate_curve(
+    grid: Grid, law: _Affine, name: str, index: Int[np.ndarray, " c"]
+) -> tuple[Float[np.ndarray, "c g"], Float[np.ndarray, "c g"]]:
+    """Return the derivatives of ln abs(1 + L) and of ln abs(X) of a limit by the gains, at points of plants."""
+    at, column, curve = law.law, index % grid.f.size, CURVES[name]
+    p, speed = grid.p.ravel()[index], grid.speed.ravel()[index]
+    one = at.rest.ravel()[index] + p * at.c_y[column]
+    by_y, by_r, by_v = (by[:, column] for by in (law.by_y, law.by_r, law.by_v))
+    by_loop = p * by_y + speed * law.by_speed[:, column]
+    near = _differentiate_size(one, by_loop) / np.abs(one)[:, None]
+    if curve.of == "1":
+        return near, 0.0 * near
+    value = curve.numerator(p, at.c_y[column], at.c_r[column], one - 1.0, at.c_v[column])
+    change = curve.change(p, by_y, by_r, by_loop, by_v)
+    return near, _differentiate_size(value, change) / np.maximum(np.abs(value), 1e-300)[:, None]
 
 
 def choose_near(usage: Float[np.ndarray, "k m"]) -> Int[np.ndarray, " c"]:
@@ -205,18 +226,18 @@ def choose_near(usage: Float[np.ndarray, "k m"]) -> Int[np.ndarray, " c"]:
 
 def _differentiate_usage(
     task: Task, grid: Grid, law: _Affine, name: str, index: Int[np.ndarray, " c"]
-) -> Float[np.ndarray, "c 5"]:
+) -> Float[np.ndarray, "c g"]:
     """Return the derivative of a limit's usage by the gains at points in discs, by central differences."""
     curve, column = CURVES[name], index % grid.f.size
     p, discs, level = grid.p.ravel()[index], grid.discs.ravel()[index], task.level(name, grid.f[column])
-    slope = np.zeros((index.size, 5))
-    for k in range(5):
+    slope = np.zeros((index.size, len(law.by_y)))
+    for k in range(len(law.by_y)):
         by_y, by_r = law.by_y[k, column], law.by_r[k, column]
         size = np.maximum(np.abs(by_y), np.abs(by_r))
-        step = STEP * np.maximum(np.abs(law.c_y[column]), 1e-9) / np.maximum(size, 1e-300)
+        step = STEP * np.maximum(np.abs(law.law.c_y[column]), 1e-9) / np.maximum(size, 1e-300)
         ends: list[Float[np.ndarray, " c"]] = []
         for sign in (1.0, -1.0):
-            c_y, c_r = (c[column] + sign * step * by for c, by in ((law.c_y, by_y), (law.c_r, by_r)))
+            c_y, c_r = (c[column] + sign * step * by for c, by in ((law.law.c_y, by_y), (law.law.c_r, by_r)))
             ends.append(use_disc(curve, level, p, discs, c_y, c_r))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     return slope
@@ -224,48 +245,52 @@ def _differentiate_usage(
 
 def _add_bandwidth(task: Task, grid: Grid, x: LawNumbers, law: _Affine, rows: _LinearLimits) -> None:
     at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
-    p, one = grid.p[0, at], np.array([1.0 + grid.p[0, at] * law.c_y[at]])
-    through = np.array([p * law.c_r[at]])
-    slope = _differentiate_size(through, p * law.by_r[:, [at]]) / np.abs(through) - _differentiate_size(
-        one, p * law.by_y[:, [at]]
-    ) / np.abs(one)
+    p, speed = grid.p[0, at], grid.speed[0, at]
+    one, through = np.array([law.law.rest[0, at] + p * law.law.c_y[at]]), np.array([p * law.law.c_r[at]])
+    by_loop = p * law.by_y[:, [at]] + speed * law.by_speed[:, [at]]
+    slope = _differentiate_size(through, p * law.by_r[:, [at]]) / np.abs(through)
+    slope = slope - _differentiate_size(one, by_loop) / np.abs(one)
     miss = task.miss(grid, x)
     rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
 
 
 def _expand_objective(
-    task: Task, grid: Grid, x: LawNumbers, law: _Affine
-) -> tuple[Float[np.ndarray, "5 5"], Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+    task: Task, grid: Grid, law: _Affine
+) -> tuple[Float[np.ndarray, "g g"], Float[np.ndarray, " n"], Float[np.ndarray, "n g"]]:
     """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
+    at, count = law.law, len(law.by_y)
     if task.spec.objective == "noise":
-        used = np.abs(law.c_y / (1.0 + grid.p[0] * law.c_y))[None]
+        used = np.abs(at.c_y / (at.rest[0] + grid.p[0] * at.c_y))[None]
         index = choose_prominent(used / np.max(used), ROWS_PER_LIMIT)
-        one, used, column = 1.0 + grid.p[0, index] * law.c_y[index], used[0, index], law.by_y[:, index]
-        slope = _differentiate_size(law.c_y[index], column) - used[:, None] * _differentiate_size(
-            one, grid.p[0, index] * column
-        )
+        one, used = at.rest[0, index] + grid.p[0, index] * at.c_y[index], used[0, index]
+        by_y = law.by_y[:, index]
+        by_loop = grid.p[0, index] * by_y + grid.speed[0, index] * law.by_speed[:, index]
+        slope = _differentiate_size(at.c_y[index], by_y) - used[:, None] * _differentiate_size(one, by_loop)
         size = np.max(used)
-        return np.zeros((5, 5)), used / size, slope / np.abs(one)[:, None] / size
+        return np.zeros((count, count)), used / size, slope / np.abs(one)[:, None] / size
     w = task.weights(grid.f)
     inside = w > 0.0
-    one = 1.0 + grid.p[:, inside] * law.c_y[inside]
+    one = at.rest[:, inside] + grid.p[:, inside] * at.c_y[inside]
     rho = np.abs(one)
     values = (1.0 / rho) @ w[inside]
     size, worst = np.max(values), int(np.argmax(values))
-    along = np.real((np.conj(one) / rho * grid.p[:, inside])[:, None] * law.by_y[None, :, inside])
+    unit = np.conj(one) / rho
+    along = np.real((unit * grid.p[:, inside])[:, None] * law.by_y[None, :, inside])
+    if task.speed_loop is not None:
+        along += np.real((unit * grid.speed[:, inside])[:, None] * law.by_speed[None, :, inside])
     slopes = -np.einsum("nkm,nm,m->nk", along, rho**-2, w[inside])
     curvature = 2.0 * np.einsum("km,lm,m,m->kl", along[worst], along[worst], rho[worst] ** -3, w[inside])
     return curvature / size, values / size, slopes / size
 
 
 def _solve_step(
-    task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " 5"]
-) -> Float[np.ndarray, " 5"] | None:
+    task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " g"]
+) -> Float[np.ndarray, " g"] | None:
     """Return the change of the gains that the quadratic program takes; None if it has no answer."""
-    law = linearise_law(task, grid, x)
+    law, gains, n = linearise_law(task, grid, x), task.gains_tuned, reach.size
     rows = _linearise_limits(task, grid, x, law)
-    curvature, values, slopes = _expand_objective(task, grid, x, law)
-    low, high = (ends[GAINS] for ends in task.bounds(x))
+    curvature, values, slopes = _expand_objective(task, grid, law)
+    low, high = (ends[gains] for ends in task.bounds(x))
     linear, least, largest = task.linear_limits(x)
     # Variables: the gains' changes in units of `reach`, the objective, the slack.
     value, slope = np.concatenate(rows.value), np.concatenate(rows.slope) * reach
@@ -273,19 +298,19 @@ def _solve_step(
         np.column_stack([slope, np.zeros(value.size), -np.ones(value.size)]),
         np.column_stack([slopes * reach, -np.ones(values.size), np.zeros(values.size)]),
         np.column_stack([linear * reach, np.zeros((3, 2))]),
-        np.column_stack([np.eye(5), np.zeros((5, 2))]),
-        np.eye(7)[-1:],
+        np.column_stack([np.eye(n), np.zeros((n, 2))]),
+        np.eye(n + 2)[-1:],
     ]
-    matrix, now = np.concatenate(rows_of), linear @ x[GAINS]
-    upper = np.concatenate([1.0 - value, -values, largest - now, np.minimum(1.0, (high - x[GAINS]) / reach), [np.inf]])
+    matrix, now = np.concatenate(rows_of), linear @ x[gains]
+    upper = np.concatenate([1.0 - value, -values, largest - now, np.minimum(1.0, (high - x[gains]) / reach), [np.inf]])
     lower = np.full(upper.size, -np.inf)
-    lower[-9:] = [*(least - now), *np.maximum(-1.0, (low - x[GAINS]) / reach), 0.0]
+    lower[-(n + 4) :] = [*(least - now), *np.maximum(-1.0, (low - x[gains]) / reach), 0.0]
     size = np.maximum(1.0, np.max(np.abs(matrix), axis=1))
-    quadratic = np.zeros((7, 7))
-    quadratic[GAINS, GAINS] = curvature * np.outer(reach, reach) + 1e-4 * np.eye(5)
-    cost = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, USAGE_PRICE])
+    quadratic = np.zeros((n + 2, n + 2))
+    quadratic[:n, :n] = curvature * np.outer(reach, reach) + 1e-4 * np.eye(n)
+    cost = np.append(np.zeros(n), [1.0, USAGE_PRICE])
     answer = solve_qp(quadratic, cost, matrix / size[:, None], lower / size, upper / size)
-    return None if answer is None else answer[GAINS] * reach
+    return None if answer is None else answer[:n] * reach
 
 
 def solve_qp(

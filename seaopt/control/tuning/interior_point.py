@@ -1,7 +1,7 @@
-r"""Refine all ten numbers of a law at once by an interior-point method on exact derivatives, the tuner's third step.
+r"""Refine all twelve numbers of a law at once by an interior-point method on exact derivatives, the tuner's third step.
 
 The quadratic programs leave filters where the scan put them and stop at a first-order step. Here gains, weights, T_f,
-T_q and notch move together: minimise the objective subject to
+T_q, T_v and notch move together: minimise the objective subject to
 
 .. math:: \ln u_i(x) \le s, \qquad \ln (\sqrt2\,|P C_r| / |1 + L|)_{f_b} = 0
 
@@ -16,11 +16,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
@@ -28,14 +28,15 @@ from seaopt.control.loops.measured.loop import leave_positive
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     FRICTION,
-    GAINS,
     K_D,
     K_I,
     K_P,
+    K_V,
     NOTCH_DEPTH,
     NOTCH_W,
     NOTCH_WIDTH,
     PASSIVE,
+    SPEED_RATE,
     T_F,
     T_Q,
     W_C,
@@ -52,6 +53,7 @@ LARGEST_FACTOR = 3.0  # factor by which a number may change in one solution
 WORST_PLANTS = 2  # plants whose objective is followed
 QUADRATURE_CHUNK = 64  # quadrature points come in multiples of this
 SLACK_PRICE = 1e3
+LEAST_SPEED_GAIN = 1e-2  # of the inverse of the speed per command at the bandwidth: k_v that makes a difference
 UNUSED = 1e-6  # of a limit: outside its band, or not imposed
 SMOOTHING = 1e-12  # keeps magnitudes differentiable at zero
 
@@ -113,7 +115,7 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNum
         What is to be tuned.
     grid : Grid
         Frequencies that the limits are looked at on.
-    start : array, shape (10,)
+    start : array, shape (12,)
         Stable.
     rounds : int
         Solutions at most; each adds the points where the one before broke a limit.
@@ -167,39 +169,52 @@ def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.nd
     return chosen
 
 
+class _Points(NamedTuple):
+    """Plants and law at some points, as expressions."""
+
+    p: _Complex
+    c_y: _Complex
+    c_r: _Complex
+    c_v: _Complex
+    loop: _Complex
+
+
 @lru_cache(maxsize=32)
 def _build_program(
-    quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool, friction: bool, discs: bool
-) -> tuple[Any, list[str]]:
+    quadrature: int, kinds: tuple[str, ...], observer: bool, notch: bool, noise: bool, discs: bool, paths: bool,
+    gains: int, inside: bool,
+) -> tuple[Any, list[str]]:  # fmt: skip
     """Return the IPOPT solver and the names of its data, in order."""
-    kinds = (*CURVES, *([PASSIVE] * passive), *([FRICTION] * friction))
+    passive = PASSIVE in kinds
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
-    shapes = {
-        "p_re": total, "p_im": total, "q_re": total, "q_im": total, "kept_re": total, "kept_im": total, "inv_re": total,
-        "inv_im": total, "weight": quadrature, "ln_level": n, "at": 8, "ts": 1, "kff": 1, "scale": 10, "linear": 15,
-        "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
+    complex_data = ("p", "q", "kept", "inverse", *(("fixed", "speed", "sense") if paths else ()))
+    shapes = {f"{name}_{part}": total for name in complex_data for part in ("re", "im")} | {
+        "weight": quadrature, "ln_level": n, "at": 2 * len(complex_data), "ts": 1, "kff": 1, "scale": 12,
+        "linear": 3 * gains, "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
-    v, t, slack = ca.MX.sym("v", 10), ca.MX.sym("t"), ca.MX.sym("slack")
+    v, t, slack = ca.MX.sym("v", 12), ca.MX.sym("t"), ca.MX.sym("slack")
     x = v * data["scale"]
 
-    def law(part: dict[str, Any]) -> tuple[_Complex, _Complex, _Complex]:
-        """Return P, C_y and C_r at some points."""
-        q = _Complex(part["q_re"], part["q_im"])
-        kept, inverse = _Complex(part["kept_re"], part["kept_im"]), _Complex(part["inv_re"], part["inv_im"])
-        series, integral, rate, more = evaluate_terms(
-            q, data["ts"], x[T_F], (x[T_Q], kept, inverse) if observer else None,
-            (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH]) if notch else None,
+    def law(part: dict[str, Any]) -> _Points:
+        """Return plants and law at some points."""
+        at = {name: _Complex(part[f"{name}_re"], part[f"{name}_im"]) for name in complex_data}
+        series, integral, rate, more, ahead = evaluate_terms(
+            at["q"], data["ts"], x[T_F], (x[T_Q], at["kept"], at["inverse"]) if observer else None,
+            (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH]) if notch else None, x[SPEED_RATE] if inside else 0.0,
         )  # fmt: skip
         both = integral * x[K_I] + x[K_P]
         c_y = (both + rate * x[K_D] + more) * series
-        c_r = (both + (data["kff"] - x[W_R]) + rate * (x[K_D] - x[W_C])) * series
-        return _Complex(part["p_re"], part["p_im"]), c_y, c_r
+        c_r = (both - x[W_R] + rate * (x[K_D] - x[W_C])) * series + _Complex.of(ahead) * data["kff"]
+        loop, c_v = at["p"] * c_y, _Complex.of(0.0)
+        if paths:
+            through = _Complex.of(series) * x[K_V]
+            loop, c_v = loop + (at["fixed"] - 1.0) + through * at["speed"], through * at["sense"]
+        return _Points(p=at["p"], c_y=c_y, c_r=c_r, c_v=c_v, loop=loop)
 
     names = [name for name in shapes if name.endswith(("_re", "_im"))]
-    p, c_y, c_r = law({name: data[name][:n] for name in names})
-    open_loop = p * c_y
+    p, c_y, c_r, c_v, open_loop = law({name: data[name][:n] for name in names})
     distance = (open_loop + 1.0).square() + SMOOTHING
     slices = {kind: slice(POINTS_PER_LIMIT * i, POINTS_PER_LIMIT * (i + 1)) for i, kind in enumerate(kinds)}
     usage: dict[str, Any] = {}
@@ -218,23 +233,23 @@ def _build_program(
             size = _bound_disc(curve, p, data["discs"], c_y, c_r)[where]
             usage[kind] = data["ln_level"][where] - size if curve.floor else size - data["ln_level"][where]
             continue
-        value = curve.numerator(p, c_y, c_r, open_loop)
+        value = curve.numerator(p, c_y, c_r, open_loop, c_v)
         top = value.square()[where] if isinstance(value, _Complex) else value
         size = 0.5 * ca.log((top + SMOOTHING) / distance[where]) - data["ln_level"][where]
         usage[kind] = -size if curve.floor else size
     point = {name: data["at"][i] for i, name in enumerate(names)}
-    p, c_y, c_r = law(point)
-    bandwidth = 0.5 * ca.log(2 * (p * c_r).square() / (p * c_y + 1.0).square())
+    there = law(point)
+    bandwidth = 0.5 * ca.log(2 * (there.p * there.c_r).square() / (there.loop + 1.0).square())
     if noise:
         where = slices["max_noise_gain"]
         worst = [usage["max_noise_gain"] + data["ln_level"][where] - t]
     else:
-        p, c_y, _ = law({name: data[name][n:] for name in names})
-        size = 1 / ca.sqrt((p * c_y + 1.0).square() + SMOOTHING)
+        along = law({name: data[name][n:] for name in names})
+        size = 1 / ca.sqrt((along.loop + 1.0).square() + SMOOTHING)
         worst = [ca.dot(data["weight"], size[quadrature * i : quadrature * (i + 1)]) - t for i in range(WORST_PLANTS)]
     g = ca.vertcat(
         bandwidth,
-        ca.reshape(data["linear"], 3, 5) @ v[GAINS],
+        ca.reshape(data["linear"], 3, gains) @ v[:gains],
         *worst,
         *(rows - slack for rows in usage.values()),
     )
@@ -264,6 +279,8 @@ def _bound_disc(curve: LimitCurve, p: _Complex, r: Any, c_y: _Complex, c_r: _Com
             centre, radius = (1.0 - open_loop) * back + reach * reach, 2.0 * reach
         case "C_y":
             centre, radius = c_y * back, reach * ca.sqrt(c_y.square() + SMOOTHING)
+        case "C_v":
+            raise AssertionError("a measured response is of one signal, and has no speed loop")
         case "P C_r":
             centre = c_r * (p * back - c_y.conjugate() * (r * r))
             radius = r * ca.sqrt(c_r.square() + SMOOTHING)
@@ -275,10 +292,11 @@ def _bound_disc(curve: LimitCurve, p: _Complex, r: Any, c_y: _Complex, c_r: _Com
 def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> LawNumbers | None:
     """Solve the program on the chosen points; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    m, kinds, passive, friction = grid.f.size, (*CURVES,), task.port is not None, grid.friction_plant.size > 0
+    m, kinds, passive, friction = grid.f.size, task.curve_names, task.port is not None, grid.friction_plant.size > 0
     flat = np.concatenate([chosen[kind] for kind in kinds])
     radii = grid.discs.ravel()[flat]
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
+    fixed, speed = grid.fixed.ravel()[flat], grid.speed.ravel()[flat]
     levels = [task.level(kind, grid.f[chosen[kind] % m]) for kind in kinds]
     if passive:
         at_port = chosen[PASSIVE]
@@ -297,36 +315,44 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         weights = np.where(np.arange(padded.size) < inside.size, task.weights(grid.f)[padded], 0.0)
         worst = np.resize(np.argsort(-_integrate_sensitivity(task, grid, start))[:WORST_PLANTS], WORST_PLANTS)
         columns = np.concatenate([columns, np.tile(padded, WORST_PLANTS)])
-        p = np.concatenate([p, grid.p[worst][:, padded].ravel()])
+        p, fixed, speed = (
+            np.concatenate([_pad(part, p.size, fill), whole[worst][:, padded].ravel()])
+            for part, whole, fill in ((p, grid.p, 0.0), (fixed, grid.fixed, 1.0), (speed, grid.speed, 0.0))
+        )
     at = int(np.argmin(np.abs(grid.f - spec.bandwidth_hz)))
     low, high = task.bounds(start)
     sizes = np.abs(start)
     sizes[[W_R, W_C]] = task.k_ff + start[K_P], start[K_D]
-    scale = np.maximum(sizes, [0.1, 0.1, 1e-4, 0.1, 1e-4, 0.1 * spec.sample_time_s, 1e-4, 1e-3, 1e-2, 1e-2])
-    linear, least, largest = task.linear_limits(start)
-    rows = np.max(np.abs(linear * scale[GAINS]), axis=1)  # each in units of its largest term
+    least_v = LEAST_SPEED_GAIN / (float(np.abs(grid.speed[0, at])) or 1.0)
+    scale = np.maximum(
+        sizes, [0.1, 0.1, 1e-4, 0.1, 1e-4, least_v, 0.1 * spec.sample_time_s, 1e-4, 1.0, 1e-3, 1e-2, 1e-2]
+    )  # fmt: skip
+    (linear, least, largest), gains = task.linear_limits(start), task.gains_tuned
+    rows = np.max(np.abs(linear * scale[gains]), axis=1)  # each in units of its largest term
     near, far = (
         np.maximum(low, start / LARGEST_FACTOR),
         np.minimum(high, LARGEST_FACTOR * np.maximum(start, 0.3 * scale)),
     )
     near[[W_R, W_C]], far[[W_R, W_C]] = low[[W_R, W_C]], high[[W_R, W_C]]
-    every = (p, grid.q[columns], grid.kept[columns], grid.inverse[columns])
-    parts = [part for z in every for part in (np.real(z), np.imag(z))]
+    every = [p, grid.q[columns], grid.kept[columns], grid.inverse[columns]]
     one = [z[at] for z in (grid.p[0], grid.q, grid.kept, grid.inverse)]
+    paths = grid.reads_more
+    if paths:
+        sense = np.zeros_like(grid.q)
+        if task.speed_loop is not None:
+            sense = task.speed_loop.sense(grid.q, spec.sample_time_s)
+        every += [_pad(fixed, columns.size, 1.0), _pad(speed, columns.size, 0.0), sense[columns]]
+        one += [grid.fixed[0, at], grid.speed[0, at], sense[at]]
+    parts = [part for z in every for part in (np.real(z), np.imag(z))]
     data = [
         *parts, weights, np.log(np.concatenate(levels)),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
-        (linear * scale[GAINS] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit), radii,
+        (linear * scale[gains] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit), radii,
     ]  # fmt: skip
     solver, _ = _build_program(
-        weights.size,
-        task.nominal is not None,
-        spec.notch is not None,
-        noise,
-        passive,
-        friction,
-        radii.size > 0,
-    )
+        weights.size, (*kinds, *([PASSIVE] * passive), *([FRICTION] * friction)), task.nominal is not None,
+        spec.notch is not None, noise, radii.size > 0, paths, gains.stop, bool(start[SPEED_RATE] > 0.0),
+    )  # fmt: skip
     used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
     value = task.objective(grid, start)
     x0 = np.concatenate([start / scale, [np.log(value) if noise else value, max(0.0, np.log(used)) + 0.01]])
@@ -343,7 +369,12 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 
 
+def _pad(values: Complex[np.ndarray, " k"], count: int, fill: float) -> Complex[np.ndarray, " n"]:
+    """Return values followed by as many of another as make up a count."""
+    return np.concatenate([values, np.full(count - values.size, fill, dtype=complex)])
+
+
 def _integrate_sensitivity(task: Task, grid: Grid, x: LawNumbers) -> Float[np.ndarray, " n"]:
     """Return the integral of abs(S) of every plant."""
-    _, c_y = task.law(grid, x)
-    return (1.0 / np.abs(1.0 + grid.p * c_y)) @ task.weights(grid.f)
+    law = task.respond(grid, x)
+    return (1.0 / np.abs(law.rest + grid.p * law.c_y)) @ task.weights(grid.f)

@@ -1,4 +1,4 @@
-r"""The optimisation problem of the tuner: plants, frequencies and limits as arrays, a law as ten numbers.
+r"""The optimisation problem of the tuner: plants, frequencies and limits as arrays, a law as twelve numbers.
 
 Every limit is one curve over frequency, its *usage*, which must not exceed 1 (`seaopt.control.laws.limits`):
 :math:`|X| / (m\,|1 + L|)`, or its inverse where abs(X) is to be above. As m is what the specification allows less the
@@ -19,10 +19,20 @@ taken off; and where a friction margin is asked for, one of each plant with fric
 The reference's weights are counted from feedforward and feedback of the error: with :math:`w_r = 1/P(0) + k_p - k_r`
 and :math:`w_c = (1 - c) k_d`,
 
-.. math:: C_r = g \,(1/P(0) + k_p - w_r + k_i I + (k_d - w_c) D), \qquad C_y = g \,(k_p + k_i I + k_d D + O)
+.. math:: C_r = h/P(0) + g \,(k_p - w_r + k_i I + (k_d - w_c) D), \qquad C_y = g \,(k_p + k_i I + k_d D + O)
 
-(terms of `LawTerms`) are affine in the first five numbers, on which there are three linear limits besides:
-:math:`k_i \ge \omega_i (1 + k_p)`, :math:`w_r \le 1/P(0) + k_p`, :math:`w_c \le k_d`.
+(terms of `LawTerms`; h is g but for the integral of a speed loop) are affine in the gains, on which there are three
+linear limits besides: :math:`k_i \ge \omega_i (1 + k_p)`, :math:`w_r \le 1/P(0) + k_p`, :math:`w_c \le k_d`.
+
+**Further signals.** The loop is broken at the command: :math:`1 + L = B + P C_y` with
+:math:`B = 1 + \sum_i P_i C_i` over the signals that the law reads besides the regulated one. Of a given filter
+:math:`C_i` it is known; of a speed loop :math:`C_v = g\,k_v \Delta` with :math:`\Delta = (1 - q)/T_s` where the speed
+is computed from an encoder, and 1 where it is measured. So
+
+.. math:: B = B_0 + g\,k_v\, \Delta P_v, \qquad B_0 = 1 + \sum_{i \ne v} P_i C_i,
+
+is affine in :math:`k_v`, and with it all of the above: gains of the force loop are those of effort, the speed loop's
+multiplied in.
 """
 
 from __future__ import annotations
@@ -36,7 +46,16 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, LimitCurve, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
-from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
+from seaopt.control.laws.structures import (
+    DisturbanceObserver,
+    Gains,
+    InnerLoop,
+    LawTerms,
+    Nominal,
+    Notch,
+    SpeedLoop,
+    evaluate_terms,
+)
 from seaopt.control.loops.absolute_stability import (
     LOWEST_ANGLE,
     SIMPLEST,
@@ -51,6 +70,7 @@ from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.plants import Plant
 from seaopt.plants.roles import Friction
 from seaopt.records import record
@@ -64,6 +84,7 @@ NO_LIMIT = 1e9
 LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 NEARLY_KEPT = 1.001
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
+SLOWEST_SPEED_RATE = 4.0 * INTEGRAL_RAD_S  # 1/T_v, rad/s, of a speed loop that integrates
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
 HIGHEST_NOTCH = 0.45  # of the sample rate
 CURVES = {limit.name: limit.curve for limit in LIMITS if limit.curve is not None}
@@ -74,9 +95,9 @@ TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r") 
 PASSIVE, FRICTION = "passive_band_hz", "min_friction_margin"
 MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
 
-LawNumbers = Float[np.ndarray, " 10"]  # k_p, k_i, k_d, w_r, w_c, T_f, T_q, notch_w, notch_width, notch_depth
-K_P, K_I, K_D, W_R, W_C, T_F, T_Q, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH = range(10)
-GAINS = slice(0, 5)  # what C_r and C_y are affine in
+# k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth
+LawNumbers = Float[np.ndarray, " 12"]
+K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH = range(12)
 
 
 @record(eq=False)
@@ -91,6 +112,9 @@ class Grid:
         Plants with hold and delay; the first is the design plant.
     discs : array, shape (plants, m)
         Radii of the discs around them of those that are measured; zeros of models.
+    fixed, speed : arrays, shape (plants, m)
+        B of the module's docstring without a speed loop, and the speed per command as the law has it; ones and zeros
+        where the law reads nothing further.
     rows : tuple of int
         Which of the task's plants they are.
     kept, inverse
@@ -106,6 +130,8 @@ class Grid:
     q: Complex[np.ndarray, " m"]
     p: Complex[np.ndarray, "n m"]
     discs: Float[np.ndarray, "n m"]
+    fixed: Complex[np.ndarray, "n m"]
+    speed: Complex[np.ndarray, "n m"]
     rows: tuple[int, ...]
     kept: Complex[np.ndarray, " m"]
     inverse: Complex[np.ndarray, " m"]
@@ -114,14 +140,30 @@ class Grid:
     friction_plant: Complex[np.ndarray, "k m"]
     friction_level: Float[np.ndarray, "k m"]
 
+    @property
+    def reads_more(self) -> bool:
+        """Whether the loop has a path besides that of the regulated signal."""
+        return bool(np.any(self.speed) or np.any(self.fixed != 1.0))
+
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
         return Grid(
-            f=self.f[index], q=self.q[index], p=self.p[:, index], discs=self.discs[:, index], rows=self.rows,
+            f=self.f[index], q=self.q[index], p=self.p[:, index], discs=self.discs[:, index],
+            fixed=self.fixed[:, index], speed=self.speed[:, index], rows=self.rows,
             kept=self.kept[index], inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
             friction_plant=self.friction_plant[:, index],
             friction_level=self.friction_level[:, index],
         )  # fmt: skip
+
+
+@record(eq=False)
+class LawResponse:
+    """Laws at a grid's frequencies: C_y and C_r of one or of n, C_v of a speed loop, and B on the grid's plants."""
+
+    c_y: Complex[np.ndarray, "*n m"]
+    c_r: Complex[np.ndarray, "*n m"]
+    c_v: Complex[np.ndarray, " m"]
+    rest: Complex[np.ndarray, "k m"]
 
 
 @record(eq=False)
@@ -162,6 +204,9 @@ class Task:
     The first is the design plant, whose port must be passive; of two `design_states` it is the sliding one, and the
     second plant is the same one stuck by its friction. `frictions` are those of which a friction margin is asked, and
     those that friction which falls with speed makes grow; `signals` are the outputs that the law reads.
+
+    What it reads besides the regulated one has an entry each in `further`: the filter C that feeds it back, which is
+    given, or the `SpeedLoop` that is tuned.
     """
 
     spec: ControllerSpec
@@ -173,6 +218,22 @@ class Task:
     design_states: int = 1
     frictions: tuple[PlantWithFriction, ...] = ()
     signals: tuple[str, ...] = ()
+    further: tuple[TransferFunction | SpeedLoop, ...] = ()
+
+    @property
+    def speed_loop(self) -> SpeedLoop | None:
+        """The speed loop that is tuned; None without one."""
+        return next((one for one in self.further if isinstance(one, SpeedLoop)), None)
+
+    @property
+    def gains_tuned(self) -> slice:
+        """The numbers that the law is affine in, the first five or six."""
+        return slice(0, K_V + (self.speed_loop is not None))
+
+    @property
+    def curve_names(self) -> tuple[str, ...]:
+        """The limits that are curves: that on a speed loop's own noise gain only where there is one."""
+        return tuple(name for name, curve in CURVES.items() if curve.of != "C_v" or self.speed_loop is not None)
 
     @property
     def asks_margin(self) -> bool:
@@ -181,11 +242,11 @@ class Task:
 
     def integrates(self, x: LawNumbers) -> bool:
         """Tell whether the law integrates the error: not a pd, nor a disturbance observer that is alone at it."""
-        return self.spec.structure == "pid" or (self.nominal is not None and bool(x[K_I] > 0.0))
+        return self.spec.structure in ("pid", "cascade") or (self.nominal is not None and bool(x[K_I] > 0.0))
 
     def tidy(self, x: LawNumbers) -> LawNumbers:
         """Return numbers within their bounds; beside an observer an integral that does too little becomes none."""
-        x, least = x.copy(), INTEGRAL_RAD_S * (1.0 + max(x[K_P], 0.0))
+        x, least = x.copy(), least_integral_rate(x) * (1.0 + max(x[K_P], 0.0))
         if self.nominal is not None and x[K_I] < 0.5 * least:
             x[K_I] = 0.0
         x = np.clip(x, *self.bounds(x))
@@ -197,13 +258,14 @@ class Task:
 
     def linear_limits(
         self, x: LawNumbers
-    ) -> tuple[Float[np.ndarray, "3 5"], Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    ) -> tuple[Float[np.ndarray, "3 g"], Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Return matrix, least and largest value of the linear limits on the gains of a law that integrates as x does.
 
         They are what an integral does at least, and the least weights, k_r = 0 and c = 0.
         """
-        rate = INTEGRAL_RAD_S if self.integrates(x) else 0.0
-        matrix = np.array([[-rate, 1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, -1.0, 0.0, 1.0]])
+        rate = least_integral_rate(x) if self.integrates(x) else 0.0
+        matrix = np.zeros((3, self.gains_tuned.stop))
+        matrix[:, :K_V] = [[-rate, 1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, -1.0, 0.0, 1.0]]
         least_c = 0.0 if self.spec.reference_weights == "measurement" else -np.inf
         return matrix, np.array([rate, -np.inf, least_c]), np.array([np.inf, max(self.k_ff, 0.0), 0.0])
 
@@ -241,8 +303,10 @@ class Task:
             free, free if integrates else fixed, free,
             free if integrates and spec.reference_weights != "error" else fixed,
             free if spec.reference_weights != "error" else fixed,
+            free if self.speed_loop is not None else fixed,
             ((spec.level("min_filter_samples") or 0.0) * ts, 4.0 / (2 * np.pi * spec.bandwidth_hz)),
-            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0), *notch,
+            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0),
+            (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed, *notch,
         ]  # fmt: skip
         low, high = (np.array(ends, dtype=float) for ends in zip(*ranges, strict=True))
         return low, high
@@ -255,15 +319,23 @@ class Task:
             notch = Notch(frequency_hz=centre, width=float(x[NOTCH_WIDTH]), depth=float(x[NOTCH_DEPTH]))
         k_p, k_d = float(x[K_P]), float(x[K_D])
         whole = self.spec.reference_weights != "measurement"
+        inner = None
+        if self.speed_loop is not None:
+            T_v = 1.0 / float(x[SPEED_RATE]) if x[SPEED_RATE] > 0.0 else np.inf
+            inner = InnerLoop(k_v=float(x[K_V]), T_v=T_v, k_ff=self.k_ff, speed=self.speed_loop)
         return Gains(
-            k_p=k_p, k_i=float(x[K_I]), k_d=k_d, T_f=float(x[T_F]), k_r=self.k_ff + k_p - float(x[W_R]),
-            c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole), notch=notch,
+            k_p=k_p, k_i=float(x[K_I]), k_d=k_d, T_f=float(x[T_F]),
+            k_r=k_p - float(x[W_R]) + (self.k_ff if inner is None else 0.0),
+            c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole), notch=notch, inner=inner,
             observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[T_Q])),
         )  # fmt: skip
 
     def law_of(self, x: LawNumbers) -> Law:
         """Return the law of a vector, not balanced."""
-        return self.gains(x).law(self.spec.structure, self.spec.sample_time_s)
+        law = self.gains(x).law(self.spec.structure, self.spec.sample_time_s)
+        for one in self.further:
+            law = law if isinstance(one, SpeedLoop) else law.reading(one)
+        return law
 
     def loop(self, x: LawNumbers, plant: int = 0) -> Loop | DiscLoop:
         """Return the loop around one plant."""
@@ -282,7 +354,7 @@ class Task:
             kept = np.polynomial.polynomial.polyval(q, self.nominal.kept)
             inverse = self.nominal.inverse_response(f, self.spec.sample_time_s)
         rows = tuple(range(len(self.plants)) if rows is None else rows)
-        p = np.array([self.plants[row].response(f) for row in rows])
+        p, fixed, speed = (np.array(part) for part in zip(*(self._respond(row, f, q) for row in rows), strict=True))
         discs = np.array([measured_discs(self.plants[row], f) for row in rows])
         port, unit = np.zeros(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
         if self.port is not None and self.spec.passive_band_hz is not None:
@@ -296,9 +368,25 @@ class Task:
         for k, one in enumerate(asked):
             plants[k], levels[k] = self._limit_feedback(one, f)
         return Grid(
-            f=f, q=q, p=p, discs=discs, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit,
-            friction_plant=plants, friction_level=levels,
+            f=f, q=q, p=p, discs=discs, fixed=fixed, speed=speed, rows=rows, kept=kept, inverse=inverse, port=port,
+            unit=unit, friction_plant=plants, friction_level=levels,
         )  # fmt: skip
+
+    def _respond(
+        self, row: int, f: Float[np.ndarray, " m"], q: Complex[np.ndarray, " m"]
+    ) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
+        """Return P, B without a speed loop, and the speed per command as the law has it, of one plant."""
+        plant, fixed, speed = self.plants[row], np.ones(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
+        if not self.further:
+            return plant.response(f), fixed, speed
+        assert isinstance(plant, DigitalPlant), "a measured response is of one signal"
+        p, *others = plant.responses(f)
+        for one, response in zip(self.further, others, strict=True):
+            if isinstance(one, SpeedLoop):
+                speed = response * one.sense(q, self.spec.sample_time_s)
+            else:
+                fixed = fixed + response * one.response(f, self.spec.sample_time_s)
+        return p, fixed, speed
 
     def _limit_feedback(
         self, aimed: PlantWithFriction, f: Float[np.ndarray, " m"]
@@ -318,48 +406,54 @@ class Task:
         """Return the law's terms on a grid."""
         observer = None if self.nominal is None else (x[T_Q], grid.kept, grid.inverse)
         notch = None if self.spec.notch is None else (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH])
-        return evaluate_terms(grid.q, self.spec.sample_time_s, x[T_F], observer, notch)
+        return evaluate_terms(grid.q, self.spec.sample_time_s, x[T_F], observer, notch, x[SPEED_RATE])
 
     def law(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
         """Return C_r and C_y on a grid."""
-        series, integral, rate, observer = self.terms(grid, x)
+        series, integral, rate, observer, ahead = self.terms(grid, x)
         both = x[K_P] + x[K_I] * integral
-        c_r = series * (both + self.k_ff - x[W_R] + (x[K_D] - x[W_C]) * rate)
+        c_r = ahead * self.k_ff + series * (both - x[W_R] + (x[K_D] - x[W_C]) * rate)
         return c_r, series * (both + x[K_D] * rate + observer)
+
+    def respond(self, grid: Grid, x: LawNumbers) -> LawResponse:
+        """Return the law on a grid, with what its further signals do on every plant of it."""
+        c_r, c_y = self.law(grid, x)
+        c_v, rest = self.feed_speed(grid, x)
+        return LawResponse(c_y=c_y, c_r=c_r, c_v=c_v, rest=rest)
+
+    def feed_speed(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, "n m"]]:
+        """Return C_v, from what a speed loop reads to effort, and B on every plant of a grid."""
+        if self.speed_loop is None:
+            return np.zeros_like(grid.q), grid.fixed
+        through = x[K_V] * self.terms(grid, x).series
+        return through * self.speed_loop.sense(grid.q, self.spec.sample_time_s), grid.fixed + through * grid.speed
 
     def usage(self, grid: Grid, x: LawNumbers) -> dict[str, Float[np.ndarray, "k m"]]:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
-        c_r, c_y = self.law(grid, x)
+        law = self.respond(grid, x)
         rows: dict[str, list[Float[np.ndarray, " m"]]] = {}
         for position in range(len(grid.rows)):
-            for name, curve in self.design_usage(grid, position, c_y, c_r).items():
+            for name, curve in self.design_usage(grid, position, law).items():
                 rows.setdefault(name, []).append(curve)
-        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r, grid.discs) | self.friction_usage(
-            grid, c_y
-        )
+        everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | self.friction_usage(grid, law.c_y)
         return everywhere | {name: np.array(curves) for name, curves in rows.items()}
 
     def curves(
-        self,
-        names: Sequence[str],
-        f: Float[np.ndarray, " m"],
-        p: Complex[np.ndarray, "*k m"],
-        c_y: Complex[np.ndarray, "*n m"],
-        c_r: Complex[np.ndarray, "*n m"],
-        discs: Float[np.ndarray, "*k m"],
-    ) -> dict[str, np.ndarray]:
-        """Return the usage of some limits on plants p, the worst of what lies in the discs around them."""
-        open_loop = p * c_y
+        self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse
+    ) -> dict[str, np.ndarray]:  # fmt: skip
+        """Return the usage of some limits on a grid's plants, the worst of what lies in the discs around them."""
+        p, rest, discs = grid.p[plants], law.rest[plants], grid.discs[plants]
+        open_loop = rest - 1.0 + p * law.c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
         measured = bool(np.any(discs))
         for name in names:
-            curve = CURVES[name]
+            curve, level = CURVES[name], self.level(name, grid.f)
             if measured:
-                out[name] = use_disc(curve, self.level(name, f), p, discs, c_y, c_r)
+                out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r)
                 continue
-            size, allowed = np.abs(curve.numerator(p, c_y, c_r, open_loop)), self.level(name, f) * distance
-            out[name] = allowed / np.maximum(size, 1e-12) if curve.floor else size / allowed
+            size = np.abs(curve.numerator(p, law.c_y, law.c_r, open_loop, law.c_v))
+            out[name] = level * distance / np.maximum(size, 1e-12) if curve.floor else size / (level * distance)
         return out
 
     def band_hz(self, name: str) -> tuple[float, float]:
@@ -371,19 +465,20 @@ class Task:
         )
         return 0.0 if low is None else low, np.inf if high is None else high
 
-    def design_usage(
-        self, grid: Grid, position: int, c_y: Complex[np.ndarray, "*n m"], c_r: Complex[np.ndarray, "*n m"]
-    ) -> dict[str, np.ndarray]:
+    def design_usage(self, grid: Grid, position: int, law: LawResponse) -> dict[str, np.ndarray]:
         """Return the usage of the limits that one of the grid's plants keeps as the design plant, sliding or stuck."""
         row = grid.rows[position]
-        out = self.curves(self.design_limits(row), grid.f, grid.p[position], c_y, c_r, grid.discs[position])
-        return out | (self.port_usage(grid, c_y) if row == 0 else {})
+        out = self.curves(self.design_limits(row), grid, position, law)
+        return out | (self.port_usage(grid, law.c_y) if row == 0 else {})
 
     def design_limits(self, row: int) -> tuple[str, ...]:
         """Return the limits that a plant keeps as the design plant, sliding or stuck; none if it is another."""
         if row >= self.design_states:
             return ()
-        return tuple(name for name in SCOPES["design plant"] if row == 0 or BY_NAME[name].stuck_too)
+        return tuple(
+            name for name in SCOPES["design plant"]
+            if (row == 0 or BY_NAME[name].stuck_too) and name in self.curve_names
+        )  # fmt: skip
 
     def port_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
         """Return the usage of the passive band, where one is asked for."""
@@ -419,7 +514,7 @@ class Task:
         return self.measure_law(
             self.law_of(x).balanced(),
             filter_samples=float(x[T_F] / self.spec.sample_time_s) if x[K_D] > 0.0 else np.inf,
-            integral_rad_s=float(x[K_I] / (1.0 + x[K_P])) if self.integrates(x) else np.inf,
+            integral_rad_s=self.gains(x).integral_rad_s if self.integrates(x) else np.inf,
         )
 
     def measure_law(self, law: Law, *, filter_samples: float, integral_rad_s: float) -> list[MeasuredLoop]:
@@ -454,8 +549,8 @@ class Task:
     def miss(self, grid: Grid, x: LawNumbers) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
         at = grid.at(np.array([int(np.argmin(np.abs(grid.f - self.spec.bandwidth_hz)))]))
-        c_r, c_y = self.law(at, x)
-        return float(np.log(np.abs(np.sqrt(2.0) * at.p[0] * c_r / (1 + at.p[0] * c_y)))[0])
+        law = self.respond(at, x)
+        return float(np.log(np.abs(np.sqrt(2.0) * at.p[0] * law.c_r / (law.rest[0] + at.p[0] * law.c_y)))[0])
 
     def rank(self, grid: Grid, x: LawNumbers) -> tuple[float, float]:
         """Return what to sort laws by: the worst usage if a limit is broken, then the objective.
@@ -468,11 +563,20 @@ class Task:
 
     def objective(self, grid: Grid, x: LawNumbers) -> float:
         """Return the objective on a grid."""
-        _, c_y = self.law(grid, x)
-        distance = np.abs(1.0 + grid.p * c_y)
+        law = self.respond(grid, x)
+        distance = np.abs(law.rest + grid.p * law.c_y)
         if self.spec.objective == "noise":
-            return float(np.max(np.abs(c_y) / distance[: self.design_states]))
+            return float(np.max(np.abs(law.c_y) / distance[: self.design_states]))
         return float(np.max((1.0 / distance) @ self.weights(grid.f)))
+
+
+def least_integral_rate(x: LawNumbers) -> float:
+    r"""Return the least k_i/(1 + k_p) of numbers, rad/s.
+
+    Behind a speed loop that integrates, two integrals act at the rate :math:`(T_v + k_p/k_i)^{-1}`; with this k_i it is
+    at least the least rate of one for every T_v allowed.
+    """
+    return INTEGRAL_RAD_S / (1.0 - INTEGRAL_RAD_S / SLOWEST_SPEED_RATE) if x[SPEED_RATE] > 0.0 else INTEGRAL_RAD_S
 
 
 def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:

@@ -44,7 +44,7 @@ def solve(task: Task, warm: Sequence[LawNumbers] = (), progress: Progress = igno
     ----------
     task : Task
         What is to be tuned.
-    warm : sequence of arrays, shape (10,)
+    warm : sequence of arrays, shape (12,)
         Numbers to start from besides those of the scan, which then tries one less.
     progress : callable, optional
         Called as starts are refined.

@@ -1,27 +1,29 @@
 r"""Find starts for the tuner: a scan of laws that have the bandwidth exactly, and one that is always stable.
 
 With the other numbers given, the design plant's bandwidth is a quadratic equation in one of them. Let :math:`a = P g`
-with g the series part, :math:`Y = k_i I + k_d D + O` and :math:`R = 1/P(0) + k_i I + (k_d - w_c) D` (terms of
-`LawTerms`). Where the reference's weight k_r is fixed, that number is k_p: at :math:`f_b`
+with g the series part, B what further signals make of 1, :math:`Y = k_i I + k_d D + O` and
+:math:`R = h/(g P(0)) + k_i I + (k_d - w_c) D` (terms of `LawTerms`). Where the reference's
+weight k_r is fixed, that number is k_p: at :math:`f_b`
 
 .. math::
-    2\,|a|^2 |k_p + R|^2 = |1 + a Y + a k_p|^2 \iff
-    |a|^2 k_p^2 + 2\,\mathrm{Re}(2|a|^2 R - a\,\overline{(1 + aY)})\,k_p + 2|a|^2|R|^2 - |1 + aY|^2 = 0 .
+    2\,|a|^2 |k_p + R|^2 = |B + a Y + a k_p|^2 \iff
+    |a|^2 k_p^2 + 2\,\mathrm{Re}(2|a|^2 R - a\,\overline{(B + aY)})\,k_p + 2|a|^2|R|^2 - |B + aY|^2 = 0 .
 
 Where it is free, that number is w_r, which leaves the loop as it is:
 
 .. math::
-    |k_p + R - w_r| = \rho = \frac{|1 + a (k_p + Y)|}{\sqrt2\,|a|} \iff
+    |k_p + R - w_r| = \rho = \frac{|B + a (k_p + Y)|}{\sqrt2\,|a|} \iff
     w_r = k_p + \mathrm{Re}\,R \pm \sqrt{\rho^2 - (\mathrm{Im}\,R)^2} .
 
 The scan solves these over a grid of the others and ranks both roots by the largest usage of a limit on a coarse set of
 frequencies, then by the objective. With k_r free the loops alone are ranked first, by the limits that the reference's
 path does not enter, and only some are given weights. Since the plants are stable, next to no feedback is a start that
-is always valid.
+is always valid. A speed loop's gain and time are scanned as filters are.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -29,16 +31,18 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S
-from seaopt.control.laws.structures import LawTerms
+from seaopt.control.laws.structures import CASCADE, LawTerms
 from seaopt.control.tuning.optimisation_problem import (
     HIGHEST_NOTCH,
     K_D,
     K_I,
     K_P,
+    K_V,
     LOWEST_NOTCH,
     NOTCH_W,
     OBJECTIVE_HZ,
     SCOPES,
+    SPEED_RATE,
     T_F,
     T_Q,
     TRACKING,
@@ -46,6 +50,7 @@ from seaopt.control.tuning.optimisation_problem import (
     W_R,
     Grid,
     LawNumbers,
+    LawResponse,
     Task,
     count_growing,
     find_light_modes,
@@ -61,7 +66,9 @@ WEIGHTS = (0.0, 0.5, 1.0)  # of w_c/k_d
 COARSE_FREQUENCIES = 90
 SCANNED_PLANTS = 4
 PASSIVE_FREQUENCIES = 20  # of the passive band
-Shape = tuple[float, ...]  # T_f, T_q, notch_w, notch_width, notch_depth
+SPEED_GAINS = (0.3, 1.0, 3.0, 10.0)  # of k_v, over the speed per command at the bandwidth
+SPEED_RATES = (0.0, 0.2)  # of 1/T_v, over the bandwidth's rad/s
+Shape = tuple[float, ...]  # k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth
 LEAST_TURN = -0.3 * np.pi  # of 1 + L from the lowest frequency to the highest: less is an encirclement
 
 
@@ -79,7 +86,7 @@ def find_starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
 
     """
     coarse = _thin_grid(task, grid)
-    merits, laws = zip(*(_rank_shape(task, coarse, shape) for shape in _list_shapes(task)), strict=True)
+    merits, laws = zip(*(_rank_shape(task, coarse, shape) for shape in _list_shapes(task, coarse)), strict=True)
     merit, points = np.concatenate(merits), np.concatenate(laws)
     distinct: list[LawNumbers] = []
     tried = 0
@@ -98,7 +105,7 @@ def find_starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
 def make_rest_start(task: Task) -> LawNumbers:
     """Return the law with next to no feedback, stable because the plants are."""
     ts = task.spec.sample_time_s
-    return task.tidy(np.array([0.0, 0.0, 0.0, 0.0, 0.0, ts, 10.0, 0.3, 0.5, 1.0]))
+    return task.tidy(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, ts, 10.0, 0.0, 0.3, 0.5, 1.0]))
 
 
 def _are_alike(task: Task, x: LawNumbers, other: LawNumbers) -> bool:
@@ -108,6 +115,8 @@ def _are_alike(task: Task, x: LawNumbers, other: LawNumbers) -> bool:
         apart = apart[NOTCH_W:]
     elif task.nominal is not None:
         apart = apart[[K_I, T_Q]]
+    elif task.speed_loop is not None:
+        apart = apart[[K_I, K_V, SPEED_RATE]]
     elif task.spec.structure == "pid":
         apart = apart[K_I]
     return bool(np.max(apart) < 0.4)
@@ -129,22 +138,36 @@ def _thin_grid(task: Task, grid: Grid) -> Grid:
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
     some = slice(SCANNED_PLANTS)
-    return replace(coarse, p=coarse.p[some], discs=coarse.discs[some], rows=coarse.rows[some])
+    return replace(
+        coarse, p=coarse.p[some], discs=coarse.discs[some], fixed=coarse.fixed[some], speed=coarse.speed[some],
+        rows=coarse.rows[some],
+    )  # fmt: skip
 
 
-def _list_shapes(task: Task) -> Iterator[Shape]:
-    """Yield (T_f, T_q, notch_w, notch_width, notch_depth) to try."""
+def _list_shapes(task: Task, grid: Grid) -> Iterator[Shape]:
+    """Yield (k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth) to try."""
     low, high = task.bounds(make_rest_start(task))
     spec, ts = task.spec, task.spec.sample_time_s
     unit = 1 / (2 * np.pi * spec.bandwidth_hz)
-    filters = np.geomspace(max(0.15 * ts, low[T_F]), min(0.7 * unit, high[T_F]), 5 if spec.notch is None else 3)
+    few = spec.notch is not None or task.speed_loop is not None
+    filters = np.geomspace(max(0.15 * ts, low[T_F]), min(0.7 * unit, high[T_F]), 3 if few else 5)
     # An output that swings at a few tenths of a hertz bears only a slow observer.
     lags = [0.5 * unit, 2.0 * unit, 8.0 * unit, 0.5, 3.0] if task.nominal is not None else [1.0]
     notches = _list_notches(task) if spec.notch is not None else [tuple(low[NOTCH_W:])]
-    for t_f in filters:
-        for t_q in lags:
-            for notch in notches:
-                yield (*np.clip((t_f, t_q, *notch), low[T_F:], high[T_F:]),)
+    for t_f, t_q, (k_v, speed_rate), notch in itertools.product(filters, lags, _list_speed_loops(task, grid), notches):
+        shape = np.clip((k_v, t_f, t_q, 0.0, *notch), low[K_V:], high[K_V:])
+        shape[SPEED_RATE - K_V] = speed_rate
+        yield (*shape,)
+
+
+def _list_speed_loops(task: Task, grid: Grid) -> list[tuple[float, float]]:
+    """Return (k_v, 1/T_v) to try: none, and of a cascade some of each."""
+    if task.speed_loop is None:
+        return [(0.0, 0.0)]
+    at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
+    gains = np.array(SPEED_GAINS) / max(float(np.abs(grid.speed[0, at])), 1e-12)
+    rates = [share * 2 * np.pi * task.spec.bandwidth_hz for share in SPEED_RATES]
+    return [(0.0, 0.0), *itertools.product(map(float, gains), rates)]
 
 
 def _list_notches(task: Task) -> list[tuple[float, float, float]]:
@@ -170,7 +193,13 @@ class _Scan:
     grid: Grid
     shape: Shape
     terms: LawTerms
+    c_v: Complex[np.ndarray, " m"]
+    rest: Complex[np.ndarray, "k m"]
     at: int
+
+    def respond(self, c_y: Complex[np.ndarray, "n m"], c_r: Complex[np.ndarray, "n m"]) -> LawResponse:
+        """Return laws of this shape."""
+        return LawResponse(c_y=c_y, c_r=c_r, c_v=self.c_v, rest=self.rest)
 
     @property
     def through(self) -> complex:
@@ -195,15 +224,17 @@ class _Scan:
     def reference(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
         """Return C_r of laws, without the series part."""
         k_p, k_i, k_d, w_r, w_c = gains.T[:, :, None]
-        return self.task.k_ff + k_p - w_r + k_i * self.terms.integral + (k_d - w_c) * self.terms.rate
+        ahead = self.task.k_ff * self.terms.ahead / self.terms.series
+        return ahead + k_p - w_r + k_i * self.terms.integral + (k_d - w_c) * self.terms.rate
 
 
-def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
+def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 12"]]:
     """Return merits (less is better) and numbers of the laws of one shape."""
-    terms = task.terms(grid, np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape]))
+    x = np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape])
+    terms, (c_v, rest) = task.terms(grid, x), task.feed_speed(grid, x)
     terms = LawTerms(*(np.broadcast_to(term, grid.f.shape) for term in terms))
     at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
-    scan = _Scan(task=task, grid=grid, shape=shape, terms=terms, at=at)
+    scan = _Scan(task=task, grid=grid, shape=shape, terms=terms, c_v=c_v, rest=rest, at=at)
     parts = [_scan_fixed_weight(scan)]
     if task.spec.structure != "pd" and task.spec.reference_weights != "error":
         parts.append(_scan_free_weight(scan))
@@ -217,7 +248,8 @@ def _scan_fixed_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.n
     grids = np.meshgrid(k_d, _list_integrals(scan), _list_weights(scan.task), indexing="ij")
     k_d, k_i, weight = (values.ravel() for values in grids)
     gains = np.column_stack([0.0 * k_d, k_i, k_d, 0.0 * k_d, weight * k_d])[(k_d > 0.0) | (weight == weight[0])]
-    k_p = _solve_bandwidth(scan.through, scan.reference(gains)[:, scan.at], scan.measurement(gains)[:, scan.at])
+    back = complex(scan.rest[0, scan.at]) + scan.through * scan.measurement(gains)[:, scan.at]
+    k_p = _solve_bandwidth(scan.through, scan.reference(gains)[:, scan.at], back)
     gains = np.tile(gains, (2, 1))
     gains[:, K_P] = k_p
     gains = gains[np.isfinite(k_p) & (k_p >= 0.0)]
@@ -239,7 +271,8 @@ def _scan_free_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.nd
     gains, c_y, merit = gains[chosen], c_y[chosen], merit[chosen]
     gains[:, W_C] = np.resize(weights, chosen.size) * gains[:, K_D]
     whole = scan.reference(gains)[:, scan.at]
-    size = np.abs(1.0 + scan.grid.p[0, scan.at] * c_y[:, scan.at]) / (np.sqrt(2.0) * abs(scan.through))
+    one = scan.rest[0, scan.at] + scan.grid.p[0, scan.at] * c_y[:, scan.at]
+    size = np.abs(one) / (np.sqrt(2.0) * abs(scan.through))
     with np.errstate(invalid="ignore"):
         gains[:, W_R] = np.real(whole) + np.resize([-1.0, 1.0], chosen.size) * np.sqrt(size**2 - np.imag(whole) ** 2)
     keep = (gains[:, W_R] >= 0.0) & (gains[:, W_R] <= scan.task.k_ff + gains[:, K_P])
@@ -271,17 +304,17 @@ def _list_integrals(scan: _Scan) -> Float[np.ndarray, " n"]:
 
 def _price_missing_integral(scan: _Scan, gains: Float[np.ndarray, "n 5"]) -> Float[np.ndarray, " n"]:
     """Return what a k_i counts that is below the least; beside an observer it will be none."""
-    if scan.task.spec.structure != "pid":
+    if scan.task.spec.structure not in ("pid", CASCADE):
         return np.zeros(gains.shape[0])
     least = INTEGRAL_RAD_S * (1 + gains[:, K_P])
     return np.maximum(0.0, np.log(least / np.maximum(gains[:, K_I], 1e-12)))
 
 
 def _solve_bandwidth(
-    a: complex, slope: Complex[np.ndarray, " n"], back: Complex[np.ndarray, " n"]
+    a: complex, slope: Complex[np.ndarray, " n"], one: Complex[np.ndarray, " n"]
 ) -> Float[np.ndarray, " two_n"]:
-    """Return both roots k_p of the bandwidth equation, not a number where there is none."""
-    size, one = abs(a) ** 2, 1.0 + a * back
+    """Return both roots k_p of the bandwidth equation, `one` being B + aY; not a number where there is none."""
+    size = abs(a) ** 2
     half = np.real(2.0 * size * slope - a * np.conj(one))
     rest = 2.0 * size * np.abs(slope) ** 2 - np.abs(one) ** 2
     with np.errstate(invalid="ignore"):
@@ -298,11 +331,11 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
         worst = np.max(margins, axis=(1, 2))
     for row, p in enumerate(grid.p):
         own = tuple(name for name in task.design_limits(row) if name not in TRACKING)
-        usage = task.curves(_imposed(task, SCOPES["every plant"] + own), grid.f, p, c_y, c_y, grid.discs[row])
+        usage = task.curves(_imposed(task, SCOPES["every plant"] + own), grid, row, scan.respond(c_y, c_y))
         usage |= task.port_usage(grid, c_y) if row == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
-        distance = 1.0 + p * c_y
+        distance = scan.rest[row] + p * c_y
         turn = np.unwrap(np.angle(distance), axis=1)
         # A stable loop turns by half a circle more for every pole of the plant that grows.
         turned = np.minimum(turned, turn[:, -1] - turn[:, 0] - np.pi * count_growing(task.plants[grid.rows[row]]))
@@ -320,7 +353,7 @@ def _judge_tracking(
     task, grid, worst = scan.task, scan.grid, np.zeros(c_y.shape[0])
     for row in range(task.design_states):
         names = _imposed(task, tuple(name for name in task.design_limits(row) if name in TRACKING))
-        for curve in task.curves(names, grid.f, grid.p[row], c_y, c_r, grid.discs[row]).values():
+        for curve in task.curves(names, grid, row, scan.respond(c_y, c_r)).values():
             worst = np.maximum(worst, np.max(curve, axis=1))
     return _price(worst)
 

@@ -1,9 +1,9 @@
 r"""Tune a controller: place a bandwidth under limits on several plants at once, for `so.tune`.
 
-The law is ten numbers at most: gains k_p, k_i, k_d; weights k_r, c of the reference; filters T_f, T_q; a notch's
-frequency, width and depth. Every limit is a curve over frequency on every plant
-(`seaopt.control.tuning.optimisation_problem`), and the design plant's bandwidth an equality. That is solved by
-`seaopt.control.tuning.solution`.
+The law is twelve numbers at most: gains k_p, k_i, k_d, and k_v of a speed loop; weights k_r, c of the reference;
+filters T_f, T_q; the speed loop's T_v; a notch's frequency, width and depth. Every limit is a curve over frequency on
+every plant (`seaopt.control.tuning.optimisation_problem`), and the design plant's bandwidth an equality. That is solved
+by `seaopt.control.tuning.solution`.
 
 The result is then measured by `Loop.figures`, which uses none of these frequencies. What is returned as feasible has
 been measured to be so. Where limits cannot all be kept, the result misses them by one common factor, the least
@@ -24,7 +24,7 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import CUSTOM, DisturbanceObserver, Nominal
+from seaopt.control.laws.structures import CASCADE, CUSTOM, DisturbanceObserver, Nominal
 from seaopt.control.laws.verdict import (
     PossibleBandwidths,
     explain_broken,
@@ -46,6 +46,7 @@ from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.optimisation_problem import (
     FRICTION,
     OBJECTIVE_HZ,
+    PASSIVE,
     LawNumbers,
     PlantWithFriction,
     Task,
@@ -134,9 +135,10 @@ def tune(
     model = name_design(plant)
     if spec.structure == CUSTOM:
         raise ControlError('structure = "custom" is of a law that is given, which nothing tunes; use seaopt.assess')
-    if not isinstance(spec.measured, str):
+    if spec.structure != CASCADE and not isinstance(spec.measured, str):
         raise ControlError(
-            f'measured = {list(spec.measured)}: structure = "{spec.structure}" feeds back one output; name one'
+            f'measured = {list(spec.measured)}: structure = "{spec.structure}" feeds back one output; name one, or '
+            'give structure = "cascade"'
         )
     spec = settle_delay(spec, model, params)
     params = params.parameters if isinstance(params, Fit) else params
@@ -212,6 +214,8 @@ def make_task(
     design = name_design(plant)
     values = design.complete(params)
     command = command_of(design, values, spec.regulated)
+    if spec.structure == CASCADE:
+        _check_cascade(spec, design)
     gain, signals = command.per_effort, find_signals(design, spec.measured)
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
@@ -262,13 +266,39 @@ def make_task(
     if isinstance(plants[0], DigitalPlant):
         nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
         port = None if spec.passive_band_hz is None else port_of(pairs[0][1][0], values, signals, gain)
+    speed_loop = spec.find_speed_loop(signals)
     frictions = _find_friction(
         spec, signals, [pair for _, pair in pairs], plants[len(first) :], whole, gain, len(first)
     )  # fmt: skip
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
         design_states=design_states, signals=signals, frictions=frictions,
+        further=() if speed_loop is None else (speed_loop,),
     )  # fmt: skip
+
+
+def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
+    """Refuse a cascade whose second signal is not the motor's speed, or of which a limit is asked that it has not.
+
+    Raises
+    ------
+    ControlError
+        As said.
+
+    """
+    first, name = list_names(spec.measured)
+    speed = None if design.sensing is None else design.sensing.motor_speed
+    if speed is not None and name != speed:
+        raise ControlError(
+            f'measured = {[first, name]}: a cascade reads the motor\'s speed second, and "{name}" is not that of '
+            f'{design.name}; give measured = ["{first}", "{speed}"]'
+        )
+    for limit in (PASSIVE, FRICTION):
+        if getattr(spec, limit) not in (None, False):
+            raise ControlError(
+                f'{limit} is not yet a limit of structure = "cascade"; leave it out and read what the certificate '
+                'says of it, or give structure = "pid"'
+            )
 
 
 def _check_measured_design(spec: ControllerSpec) -> None:
