@@ -167,7 +167,5 @@ def _fit_all(table: Table, executor: Executor, logs: Sequence[FleetLog], progres
         with suppress(SeaoptError):  # of a full disk the first error tells
             table.flush()
         raise
-    table.flush()
-    if len(table.parts()) > 1:
-        table.merge()
+    table.finish()
     return counts[UNCHANGED]

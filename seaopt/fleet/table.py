@@ -1,9 +1,17 @@
-"""The table of a fleet: a folder of Parquet files, a row a log, each file whole or absent.
+"""The table of a fleet: a folder of Parquet files, a row per log, each file whole or absent.
 
 Rows are written in parts as they come, into a folder of work beside, and moved into place: what was done when a client
-is killed is there. Parts are merged now and then, and where a row replaces an older one of the same log. The merged
-file is whole before the parts go, and moved into place when they are gone, so that no row is ever seen twice; what a
-killed merge left behind is finished when the table is opened again. One client at a time has a table.
+is killed is there. Two rules keep the cost of a row the same however long the table is:
+
+- Parts are merged when there are many of them, but only small ones; a file of `LARGE` rows is not merged again. A row
+  is so written a bounded number of times, and a table of n rows has about n/LARGE files.
+- Rows that replace older ones of the same logs wait in the folder of work until they are a fixed share of the table,
+  or the run ends. Then each file that has one of these logs is written anew. A table of n rows that is replaced whole
+  is rewritten 1/`SHARE` times, however many flushes that took.
+
+A merged file is whole before the parts that it replaces go, and moved into place when they are gone, so that no row is
+ever seen twice; what a killed client left behind is finished when the table is opened again. One client at a time has
+a table.
 """
 
 from __future__ import annotations
@@ -28,9 +36,12 @@ from seaopt.fleet.worker import FAILED, Row
 
 PART_S, PART_ROWS = 2.0, 5000  # a part is written after so long, or so many rows
 WRITING = 0.1  # of the time, at most, goes into writing
-MOST_PARTS = 64  # until they are merged
+MOST_PARTS = 64  # new ones, until the small ones are merged
+LARGE = 50_000  # rows of a file that is merged no more
+SHARE = 0.25  # of the table's rows, that newer ones are when they replace them
 WORK = ".fleet"  # the folder of work: readers of a folder of Parquet files want no others in it
 MERGED = "merged-"  # begins the name of a file there that is whole; of its parts, some may be gone
+NEWER = "newer-"  # begins the name of a file there with rows that replace others in the table
 
 _FINDING = pl.Struct({"severity": pl.String, "kind": pl.String, "where": pl.String, "text": pl.String})
 
@@ -84,6 +95,8 @@ class Table:
         self.schema = schema
         self.plan = plan
         self.rows: list[Row] = []
+        self.waiting = 0  # rows in the folder of work that replace others
+        self.fresh = 0  # parts since the small ones were merged
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.work.mkdir(exist_ok=True)
@@ -113,36 +126,40 @@ class Table:
             self.flush()
 
     def flush(self) -> None:
-        """Write the rows that are kept, each in place of an older one of its log."""
+        """Write the rows that are kept; those of logs that have a row already wait until they replace it."""
         started = time.monotonic()
         if self.rows:
-            new = make_frame(self.rows, self.schema, self.plan)
-            if self.present.isdisjoint(new["log"]):
-                name = f"part-{secrets.token_hex(8)}.parquet"
-                self._write(new, name).rename(self.folder / name)
-                if len(self.parts()) >= MOST_PARTS:
-                    self.merge()
-            else:
-                self.merge(new)
-            self.present.update(new["log"])
+            frame = make_frame(self.rows, self.schema, self.plan)
+            older = frame["log"].is_in(self.present)
+            fresh, newer = frame.filter(~older), frame.filter(older)
+            if len(fresh):
+                name = _name_part()
+                self._write(fresh, name).rename(self.folder / name)
+                self.present.update(fresh["log"])
+                self.fresh += 1
+            if len(newer):
+                self._write(newer, f"{NEWER}{_name_part()}")
+                self.waiting += len(newer)
             self.rows = []
+            if self.fresh >= MOST_PARTS:
+                self._merge_small()
+            if self.waiting >= SHARE * len(self.present):
+                self._replace_older()
         took = time.monotonic() - started
         self.due = time.monotonic() + max(PART_S, took / WRITING)
+
+    def finish(self) -> None:
+        """Write what is kept, replace what is older, and merge small parts."""
+        self.flush()
+        self._replace_older()
+        self._merge_small()
 
     def read(self) -> pl.DataFrame:
         """Return all rows that are written, in order of their logs, in columns of the schema, then others there are."""
         frames = [_read(path) for path in self.parts()]
         missing = pl.DataFrame(schema=dict(self.schema))
-        return pl.concat([missing, *frames], how="diagonal_relaxed").sort("log")
-
-    def merge(self, new: pl.DataFrame | None = None) -> None:
-        """Put all rows into one file, in order of their logs, with new ones in place of older ones of the same logs."""
-        parts, rows = self.parts(), self.read()
-        if new is not None:
-            rows = rows.join(new.select("log"), on="log", how="anti")
-            rows = pl.concat([rows, new], how="diagonal_relaxed").sort("log")
-        names = json.dumps([path.name for path in parts])
-        self._replace(self._write(rows, f"{MERGED}part-{secrets.token_hex(8)}.parquet", {"replaces": names}))
+        rows, newer = pl.concat([missing, *frames], how="diagonal_relaxed"), self._read_newer()
+        return _put(rows, newer).sort("log")
 
     def relabel(self, names: Sequence[str], logs: Sequence[FleetLog]) -> None:
         """Give the rows of logs the identities that these have now."""
@@ -153,7 +170,48 @@ class Table:
         labelled = rows.drop(names).join(now, on="log").select(rows.columns)
         before = rows.join(now.select("log"), on="log", how="semi")
         if not labelled.select("log", *names).equals(before.select("log", *names)):
-            self.merge(labelled)
+            self._write(labelled, f"{NEWER}{_name_part()}")
+            self._replace_older()
+
+    def _merge_small(self) -> None:
+        """Put the rows of all small parts into one, in order of their logs."""
+        small = [path for path in self.parts() if _count_rows(path) < LARGE]
+        if len(small) > 1:
+            rows = pl.concat([_read(path) for path in small], how="diagonal_relaxed")
+            self._write_merged(rows, small)
+        self.fresh = 0
+
+    def _replace_older(self) -> None:
+        """Put the rows that wait in the place of older ones of the same logs, file by file."""
+        waiting = self._list_newer()
+        if not waiting:
+            return
+        newer, found = self._read_newer(), pl.DataFrame(schema={"log": pl.String})
+        for path in self.parts():
+            rows = _read(path)
+            logs = rows.select("log")
+            if len(mine := newer.join(logs, on="log", how="semi")):
+                self._write_merged(_put(rows, mine), [path])
+                found = pl.concat([found, mine.select("log")])
+        rest = newer.join(found, on="log", how="anti")
+        if len(rest):  # somebody has deleted the file with the older ones
+            self._write_merged(rest, [])
+        for path in waiting:
+            path.unlink()
+        self.waiting = 0
+
+    def _list_newer(self) -> list[Path]:
+        return sorted(self.work.glob(f"{NEWER}*.parquet"))
+
+    def _read_newer(self) -> pl.DataFrame:
+        """Return the rows that wait; a run has one per log."""
+        frames = [_read(path) for path in self._list_newer()]
+        return pl.concat([pl.DataFrame(schema={"log": pl.String}), *frames], how="diagonal_relaxed")
+
+    def _write_merged(self, rows: pl.DataFrame, parts: Sequence[Path]) -> None:
+        """Write rows in order of their logs as a part that replaces others."""
+        names = json.dumps([path.name for path in parts])
+        self._replace(self._write(rows.sort("log"), f"{MERGED}{_name_part()}", {"replaces": names}))
 
     def _replace(self, merged: Path) -> None:
         """Delete the parts that a merged file replaces, then show it."""
@@ -165,15 +223,30 @@ class Table:
         """Finish what a client that was killed had begun."""
         for path in self.work.glob(f"{MERGED}*"):
             self._replace(path)
-        for path in self.work.glob("*.parquet"):
+        for path in self.work.glob("part-*.parquet"):
             path.rename(self.folder / path.name)  # whole, too
         for path in self.work.glob(".seaopt-*"):
             path.unlink()
+        self._replace_older()
 
     def _write(self, frame: pl.DataFrame, name: str, metadata: dict[str, str] | None = None) -> Path:
         content = io.BytesIO()
         frame.write_parquet(content, metadata=metadata)
         return write_bytes(self.work / name, content.getvalue())
+
+
+def _name_part() -> str:
+    return f"part-{secrets.token_hex(8)}.parquet"
+
+
+def _put(rows: pl.DataFrame, newer: pl.DataFrame) -> pl.DataFrame:
+    """Return rows with newer ones in place of those of the same logs."""
+    kept = rows.join(newer.select("log"), on="log", how="anti")
+    return pl.concat([kept, newer], how="diagonal_relaxed")
+
+
+def _count_rows(path: Path) -> int:
+    return int(pl.scan_parquet(path).select(pl.len()).collect().item())
 
 
 def find_done(rows: pl.DataFrame, plan: Plan) -> dict[str, str]:
