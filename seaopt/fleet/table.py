@@ -130,7 +130,7 @@ class Table:
         started = time.monotonic()
         if self.rows:
             frame = make_frame(self.rows, self.schema, self.plan)
-            older = frame["log"].is_in(self.present)
+            older = pl.Series([log in self.present for log in frame["log"]], dtype=pl.Boolean)
             fresh, newer = frame.filter(~older), frame.filter(older)
             if len(fresh):
                 name = _name_part()
