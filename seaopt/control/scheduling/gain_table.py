@@ -1,0 +1,173 @@
+r"""Gains at the points of one scheduling variable, and lines between them.
+
+The variable s is a state of the plant that is measured (an angle) or a parameter that is known as it runs (a load).
+Between two points every gain is interpolated by itself,
+
+.. math:: g(s) = g_i + t\,(g_{i+1} - g_i), \qquad t = \frac{s - s_i}{s_{i+1} - s_i},
+
+and beyond the ends it stays. The gains are those of `seaopt.control.laws.structures`, in one realisation whose states
+mean the same at every s (`seaopt.control.scheduling.runnable_schedule`); matrices of a balanced realisation have
+coordinates of their own at every point, and cannot be interpolated.
+
+**How much the law changes.** With :math:`\bar s` the middle of a stretch between two points, h its half width and a dash
+for a slope,
+
+.. math::
+    C_y(s) - C_y(\bar s) = (s - \bar s)\,(k_p' + k_i' I + k_d' D(\bar s)) + k_d(s)\,(D(s) - D(\bar s)), \qquad
+    \Big|\frac{\partial D}{\partial T_f}\Big| = \frac{|1 - q|^2}{|T_s + T_f (1 - q)|^2} .
+
+The real part of 1 - q is not negative, so that this derivative is largest where T_f is smallest, and
+
+.. math::
+    |C_y(s) - C_y(\bar s)| \le h\,|k_p' + k_i' I + k_d' D(\bar s)|
+        + \max k_d \; h\,|T_f'|\,\max \Big|\frac{\partial D}{\partial T_f}\Big|
+
+holds at every frequency for the whole stretch, which `bound_change` returns over :math:`|C_y(\bar s)|`.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.laws.structures import LAW_GAINS, Gains, Structure, evaluate_terms
+from seaopt.control.loops.law import Law
+from seaopt.errors import ControlError
+from seaopt.records import record
+
+STRUCTURES = ("pd", "pid")  # whose gains can be interpolated
+MOST_POINTS = 100
+
+
+@record(eq=False)
+class GainTable:
+    """Gains at points of a scheduling variable.
+
+    Parameters
+    ----------
+    over, unit : str
+        The variable, and its SI unit.
+    points : array, shape (n,)
+        Its values, ascending.
+    gains : mapping of name to array, shape (n,)
+        k_p, k_i, k_d, T_f, k_r and c at these.
+    structure : {"pd", "pid"}
+    sample_time_s : float
+        Seconds.
+
+    Raises
+    ------
+    ControlError
+        There are fewer than two points or too many, they do not ascend, the gains are not those of the structure, or
+        some of them integrate and others do not.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rows = {"k_p": [1.0, 3.0], "k_i": [8.0, 4.0], "k_d": [0.0, 0.0], "T_f": [1e-3] * 2, "k_r": [2.0, 4.0], "c": [1.0] * 2}
+    >>> table = GainTable(
+    ...     over="phi", unit="rad", points=np.array([0.0, 1.0]), gains={k: np.array(v) for k, v in rows.items()},
+    ...     structure="pid", sample_time_s=1e-3,
+    ... )
+    >>> table.interpolate(0.5)["k_p"], table.interpolate(7.0)["k_p"]
+    (2.0, 3.0)
+
+    """  # noqa: E501
+
+    over: str
+    unit: str
+    points: Float[np.ndarray, " n"]
+    gains: Mapping[str, Float[np.ndarray, " n"]]
+    structure: Structure
+    sample_time_s: float
+
+    def __post_init__(self) -> None:
+        check_points(self.over, self.points)
+        if self.structure not in STRUCTURES:
+            raise ControlError(
+                f'structure = "{self.structure}" cannot be scheduled: its states change their meaning from point to '
+                'point; use structure = "pid" or "pd"'
+            )
+        if set(self.gains) != set(LAW_GAINS):
+            raise ControlError(
+                f"gains of a schedule are {', '.join(sorted(self.gains))}; give {', '.join(LAW_GAINS)} and no others"
+            )
+        for name, values in self.gains.items():
+            if np.shape(values) != self.points.shape or not np.all(np.isfinite(values)):
+                raise ControlError(f"{name} of a schedule: give {self.points.size} finite numbers, one per point")
+        integrates = np.asarray(self.gains["k_i"]) > 0.0
+        if np.any(integrates) and not np.all(integrates):
+            at = ", ".join(f"{value:g}" for value in self.points[~integrates])
+            raise ControlError(
+                f"k_i is 0 at {self.over} = {at} and not elsewhere: what was integrated would stay in the command "
+                'there for ever; use structure = "pd", or other points'
+            )
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the law integrates."""
+        return self.structure != "pd" and bool(self.gains["k_i"][0] > 0.0)
+
+    def find_stretch(self, value: float) -> tuple[int, float]:
+        """Return the point below a value and the share of the way to the next; at the ends beyond them."""
+        points = self.points
+        inside = min(max(value, float(points[0])), float(points[-1]))
+        i = min(max(bisect_right(points, inside) - 1, 0), points.size - 2)
+        return i, (inside - float(points[i])) / (float(points[i + 1]) - float(points[i]))
+
+    def interpolate(self, value: float) -> dict[str, float]:
+        """Return the gains at a finite value, by name."""
+        i, t = self.find_stretch(value)
+        return {name: float(row[i] + t * (row[i + 1] - row[i])) for name, row in self.gains.items()}
+
+    def law(self, value: float) -> Law:
+        """Return the law while the variable stands at a value."""
+        return Gains.from_names(self.interpolate(value)).law(self.structure, self.sample_time_s).balanced()
+
+    def bound_change(self, low: float, high: float, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return what abs(C_y(s)/C_y(middle) - 1) stays below for every s from low to high, at frequencies in Hz.
+
+        Raises
+        ------
+        ControlError
+            A point of the table lies between the two.
+
+        """
+        if np.any((self.points > low) & (self.points < high)):
+            raise ControlError(f"a stretch from {low:g} to {high:g} has a point of the table in it; end it there")
+        ts, half = self.sample_time_s, 0.5 * (high - low)
+        first, last, middle = (self.interpolate(value) for value in (low, high, 0.5 * (low + high)))
+        width = max(high - low, np.finfo(float).tiny)
+        slope = {name: (last[name] - first[name]) / width for name in LAW_GAINS}
+        q = np.exp(-2j * np.pi * f * ts)
+        terms = evaluate_terms(q, ts, middle["T_f"])
+        integral = terms.integral if self.integrates else 0.0
+        least_filter = min(first["T_f"], last["T_f"])
+        filtering = np.abs((1.0 - q) / (ts + least_filter * (1.0 - q))) ** 2 * half * abs(slope["T_f"])
+        change = half * np.abs(slope["k_p"] + slope["k_i"] * integral + slope["k_d"] * terms.rate)
+        change = change + max(first["k_d"], last["k_d"]) * filtering
+        return change / np.abs(middle["k_p"] + middle["k_i"] * integral + middle["k_d"] * terms.rate)
+
+
+def check_points(over: str, points: Float[np.ndarray, " n"]) -> None:
+    """Refuse points that no table can have.
+
+    Raises
+    ------
+    ControlError
+        There are fewer than two or too many, or they do not ascend.
+
+    """
+    values = np.asarray(points)
+    if values.ndim != 1 or not 2 <= values.size <= MOST_POINTS:
+        raise ControlError(
+            f"points of {over} = {values.tolist()}: give 2 to {MOST_POINTS} values, the ends of its range among them"
+        )
+    if not np.all(np.isfinite(values)) or not np.all(np.diff(values) > 0.0):
+        raise ControlError(
+            f"points of {over} = {values.tolist()} do not ascend; give each once: "
+            f"points = {np.unique(values[np.isfinite(values)]).tolist()}"
+        )

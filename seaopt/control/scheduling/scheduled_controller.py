@@ -1,0 +1,452 @@
+"""A scheduled controller: one controller per point of a variable, the lines between their gains, and its judgement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from seaopt.control.laws.command import Command
+from seaopt.control.laws.controller import Controller, name_gain_units
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.control.loops.sampled_plant import conditions
+from seaopt.control.scheduling.gain_table import GainTable
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
+from seaopt.control.tuning.tuner import describe_law, make_task
+from seaopt.errors import ControlError, suggestion
+from seaopt.formatting import format_count, format_number, html_text, join_words
+from seaopt.parameters import ParameterSet
+from seaopt.plants import CompletedParameters, Plant
+from seaopt.records import record
+from seaopt.units import unit_after
+
+SCHEDULE_SCHEMA = "seaopt/schedule/1"
+PARTS = 4  # of every stretch between two points, at whose ends the limits are judged
+LEAST_BANDWIDTH = 0.9  # of the one asked, that the law has between the points
+LARGE_STEP = 1.0  # of a gain between neighbours, over the smaller of the two, from which it is remarked on
+Plants = Mapping[str, tuple[Plant, ParameterSet]]
+
+
+@record(eq=False)
+class PlaceFigures:
+    """What the law does while the variable stands at a value between the points.
+
+    Parameters
+    ----------
+    value : float
+        Of the variable.
+    bandwidth_hz : float or None
+        Of the design plant.
+    asked_hz : float
+        The bandwidth asked there, interpolated.
+    ms, mt : float
+        The worst of all plants.
+    broken : tuple of str
+        The limits that are broken.
+
+    """
+
+    value: float
+    bandwidth_hz: float | None
+    asked_hz: float
+    ms: float
+    mt: float
+    broken: tuple[str, ...]
+
+
+@record(eq=False, repr=False)
+class ScheduledController:
+    """A controller per point of one scheduling variable, with its gains interpolated between them.
+
+    Parameters
+    ----------
+    over, unit : str
+        The variable: a state of the plants that is measured, or a parameter that is known as the law runs.
+    points : tuple of float
+        Its values, ascending.
+    controllers : tuple of Controller
+        Tuned at these, each with its design plant there.
+    others : mapping of name to (Plant, ParameterSet)
+        The plants of robust_to, with their nominal parameters.
+    fallback : float
+        The point whose law counts until a finite value of the variable was read.
+    between : tuple of PlaceFigures
+        What was found between the points.
+
+    """
+
+    over: str
+    unit: str
+    points: tuple[float, ...]
+    controllers: tuple[Controller, ...]
+    others: Plants
+    fallback: float
+    between: tuple[PlaceFigures, ...] = ()
+
+    @property
+    def table(self) -> GainTable:
+        """The gains at the points."""
+        return make_table(self.over, self.unit, self.points, self.controllers)
+
+    @property
+    def spec(self) -> ControllerSpec:
+        """The specification at the first point; the others differ in their bandwidth."""
+        return self.controllers[0].spec
+
+    @property
+    def command(self) -> Command:
+        """What is commanded for an effort."""
+        return self.controllers[0].command
+
+    @property
+    def design(self) -> tuple[Plant, ParameterSet]:
+        """The design plant, and its parameters at the first point."""
+        design = self.controllers[0].design
+        assert design is not None  # a schedule is tuned on models
+        return design
+
+    @property
+    def bandwidths_hz(self) -> tuple[float, ...]:
+        """The bandwidths asked at the points."""
+        return tuple(one.spec.bandwidth_hz for one in self.controllers)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether every limit is met at the points, and where it was looked between them."""
+        return all(one.feasible for one in self.controllers) and not any(place.broken for place in self.between)
+
+    @property
+    def broken(self) -> tuple[str, ...]:
+        """The limits that are broken, each once with where: at the points, and between them."""
+        found = [
+            *((point, () if one.feasible else one.active_constraints) for point, one in self._pairs),
+            *((one.value, one.broken) for one in self.between),
+        ]
+        places: dict[str, list[float]] = {}
+        for value, names in found:
+            for name in names:
+                places.setdefault(name, []).append(value)
+        return tuple(f"{name} at {self._list_places(sorted(values))}" for name, values in places.items())
+
+    def _list_places(self, values: Sequence[float]) -> str:
+        more = f" and {format_count(len(values) - 1, 'more value')}" if len(values) > 1 else ""
+        return f"{self.over} = {values[0]:g}{more}"
+
+    @property
+    def _pairs(self) -> list[tuple[float, Controller]]:
+        return list(zip(self.points, self.controllers, strict=True))
+
+    @property
+    def remedy(self) -> str:
+        """What to change where a limit is broken; empty where none is."""
+        infeasible = [(point, one) for point, one in self._pairs if not one.feasible]
+        if infeasible:
+            point, one = infeasible[0]
+            return f"at {self.over} = {point:g}: {one.explanation}"
+        missed = [one.value for one in self.between if one.broken]
+        if not missed:
+            return ""
+        stretches = zip(self.points[:-1], self.points[1:], strict=True)
+        middles = [0.5 * (low + high) for low, high in stretches if any(low < value < high for value in missed)]
+        points = ", ".join(f"{value:.4g}" for value in sorted((*self.points, *middles)))
+        return f"add points where it is broken: points = [{points}]; or tune with more room: reserve = 0.03"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks besides the limits, one sentence each."""
+        shared = [note for note in self.controllers[0].notes if all(note in one.notes for one in self.controllers)]
+        return (*shared, *self._step_notes())
+
+    def _step_notes(self) -> tuple[str, ...]:
+        """Name gains that more than double from a point to the next: another valley of the tuner, or too few points."""
+        notes: list[str] = []
+        for name, row in self.table.gains.items():
+            low, high = np.abs(row[:-1]), np.abs(row[1:])
+            smaller = np.maximum(np.minimum(low, high), 1e-3 * np.max(np.abs(row)) or 1.0)
+            steps = np.abs(high - low) / smaller
+            if name not in ("c", "k_r") and np.max(steps) > LARGE_STEP:
+                at = int(np.argmax(steps))
+                notes.append(
+                    f"{name} changes from {row[at]:.4g} to {row[at + 1]:.4g} between {self.over} = {self.points[at]:g} "
+                    f"and {self.points[at + 1]:g}: a point between them would make the step smaller"
+                )
+        return tuple(notes)
+
+    def asked_hz(self, value: float) -> float:
+        """Return the bandwidth asked at a value of the variable, between the points interpolated."""
+        return float(np.interp(value, self.points, self.bandwidths_hz))
+
+    def at(self, value: float) -> Controller:
+        """Return the controller that the schedule is while the variable stands at a value.
+
+        At a point it is the one that was tuned there. Elsewhere its specification asks for the bandwidth that it has:
+        what is asked there is judged by `between`.
+
+        Raises
+        ------
+        ControlError
+            The value is not finite, or outside the points.
+
+        """
+        low, high = self.points[0], self.points[-1]
+        if not low <= value <= high:
+            raise ControlError(f"{self.over} = {value:g} is outside the points; give {low:g} to {high:g}")
+        if value in self.points:
+            return self.controllers[self.points.index(value)]
+        return freeze(self.table, value, self._ask(value), self.design, self.others)
+
+    def _ask(self, value: float) -> ControllerSpec:
+        return replace(self.spec, bandwidth_hz=self.asked_hz(value))
+
+    def with_places(self, parts: int = PARTS) -> ScheduledController:
+        """Return the schedule judged at the inner ends of so many parts of every stretch between two points."""
+        return replace(self, between=tuple(self._judge_place(value) for value in list_inner(self.points, parts)))
+
+    def _judge_place(self, value: float) -> PlaceFigures:
+        """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
+        frozen, asked = self.at(value), self.asked_hz(value)
+        worst = [frozen.achieved, *(
+            frozen.close(plant, place_variable(plant, params, self.over, value)).figures()
+            for plant, params in self.others.values()
+        )]  # fmt: skip
+        band = frozen.achieved.bandwidth_hz
+        broken = () if frozen.feasible else frozen.active_constraints
+        if band is None or band < LEAST_BANDWIDTH * asked:
+            broken = (*broken, f"{LEAST_BANDWIDTH:g} of bandwidth_hz")
+        return PlaceFigures(
+            value=value, bandwidth_hz=band, asked_hz=asked, ms=max(one.ms for one in worst),
+            mt=max(one.mt for one in worst), broken=broken,
+        )  # fmt: skip
+
+    def runnable(
+        self, *, limit: float | None = None, tracking_time_s: float | None = None
+    ) -> RunnableSchedule:
+        """Return the law ready to run.
+
+        Parameters
+        ----------
+        limit : float, optional
+            Of the command, in its unit; the specification's if left out.
+        tracking_time_s : float, optional
+            Of the anti-windup.
+
+        """
+        return make_runnable(
+            self.table, per_effort=self.command.per_effort,
+            limit=self.controllers[0].command_limit if limit is None else self.command.limit(limit),
+            fallback=self.fallback, tracking_time_s=tracking_time_s,
+            command=(self.command.input, self.command.unit),
+        )  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of schedule.json (schema seaopt/schedule/1)."""
+        return {
+            "schema": SCHEDULE_SCHEMA,
+            "over": self.over,
+            "unit": self.unit,
+            "points": list(self.points),
+            "fallback": self.fallback,
+            "feasible": self.feasible,
+            "broken": list(self.broken),
+            "notes": list(self.notes),
+            "gains": {name: row.tolist() for name, row in self.table.gains.items()},
+            "anti_windup": self.runnable().anti_windup.tolist(),
+            "between": [
+                {
+                    "value": one.value, "bandwidth_hz": one.bandwidth_hz, "asked_hz": one.asked_hz,
+                    "ms": one.ms, "mt": one.mt, "broken": list(one.broken),
+                }
+                for one in self.between
+            ],
+            "controllers": [one.to_dict() for one in self.controllers],
+        }  # fmt: skip
+
+    @classmethod
+    def from_dict(
+        cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet, others: Plants | None = None
+    ) -> ScheduledController:
+        """Return the schedule of a schedule.json; what it achieves is computed again.
+
+        Raises
+        ------
+        FileError
+            A field is missing or malformed, or contradicts another: the gains must be those of the controllers.
+
+        """
+        from seaopt.control.scheduling.stored import read_schedule  # deferred: pydantic
+
+        stored = read_schedule(content)
+        controllers = tuple(
+            Controller.from_dict(one, plant, place_variable(plant, params, stored.over, point))
+            for point, one in zip(stored.points, content["controllers"], strict=True)
+        )
+        return cls(
+            over=stored.over, unit=stored.unit, points=tuple(stored.points), controllers=controllers,
+            others=others or {}, fallback=stored.fallback,
+        ).with_places()  # fmt: skip
+
+    def list_rows(self) -> list[tuple[str, ...]]:
+        """Return the points as text: value, gains, bandwidth, Ms, Mt, and whether the limits are met."""
+        return [
+            (
+                f"{point:g}", *(f"{one.gains[name]:.4g}" for name in LAW_GAINS),
+                format_number(one.achieved.bandwidth_hz, missing="none"), f"{one.achieved.ms:.3f}",
+                f"{one.achieved.mt:.3f}", "met" if one.feasible else "not met",
+            )
+            for point, one in self._pairs
+        ]  # fmt: skip
+
+    @property
+    def row_heads(self) -> tuple[str, ...]:
+        """What stands above the columns of `list_rows`."""
+        units = name_gain_units(self.command)
+        gains = [f"{name}{unit_after(units[name]) if name in units else ''}" for name in LAW_GAINS]
+        return (f"{self.over}{unit_after(self.unit)}", *gains, "bandwidth Hz", "Ms", "Mt", "limits")
+
+    def describe_between(self) -> str:
+        """Return one line on what was found between the points."""
+        bands = [one.bandwidth_hz or 0.0 for one in self.between]
+        if not bands:
+            return "nothing was looked at between the points"
+        return (
+            f"between the points, at {format_count(len(bands), 'value')}: bandwidth {min(bands):.4g} to "
+            f"{max(bands):.4g} Hz, Ms up to {max(one.ms for one in self.between):.3f}, Mt up to "
+            f"{max(one.mt for one in self.between):.3f}"
+        )
+
+    def __repr__(self) -> str:
+        spec, verdict = self.spec, "every limit met" if self.feasible else "NOT FEASIBLE"
+        rows = [self.row_heads, *self.list_rows()]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+        return "\n".join(
+            [
+                f"ScheduledController {spec.structure} on {spec.measured} over {self.over}, "
+                f"{format_count(len(self.points), 'point')}, at {spec.sample_rate_hz:g} Hz: {verdict}",
+                *("  " + "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows),
+                f"  {self.describe_between()}",
+                *(f"  not met: {text}" for text in self.broken),
+                *([f"  {self.remedy}"] if self.remedy else []),
+                *(f"  note: {note}" for note in self.notes),
+            ]
+        )
+
+    _repr_html_ = html_text
+
+
+def make_table(over: str, unit: str, points: Sequence[float], controllers: Sequence[Controller]) -> GainTable:
+    """Return the gains of controllers at points.
+
+    Raises
+    ------
+    ControlError
+        Their gains cannot be interpolated, they run at different rates, or command an effort differently.
+
+    """
+    first = controllers[0]
+    for point, one in zip(points, controllers, strict=True):
+        own = set(one.gains) == set(LAW_GAINS) and Gains.from_names(one.gains).makes(one.law, one.spec.structure)
+        if not own:
+            raise ControlError(
+                f"the controller at {over} = {point:g} is more than k_p, k_i, k_d, T_f, k_r and c, which are what can "
+                'be interpolated; use structure = "pid" or "pd" without a notch or other parts'
+            )
+        if one.sample_time_s != first.sample_time_s or not math.isclose(
+            one.command.per_effort, first.command.per_effort, rel_tol=1e-9
+        ):
+            raise ControlError(
+                f"the controller at {over} = {point:g} runs at another rate, or commands its effort by another factor, "
+                f"than that at {points[0]:g}; a schedule has one of each"
+            )
+    return GainTable(
+        over=over, unit=unit, points=np.array(points, dtype=float),
+        gains={name: np.array([one.gains[name] for one in controllers]) for name in LAW_GAINS},
+        structure=first.spec.structure, sample_time_s=first.sample_time_s,
+    )  # fmt: skip
+
+
+def freeze(
+    table: GainTable, value: float, spec: ControllerSpec, design: tuple[Plant, ParameterSet], others: Plants
+) -> Controller:
+    """Return the controller of a table's gains at a value, judged on the plants there by all but the bandwidth asked.
+
+    The limits that depend on the bandwidth, such as a droop up to a third of it, are those of the bandwidth it has.
+    """
+    plant, params = design[0], place_variable(*design, table.over, value)
+    robust_to = {name: (one, place_variable(one, own, table.over, value)) for name, (one, own) in others.items()}
+    task = make_task(plant, plant.complete(params), spec, robust_to)
+    gains, law = table.interpolate(value), table.law(value)
+
+    def describe() -> Controller:
+        loops = task.measure_law(
+            law,
+            filter_samples=gains["T_f"] / table.sample_time_s if gains["k_d"] else math.inf,
+            integral_rad_s=gains["k_i"] / (1.0 + gains["k_p"]) if table.integrates else math.inf,
+        )
+        return describe_law(task, law, loops, (plant, params), gains=gains)
+
+    asked = describe()
+    band = asked.achieved.bandwidth_hz
+    if band is None or not math.isfinite(band):
+        return asked
+    low, high = spec.bandwidth_range_hz
+    own = replace(spec, bandwidth_hz=band, bandwidth_range_hz=(min(low, band), max(high, band)))
+    task = replace(task, spec=own)
+    return describe()
+
+
+def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) -> ParameterSet:
+    """Return a plant's parameters with the scheduling variable at a value; as they are of a plant without it.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> swing = so.plants.moving_output()
+    >>> place_variable(swing, so.plants.thor(), "phi", 0.5)["phi"].value  # a state
+    0.5
+    >>> place_variable(swing, so.plants.thor(), "m", 2.0)["m"].value  # a parameter
+    2.0
+
+    """
+    given = params.given if isinstance(params, CompletedParameters) else params
+    if over in plant.parameters:
+        return given.with_parameters(replace(plant.complete(given)[over], value=value))
+    known = conditions((plant,))
+    return given.with_parameters(replace(known[over], value=value)) if over in plant.states else given
+
+
+def find_unit(over: str, plants: Mapping[str, Plant]) -> str:
+    """Return the unit of a scheduling variable, a state or a parameter of some plant.
+
+    Raises
+    ------
+    ControlError
+        No plant has it.
+
+    """
+    for plant in plants.values():
+        if over in plant.parameters:
+            return plant.parameter_unit(over)
+        if over in plant.states:
+            return plant.states[over]
+    known = dict.fromkeys(name for plant in plants.values() for name in (*plant.parameters, *plant.states))
+    raise ControlError(
+        f'over = "{over}" is no state and no parameter of {join_words(list(plants))}; {suggestion(over, known)}'
+    )
+
+
+def list_inner(points: Sequence[float], parts: int) -> list[float]:
+    """Return the inner ends of so many equal parts of every stretch between two points.
+
+    Examples
+    --------
+    >>> list_inner([0.0, 1.0, 3.0], 2)
+    [0.5, 2.0]
+
+    """
+    return [
+        low + (high - low) * k / parts for low, high in zip(points[:-1], points[1:], strict=True) for k in range(1, parts)
+    ]

@@ -1,0 +1,230 @@
+"""Tune a schedule: the same structure and limits at every point, each point started from its neighbour.
+
+A law that is tuned by itself may sit in another valley than its neighbour's, with an integral a hundred times slower
+say, and lines between the two mean nothing. So one end is tuned as `seaopt.tune` does, from a scan, and every further
+point from its neighbour's numbers alone; a scan follows only where that breaks a limit. This is done from both ends,
+and the chain is taken that breaks limits at fewer points; of two that keep them, the one whose objective, over the best
+that is known at each point, is the smaller at its worst point.
+
+A reading that is missing from the start leaves the law without a place in the table. What counts then is the point
+whose law has the least Ms on the worst plant of all points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.verdict import list_broken_limits
+from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.control.scheduling.gain_table import STRUCTURES, check_points
+from seaopt.control.scheduling.scheduled_controller import (
+    Plants,
+    ScheduledController,
+    find_unit,
+    make_table,
+    place_variable,
+)
+from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.interior_point import refine
+from seaopt.control.tuning.optimisation_problem import LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.solution import recheck, solve
+from seaopt.control.tuning.tuner import make_controller, make_task, tune
+from seaopt.errors import ControlError, require_type
+from seaopt.estimation import Fit
+from seaopt.frequency import MeasuredResponse
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.plant import require_plant
+from seaopt.progress import Progress, count_off, divide, ignore
+
+Chain = list[tuple[LawNumbers, list[MeasuredLoop]]]  # of every point
+
+
+def tune_schedule(
+    plant: Plant,
+    params: Fit | ParameterSet,
+    spec: ControllerSpec,
+    over: str,
+    points: Sequence[float],
+    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    *,
+    bandwidths_hz: Sequence[float] | None = None,
+    draws: Sequence[Mapping[str, float]] = (),
+    progress: Progress = ignore,
+) -> ScheduledController:
+    """Tune a controller per point of a scheduling variable, with gains that are interpolated between the points.
+
+    Parameters
+    ----------
+    plant : Plant
+        The design plant.
+    params : Fit or ParameterSet
+        Its parameters.
+    spec : ControllerSpec
+        Limits, the same at every point; the structure "pd" or "pid" without a notch, and one measured output.
+    over : str
+        The variable: a state that is measured, such as an angle, at which the plants are linearised; or a parameter
+        that is known while the law runs, such as a load.
+    points : sequence of float
+        Its values, ascending, SI; the ends are the range for which the schedule is made.
+    robust_to : mapping of name to Plant or (Plant, ParameterSet), optional
+        As in `seaopt.tune`; those that have the variable are placed at each point.
+    bandwidths_hz : sequence of float, optional
+        One per point, in place of the specification's.
+    draws : sequence of mappings, optional
+        As in `seaopt.tune`.
+    progress : callable, optional
+        Called with what is done and the share of it that is done.
+
+    Returns
+    -------
+    ScheduledController
+        Judged at the points and at three values in every stretch between two of them.
+
+    Raises
+    ------
+    ControlError
+        As `seaopt.tune`; no plant has the variable, the points do not ascend, or the gains cannot be interpolated.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control import tune_schedule
+    >>> spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6)
+    >>> stiffer = tune_schedule(so.plants.high_impedance(), so.plants.thor(), spec, "k", [3e5, 6e5])
+    >>> stiffer.feasible, [round(one.achieved.bandwidth_hz) for one in stiffer.controllers]
+    (True, [20, 20])
+
+    """
+    require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
+    require_plant(plant, "plant", ControlError)
+    _check_structure(spec)
+    places = np.asarray(points, dtype=float)
+    check_points(over, places)
+    spec = settle_delay(spec, plant, params)
+    values = params.parameters if isinstance(params, Fit) else params
+    others = _pair_plants(robust_to or {}, values)
+    if over == DELAY:
+        raise ControlError(f'over = "{DELAY}": a delay cannot be read as the law runs; give a state or a parameter')
+    if any(over in draw for draw in draws):
+        raise ControlError(f'draws have "{over}", which the schedule is over; take it out of the draws')
+    unit = find_unit(over, {"the design plant": plant, **{name: one for name, (one, _) in others.items()}})
+    specs = _specify(spec, places, bandwidths_hz)
+    tasks: list[Task] = []
+    for value, own in zip(places.tolist(), specs, strict=True):
+        here = place_variable(plant, values, over, value)
+        there = {name: (one, place_variable(one, given, over, value)) for name, (one, given) in others.items()}
+        tasks.append(make_task(plant, plant.complete(here), own, there, draws))
+    chain = _choose_chain(tasks, progress)
+    controllers: list[Controller] = []
+    for value, task, (x, loops) in zip(places.tolist(), tasks, chain, strict=True):
+        here = place_variable(plant, values, over, value)
+        if _breaks_limits(task, loops):  # what blocks, and what is possible instead, is for the tuner to say
+            there = {name: (one, place_variable(one, given, over, value)) for name, (one, given) in others.items()}
+            controllers.append(tune(plant, here, task.spec, there, draws=draws))
+        else:
+            controllers.append(make_controller(task, x, loops, (plant, here)))
+    make_table(over, unit, places.tolist(), controllers)  # refuses gains that cannot be interpolated
+    schedule = ScheduledController(
+        over=over, unit=unit, points=tuple(places.tolist()), controllers=tuple(controllers), others=others,
+        fallback=float(places[0]),
+    ).with_places()  # fmt: skip
+    progress(f"{places.size} points over {over}", 1.0)
+    return replace(schedule, fallback=_choose_fallback(schedule))
+
+
+def _check_structure(spec: ControllerSpec) -> None:
+    if spec.structure not in STRUCTURES or spec.notch is not None:
+        what = "a notch" if spec.notch is not None else f'structure = "{spec.structure}"'
+        raise ControlError(
+            f'{what} cannot be scheduled: its states change their meaning from point to point; use structure = "pid" '
+            "without a notch"
+        )
+    if not isinstance(spec.measured, str):
+        raise ControlError(f"measured = {list(spec.measured)}: a schedule feeds back one output; name one")
+
+
+def _pair_plants(robust_to: Mapping[str, Any], values: ParameterSet) -> Plants:
+    """Return the plants of robust_to with their parameters."""
+    out: dict[str, tuple[Plant, ParameterSet]] = {}
+    for name, one in robust_to.items():
+        if isinstance(one, MeasuredResponse):
+            raise ControlError(
+                f"robust_to: {name} is a measured response, which stands at one value of the variable; name a plant"
+            )
+        pair = one if isinstance(one, tuple) else (one, values)
+        require_plant(pair[0], f"robust_to: {name}", ControlError)
+        out[str(name)] = pair
+    return out
+
+
+def _specify(spec: ControllerSpec, points: Any, bandwidths_hz: Sequence[float] | None) -> list[ControllerSpec]:
+    """Return the specification of every point."""
+    if bandwidths_hz is None:
+        return [spec] * len(points)
+    if len(bandwidths_hz) != len(points):
+        raise ControlError(
+            f"bandwidths_hz has {len(bandwidths_hz)} values and points {len(points)}; give one per point"
+        )
+    return [replace(spec, bandwidth_hz=band) for band in bandwidths_hz]
+
+
+def _choose_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
+    """Return the numbers of every point with their loops, of the better of the chains from either end."""
+    forward, backward = divide(progress, 1.0, 1.0)
+    chains = [_tune_chain(tasks, forward), _tune_chain(tasks[::-1], backward)[::-1]]
+    values = np.array([
+        [task.objective(task.grid(place_frequencies(task)), x) for task, (x, _) in zip(tasks, chain, strict=True)]
+        for chain in chains
+    ])  # fmt: skip
+    losses = np.max(values / np.min(values, axis=0), axis=1)
+    broken = [sum(_breaks_limits(task, loops) for task, (_, loops) in zip(tasks, chain, strict=True)) for chain in chains]
+    return chains[min(range(2), key=lambda k: (broken[k], losses[k]))]
+
+
+def _tune_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
+    """Return the numbers of every point, of the first from a scan and of the others from the one before."""
+    chain: Chain = []
+    for task in count_off(tasks, "point", progress):
+        if chain:
+            x = _follow(task, chain[-1][0])
+            loops = task.measure(x)
+        if not chain or _breaks_limits(task, loops):
+            x, loops = solve(task, [chain[-1][0]] if chain else ())
+        chain.append((x, loops))
+    return chain
+
+
+def _breaks_limits(task: Task, loops: Sequence[MeasuredLoop]) -> bool:
+    return bool(list_broken_limits(task.spec, loops, task.design_states))
+
+
+def _follow(task: Task, x: LawNumbers) -> LawNumbers:
+    """Return the numbers that the optimisation reaches from those of a neighbour, without a scan."""
+    grid = task.grid(place_frequencies(task))
+    start = task.tidy(x)
+    return recheck(task, grid, refine(task, grid, improve(task, grid, start)[1])) if task.is_stable(start) else start
+
+
+def _choose_fallback(schedule: ScheduledController) -> float:
+    """Return the point whose law has the least Ms on the worst plant of all points."""
+
+    def find_worst(controller: Controller) -> float:
+        plant, params = schedule.design
+        plants = [(plant, params), *schedule.others.values()]
+        return max(
+            controller.close(one, place_variable(one, own, schedule.over, value)).figures().ms
+            for value in schedule.points
+            for one, own in plants
+        )
+
+    worst = [find_worst(one) for one in schedule.controllers]
+    return schedule.points[int(np.argmin(worst))]
