@@ -30,6 +30,10 @@ from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.running.closed_loop import run_loop
 from seaopt.control.running.force_run import ForceRun, close_loop
 from seaopt.control.running.sampled_loop import SampledLoop
+from seaopt.control.scheduling.gain_table import GainTable
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
+from seaopt.control.scheduling.scheduled_controller import ScheduledController
+from seaopt.control.scheduling.tuning import tune_schedule
 from seaopt.control.tuning.corners import corners, draw
 from seaopt.control.tuning.free_law import FreeLaw, bound_free_law
 from seaopt.control.tuning.frontier import Frontier, sweep
@@ -37,12 +41,13 @@ from seaopt.control.tuning.tuner import tune
 
 __all__ = [
     "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
-    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "Gains", "GateState", "GivenLaw",
-    "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep",
-    "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate", "Rendering", "RunnableLaw",
-    "SampledLoop", "Score", "Scorecard", "TransferFunction", "add_impedance", "assess", "bound_free_law",
-    "cascade_pid", "close_loop", "command_of", "corners", "critical_impedance", "draw", "drive_pid", "estimate_noise",
-    "estimator", "export", "export_mpc", "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid",
-    "passive_region", "passivity", "passivity_rows", "read_law", "realise", "render", "run_loop", "runnable",
-    "sample", "scorecard", "sweep", "tune",
+    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "GainTable", "Gains",
+    "GateState", "GivenLaw", "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec",
+    "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate",
+    "Rendering", "RunnableLaw", "RunnableSchedule", "SampledLoop", "ScheduleState", "ScheduledController", "Score",
+    "Scorecard", "TransferFunction", "add_impedance", "assess", "bound_free_law", "cascade_pid", "close_loop",
+    "command_of", "corners", "critical_impedance", "draw", "drive_pid", "estimate_noise", "estimator", "export",
+    "export_mpc", "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid", "passive_region", "passivity",
+    "passivity_rows", "read_law", "realise", "render", "run_loop", "runnable", "sample", "scorecard", "sweep",
+    "tune", "tune_schedule",
 ]  # fmt: skip

@@ -12,12 +12,21 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from seaopt.control.deploy.c_text import (
+    LARGEST_NUMBER,
+    Precision,
+    check_prefix,
+    identifier,
+    literal,
+    render,
+    strip_markup,
+)
+from seaopt.control.deploy.schedule_export import export_schedule, is_schedule
 from seaopt.control.laws.controller import Controller, name_gain_units
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
@@ -26,25 +35,14 @@ from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
+from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, FileError, require_type
 from seaopt.files import write_text
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating
 from seaopt.units import mechanics_of
 
-Precision = Literal["double", "float"]
-LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
 TEMPLATES = {"{}.h": "law.h.jinja", "{}.c": "law.c.jinja", "{}_gains.h": "gains.h.jinja", "{}_gains.m": "gains.m.jinja"}
-LONGEST_NAME = 25  # C99 promises 31 characters of an external name, and ours end in _reset
-RESERVED = (
-    # Keywords of C99 (ISO/IEC 9899:1999, 6.4.1), C11, C23 and C++ that could begin a file; headers of C23 (7.1.2).
-    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
-    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true "
-    "false nullptr constexpr typeof alignas alignof thread_local static_assert asm class delete export friend mutable "
-    "namespace new operator private protected public template this throw try catch typename using virtual wchar_t main "
-    "assert complex ctype errno fenv inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic "
-    "stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
-)
 FIGURES = {
     "bandwidth_hz": "bandwidth {:.4g} Hz", "ms": "Ms {:.4g}", "mt": "Mt {:.4g}", "noise_gain": "noise gain {:.4g}",
     "gain_margin_db": "gain margin {:.4g} dB", "phase_margin_deg": "phase margin {:.4g} deg",
@@ -52,7 +50,7 @@ FIGURES = {
 
 
 def export(
-    controller: Controller | Mapping[str, Any],
+    controller: Controller | ScheduledController | Mapping[str, Any],
     folder: Path | str,
     *,
     precision: Precision = "double",
@@ -69,8 +67,9 @@ def export(
 
     Parameters
     ----------
-    controller : Controller or mapping
-        The controller, or the content of its controller.json.
+    controller : Controller, ScheduledController or mapping
+        The controller, or the content of its controller.json; or of a schedule.json, of which NAME.h and NAME.c are
+        written, without gate and derating (`seaopt.control.deploy.schedule_export`).
     folder : path
         For NAME.h, NAME.c, NAME_gains.h and NAME_gains.m; created if it does not exist.
     precision : {"double", "float"}
@@ -114,9 +113,20 @@ def export(
     ['knee.h', 'knee.c', 'knee_gains.h', 'knee_gains.m']
 
     """
+    if isinstance(controller, ScheduledController) or (isinstance(controller, Mapping) and is_schedule(controller)):
+        if gate is not None or derate:
+            raise ControlError(
+                f"{'gate' if gate is not None else 'derate'}: is not exported with a schedule; leave it out, and check "
+                "the reading, or lower the command's limit, before the step"
+            )
+        return export_schedule(
+            controller, folder, precision=precision, name=name, current_limit_A=current_limit_A,
+            command_limit=command_limit, tracking_time_s=tracking_time_s, allow_infeasible=allow_infeasible,
+            fit_met=fit_met,
+        )  # fmt: skip
     if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
-    prefix = _check_prefix(name)
+    prefix = check_prefix(name)
     if Path(folder).exists() and not Path(folder).is_dir():
         raise FileError(f"{folder}: is a file; give a folder")
     if isinstance(controller, Controller):
@@ -147,9 +157,9 @@ def export(
         "NAME": prefix.upper(),
         "fit_met": fit_met,
     }
-    numbers = {".m": repr, ".h": _literal(precision), ".c": _literal(precision)}
+    numbers = {".m": repr, ".h": literal(precision), ".c": literal(precision)}
     texts = {
-        pattern.format(prefix): _render(template, context | _numbers(stored, law, numbers[pattern[-2:]], precision))
+        pattern.format(prefix): render(template, context | _numbers(stored, law, numbers[pattern[-2:]], precision))
         for pattern, template in TEMPLATES.items()
     }
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
@@ -180,27 +190,6 @@ def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard |
                 "tune again"
             )
     return HeatGuard.of_rating(rating, period, margin_K=margin_K)
-
-
-def _check_prefix(name: str) -> str:
-    """Return a name that files and names in C begin with; one that C does not take as it is is refused."""
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise ControlError(
-            f'name = "{name}" cannot begin a name in C; give a letter, then letters, digits and underscores: force_law'
-        )
-    return _identifier(name)
-
-
-def _identifier(name: str) -> str:
-    """Return a name that C takes, made of one that it may not take."""
-    identifier = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
-    if not identifier or identifier[0].isdigit() or len(identifier) > LONGEST_NAME:
-        raise ControlError(
-            f'name = "{name}" cannot begin a name in C; give a letter and up to {LONGEST_NAME - 1} letters or digits'
-        )
-    if identifier.lower() in RESERVED.split():
-        raise ControlError(f'name = "{name}" is a keyword or a header of C; give another, such as {identifier}_law')
-    return identifier
 
 
 def _figures(controller: Controller) -> list[str]:
@@ -251,17 +240,17 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     """Return what the files say in words."""
     command = stored["command"]
     return {
-        "structure": _strip_markup(stored["structure"]),
-        "measured": _strip_markup(", ".join(_list_signals(stored))),
+        "structure": strip_markup(stored["structure"]),
+        "measured": strip_markup(", ".join(_list_signals(stored))),
         "effort": stored["command"].mechanics.word,
-        "command": {name: _strip_markup(getattr(command, name)) for name in ("word", "unit", "effort_unit")},
+        "command": {name: strip_markup(getattr(command, name)) for name in ("word", "unit", "effort_unit")},
         "symbol": command.symbol,
         "LIMIT": command.limit_symbol,
         "suffix": re.sub("[^A-Za-z0-9]+", "_per_", command.reference_unit.replace(" ", "")).strip("_"),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
         "delay_samples": stored["delay_samples"],
         "feasible": stored["feasible"],
-        "blocking": _strip_markup(join_labels(stored["active_constraints"])),
+        "blocking": strip_markup(join_labels(stored["active_constraints"])),
         "limited": math.isfinite(law.current_limit_A),
         "order": law.c.size,
         "storage": max(law.c.size, 1),
@@ -282,23 +271,6 @@ def _list_signals(stored: Mapping[str, Any]) -> tuple[str, ...]:
     return stored["reads"] or list_names(stored["spec"].measured)
 
 
-def _strip_markup(text: str) -> str:
-    """Return text without what would end a comment."""
-    return re.sub(r"[^\w .,:;+()<>=-]", "", str(text), flags=re.ASCII)
-
-
-def _literal(precision: Precision) -> Callable[[float], str]:
-    """Return what writes a number as a C literal that reads back as itself (in float: as the nearest float)."""
-    if precision == "double":
-        return lambda value: repr(float(value))
-
-    def single(value: float) -> str:
-        text = repr(float(str(np.float32(value))))
-        return f"{text}f"
-
-    return single
-
-
 def _numbers(
     stored: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str], precision: Precision
 ) -> dict[str, Any]:
@@ -312,7 +284,7 @@ def _numbers(
     b, d, rest = (
         np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
     )
-    others = [_strip_markup(name) for name in _list_signals(stored)[1:]]
+    others = [strip_markup(name) for name in _list_signals(stored)[1:]]
     units = name_gain_units(stored["command"])
     largest = float(LARGEST_NUMBER[precision])
     return {
@@ -336,7 +308,7 @@ def _numbers(
                 "d": number(float(d[i, 0])),
                 "rest": row(rest[i]),
             }
-            for i, name in enumerate(map(_identifier, others), start=1)
+            for i, name in enumerate(map(identifier, others), start=1)
         ],
         "effort_limit": number(min(law.force_limit_N, largest)),
         "command_limit": number(min(law.current_limit_A, largest)),
@@ -356,14 +328,14 @@ def _numbers(
         "ambient": "" if law.heat is None else f"{law.heat.ambient:g}",
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
-            {"name": _identifier(key), "value": number(float(value)), "unit": units.get(key, "-")}
+            {"name": identifier(key), "value": number(float(value)), "unit": units.get(key, "-")}
             for key, value in stored["gains"].items()
         ],
         "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
             for key, tf in zip(
-                ("reference", "measurement", *(f"measurement_{_identifier(name)}" for name in others)),
+                ("reference", "measurement", *(f"measurement_{identifier(name)}" for name in others)),
                 transfer_functions,
                 strict=True,
             )
@@ -383,14 +355,3 @@ def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, 
         "shown_stiffness": f"{outer.stiffness:.6g}",
         "shown_damping": f"{outer.damping:.6g}",
     }
-
-
-def _render(template: str, context: Mapping[str, Any]) -> str:
-    from jinja2 import Environment, StrictUndefined, select_autoescape
-
-    environment = Environment(
-        autoescape=select_autoescape(default=False), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-        undefined=StrictUndefined,
-    )  # fmt: skip
-    text = files("seaopt.control.deploy").joinpath("templates", template).read_text(encoding="utf-8")
-    return environment.from_string(text).render(context)

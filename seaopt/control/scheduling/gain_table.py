@@ -9,8 +9,8 @@ and beyond the ends it stays. The gains are those of `seaopt.control.laws.struct
 mean the same at every s (`seaopt.control.scheduling.runnable_schedule`); matrices of a balanced realisation have
 coordinates of their own at every point, and cannot be interpolated.
 
-**How much the law changes.** With :math:`\bar s` the middle of a stretch between two points, h its half width and a dash
-for a slope,
+**How much the law changes.** With :math:`\bar s` the middle of a stretch between two points, h its half width and a
+dash for a slope,
 
 .. math::
     C_y(s) - C_y(\bar s) = (s - \bar s)\,(k_p' + k_i' I + k_d' D(\bar s)) + k_d(s)\,(D(s) - D(\bar s)), \qquad

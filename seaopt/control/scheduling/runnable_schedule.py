@@ -8,9 +8,10 @@ r"""A scheduled law as it runs: one step a sample, with the gains of where the s
 
 The integral's state is an effort, and those of the derivative's filter are a reference and a measurement: a gain that
 changes never makes a jump of what is stored in them. With gains that stand still this is the law of
-`seaopt.control.laws.structures` exactly, since :math:`\frac{T_s}{2}\frac{1+q}{1-q} = T_s \frac{q}{1-q} + \frac{T_s}2` and
-:math:`D = \alpha (1 - \frac{(1-p) q}{1 - p q})` with :math:`p = T_f/(T_f + T_s)`; c stands outside the filter, so that its
-change is not differentiated. K is the anti-windup of `seaopt.control.laws.realisation` at every point, interpolated too.
+`seaopt.control.laws.structures` exactly, since :math:`\frac{T_s}{2}\frac{1+q}{1-q} = T_s \frac{q}{1-q} +
+\frac{T_s}2` and :math:`D = \alpha (1 - \frac{(1-p) q}{1 - p q})` with :math:`p = T_f/(T_f + T_s)`; c stands outside the
+filter, so that its change is not differentiated. K is the anti-windup of `seaopt.control.laws.realisation` at every
+point, interpolated too.
 
 A scheduling variable that is not finite is not used: the last one that was stands, and the value of `fallback` where
 there was none since the reset.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -150,7 +151,7 @@ class ScheduledController:
         missed = [one.value for one in self.between if one.broken]
         if not missed:
             return ""
-        stretches = zip(self.points[:-1], self.points[1:], strict=True)
+        stretches = pairwise(self.points)
         middles = [0.5 * (low + high) for low, high in stretches if any(low < value < high for value in missed)]
         points = ", ".join(f"{value:.4g}" for value in sorted((*self.points, *middles)))
         return f"add points where it is broken: points = [{points}]; or tune with more room: reserve = 0.03"
@@ -222,9 +223,7 @@ class ScheduledController:
             mt=max(one.mt for one in worst), broken=broken,
         )  # fmt: skip
 
-    def runnable(
-        self, *, limit: float | None = None, tracking_time_s: float | None = None
-    ) -> RunnableSchedule:
+    def runnable(self, *, limit: float | None = None, tracking_time_s: float | None = None) -> RunnableSchedule:
         """Return the law ready to run.
 
         Parameters
@@ -447,6 +446,4 @@ def list_inner(points: Sequence[float], parts: int) -> list[float]:
     [0.5, 2.0]
 
     """
-    return [
-        low + (high - low) * k / parts for low, high in zip(points[:-1], points[1:], strict=True) for k in range(1, parts)
-    ]
+    return [low + (high - low) * k / parts for low, high in pairwise(points) for k in range(1, parts)]

@@ -35,7 +35,7 @@ from seaopt.control.scheduling.scheduled_controller import (
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task, place_frequencies
-from seaopt.control.tuning.solution import recheck, solve
+from seaopt.control.tuning.solution import Solution, recheck, solve
 from seaopt.control.tuning.tuner import make_controller, make_task, tune
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
@@ -45,7 +45,7 @@ from seaopt.plants import Plant
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, count_off, divide, ignore
 
-Chain = list[tuple[LawNumbers, list[MeasuredLoop]]]  # of every point
+Chain = list[Solution]  # of every point
 
 
 def tune_schedule(
@@ -99,7 +99,7 @@ def tune_schedule(
     >>> import seaopt as so
     >>> from seaopt.control import tune_schedule
     >>> spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6)
-    >>> stiffer = tune_schedule(so.plants.high_impedance(), so.plants.thor(), spec, "k", [3e5, 6e5])
+    >>> stiffer = tune_schedule(so.plants.high_impedance(), so.plants.thor(), spec, "k", [5e5, 6e5])
     >>> stiffer.feasible, [round(one.achieved.bandwidth_hz) for one in stiffer.controllers]
     (True, [20, 20])
 
@@ -186,7 +186,9 @@ def _choose_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
         for chain in chains
     ])  # fmt: skip
     losses = np.max(values / np.min(values, axis=0), axis=1)
-    broken = [sum(_breaks_limits(task, loops) for task, (_, loops) in zip(tasks, chain, strict=True)) for chain in chains]
+    broken = [
+        sum(_breaks_limits(task, loops) for task, (_, loops) in zip(tasks, chain, strict=True)) for chain in chains
+    ]
     return chains[min(range(2), key=lambda k: (broken[k], losses[k]))]
 
 
@@ -194,12 +196,13 @@ def _tune_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
     """Return the numbers of every point, of the first from a scan and of the others from the one before."""
     chain: Chain = []
     for task in count_off(tasks, "point", progress):
-        if chain:
-            x = _follow(task, chain[-1][0])
-            loops = task.measure(x)
-        if not chain or _breaks_limits(task, loops):
-            x, loops = solve(task, [chain[-1][0]] if chain else ())
-        chain.append((x, loops))
+        if not chain:
+            chain.append(solve(task))
+            continue
+        before = chain[-1][0]
+        x = _follow(task, before)
+        loops = task.measure(x)
+        chain.append(solve(task, [before]) if _breaks_limits(task, loops) else (x, loops))
     return chain
 
 

@@ -1,0 +1,75 @@
+"""Text of C and MATLAB files: names that C takes, numbers that read back as they are, comments, and templates."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from importlib.resources import files
+from typing import Any, Literal
+
+import numpy as np
+
+from seaopt.errors import ControlError
+
+Precision = Literal["double", "float"]
+LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
+LONGEST_NAME = 25  # C99 promises 31 characters of an external name, and ours end in _reset
+RESERVED = (
+    # Keywords of C99 (ISO/IEC 9899:1999, 6.4.1), C11, C23 and C++ that could begin a file; headers of C23 (7.1.2).
+    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
+    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true "
+    "false nullptr constexpr typeof alignas alignof thread_local static_assert asm class delete export friend mutable "
+    "namespace new operator private protected public template this throw try catch typename using virtual wchar_t main "
+    "assert complex ctype errno fenv inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic "
+    "stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
+)
+
+
+def check_prefix(name: str) -> str:
+    """Return a name that files and names in C begin with; one that C does not take as it is is refused."""
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise ControlError(
+            f'name = "{name}" cannot begin a name in C; give a letter, then letters, digits and underscores: force_law'
+        )
+    return identifier(name)
+
+
+def identifier(name: str) -> str:
+    """Return a name that C takes, made of one that it may not take."""
+    made = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+    if not made or made[0].isdigit() or len(made) > LONGEST_NAME:
+        raise ControlError(
+            f'name = "{name}" cannot begin a name in C; give a letter and up to {LONGEST_NAME - 1} letters or digits'
+        )
+    if made.lower() in RESERVED.split():
+        raise ControlError(f'name = "{name}" is a keyword or a header of C; give another, such as {made}_law')
+    return made
+
+
+def strip_markup(text: str) -> str:
+    """Return text without what would end a comment."""
+    return re.sub(r"[^\w .,:;+()<>=-]", "", str(text), flags=re.ASCII)
+
+
+def literal(precision: Precision) -> Callable[[float], str]:
+    """Return what writes a number as a C literal that reads back as itself (in float: as the nearest float)."""
+    if precision == "double":
+        return lambda value: repr(float(value))
+
+    def single(value: float) -> str:
+        text = repr(float(str(np.float32(value))))
+        return f"{text}f"
+
+    return single
+
+
+def render(template: str, context: Mapping[str, Any]) -> str:
+    """Return a template of this package filled in."""
+    from jinja2 import Environment, StrictUndefined, select_autoescape
+
+    environment = Environment(
+        autoescape=select_autoescape(default=False), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )  # fmt: skip
+    text = files("seaopt.control.deploy").joinpath("templates", template).read_text(encoding="utf-8")
+    return environment.from_string(text).render(context)

@@ -1,0 +1,181 @@
+"""A scheduled controller for the target: C99 with the table of its gains, which needs no library.
+
+The C code is `RunnableSchedule.step` with the numbers filled in, operation for operation: one struct, `init`, `reset`
+and `step`, no allocation, and no include but its own header. The step takes the scheduling variable beside reference
+and measurement; outside the table the gains of its ends count, and one that is not finite is replaced by the last that
+was, or by the table's `fallback` where there was none since the reset.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from seaopt.control.deploy.c_text import (
+    LARGEST_NUMBER,
+    Precision,
+    check_prefix,
+    identifier,
+    literal,
+    render,
+    strip_markup,
+)
+from seaopt.control.laws.controller import name_gain_units
+from seaopt.control.laws.realisation import choose_limit
+from seaopt.control.laws.spec import check_command_limits
+from seaopt.control.laws.structures import AGREES, LAW_GAINS
+from seaopt.control.scheduling.gain_table import GainTable
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
+from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA, ScheduledController
+from seaopt.errors import ControlError, FileError
+from seaopt.files import write_text
+
+TEMPLATES = {"{}.h": "schedule.h.jinja", "{}.c": "schedule.c.jinja"}
+COLUMNS = (*LAW_GAINS, "anti_windup")
+
+
+def is_schedule(content: Mapping[str, Any]) -> bool:
+    """Tell whether the content of a file is that of a schedule.json."""
+    return content.get("schema") == SCHEDULE_SCHEMA
+
+
+def export_schedule(
+    schedule: ScheduledController | Mapping[str, Any],
+    folder: Path | str,
+    *,
+    precision: Precision = "double",
+    name: str = "force_law",
+    current_limit_A: float | None = None,
+    command_limit: float | None = None,
+    tracking_time_s: float | None = None,
+    allow_infeasible: bool = False,
+    fit_met: bool | None = None,
+) -> tuple[Path, ...]:
+    """Write a scheduled controller as C99: NAME.h and NAME.c.
+
+    Parameters
+    ----------
+    schedule : ScheduledController or mapping
+        The schedule, or the content of its schedule.json.
+    folder, precision, name, current_limit_A, command_limit, tracking_time_s, allow_infeasible, fit_met
+        As in `seaopt.export`.
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    ControlError
+        The schedule is not feasible, or an argument is out of range.
+    FileError
+        The content is malformed or contradicts itself, or the folder cannot be written.
+
+    """
+    if precision not in LARGEST_NUMBER:
+        raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
+    prefix = check_prefix(name)
+    if Path(folder).exists() and not Path(folder).is_dir():
+        raise FileError(f"{folder}: is a file; give a folder")
+    check_command_limits(current_limit_A, command_limit)
+    content = schedule.to_dict() if isinstance(schedule, ScheduledController) else schedule
+    law, first = read_runnable(content, command_limit if current_limit_A is None else current_limit_A, tracking_time_s)
+    if not content["feasible"] and not allow_infeasible:
+        raise ControlError(
+            f"the schedule misses {'; '.join(content['broken'])}; tune one that does not, or allow an infeasible one"
+        )
+    if not isinstance(schedule, ScheduledController):
+        fit_met = content.get("fit_met", True) is True if fit_met is None else fit_met
+    context = _describe(content, law, first, precision) | {
+        "name": prefix, "NAME": prefix.upper(), "precision": precision, "fit_met": fit_met,
+    }  # fmt: skip
+    texts = {pattern.format(prefix): render(template, context) for pattern, template in TEMPLATES.items()}
+    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+
+
+def read_runnable(
+    content: Mapping[str, Any], limit: float | None = None, tracking_time_s: float | None = None
+) -> tuple[RunnableSchedule, dict[str, Any]]:
+    """Return the law of a schedule.json ready to run, and the fields of its first controller.
+
+    Raises
+    ------
+    ControlError
+        A number is out of range.
+    FileError
+        The content is malformed or contradicts itself.
+
+    """
+    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+    from seaopt.control.scheduling.stored import read_schedule
+
+    table = read_schedule(content)
+    first, *_ = controllers = [read_controller(one) for one in content["controllers"]]
+    command = first["command"]
+    for point, one in zip(table.points, controllers, strict=True):
+        same = one["command"] == command and one["sample_time_s"] == first["sample_time_s"]
+        if not same or one["structure"] != first["structure"]:
+            raise FileError(
+                f"schedule.json: the controller at {table.over} = {point:g} has another command, rate or structure "
+                "than the first; tune again"
+            )
+    law = make_runnable(
+        GainTable(
+            over=table.over, unit=table.unit, points=np.array(table.points),
+            gains={name: np.array(table.gains[name]) for name in LAW_GAINS}, structure=first["structure"],
+            sample_time_s=first["sample_time_s"],
+        ),
+        per_effort=command.per_effort, limit=choose_limit(command, first["spec"], limit), fallback=table.fallback,
+        tracking_time_s=tracking_time_s, command=(command.input, command.unit),
+    )  # fmt: skip
+    if tracking_time_s is None and not np.allclose(law.anti_windup, table.anti_windup, rtol=AGREES, atol=0.0):
+        raise FileError("schedule.json: anti_windup is not what the gains give; tune again")
+    return law, first
+
+
+def _describe(
+    content: Mapping[str, Any], law: RunnableSchedule, first: Mapping[str, Any], precision: Precision
+) -> dict[str, Any]:
+    """Return words and numbers of the files."""
+    command, spec, table = first["command"], first["spec"], law.table
+    number, largest = literal(precision), float(LARGEST_NUMBER[precision])
+    units = name_gain_units(command)
+    rows = {**table.gains, "anti_windup": law.anti_windup}
+    most = law.limit / law.per_effort
+    return {
+        "structure": table.structure,
+        "measured": strip_markup(cast(str, spec.measured)),
+        "effort": command.mechanics.word,
+        "command": {key: strip_markup(getattr(command, key)) for key in ("word", "unit", "effort_unit")},
+        "symbol": command.symbol,
+        "LIMIT": command.limit_symbol,
+        "per_effort_unit": command.per_effort_unit,
+        "rate_hz": f"{1.0 / table.sample_time_s:.10g}",
+        "delay_samples": first["delay_samples"],
+        "feasible": content["feasible"],
+        "broken": [strip_markup(one) for one in content["broken"]],
+        "limited": math.isfinite(law.limit),
+        "integrates": table.integrates,
+        "over": strip_markup(table.over),
+        "over_unit": strip_markup(table.unit),
+        "place": f"at_{identifier(table.over)}",
+        "ends": [f"{table.points[k]:g}" for k in (0, -1)],
+        "shown_fallback": f"{law.fallback:g}",
+        "count": table.points.size,
+        "points": ", ".join(number(float(value)) for value in table.points),
+        "columns": [f"{key}{f' [{units[key]}]' if key in units else ''}" for key in COLUMNS],
+        "rows": [
+            ", ".join(number(float(rows[key][i])) for key in COLUMNS) for i in range(table.points.size)
+        ],
+        "fallback": number(law.fallback),
+        "period": number(table.sample_time_s),
+        "half_period": number(0.5 * table.sample_time_s),
+        "effort_limit": number(min(most, largest)),
+        "command_limit": number(min(law.limit, largest)),
+        "per_effort": number(law.per_effort),
+    }  # fmt: skip

@@ -1,0 +1,208 @@
+"""Scheduled gains: the law that interpolates them, and its tuning."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import GainTable, ScheduledController, realise, tune_schedule
+from seaopt.control.laws.structures import Gains
+from seaopt.control.scheduling.runnable_schedule import make_runnable
+from seaopt.errors import ControlError, FileError
+from seaopt.files import to_json
+from tests.schedules import read_knee, tune_knee
+
+ROWS = {
+    "k_p": [57.0, 90.0, 161.0], "k_i": [4297.0, 6000.0, 11236.0], "k_d": [0.95, 1.4, 2.45], "T_f": [1e-3, 2e-3, 3e-3],
+    "k_r": [55.0, 88.0, 156.0], "c": [0.63, 0.4, 0.2],
+}  # fmt: skip
+POINTS = (0.0, 0.7, 1.15)
+
+
+def make_table(**changed):
+    gains = {name: np.array(row) for name, row in (ROWS | changed).items()}
+    return GainTable(over="phi", unit="rad", points=np.array(POINTS), gains=gains, structure="pid", sample_time_s=1e-3)
+
+
+def simulate_by_hand(table, place, references, measurements):
+    """Direct form of the structure's equation, sums and differences kept as such; no limit."""
+    ts, integral, rate, before = table.sample_time_s, 0.0, 0.0, None
+    out = []
+    for r, y, s in zip(references, measurements, place, strict=True):
+        g = {name: np.interp(s, table.points, row) for name, row in table.gains.items()}
+        error, weighted = r - y, g["c"] * r - y
+        last_error, last_weighted = (0.0, 0.0) if before is None else before
+        integral += g["k_i"] * ts / 2 * (error + last_error)
+        rate = g["T_f"] / (g["T_f"] + ts) * rate + (weighted - last_weighted) / (g["T_f"] + ts)
+        out.append(g["k_r"] * r - g["k_p"] * y + integral + g["k_d"] * rate)
+        before = (error, weighted)
+    return np.array(out)
+
+
+class TestGainTable:
+    def test_gains_are_those_of_the_points_and_of_lines_between_them(self):
+        table = make_table()
+        for name, row in ROWS.items():
+            for s in (0.0, 0.2, 0.7, 1.0, 1.15):
+                assert table.interpolate(s)[name] == pytest.approx(np.interp(s, POINTS, row), rel=1e-14)
+
+    @pytest.mark.parametrize(("value", "end"), [(-3.0, 0), (9.0, -1), (math.inf, -1), (-math.inf, 0)])
+    def test_beyond_the_ends_the_ends_count(self, value, end):
+        assert make_table().interpolate(value)["k_p"] == ROWS["k_p"][end]
+
+    def test_the_change_of_the_law_stays_below_its_bound_on_every_stretch(self):
+        table, f = make_table(), np.geomspace(0.01, 499.0, 400)
+        for low, high in ((0.0, 0.7), (0.7, 1.15), (0.8, 0.9)):
+            middle = table.law(0.5 * (low + high)).measurement_response(f)
+            changes = [np.abs(table.law(s).measurement_response(f) / middle - 1.0) for s in np.linspace(low, high, 31)]
+            bound = table.bound_change(low, high, f)
+            assert np.all(np.max(changes, axis=0) <= bound * (1.0 + 1e-9))
+        # A bound that is far too large would say nothing: on a short stretch it is of the size of the change itself.
+        assert np.max(bound / np.max(changes, axis=0)) < 5.0
+
+    def test_a_stretch_across_a_point_is_refused(self):
+        with pytest.raises(ControlError, match=r"0\.5 to 0\.9"):
+            make_table().bound_change(0.5, 0.9, np.array([1.0]))
+
+    def test_points_that_do_not_ascend_and_a_single_one_are_refused(self):
+        for points in ([1.0, 0.0], [0.0, 0.0], [0.5], [0.0, math.nan]):
+            with pytest.raises(ControlError, match="points of phi"):
+                GainTable(
+                    over="phi", unit="rad", points=np.array(points),
+                    gains={name: np.array(row[: len(points)]) for name, row in ROWS.items()}, structure="pid",
+                    sample_time_s=1e-3,
+                )  # fmt: skip
+
+    def test_an_integral_at_some_points_only_is_refused(self):
+        with pytest.raises(ControlError, match=r"k_i is 0 at phi = 0\.7"):
+            make_table(k_i=[10.0, 0.0, 10.0])
+
+
+class TestRunnableSchedule:
+    @pytest.mark.parametrize("place", [0.0, 0.3, 0.7, 1.15])
+    def test_standing_still_it_is_the_law_of_the_interpolated_gains(self, place):
+        table, rng = make_table(), np.random.default_rng(1)
+        scheduled = make_runnable(table)
+        frozen = realise(Gains.from_names(table.interpolate(place)).law("pid", 1e-3))
+        state, other = scheduled.reset(2.0, 1.5, place, 30.0), frozen.reset(2.0, 1.5, 30.0)
+        for _ in range(400):
+            r, y = rng.normal(size=2)
+            command, state = scheduled.step(state, r, y, place)
+            expected, other = frozen.step(other, r, y)
+            assert command == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+    def test_at_a_point_its_anti_windup_is_that_of_the_plain_law(self):
+        table = make_table()
+        scheduled, frozen = make_runnable(table, limit=50.0), realise(table.law(0.7), current_limit_A=50.0)
+        state, other = scheduled.reset(place=0.7), frozen.reset()
+        for k in range(600):
+            r = 5.0 if k < 300 else 0.2
+            command, state = scheduled.step(state, r, 0.1, 0.7)
+            expected, other = frozen.step(other, r, 0.1)
+            assert command == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+    def test_while_it_moves_the_states_keep_their_meaning(self):
+        # With c and T_f the same at all points the direct form has the same states, so that both agree on the way,
+        # but for the integral: a trapezium takes both ends' k_i, and this law each end's own, which differ by a sample.
+        table = make_table(c=[0.5] * 3, T_f=[1e-3] * 3, k_i=[1e-3] * 3)
+        law, n = make_runnable(table), 500
+        place = 0.575 - 0.575 * np.cos(2 * np.pi * 3.0 * np.arange(n) * 1e-3)
+        rng = np.random.default_rng(2)
+        references, measurements = np.cumsum(rng.normal(size=(2, n)), axis=1) * 0.1
+        references[0] = measurements[0] = 0.0
+        state, out = law.reset(place=0.0), np.zeros(n)
+        for k in range(n):
+            out[k], state = law.step(state, references[k], measurements[k], place[k])
+        expected = simulate_by_hand(table, place, references, measurements)
+        assert np.max(np.abs(out - expected)) < 1e-9 * np.max(np.abs(expected))
+
+    def test_at_rest_a_moving_integral_gain_moves_nothing(self):
+        law = make_runnable(make_table(k_p=[80.0] * 3, k_r=[78.0] * 3))
+        state = law.reset(3.0, 3.0, 0.0, 40.0)
+        for s in np.linspace(0.0, 1.15, 50):
+            command, state = law.step(state, 3.0, 3.0, s)
+            assert command == pytest.approx(40.0, rel=1e-12)
+
+    def test_a_missing_place_is_the_last_one_and_first_of_all_the_fallback(self):
+        law = make_runnable(make_table(), fallback=1.15)
+        for start, expected in ((math.nan, 1.15), (0.3, 0.3)):
+            state = law.reset(place=start)
+            lost, after = law.step(state, 1.0, 0.0, math.nan)
+            told, _ = law.step(state, 1.0, 0.0, expected)
+            assert lost == told and after.misplaced == state.misplaced + 1
+        assert law.step(after, 1.0, 0.0, 0.5)[1].misplaced == 0
+
+    def test_a_reading_that_is_not_finite_holds_the_last_command(self):
+        law = make_runnable(make_table(), limit=50.0)
+        command, state = law.step(law.reset(place=0.2), 0.3, 0.1, 0.2)
+        held, after = law.step(state, 0.3, math.nan, 0.4)
+        assert held == command and after.held == 1 and after.effort == state.effort
+
+
+@pytest.fixture(scope="module")
+def plants():
+    return read_knee()
+
+
+@pytest.fixture(scope="module")
+def schedule():
+    return tune_knee()
+
+
+class TestTuneSchedule:
+    def test_every_point_has_the_bandwidth_on_its_own_plant(self, schedule, plants):
+        stand, _, values = plants
+        for point, controller in zip(schedule.points, schedule.controllers, strict=True):
+            figures = controller.close(stand, values.update(phi=point)).figures()
+            assert figures.bandwidth_hz == pytest.approx(30.0, rel=0.005)
+            assert figures.ms <= 1.6
+
+    def test_gains_move_one_way_as_the_arm_does(self, schedule):
+        assert np.all(np.diff(schedule.table.gains["k_p"]) > 0.0)
+
+    def test_between_the_points_the_limits_hold_on_the_plant_there(self, schedule, plants):
+        stand, swing, values = plants
+        assert schedule.feasible, schedule
+        for place in schedule.between:
+            law = schedule.at(place.value)
+            here = values.update(phi=place.value)
+            for plant in (stand, swing):
+                assert law.close(plant, here).figures().ms <= 1.6
+            assert place.bandwidth_hz >= 0.9 * 30.0
+
+    def test_what_is_stored_is_read_back_the_same(self, schedule, plants):
+        stand, swing, values = plants
+        content = json.loads(to_json(schedule.to_dict()))
+        again = ScheduledController.from_dict(content, stand, values, {"swing": (swing, values)})
+        assert repr(again) == repr(schedule)
+
+    def test_gains_that_are_not_those_of_the_controllers_are_refused(self, schedule, plants):
+        content = json.loads(to_json(schedule.to_dict()))
+        content["gains"]["k_p"][1] *= 1.01
+        with pytest.raises(FileError, match=r"gains\.k_p"):
+            ScheduledController.from_dict(content, plants[0], plants[2])
+
+    def test_a_reader_of_controllers_refuses_a_schedule(self, schedule, plants):
+        with pytest.raises(FileError):
+            so.Controller.from_dict(json.loads(to_json(schedule.to_dict())), plants[0], plants[2])
+
+    @pytest.mark.slow
+    def test_bandwidths_may_differ_from_point_to_point(self, plants):
+        spec = so.ControllerSpec(measured="tau", bandwidth_hz=30, max_sensitivity=1.6, reserve=0.03)
+        made = tune_schedule(plants[0], plants[2], spec, "phi", [0.0, 0.4], bandwidths_hz=[30, 25])
+        assert [round(one.achieved.bandwidth_hz, 1) for one in made.controllers] == [30.0, 25.0]
+
+    def test_what_cannot_be_scheduled_is_refused(self, plants):
+        stand, _, values = plants
+        spec = so.ControllerSpec(measured="tau", bandwidth_hz=30)
+        for changed, over, what in (
+            ({"structure": "pid_dob"}, "phi", "pid_dob"),
+            ({"notch": so.control.Notch()}, "phi", "notch"),
+            ({}, "ph", "phi"),
+            ({}, "delay_s", "delay"),
+        ):
+            with pytest.raises(ControlError, match=what):
+                tune_schedule(stand, values, replace(spec, **changed), over, [0.0, 0.4])
