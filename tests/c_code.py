@@ -67,8 +67,11 @@ class CompiledMPC:
             subprocess.run([*compiler, *MPC_FLAGS, *rest], cwd=self.folder, check=True)
 
     def run(self, references, measurements):
-        """Return a row per sample: the current, whether it was solved, ..., what the gate says."""
-        pairs = zip(map(float, references), map(float, measurements), strict=True)
-        lines = "\n".join(f"{reference!r} {measurement!r}" for reference, measurement in pairs)
+        """Return a row per sample: the current, whether it was solved, iterations, ..., what the gate says.
+
+        A reference is a number, or with preview an array of the present one and those that follow.
+        """
+        samples = zip(references, measurements, strict=True)
+        lines = "\n".join(" ".join(repr(float(x)) for x in (*np.atleast_1d(r), y)) for r, y in samples)
         said = subprocess.run([str(self.folder / "example")], input=lines, capture_output=True, text=True, check=True)
         return np.array([line.split() for line in said.stdout.splitlines()], dtype=float)

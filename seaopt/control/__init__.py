@@ -24,9 +24,10 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import Estimator, EstimatorRun, EstimatorState, estimator
 from seaopt.control.mpc.export import export_mpc
 from seaopt.control.mpc.innovations import estimate_noise
-from seaopt.control.mpc.mpc import ForceMPC, MPCState, MPCStep, force_mpc
+from seaopt.control.mpc.mpc import ForceMPC, force_mpc
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.spec import MPCSpec
+from seaopt.control.mpc.step import MPCState, MPCStep
 from seaopt.control.running.closed_loop import run_loop
 from seaopt.control.running.force_run import ForceRun, close_loop
 from seaopt.control.running.sampled_loop import SampledLoop

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
-from seaopt.control.mpc.quadratic_program import RHO, make_solver
+from seaopt.control.mpc.output_bounds import SLACK_UNIT
+from seaopt.control.mpc.quadratic_program import PENALTY, RHO, WIDE, make_solver
 from seaopt.errors import FileError
 from seaopt.files import write_text
 
@@ -41,7 +42,7 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
     target = Path(folder)
     try:
         target.mkdir(parents=True, exist_ok=True)
-        make_solver(mpc.prediction).codegen(
+        make_solver(mpc.prediction, mpc.spec.max_iterations).codegen(
             str(target), parameters="matrices", extension_name=None, force_rewrite=True, use_float=single_precision,
             prefix="force_mpc_",
         )  # fmt: skip
@@ -56,23 +57,27 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
 
 
 def _format_data(mpc: ForceMPC) -> str:
-    kalman, prediction, spec = mpc.kalman, mpc.prediction, mpc.spec
-    rows = prediction.knots.size + len(prediction.M)
+    kalman, prediction, spec, outputs = mpc.kalman, mpc.prediction, mpc.spec, mpc.prediction.outputs
     sizes = {
         "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": mpc.delay_samples,
-        "KNOTS": prediction.knots.size, "ROWS": rows, "GATE": int(mpc.gate is not None),
+        "KNOTS": prediction.knots.size, "ROWS": len(prediction.rows), "SLEWS": len(prediction.M),
+        "SIGNALS": len(outputs.names), "SAMPLES": outputs.samples, "PREVIEW": spec.preview_samples,
+        "HORIZON": spec.samples, "MAX_ITERATIONS": spec.max_iterations, "GATE": int(mpc.gate is not None),
         "MAX_HELD": 0 if mpc.gate is None else mpc.gate.max_held,
     }  # fmt: skip
     numbers = {
         "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
-        "offset": float(kalman.offset[0]), "violation": VIOLATION, "rho": RHO,
+        "offset": float(kalman.offset[0]), "violation": VIOLATION, "rho": RHO, "penalty": PENALTY, "wide": WIDE,
+        "slack_unit": SLACK_UNIT,
+        "lag": spec.lag_s / spec.sample_time_s,
     }  # fmt: skip
     if mpc.gate is not None:
         (numbers["low"], numbers["high"]), numbers["step"] = mpc.gate.range_N, mpc.gate.max_step_N
         numbers["ramp"] = mpc.gate.ramp_A_per_s * spec.sample_time_s
     arrays = {
         "A": kalman.A, "B": kalman.B[:, 0], "C": kalman.C[0], "gain": kalman.gain[:, 0], "rest": mpc.rest,
-        "F": prediction.F, "M": prediction.M, "shift": mpc.shift,
+        "F": prediction.F, "M": prediction.M, "R": prediction.R, "shift": mpc.shift, "free": outputs.free,
+        "forced": outputs.forced, "static": outputs.static, "centre": outputs.middle / outputs.half,
     }  # fmt: skip
     units = {
         "COMMAND": mpc.actuation.word,

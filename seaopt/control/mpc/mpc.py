@@ -33,7 +33,7 @@ from jaxtyping import Float
 from seaopt.control.laws.command import Command, command_of, limit_notes
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.limits import MeasuredLoop
-from seaopt.control.laws.plausibility import GateState, PlausibilityGate
+from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import describe_lifted
 from seaopt.control.laws.verdict import Verdict, explain_broken, join_labels, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
@@ -42,10 +42,13 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
+from seaopt.control.mpc.knots import interpolate_knots, spread_knots
 from seaopt.control.mpc.noise import NoiseModel
-from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
-from seaopt.control.mpc.quadratic_program import make_solver, solve_program
+from seaopt.control.mpc.output_bounds import SLACK_UNIT, bound_outputs
+from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, tune_regulator
+from seaopt.control.mpc.quadratic_program import PENALTY, SOLVED, WIDE, make_solver, solve_program
 from seaopt.control.mpc.spec import MPCSpec
+from seaopt.control.mpc.step import MPCState, MPCStep
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
@@ -62,69 +65,6 @@ from seaopt.units import mechanics_of, name_command, show_command, unit_after
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that is possible is looked for
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
-
-
-@record(eq=False)
-class MPCState:
-    """The controller's state from sample to sample.
-
-    Parameters
-    ----------
-    kalman : EstimatorState
-    current_A : float
-        The last command.
-    plan : array, shape (n,)
-        The currents planned at the knots, A.
-    dual : array, shape (m,)
-        Of the last program, where the next starts.
-    gate : GateState
-        What the plausibility gate, where there is one, has seen; its `status` is "ok", "held" or "fault".
-
-    """
-
-    kalman: EstimatorState
-    current_A: float
-    plan: Float[np.ndarray, " n"]
-    dual: Float[np.ndarray, " m"]
-    gate: GateState = GateState()
-
-
-@record(eq=False)
-class MPCStep:
-    """One sample's result.
-
-    Parameters
-    ----------
-    current_A : float
-        The command, within limits.
-    state : MPCState
-        For the next step.
-    solved : bool
-        False: the solver failed, and the current is the safe one.
-    status : str
-        The solver's, or what was wrong with its solution.
-    force_N : float
-        Estimate of the measured force, with this sample.
-    target_N : float
-        The reference, or the nearest force that the current limit can hold.
-    iterations : int
-        Of the solver.
-    solve_time_s : float
-        The solver's own, in C.
-    step_time_s : float
-        The whole step's, in Python.
-
-    """
-
-    current_A: float
-    state: MPCState
-    solved: bool
-    status: str
-    force_N: float
-    target_N: float
-    iterations: int
-    solve_time_s: float
-    step_time_s: float
 
 
 @record(eq=False)
@@ -279,50 +219,68 @@ class ForceMPC:
     @property
     def start(self) -> MPCState:
         """At rest at zero."""
-        n, m = self.prediction.knots.size, self.prediction.knots.size + len(self.prediction.M)
-        return MPCState(kalman=self.kalman.start, current_A=0.0, plan=np.zeros(n), dual=np.zeros(m))
+        n, m = self.prediction.knots.size, len(self.prediction.rows)
+        return MPCState(
+            kalman=self.kalman.start, current_A=0.0, plan=np.zeros(n), dual=np.zeros(m), age=self.spec.samples
+        )
 
-    def step(self, state: MPCState, reference_N: float, measurement_N: float) -> MPCStep:
+    def step(
+        self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float
+    ) -> MPCStep:  # fmt: skip
         """Return the current for a reference and a measured force; one that is not finite is predicted instead.
+
+        Parameters
+        ----------
+        state : MPCState
+            After the last sample.
+        reference_N : float or array, shape (r,)
+            Of this sample, and of those that follow as far as they are known, `spec.preview_samples` of them at most;
+            the last is held.
+        measurement_N : float
+            The measured force.
 
         Raises
         ------
         ControlError
-            The reference is not a finite number.
+            A reference is not a finite number, or there are more of them than the specification says.
 
         """
         began = time.perf_counter()
-        if not np.isfinite(reference_N):
-            raise ControlError(f"reference_N = {reference_N}: not a force; hold the last one instead")
+        references = self._read_references(reference_N)
         limit, last, seen = self.command_limit, state.current_A, state.gate
         if self.gate is not None:
             _, seen = self.gate.screen(seen, measurement_N)
             measurement_N = np.nan if seen.held else measurement_N
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
-        xi, u_s, target = self._targets(ahead, reference_N)
-        q, low, high = self.program(xi, u_s, last)
-        first = (self.shift @ state.plan - u_s) / limit
+        drift = float(ahead[-1])
+        u_s, targets = self._targets(drift, references)
+        xi = ahead[: self.rest.size] - self.rest * (u_s + drift)
+        q, low, high = self.program(xi, u_s, last, drift, targets)
+        shifted = self.shift @ state.plan
+        first = np.concatenate([(shifted - u_s) / limit, np.zeros(q.size - shifted.size)])
         theta, dual, status, info = solve_program(self.solver, q, low, high, first, state.dual)
-        status = status or self._fault(theta, low, high)
+        if not status and (fault := self._fault(theta, low, high)):
+            status = fault if info.status == SOLVED else f"{info.status}, {fault}"
+        planned, age = limit * theta[: shifted.size] + u_s, 0
+        if status:  # the last plan goes on for as long as its horizon
+            old = state.age >= self.spec.samples
+            planned, age = (np.full(shifted.size, u_s) if old else shifted), min(state.age + 1, self.spec.samples)
         if self.gate is not None and seen.fault:
-            status, u_s = "sensor fault", self.gate.ramp(last, self.spec.sample_time_s)
-        if status:
-            theta, dual = np.zeros_like(q), np.zeros_like(low)
-            plan = np.full(q.size, u_s)
-            current = u_s
-        else:
-            plan = limit * theta + u_s
-            current = float(plan[0])
-        current = self.admissible(current, last)
+            status, age, dual = "sensor fault", self.spec.samples, np.zeros_like(dual)
+            planned = np.full(shifted.size, self.gate.ramp(last, self.spec.sample_time_s))
+        current = self.admissible(float(planned[0]), last)
         kalman = self._advance(state.kalman, corrected, innovation, current)
         return MPCStep(
-            current_A=current, solved=not status, status=status or "solved", target_N=target,
-            state=MPCState(kalman=kalman, current_A=current, plan=plan, dual=dual, gate=seen),
+            current_A=current, solved=not status, status=status or str(info.status), target_N=float(targets[-1]),
+            slack=0.0 if status else SLACK_UNIT * float(np.max(theta[shifted.size :], initial=0.0)),
+            state=MPCState(kalman=kalman, current_A=current, plan=planned, dual=dual, age=age, gate=seen),
             force_N=float(self.kalman.C[0] @ corrected), iterations=int(info.iter), solve_time_s=float(info.run_time),
             step_time_s=time.perf_counter() - began,
         )  # fmt: skip
 
-    def command(self, state: MPCState, reference_N: float, measurement_N: float) -> tuple[float, MPCState]:
+    def command(
+        self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float
+    ) -> tuple[float, MPCState]:  # fmt: skip
         """Return the current and the next state alone, as `close_loop` takes them."""
         result = self.step(state, reference_N, measurement_N)
         return result.current_A, result.state
@@ -333,17 +291,44 @@ class ForceMPC:
         return float(np.clip(np.clip(current_A, last_A - slew, last_A + slew), -limit, limit))
 
     def program(
-        self, xi: Float[np.ndarray, " nx"], u_s: float, last_A: float
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows."""
-        limit, one = self.command_limit, np.ones(self.prediction.knots.size)
-        slopes = np.zeros(len(self.prediction.M))
+        self, xi: Float[np.ndarray, " nx"], u_s: float, last_A: float, drift: float, targets: Float[np.ndarray, " r"]
+    ) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows.
+
+        Parameters
+        ----------
+        xi : array, shape (nx,)
+            The state's distance from its target.
+        u_s, last_A, drift : float
+            The command at rest, the last one, and the estimate of its disturbance.
+        targets : array, shape (p + 1,)
+            The force's targets from the first sample that a command reaches, as far as they are known.
+
+        """
+        prediction, limit, one = self.prediction, self.command_limit, np.ones(self.prediction.knots.size)
+        slopes = np.zeros(len(prediction.M))
         if slopes.size:
             slopes[0] = (last_A - u_s) / self.spec.slew_per_sample_A
-        q = self.prediction.F @ np.append(xi, last_A - u_s)
-        low = np.concatenate([(-1.0 - u_s / limit) * one, slopes - 1.0])
-        high = np.concatenate([(1.0 - u_s / limit) * one, slopes + 1.0])
+        lag = self.spec.lag_s / self.spec.sample_time_s
+        delta = targets[:-1] - targets[-1] + lag * np.diff(targets)
+        gradient = prediction.F @ np.append(xi, last_A - u_s) + prediction.R @ delta
+        under, over = prediction.outputs.limits(xi, u_s + drift, WIDE)
+        q = np.concatenate([gradient, np.full(len(prediction.outputs.names), PENALTY)])
+        low = np.concatenate([(-1.0 - u_s / limit) * one, slopes - 1.0, under])
+        high = np.concatenate([(1.0 - u_s / limit) * one, slopes + 1.0, over])
         return q, low, high
+
+    def _read_references(self, given: float | Float[np.ndarray, " r"]) -> Float[np.ndarray, " p"]:
+        """Return the references of this sample and of all that may be known, the last held."""
+        references, count = np.atleast_1d(np.asarray(given, dtype=float)), 1 + self.spec.preview_samples
+        if not (references.ndim == 1 and 1 <= references.size <= count):
+            raise ControlError(
+                f"reference_N has the shape {references.shape}, and preview_samples = {count - 1} takes up to {count}; "
+                f"give preview_samples = {references.size - 1} in the specification"
+            )
+        if not np.all(np.isfinite(references)):
+            raise ControlError(f"reference_N = {given}: not a force; hold the last one instead")
+        return np.concatenate([references, np.full(count - references.size, references[-1])])
 
     def _observe(
         self, kalman: EstimatorState, measurement: float
@@ -358,17 +343,18 @@ class ForceMPC:
         return corrected, innovation, ahead
 
     def _targets(
-        self, ahead: Float[np.ndarray, " n"], reference: float
-    ) -> tuple[Float[np.ndarray, " nx"], float, float]:
-        """Return the state's distance from its target, the target current, and the force it holds."""
-        limit, nx, drift = self.command_limit, self.rest.size, float(ahead[-1])
-        u_s = float(np.clip(reference / self.static_gain - drift, -limit, limit))
-        return ahead[:nx] - self.rest * (u_s + drift), u_s, self.static_gain * (u_s + drift)
+        self, drift: float, references: Float[np.ndarray, " p"]
+    ) -> tuple[float, Float[np.ndarray, " r"]]:  # fmt: skip
+        """Return the current at rest for the last reference, and the nearest forces to all that the limits can hold."""
+        ends = self.prediction.outputs.admissible_rest(drift, self.command_limit)
+        currents = np.clip(references / self.static_gain - drift, *ends)
+        first = min(self.delay_samples, references.size - 1)
+        return float(currents[-1]), self.static_gain * (currents[first:] + drift)
 
     def _fault(
-        self, theta: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]
+        self, theta: Float[np.ndarray, " nv"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]
     ) -> str:
-        rows = np.concatenate([theta, self.prediction.M @ theta])
+        rows = self.prediction.rows @ theta
         outside = float(np.max(np.maximum(low - rows, rows - high)))
         return "" if outside <= VIOLATION else f"solution breaks a limit by {outside:.1%} of it"
 
@@ -545,14 +531,17 @@ def _design(
         delay_samples=spec.loop_delay_samples,
     )  # fmt: skip
     a, b, c = digital.a, digital.b, digital.c
-    weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, completed, spec.measured)
+    weighted = c + spec.lag_s * _rate(plant, completed, spec.measured)
     regulator = tune_regulator(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
     knots = spread_knots(spec.samples, spec.moves)
-    prediction = condense(a, b, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A)
+    outputs = bound_outputs(spec.bounds, kalman, a, b, interpolate_knots(knots), limit)
+    known = max(spec.preview_samples - spec.loop_delay_samples, 0)
+    prediction = condense(a, b, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A, known, outputs)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
         spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
-        rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
+        rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift,
+        solver=make_solver(prediction, spec.max_iterations),
         gate=gate, warnings=warnings,
     )  # fmt: skip
 

@@ -15,6 +15,10 @@ the bandwidth that is asked of it.
 
 Currents are free at some knots only, and straight lines between: :math:`\mu = W \theta`. A limit on size or slope of
 such a line holds everywhere if it holds at the knots, so that nothing is lost but freedom.
+
+A reference that is known ahead moves the target of sample j by :math:`\delta_j = (1 + \tau\,d/dt)(r_j - r_s)` from the
+last that is known, :math:`r_s`, which is the target of the end: the cost weighs :math:`w\,\xi_j - \delta_j` instead,
+and :math:`\delta` adds to the gradient. Bounds of outputs are in `output_bounds`.
 """
 
 from __future__ import annotations
@@ -25,6 +29,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.control.mpc.knots import interpolate_knots
+from seaopt.control.mpc.output_bounds import OutputBounds
 from seaopt.errors import ControlError
 from seaopt.records import record
 
@@ -57,7 +63,8 @@ class Regulator:
 class HorizonProgram:
     """The quadratic program in theta, the knots' deviations from u_s in units of the current limit.
 
-    Minimise theta' H theta / 2 + (F s)' theta, s = [xi_0, mu_-1], with rows theta and M theta within bounds.
+    Minimise theta' H theta / 2 + (F s + R delta)' theta, s = [xi_0, mu_-1], with rows theta and M theta within bounds,
+    and those of `outputs`, whose slacks are variables too.
 
     Parameters
     ----------
@@ -67,6 +74,11 @@ class HorizonProgram:
     F : array, shape (n, nx + 1)
     M : array, shape (n, n) or (0, n)
         Slopes between knots over the slew limit, if there is one; the first row is the step from the last current.
+    R : array, shape (n, p)
+        Of the differences to the last reference known, at as many samples as can be known ahead.
+    outputs : OutputBounds
+    rows : array, shape (r, nv)
+        The matrix of all rows, over knots and slacks: knots, slopes, and those of `outputs`.
 
     """
 
@@ -74,6 +86,9 @@ class HorizonProgram:
     H: Float[np.ndarray, "n n"]
     F: Float[np.ndarray, "n s"]
     M: Float[np.ndarray, "m n"]
+    R: Float[np.ndarray, "n p"]
+    outputs: OutputBounds
+    rows: Float[np.ndarray, "r nv"]
 
 
 def solve_regulator(
@@ -138,52 +153,25 @@ def tune_regulator(
     return regulator
 
 
-def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
-    """Return `moves` samples from 0 to samples - 1, each step longer than the last by about a constant factor.
-
-    Examples
-    --------
-    >>> spread_knots(50, 8).tolist()
-    [0, 1, 3, 5, 10, 17, 29, 49]
-    >>> spread_knots(5, 5).tolist()
-    [0, 1, 2, 3, 4]
-
-    """
-    low, high = 1.0, 10.0
-    for _ in range(80):  # the factor for which `moves` - 1 steps reach the end
-        factor = 0.5 * (low + high)
-        if _space_knots(factor, moves)[-1] < samples - 1:
-            low = factor
-        else:
-            high = factor
-    knots = np.round(_space_knots(high, moves)).astype(int)
-    knots[-1] = samples - 1
-    return np.maximum(knots, np.arange(moves))
-
-
-def _space_knots(factor: float, moves: int) -> Float[np.ndarray, " n"]:
-    return np.concatenate([[0.0], np.cumsum(factor ** np.arange(moves - 1))])
-
-
-def interpolate_knots(knots: Int[np.ndarray, " n"]) -> Float[np.ndarray, "samples n"]:
-    """Return W, which draws straight lines between the knots."""
-    samples = np.arange(knots[-1] + 1)
-    return np.column_stack([np.interp(samples, knots, row) for row in np.eye(knots.size)])
-
-
 def condense(
     a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float,
-    regulator: Regulator, knots: Int[np.ndarray, " n"], limit: float, slew_per_sample: float,
+    regulator: Regulator, knots: Int[np.ndarray, " n"], limit: float, slew_per_sample: float, known: int,
+    outputs: OutputBounds,
 ) -> HorizonProgram:  # fmt: skip
-    """Return the quadratic program of a horizon; `limit` in A, `slew_per_sample` in A, infinite if there is none."""
+    """Return the quadratic program of a horizon.
+
+    `limit` and `slew_per_sample` are in A, the latter infinite if there is none; references are known at `known`
+    samples besides the last.
+    """
     W = interpolate_knots(knots)
     N, nx = len(W), b.size
     free, forced = np.eye(nx), np.zeros((nx, N))  # xi_j = free xi_0 + forced mu
-    hessian, cross = np.zeros((N, N)), np.zeros((N, nx + 1))
+    hessian, cross, ahead = np.zeros((N, N)), np.zeros((N, nx + 1)), np.zeros((N, N))
     for j in range(N):
         row, start = w @ forced / gain, w @ free / gain
         hessian += np.outer(row, row)
         cross[:, :nx] += np.outer(row, start)
+        ahead[:, j] = -row / gain
         free, forced = a @ free, a @ forced
         forced[:, j] += b
     step = np.eye(N) - np.eye(N, k=-1)  # mu_j - mu_{j-1}, of which the first has mu_-1
@@ -194,9 +182,14 @@ def condense(
     begin[:nx, :nx] = free
     hessian += end.T @ regulator.Pi @ end
     cross += end.T @ regulator.Pi @ begin
-    H, F = limit**2 * W.T @ hessian @ W, limit * W.T @ cross
+    H, F, R = limit**2 * W.T @ hessian @ W, limit * W.T @ cross, limit * W.T @ ahead[:, :known]
     scale = knots.size / float(np.trace(H))
     steps = np.diff(knots, prepend=knots[0] - 1)
     slopes = (np.eye(knots.size) - np.eye(knots.size, k=-1)) * limit / (slew_per_sample * steps)[:, None]
-    rows = knots.size if np.isfinite(slew_per_sample) else 0
-    return HorizonProgram(knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=slopes[:rows])
+    M = slopes if np.isfinite(slew_per_sample) else slopes[:0]
+    limits = np.vstack([np.eye(knots.size), M])
+    slackless = np.zeros((len(limits), len(outputs.names)))
+    return HorizonProgram(
+        knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=M, R=R * scale, outputs=outputs,
+        rows=np.vstack([np.hstack([limits, slackless]), outputs.rows()]),
+    )  # fmt: skip

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import field, replace
 from types import NoneType
 
 import numpy as np
@@ -16,6 +17,8 @@ from seaopt.records import record
 
 MAX_HORIZON_SAMPLES = 500  # of a horizon
 MAX_MPC_DELAY_SAMPLES = 100
+MAX_MPC_ITERATIONS = 10_000
+ITERATIONS_PER_CHECK = 5  # of the solver, after which it looks whether it is done
 MPC_BANDWIDTH_TOLERANCE = 0.02  # the weight makes the bandwidth of a plan with every current free; few cost accuracy
 MPC_LIMITS = (  # of the table of limits, those of a loop without gains
     *(BY_NAME[name] for name in (
@@ -60,6 +63,14 @@ class MPCSpec:
         Number of free currents in the plan, with straight lines between.
     largest_force_N : float, optional
         A force that the current limit must be able to hold; a limit too low for it is refused.
+    bounds : mapping of name to (low, high)
+        Of outputs and states of the plant, deflection and rate of its spring (`spring_deflection`, `spring_rate`), in
+        their units. They are soft: a plan breaks them where none keeps them, and then as little as it can.
+    preview_samples : int
+        How many references beyond the present one the controller may be given; the horizon and the delay at most.
+    max_iterations : int
+        Of the solver in one step. Where they do not suffice, its plan is used if it keeps the limits; otherwise the
+        last plan goes on.
     noise : NoiseModel, optional
         Of the Kalman filter, with a drift of the current. If left out, one that makes the filter quick: its sensor
         noise is 1/120 of the static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).
@@ -86,6 +97,9 @@ class MPCSpec:
     horizon_s: float = 0.05
     moves: int = 12
     largest_force_N: float | None = None
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    preview_samples: int = 0
+    max_iterations: int = 500
     noise: NoiseModel | None = None
     max_sensitivity: Level = BY_NAME["max_sensitivity"].default
     max_complementary: Level = BY_NAME["max_complementary"].default
@@ -108,7 +122,11 @@ class MPCSpec:
         require_type(self.noise, (NoiseModel, NoneType), "noise", "give a NoiseModel", ControlError)
         if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
             raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
-        for name, least, most in (("delay_samples", 0, MAX_MPC_DELAY_SAMPLES), ("moves", 2, MAX_HORIZON_SAMPLES)):
+        ranges = {
+            "delay_samples": (0, MAX_MPC_DELAY_SAMPLES), "moves": (2, MAX_HORIZON_SAMPLES),
+            "max_iterations": (ITERATIONS_PER_CHECK, MAX_MPC_ITERATIONS), "preview_samples": (0, MAX_HORIZON_SAMPLES),
+        }  # fmt: skip
+        for name, (least, most) in ranges.items():
             value = getattr(self, name)
             if name == "delay_samples" and value is None:
                 continue
@@ -125,6 +143,7 @@ class MPCSpec:
                 f"{MAX_HORIZON_SAMPLES}"
             )
 
+        self._check_bounds()
         for limit in MPC_LIMITS:
             if limit.has_field:
                 limit.check(getattr(self, limit.name), self.bandwidth_hz)
@@ -133,6 +152,26 @@ class MPCSpec:
         value = getattr(self, name)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
             raise ControlError(f"{name} = {value!r} is not a number above zero; give one")
+
+    def _check_bounds(self) -> None:
+        if not isinstance(self.bounds, Mapping):
+            raise ControlError(f"bounds is a {type(self.bounds).__name__}; give a mapping of name to (low, high)")
+        for name, ends in self.bounds.items():
+            numbers = isinstance(ends, (tuple, list)) and len(ends) == 2
+            if not (numbers and all(isinstance(end, (int, float)) and math.isfinite(end) for end in ends)):
+                raise ControlError(f"bounds of {name} = {ends!r} are not two numbers; give (low, high)")
+            if not ends[0] < ends[1]:
+                raise ControlError(f"bounds of {name} = {ends!r} leave nothing between; give (low, high)")
+        if self.preview_samples > self.samples + self.loop_delay_samples:
+            raise ControlError(
+                f"preview_samples = {self.preview_samples} reach beyond horizon_s = {self.horizon_s:g} and the delay; "
+                f"give preview_samples = {self.samples + self.loop_delay_samples} at most"
+            )
+
+    @property
+    def lag_s(self) -> float:
+        """Time constant with which a force error dies out at no cost, s."""
+        return self.decay / (2.0 * math.pi * self.bandwidth_hz)
 
     @property
     def loop_delay_samples(self) -> int:

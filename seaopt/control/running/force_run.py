@@ -93,7 +93,7 @@ class ForceRun:
 
 
 def close_loop(
-    step: Callable[[State, float, float], tuple[float, State]],
+    step: Callable[[State, Any, float], tuple[float, State]],
     start: State,
     plant: Plant,
     params: ParameterSet,
@@ -102,6 +102,7 @@ def close_loop(
     measured: str = "F1",
     sample_time_s: float = 1e-3,
     delay_samples: int = 1,
+    preview_samples: int = 0,
     sensor_std: float = 0.0,
     disturbance_A: float | Float[np.ndarray, " n"] = 0.0,
     seed: int = 0,
@@ -112,7 +113,8 @@ def close_loop(
     Parameters
     ----------
     step : callable ``(state, reference, measurement) -> (current, state)``
-        The law, such as ``mpc.command``; it sees the measurement before its current.
+        The law, such as ``mpc.command``; it sees the measurement before its current. `reference` is a number, or an
+        array with `preview_samples`.
     start
         Its state at the first sample.
     plant, params
@@ -126,6 +128,9 @@ def close_loop(
         Seconds.
     delay_samples : int
         Whole samples from a command to the plant.
+    preview_samples : int
+        How many references beyond the present one the law is given: it is called with an array of them all, the present
+        one first, fewer at the end; with 0, with the present one as a number.
     sensor_std : float
         White noise on the measurement.
     disturbance_A : float or array, shape (n,)
@@ -138,8 +143,8 @@ def close_loop(
     Raises
     ------
     ControlError
-        The plant has no such output or that output responds to the current at once, the parameters contain another
-        condition than `delay_s`, or the loop diverges.
+        `preview_samples` is no number of samples, the plant has no such output or that output responds to the current
+        at once, the parameters contain another condition than `delay_s`, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
 
@@ -147,6 +152,8 @@ def close_loop(
     values = plant.complete(params)
     extra_delay_s = _check(plant, values, measured, delay_samples)
     whole, rest_s = whole_samples(extra_delay_s, sample_time_s)
+    if isinstance(preview_samples, bool) or not isinstance(preview_samples, int) or preview_samples < 0:
+        raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, ca.DM(values.vector)
     output, integrator = output_function(plant), _Integrator(plant=plant, rtol=rtol)
     row, others = list(plant.outputs).index(measured), [0.0] * (len(plant.inputs) - 1)
@@ -162,7 +169,8 @@ def close_loop(
         older = k - newer - (rest_s > 0.0)
         force[k] = float(output(time_s[k], x, inputs(k, min(older, k - 1)), p)[row])
         call_start_s = time.perf_counter()
-        current[k], law = step(law, float(reference[k]), float(force[k] + noise[k]))
+        coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
+        current[k], law = step(law, coming, float(force[k] + noise[k]))
         law_time_s[k] = time.perf_counter() - call_start_s
         states[k] = x
         if rest_s > 0.0:

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 import seaopt as so
 from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, sample
-from seaopt.control.mpc.prediction import interpolate_knots, spread_knots
+from seaopt.control.mpc.knots import interpolate_knots, spread_knots
 from seaopt.errors import ControlError
 from tests.c_code import CompiledMPC
 
@@ -81,7 +81,7 @@ def exact(mpc, x0, u_last, reference, drift, samples):
 @pytest.mark.parametrize("slew", [500.0, pytest.param(2000.0, marks=pytest.mark.slow)])
 def test_with_limits_it_is_what_another_solver_finds(stand, thor, slew):
     """From 25 random states, every sample free, no delay: within 5 mA, which OSQP's tolerance leaves."""
-    mpc = made(stand, thor, horizon_s=0.03, moves=30, current_slew_A_per_s=slew, delay_samples=0)
+    mpc = made(stand, thor, horizon_s=0.03, moves=30, current_slew_A_per_s=slew, delay_samples=0, max_iterations=2000)
     rng = np.random.default_rng(7)
     at_limit = 0
     for _ in range(25):
@@ -230,7 +230,7 @@ def test_the_c_code_does_the_same(compiler, stand, thor, mpc, tmp_path):
     run = close_loop(watched, mpc.start, stand, thor, reference, sensor_std=2.0)
     rows = CompiledMPC(compiler, tmp_path / "code", mpc).run(reference, measurements)
     assert np.max(np.abs(run.current)) == 9.0
-    assert rows[:, 0] == pytest.approx(run.current, abs=1e-8)
+    assert rows[:, 0] == pytest.approx(run.current, abs=1e-6)
     assert np.all(rows[:, 1] == 1)
 
 

@@ -1,16 +1,27 @@
-/* Lines of reference and measurement in; command, solved, iterations, the step's time (s) and status out. */
+/* Lines in: 1 + FORCE_MPC_PREVIEW references, of this sample and those that follow, and the measurement.
+ * Lines out: command, solved, iterations, the step's time (s) and status. */
 #include <stdio.h>
 #include <time.h>
 
 #include "force_mpc.h"
 
+static int read_line(OSQPFloat *values, int count) {
+  for (int i = 0; i < count; i++) {
+    double value;
+    if (scanf("%lf", &value) != 1) return 0;
+    values[i] = (OSQPFloat)value;
+  }
+  return 1;
+}
+
 int main(void) {
   static force_mpc controller;
-  double reference, measurement;
+  OSQPFloat line[FORCE_MPC_PREVIEW + 2];
   force_mpc_reset(&controller);
-  while (scanf("%lf %lf", &reference, &measurement) == 2) {
+  while (read_line(line, FORCE_MPC_PREVIEW + 2)) {
     clock_t began = clock();
-    double command = (double)force_mpc_step(&controller, (OSQPFloat)reference, (OSQPFloat)measurement);
+    double command =
+        (double)force_mpc_step_ahead(&controller, line, FORCE_MPC_PREVIEW + 1, line[FORCE_MPC_PREVIEW + 1]);
     double took = (double)(clock() - began) / CLOCKS_PER_SEC;
     printf("%.17g %d %d %.9f %d\n", command, controller.solved, controller.iterations, took, controller.status);
   }

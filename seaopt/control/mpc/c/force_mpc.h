@@ -15,8 +15,9 @@ typedef struct {
   OSQPFloat estimate;             /* of what is measured */
   OSQPFloat plan[FORCE_MPC_KNOTS];
   OSQPFloat dual[FORCE_MPC_ROWS];
-  int solved;                     /* 0: the last command is the safe one, not the solver's */
-  int iterations;
+  int solved;                     /* 0: the command is that of the last plan, or after a horizon without one, of rest */
+  int age;                        /* samples since a program was solved */
+  int iterations;                 /* of the last program; FORCE_MPC_MAX_ITERATIONS at most, whatever the input */
   int status;                     /* FORCE_MPC_OK, _HELD or _FAULT */
   unsigned long refused;          /* measurements in a row that were not believed */
   OSQPFloat measurement;          /* the last that was */
@@ -34,5 +35,9 @@ void force_mpc_reset(force_mpc *s);
  * FORCE_MPC_UNIT; it is within limits whatever the input.
  * A measurement that is not finite is predicted; a reference that is not finite leaves the last one. */
 OSQPFloat force_mpc_step(force_mpc *s, OSQPFloat reference, OSQPFloat measurement);
+
+/* The same with references known ahead: `count` of them, of this sample and of those that follow, the last of which is
+ * held. More than 1 + FORCE_MPC_PREVIEW are not read. */
+OSQPFloat force_mpc_step_ahead(force_mpc *s, const OSQPFloat *references, int count, OSQPFloat measurement);
 
 #endif

@@ -1,0 +1,172 @@
+r"""Bounds of a plant's outputs and states over the horizon: rows of the quadratic program, softened exactly.
+
+With :math:`\xi`, :math:`\mu` counted from the target (see `prediction`), a bounded signal of the sampled plant is
+
+.. math:: y_{ij} = g_i (u_s + \hat d) + c_i \xi_j + d_i \mu_j, \qquad
+          \xi_j = A^j \xi_0 + \sum_{l<j} A^{j-1-l} b\, W_l\, \theta
+
+with g its static gain. It is held within :math:`[l_i, h_i]` at some samples j of the horizon, close together where it
+begins: what comes between two of them comes to a closer one as the horizon moves. Over half the width of the bounds,
+
+.. math:: y_{ij} - s_i \le h_i, \qquad y_{ij} + s_i \ge l_i, \qquad s_i \ge 0, \qquad
+          J + \omega \sum_i s_i + \tfrac{\epsilon}{2} \sum_i s_i^2
+
+so that the program has a solution whatever the state: no command can undo a speed that is there already. The penalty is
+exact (Kerrigan and Maciejowski, UKACC Control 2000): where :math:`\omega` is above the sum of a signal's multipliers,
+its slack is zero as long as a plan without it exists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.mpc.estimator import Estimator
+from seaopt.control.mpc.knots import spread_knots
+from seaopt.errors import ControlError, suggestion
+from seaopt.records import record
+
+BOUND_SAMPLES = 12  # of the horizon at which a bounded signal is held
+SLACK_UNIT = 0.1  # of a slack, in half widths: the solver's tolerance grows with the penalty of one unit
+
+
+@record(eq=False)
+class OutputBounds:
+    """Bounded signals over the horizon, each in units of half the width of its bounds.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Outputs and states of the plant.
+    middle, half : arrays, shape (k,)
+        Centre and half width of the bounds, in the signals' units.
+    static : array, shape (k,)
+        Value at rest per unit of command, over `half`.
+    free : array, shape (k m, nx)
+        From the state's distance to its target to the signal at m samples, signal by signal.
+    forced : array, shape (k m, n)
+        The same of the knots, in units of the limit of the command.
+
+    """
+
+    names: tuple[str, ...]
+    middle: Float[np.ndarray, " k"]
+    half: Float[np.ndarray, " k"]
+    static: Float[np.ndarray, " k"]
+    free: Float[np.ndarray, "km nx"]
+    forced: Float[np.ndarray, "km n"]
+
+    @property
+    def samples(self) -> int:
+        """At how many samples of the horizon each signal is held."""
+        return len(self.free) // len(self.names) if self.names else 0
+
+    @property
+    def slacks(self) -> Float[np.ndarray, "km k"]:
+        """Which signal's slack each row has, one column per signal."""
+        return SLACK_UNIT * np.repeat(np.eye(len(self.names)), self.samples, axis=0)
+
+    def rows(self) -> Float[np.ndarray, "r nv"]:
+        """Return the rows of the program, over knots and slacks: upper ends, lower ends, slacks."""
+        k, n = len(self.names), self.forced.shape[1]
+        slack = self.slacks
+        return np.block([[self.forced, -slack], [self.forced, slack], [np.zeros((k, n)), np.eye(k)]])
+
+    def limits(
+        self, xi: Float[np.ndarray, " nx"], rest: float, wide: float
+    ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
+        """Return lower and upper ends of these rows.
+
+        Parameters
+        ----------
+        xi : array, shape (nx,)
+            The state's distance from its target.
+        rest : float
+            The command that reaches the plant at rest, with its disturbance.
+        wide : float
+            What stands for no limit.
+
+        """
+        k = len(self.names)
+        base = np.repeat(self.static * rest - self.middle / self.half, self.samples) + self.free @ xi
+        none = np.full(base.size, wide)
+        return (
+            np.concatenate([-none, -1.0 - base, np.zeros(k)]),
+            np.concatenate([1.0 - base, none, np.full(k, wide)]),
+        )
+
+    def admissible_rest(self, drift: float, limit: float) -> tuple[float, float]:
+        """Return the commands at rest, least and largest, that keep the bounds; within the limit of the command.
+
+        Where no command keeps them all, it is the one that breaks them least.
+        """
+        moves = np.abs(self.static) > 0.0
+        ends = (self.middle[moves] / self.half[moves] + np.array([[-1.0], [1.0]])) / self.static[moves] - drift
+        low = float(np.clip(np.max(np.min(ends, axis=0), initial=-limit), -limit, limit))
+        high = float(np.clip(np.min(np.max(ends, axis=0), initial=limit), -limit, limit))
+        middle = 0.5 * (low + high)
+        return (low, high) if low <= high else (middle, middle)
+
+
+def bound_outputs(
+    bounds: Mapping[str, tuple[float, float]],
+    kalman: Estimator,
+    a: Float[np.ndarray, "nx nx"],
+    b: Float[np.ndarray, " nx"],
+    W: Float[np.ndarray, "samples n"],
+    limit: float,
+) -> OutputBounds:
+    """Return the rows of bounds by name.
+
+    Parameters
+    ----------
+    bounds : mapping of name to (low, high)
+        Of outputs and states of the plant, deflection and rate of its spring, in their units.
+    kalman : Estimator
+        Whose estimates they are.
+    a, b
+        The sampled plant.
+    W : array, shape (samples, n)
+        From the knots to the command at each sample of the horizon.
+    limit : float
+        Of the command, the unit of the knots.
+
+    Raises
+    ------
+    ControlError
+        A name is not one of the estimates.
+
+    """
+    nx, N = b.size, len(W)
+    known = [name for name, row in zip(kalman.names, kalman.G, strict=True) if np.any(row[:nx])]
+    for name in bounds:
+        if name not in known:
+            raise ControlError(
+                f'bounds of "{name}": not an output or state of {kalman.plant.name}; {suggestion(name, known)}'
+            )
+    rows = [kalman.names.index(name) for name in bounds]
+    C, D = kalman.G[rows][:, :nx], kalman.H[rows, 0]
+    ends = np.array(list(bounds.values()), dtype=float).reshape(-1, 2)
+    half = 0.5 * (ends[:, 1] - ends[:, 0])
+    at = set(spread_knots(N, min(BOUND_SAMPLES, N)).tolist())
+    free, forced = np.eye(nx), np.zeros((nx, N))
+    frees: list[Float[np.ndarray, "k nx"]] = []
+    forces: list[Float[np.ndarray, "k n"]] = []
+    for j in range(N):  # a signal that the command reaches at once is held at j, with mu_j; another one sample later
+        now = C @ forced + np.outer(D, np.eye(N)[j])
+        free_now = C @ free
+        free, forced = a @ free, a @ forced
+        forced[:, j] += b
+        direct = (D != 0.0)[:, None]
+        if j in at:
+            frees.append(np.where(direct, free_now, C @ free))
+            forces.append(limit * np.where(direct, now, C @ forced) @ W)
+    scale = half[:, None, None]
+    return OutputBounds(
+        names=tuple(bounds), middle=ends.mean(axis=1), half=half,
+        static=(C @ np.linalg.solve(np.eye(nx) - a, b) + D) / half,
+        free=(np.stack(frees, axis=1) / scale).reshape(-1, nx),
+        forced=(np.stack(forces, axis=1) / scale).reshape(-1, W.shape[1]),
+    )  # fmt: skip

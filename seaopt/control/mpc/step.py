@@ -1,0 +1,80 @@
+"""What a predictive controller remembers from sample to sample, and what one of its steps returns."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.laws.plausibility import GateState
+from seaopt.control.mpc.estimator import EstimatorState
+from seaopt.records import record
+
+
+@record(eq=False)
+class MPCState:
+    """The controller's state from sample to sample.
+
+    Parameters
+    ----------
+    kalman : EstimatorState
+    current_A : float
+        The last command.
+    plan : array, shape (n,)
+        The currents planned at the knots, A.
+    dual : array, shape (m,)
+        Of the last program, where the next starts.
+    age : int
+        Samples since a program was solved: so old is the plan. Of one that never was: the horizon.
+    gate : GateState
+        What the plausibility gate, where there is one, has seen; its `status` is "ok", "held" or "fault".
+
+    """
+
+    kalman: EstimatorState
+    current_A: float
+    plan: Float[np.ndarray, " n"]
+    dual: Float[np.ndarray, " m"]
+    age: int
+    gate: GateState = GateState()
+
+
+@record(eq=False)
+class MPCStep:
+    """One sample's result.
+
+    Parameters
+    ----------
+    current_A : float
+        The command, within limits.
+    state : MPCState
+        For the next step.
+    solved : bool
+        False: there is no plan that keeps the limits, and the current is that of the last one, or the safe one.
+    status : str
+        The solver's ("maximum iterations reached" with `solved`: the plan keeps the limits, and may not be the best),
+        or what was wrong with its solution.
+    force_N : float
+        Estimate of the measured force, with this sample.
+    target_N : float
+        The last reference known, or the nearest force that the limits can hold.
+    slack : float
+        By how much the plan breaks the bounds of outputs, in units of half their width; the largest.
+    iterations : int
+        Of the solver.
+    solve_time_s : float
+        The solver's own, in C.
+    step_time_s : float
+        The whole step's, in Python.
+
+    """
+
+    current_A: float
+    state: MPCState
+    solved: bool
+    status: str
+    force_N: float
+    target_N: float
+    slack: float
+    iterations: int
+    solve_time_s: float
+    step_time_s: float
