@@ -66,13 +66,16 @@ class Columns:
     units : mapping of name to unit
         Of the parameters and figures, each of which has a column of its standard deviation, too.
     outputs : tuple of str
+    fitted : tuple of str
+        Which of the units a fit estimates: free parameters, delay and gains; the others follow from these.
     free : tuple of str
-        The parameters among the units that a fit estimates with their covariance.
+        The parameters among them, of whose covariance a fit tells.
 
     """
 
     units: Mapping[str, str]
     outputs: tuple[str, ...]
+    fitted: tuple[str, ...]
     free: tuple[str, ...]
 
 
@@ -112,8 +115,9 @@ def list_columns(problem: Problem) -> Columns:
     free = tuple(units)
     units |= {"delay_s": "s"} if _is_free(template.delay_s) else {}
     units |= {f"gain_{name}": "-" for name, given in template.gain.items() if _is_free(given)}
+    fitted = tuple(units)
     units |= {name: unit for name, (_, unit) in plant.derived_values().items() if name not in units}
-    return Columns(units=units, outputs=tuple(template.outputs), free=free)
+    return Columns(units=units, outputs=tuple(template.outputs), fitted=fitted, free=free)
 
 
 def name_correlation(one: str, other: str) -> str:

@@ -57,6 +57,10 @@ class Fleet:
         Columns that say whose log it is.
     unchanged : int
         How many were done before.
+    fitted : tuple of str
+        Which of the units' columns a fit estimates: free parameters, delay and gains; the others follow from these.
+    free : tuple of str
+        The parameters among them, whose errors' correlations have columns, too.
 
     """
 
@@ -64,6 +68,8 @@ class Fleet:
     units: Mapping[str, str]
     identity: tuple[str, ...] = ()
     unchanged: int = 0
+    fitted: tuple[str, ...] = ()
+    free: tuple[str, ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:

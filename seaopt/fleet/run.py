@@ -125,7 +125,10 @@ def fit_fleet(
         table.relabel(names, chosen)
         unchanged = _fit_all(table, executor, chosen, progress)
         rows = table.read().filter(pl.col("log").is_in([log.path for log in chosen])).select(*schema)
-        result = Fleet(rows=rows, units=columns.units, identity=tuple(names), unchanged=unchanged)
+        result = Fleet(
+            rows=rows, units=columns.units, identity=tuple(names), unchanged=unchanged, fitted=columns.fitted,
+            free=columns.free,
+        )  # fmt: skip
         if folder is not None:
             made_from = {"problem_sha256": plan.digest, "version": plan.version}
             write_json(place / "fleet.json", result.to_dict() | made_from)

@@ -1,0 +1,233 @@
+r"""CUSUM charts of standardised innovations, and how often they raise an alarm where nothing has changed.
+
+A chart of one parameter of one actuator has a run of value :math:`y_t` with variance :math:`R_t` (of the fit, and
+between runs) at a time. While nothing changes, :math:`y_t = \mu + e_t`; the mean of the runs so far, weighted by
+:math:`1/R`, has the variance :math:`P_{t-1} = 1 / \sum_{j<t} 1/R_j`, and the innovations
+
+.. math:: z_t = (y_t - m_{t-1}) / \sqrt{P_{t-1} + R_t}, \qquad t = 2, 3, \ldots
+
+are independent and standard normal, although the baseline is learnt from the same runs: they are recursive residuals
+(Brown, Durbin and Evans 1975). Charts of them start by themselves (Hawkins 1987) and need no healthy period. Where R
+is an estimate of few degrees of freedom, Student's distribution is mapped to the normal one. An innovation counts for
+no more than `CLIP`, in chart and baseline alike: one wild run raises no alarm, two that agree do. Both sides are
+
+.. math:: S^\pm_t = \max(0,\ S^\pm_{t-1} \pm z_t - k), \qquad \text{alarm where } S^\pm_t > h
+
+(Page 1954). For the probability of an alarm within n runs, S between 0 and h is a Markov chain of many states (Brook
+and Evans 1972). The threshold h is where that is what is allowed, shared out evenly (Bonferroni) among the charts of
+an actuator and their two sides; clipping makes alarms rarer yet.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import brentq
+from scipy.special import ndtr
+from scipy.stats import norm, t
+
+from seaopt.errors import SeaoptError
+from seaopt.records import record
+
+ALLOWANCE = 0.5  # k: best for a change of one standard deviation
+CLIP = 4.0
+STATES = 200  # of the Markov chain: average run lengths are right within 0.1 %
+LARGEST = 40.0  # threshold that is looked for
+LEAST = 1e-10  # probability of one side of a chart, for which rounding leaves digits
+LEARNT_DOF = 1e6  # from where on a variance is known
+
+
+def _make_chain(threshold: float, allowance: float) -> Float[np.ndarray, "m m"]:
+    """Return the transitions of a one-sided chart among its states below the threshold; what is missing is alarm."""
+    width = 2.0 * threshold / (2 * STATES - 1)  # the state of zero is half as wide: it has no values below
+    steps = (np.arange(STATES)[None, :] - np.arange(STATES)[:, None]) * width + allowance
+    chain = ndtr(steps + width / 2) - ndtr(steps - width / 2)
+    chain[:, 0] = ndtr(steps[:, 0] + width / 2)
+    return chain
+
+
+def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
+    """Return after how many runs a one-sided chart raises an alarm on average, where nothing has changed.
+
+    Parameters
+    ----------
+    threshold, allowance : float
+        h and k, in standard deviations.
+
+    Examples
+    --------
+    Two sides halve it, to the 465 that textbooks have for k = 0.5 and h = 5:
+
+    >>> round(average_run_length(5.0) / 2)
+    465
+
+    """
+    chain = _make_chain(threshold, allowance)
+    return float(np.linalg.solve(np.eye(STATES) - chain, np.ones(STATES))[0])
+
+
+def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> Float[np.ndarray, " runs+1"]:
+    """Return the probabilities that a one-sided chart raises an alarm within 0, 1, ... runs, where nothing has changed.
+
+    Parameters
+    ----------
+    threshold : float
+        h, in standard deviations.
+    runs : int
+        How many, at most.
+    allowance : float
+        k, in standard deviations.
+
+    Examples
+    --------
+    >>> alarm_probabilities(5.0, 100)[[0, 10, 100]].round(4)
+    array([0.    , 0.0047, 0.0967])
+
+    """
+    chain, left = _make_chain(threshold, allowance), np.eye(STATES)[0]
+    within = np.zeros(runs + 1)
+    for run in range(runs):
+        left = left @ chain
+        within[run + 1] = 1.0 - left.sum()
+    return within
+
+
+@lru_cache(maxsize=64)
+def choose_threshold(probability: float, runs: int, charts: int, allowance: float = ALLOWANCE) -> float:
+    """Return the threshold h with which an actuator raises a false alarm with at most this probability.
+
+    Parameters
+    ----------
+    probability : float
+        Of an alarm of any of its charts within `runs` runs.
+    runs, charts : int
+        How many runs; how many parameters of an actuator have a chart.
+    allowance : float
+        k, in standard deviations.
+
+    Raises
+    ------
+    SeaoptError
+        The probability is not between 0 and 1, or too small for any threshold.
+
+    Examples
+    --------
+    >>> round(choose_threshold(0.01, 100, 2), 2)
+    8.61
+
+    """
+    if not 0.0 < probability < 1.0:
+        raise SeaoptError(f"false_alarms = {probability:g} is no probability above 0 and below 1; give 0.01")
+    share = probability / (2 * charts)
+    if share < LEAST:
+        raise SeaoptError(f"false_alarms = {probability:g} is too small for {charts} charts; give 1e-6 or more")
+
+    def exceed(threshold: float) -> float:
+        return float(np.log(max(alarm_probabilities(threshold, runs, allowance)[-1], 1e-15) / share))
+
+    solver: Any = brentq
+    return float(solver(exceed, 0.1, LARGEST, xtol=1e-4))
+
+
+@record(eq=False)
+class Charts:
+    """Charts of one parameter, a row an actuator, a column a run.
+
+    Parameters
+    ----------
+    innovations : array
+        As they counted; nan at the first run and where there is none.
+    upper, lower : array
+        S+ and S-.
+    alarm : array of int
+        At which run the alarm was raised; -1 for none.
+
+    """
+
+    innovations: Float[np.ndarray, "actuators runs"]
+    upper: Float[np.ndarray, "actuators runs"]
+    lower: Float[np.ndarray, "actuators runs"]
+    alarm: Int[np.ndarray, " actuators"]
+
+
+def chart_runs(
+    values: Float[np.ndarray, "actuators runs"],
+    variances: Float[np.ndarray, "actuators runs"],
+    threshold: float,
+    *,
+    dof: float = np.inf,
+    allowance: float = ALLOWANCE,
+) -> Charts:
+    """Chart runs, the values of each actuator in the order of time.
+
+    After an alarm the baseline stays as it was, so that it does not learn what is wrong.
+
+    Parameters
+    ----------
+    values : array
+        nan where an actuator has no run.
+    variances : array
+        Of each value: that of its fit, and between runs.
+    threshold, allowance : float
+        h and k, in standard deviations.
+    dof : float
+        Degrees of freedom of the variances; infinite where they are known.
+
+    Examples
+    --------
+    A value of unit variance that rises by three standard deviations at its 21st run:
+
+    >>> values = np.random.default_rng(1).normal(size=(1, 40)) + 3.0 * (np.arange(40) >= 20)
+    >>> charts = chart_runs(values, np.ones((1, 40)), choose_threshold(0.01, 100, 1))
+    >>> charts.alarm
+    array([23])
+    >>> find_change(values[0, :24], np.ones(24))
+    20
+
+    """
+    count, runs = values.shape
+    innovations, sums = np.full((count, runs), np.nan), np.zeros((2, count, runs))
+    mean, weight, now = np.zeros(count), np.zeros(count), np.zeros((2, count))
+    alarm = np.full(count, -1)
+    for run in range(runs):
+        present = np.isfinite(values[:, run])
+        known = present & (weight > 0.0)
+        variance = np.where(present, variances[:, run], 1.0)
+        spread = np.sqrt(variance + 1.0 / np.where(weight > 0.0, weight, 1.0))
+        z = np.where(known, np.clip(_normalise((values[:, run] - mean) / spread, dof), -CLIP, CLIP), 0.0)
+        innovations[known, run] = z[known]
+        now = np.where(known, np.maximum(0.0, now + np.stack([z, -z]) - allowance), now)
+        sums[:, :, run] = now
+        alarm[(alarm < 0) & np.any(now > threshold, axis=0)] = run
+        learns = present & (alarm < 0)
+        gain = 1.0 / (1.0 + variance * weight)  # of the new run's weight in the mean
+        mean = np.where(learns, np.where(known, mean + gain * z * spread, values[:, run]), mean)
+        weight = weight + np.where(learns, 1.0 / variance, 0.0)
+    return Charts(innovations=innovations, upper=sums[0], lower=sums[1], alarm=alarm)
+
+
+def _normalise(ratio: Float[np.ndarray, " n"], dof: float) -> Float[np.ndarray, " n"]:
+    """Return what is distributed as Student's t as what is standard normal."""
+    if dof > LEARNT_DOF:
+        return ratio
+    return np.sign(ratio) * norm.isf(np.maximum(t.sf(np.abs(ratio), dof), 1e-300))
+
+
+def find_change(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> int:
+    """Return from which run on a mean is another one: the step that is most likely, if there is one (Hinkley 1970).
+
+    Parameters
+    ----------
+    values, weights : array
+        Of at least two runs; one over their variances.
+
+    """
+    before = np.cumsum(weights)[:-1]
+    after = weights.sum() - before
+    below = np.cumsum(weights * values)[:-1]
+    above = np.sum(weights * values) - below
+    gain = (above / after - below / before) ** 2 * before * after / (before + after)
+    return int(np.argmax(gain)) + 1
