@@ -1,4 +1,4 @@
-"""Drift of a fleet: false alarms of healthy actuators, and the delay to those that drift: bench_fleet_drift.py [FLEETS].
+"""Drift of a fleet, false alarms and delays: python benchmarks/bench_fleet_drift.py [FLEETS].
 
 Healthy actuators have three parameters, whose values scatter from run to run around a mean of the actuator's own, with
 fits of unlike stds besides. An alarm of any of the three within 100 runs after the first counts; 1 % is what is stated.

@@ -69,7 +69,7 @@ def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
     return float(np.linalg.solve(np.eye(STATES) - chain, np.ones(STATES))[0])
 
 
-def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> Float[np.ndarray, " runs+1"]:
+def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> Float[np.ndarray, " n"]:
     """Return the probabilities that a one-sided chart raises an alarm within 0, 1, ... runs, where nothing has changed.
 
     Parameters

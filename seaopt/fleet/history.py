@@ -31,7 +31,7 @@ FORMATS = (
 YEARS = (1980, 2100)  # other numbers are no dates
 UNIX_S = 1e8  # seconds since 1970, beyond which a number is that, and no count
 DAY_S = 86400.0
-DAY, RUN = "day", "run"
+DAY, ORDER = "day", ""  # units: the latter of texts that have an order only
 
 
 @record(eq=False)
@@ -102,7 +102,7 @@ def order_runs(fleet: Fleet, actuator: Sequence[str] | None = None, time: Sequen
     rows = rows.with_columns(pl.Series(TIME, times, dtype=pl.Float64), paths).sort(
         LABEL, TIME, ":path", nulls_last=True
     )
-    if unit == RUN:  # an actuator's own runs are counted
+    if unit == ORDER:  # an actuator's own runs are counted
         ordinal = pl.col(TIME).cum_count().over(LABEL).cast(pl.Float64)
         rows = rows.with_columns(pl.when(pl.col(TIME).is_not_null()).then(ordinal).alias(TIME))
     several = rows[LABEL].n_unique() < len(rows)
@@ -112,7 +112,7 @@ def order_runs(fleet: Fleet, actuator: Sequence[str] | None = None, time: Sequen
             "no column says when a log was taken: the order of their paths is taken for that of time; name the columns "
             "with --time, or in the identity: {joint}_{date}.csv"
         )
-    return History(rows=rows.drop(":path"), actuator=whose, unit=unit, source=source, warning=warning)
+    return History(rows=rows.drop(":path"), actuator=whose, unit=unit or "run", source=source, warning=warning)
 
 
 def _check_columns(names: Sequence[str], identity: Sequence[str], argument: str) -> tuple[str, ...]:
@@ -148,7 +148,7 @@ def _label(rows: pl.DataFrame, whose: Sequence[str]) -> pl.Series:
 def _read_times(rows: pl.DataFrame, when: Sequence[str]) -> tuple[list[float | None], str, str]:
     """Return each log's time as a number, its unit, and where it is from."""
     if not when:
-        return [float(rank) for rank in _rank(rows["log"].to_list())], RUN, "the order of the paths"
+        return [float(rank) for rank in _rank(rows["log"].to_list())], ORDER, "the order of the paths"
     columns = [rows[name].cast(pl.String).fill_null("").to_list() for name in when]
     texts = [" ".join(parts).strip() for parts in zip(*columns, strict=True)]
     source = f"column{'s' if len(when) > 1 else ''} " + join_words([f'"{name}"' for name in when])
@@ -167,7 +167,7 @@ def _read_times(rows: pl.DataFrame, when: Sequence[str]) -> tuple[list[float | N
             "2026-01-31T12:00:00, or name another column with --time"
         )
     ranks = _rank(texts)
-    return [float(rank) if text else None for rank, text in zip(ranks, texts, strict=True)], RUN, source
+    return [float(rank) if text else None for rank, text in zip(ranks, texts, strict=True)], ORDER, source
 
 
 def _read_dates(texts: Sequence[str]) -> list[float | None] | None:
