@@ -87,7 +87,7 @@ MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 
 REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
-OF_THE_LAW = ("structure", "notch", "reference_weights", "sample_rate_hz", "delay_samples")
+OF_THE_LAW = ("structure", "notch", "prefilter", "reference_weights", "sample_rate_hz", "delay_samples")
 SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
     "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",

@@ -14,7 +14,7 @@ from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch
+from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch, Prefilter
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.margins import DiskMargin, Margins, margins, nu_gap
@@ -45,8 +45,8 @@ __all__ = [
     "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "GainTable", "Gains",
     "GateState", "GivenLaw", "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec",
     "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate",
-    "Rendering", "RunnableLaw", "RunnableSchedule", "SampledLoop", "ScheduleState", "ScheduledController", "Score",
-    "Scorecard", "TransferFunction", "add_impedance", "assess", "bound_free_law", "cascade_pid", "close_loop",
+    "Prefilter", "Rendering", "RunnableLaw", "RunnableSchedule", "SampledLoop", "ScheduleState", "ScheduledController",
+    "Score", "Scorecard", "TransferFunction", "add_impedance", "assess", "bound_free_law", "cascade_pid", "close_loop",
     "command_of", "corners", "critical_impedance", "draw", "drive_pid", "estimate_noise", "estimator", "export",
     "export_mpc", "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid", "passive_region", "passivity",
     "passivity_rows", "read_law", "realise", "render", "run_loop", "runnable", "sample", "scorecard", "sweep",

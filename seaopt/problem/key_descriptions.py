@@ -224,11 +224,17 @@ KEYS: dict[str, dict[str, str]] = {
         "width": "Tuned where left out.",
         "depth": "Gain at its centre; tuned where left out.",
     },
+    "PrefilterTable": {
+        "order": "With or without a damping.",
+        "corner_hz": "Where its asymptotes meet; tuned where left out.",
+        "damping": "Of one of second order; tuned where left out.",
+    },
     "ControllerTable": {
         "plant": 'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.',
         "measured": "The output that is regulated; or a list, it and what else is fed back, such as the motor's speed.",
         "structure": "pid_dob adds a disturbance observer.",
         "notch": "Whether there is one, or which.",
+        "prefilter": "A low-pass of the reference alone, of this order, or which; the bandwidth is placed with it.",
         "reference_weights": '"tuned": of how the reference enters; "error", "measurement": fixed.',
         "bandwidth_range_hz": "Within which bandwidths are sensible; 15 to 60 where left out.",
         "sample_rate_hz": "At which it runs.",

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
-from seaopt.control import ControllerSpec, Notch
+from seaopt.control import ControllerSpec, Notch, Prefilter
 from seaopt.control import draw as draw_values
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.documents import check_table
@@ -48,6 +48,7 @@ from seaopt.problem.schema import (
     FitTable,
     ParameterTable,
     PlantTable,
+    PrefilterTable,
     ProblemTable,
     RobustnessTable,
     SensorsTable,
@@ -647,13 +648,17 @@ def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
 def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    fields = table.controller.model_dump(exclude={"plant", "robust_to", "frf_confidence", "draws", "notch"})
+    fields = table.controller.model_dump(
+        exclude={"plant", "robust_to", "frf_confidence", "draws", "notch", "prefilter"}
+    )
+    low_pass = table.controller.prefilter
+    prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass
     notch = table.controller.notch
     tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
     if table.robustness is not None and table.robustness.min_friction_margin is not None:
         designed, certified = fields["min_friction_margin"], table.robustness.min_friction_margin
         fields["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
-    return ControllerSpec(**fields, notch=tuned)
+    return ControllerSpec(**fields, notch=tuned, prefilter=prefilter)
 
 
 def _read_table(source: Path) -> ProblemTable:

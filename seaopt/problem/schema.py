@@ -381,6 +381,14 @@ class NotchTable(_Strict):
     depth: Number | None = None
 
 
+class PrefilterTable(_Strict):
+    """A low-pass of the reference alone; what is left out is tuned."""
+
+    order: Literal["first_order", "second_order"]
+    corner_hz: Number | None = None
+    damping: Number | None = None
+
+
 def _limit(name: str) -> Any:
     """Return the field of a limit, with default and description of its row."""
     return Field(default=BY_NAME[name].default, description=BY_NAME[name].description)
@@ -396,6 +404,7 @@ class ControllerTable(_Strict):
     measured: str | tuple[str, ...] = "F1"
     structure: Literal["pd", "pid", "pid_dob"] = "pid"
     notch: Flag | NotchTable = False
+    prefilter: Literal["first_order", "second_order"] | PrefilterTable | None = None
     reference_weights: Literal["tuned", "error", "measurement"] = "tuned"
     bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)

@@ -11,6 +11,10 @@ its Taylor series at :math:`\delta = 0`, whose terms are those of
 
 a system with the same poles: what cancels is never computed. As :math:`1/\delta = 1 + w`, w = 1/(z - 1), the
 :math:`g_j` become the chain of `seaopt.control.loops.law`.
+
+A filter F of the reference alone, of unit static gain, has :math:`F - 1 = \delta G`, G with the poles of F. What
+integrates the error integrates :math:`F r - y = (r - y) + \delta G r`: its integral of the error is as before, to the
+last bit, and the rest has one integrator less.
 """
 
 from __future__ import annotations
@@ -96,6 +100,39 @@ class Assembly:
         row = np.linalg.solve(inner.T, self.c)
         return Assembly(
             chain=np.vstack([static, self.chain]), a=self.a, b=self.b, c=-row @ self.a, d=-row @ self.b
+        )  # fmt: skip
+
+    def with_reference_behind(self, part: TransferFunction, rest: TransferFunction) -> Assembly:
+        """Return this, the inputs being error, reference and further signals, with the reference behind a filter.
+
+        Parameters
+        ----------
+        part : TransferFunction
+            The filter F, stable and of unit static gain.
+        rest : TransferFunction
+            (F - 1)/delta, over the same denominator.
+
+        """
+        a, b, row, through = rest.state_space()
+        n, more, chain, whole = self.c.size, b.size, self.chain.copy(), np.sum(self.chain[:, :2], axis=1)
+        c, d, inner = np.zeros(more), 0.0, np.eye(more) - a
+        for power in range(len(chain)):  # rest/delta^power: what it leaves at 0 Hz goes to the chain, term by term
+            c, d = c + whole[power] * row, d + whole[power] * through
+            for order in range(power + 1, len(chain)):
+                chain[order - power - 1, 1] += whole[order] * (through + float(row @ np.linalg.solve(inner, b)))
+            fixed = np.linalg.solve(inner.T, row)
+            row, through = -fixed @ a, -float(fixed @ b)
+        _, _, seen, direct = part.state_space()  # of F; F - 1 has the same states
+        direct -= 1.0
+        into, onto = np.sum(self.b[:, :2], axis=1), float(np.sum(self.d[:2]))
+        states = np.zeros((n + more, n + more))
+        states[:n, :n], states[n:, n:], states[:n, n:] = self.a, a, np.outer(into, seen)
+        entry, direct_from = np.zeros((n + more, self.d.size)), self.d.copy()
+        direct_from[1] += onto * direct + d
+        entry[:n], entry[n:, 1] = self.b, b
+        entry[:n, 1] += into * direct
+        return Assembly(
+            chain=chain, a=states, b=entry, c=np.concatenate([self.c, onto * seen + c]), d=direct_from
         )  # fmt: skip
 
     def law(self, sample_time_s: float) -> Law:

@@ -11,7 +11,7 @@ import numpy as np
 from seaopt.control.laws.command import Command, actuation_notes, limit_notes
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
-from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, SpeedLoop
+from seaopt.control.laws.structures import LAW_GAINS, PREFILTER, DisturbanceObserver, Gains, Prefilter, SpeedLoop
 from seaopt.control.laws.verdict import (
     DesignFigure,
     PossibleBandwidths,
@@ -53,9 +53,10 @@ from seaopt.units import divide_units, mechanics_of, unit_after
 if TYPE_CHECKING:
     import control
 
-FRICTION_MARGIN = "friction_margin"  # among what controller.json says is achieved
+# Among what controller.json says is achieved:
+FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
 CONTROLLER_SCHEMA = "seaopt/controller/2"
-GAIN_UNITS = {"T_f": "s", "T_q": "s"}  # besides those of effort over what is measured
+GAIN_UNITS = {"T_f": "s", "T_q": "s", PREFILTER: "Hz"}  # besides those of effort over what is measured
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SAME_POLE = 1e-3  # to which poles that are equal are computed
 NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
@@ -171,6 +172,23 @@ class Controller:
         if self.friction is None or self.design is None:
             return loop
         return replace(loop, friction_slope=self.friction.least_slope, slope_unit=name_slope_unit(self.design[0]))
+
+    @property
+    def prefilter(self) -> Prefilter | None:
+        """The low-pass of the reference, with its numbers; None without one."""
+        return Gains.from_names(self.gains, self.observer, self.speed_loop).prefilter if self.gains else None
+
+    @property
+    def bandwidth_without_prefilter_hz(self) -> float | None:
+        """The bandwidth that the same loop has on the design plant where its reference is not filtered.
+
+        None without a prefilter, of a loop that never falls to -3 dB, and of a measured design plant.
+        """
+        if self.prefilter is None or self.design is None:
+            return None
+        bare = replace(Gains.from_names(self.gains, self.observer, self.speed_loop), prefilter=None)
+        loop = replace(self.close(*self.design), law=bare.law(self.spec.structure, self.sample_time_s))
+        return loop.figures().bandwidth_hz
 
     @property
     def judged_on(self) -> str:
@@ -332,7 +350,8 @@ class Controller:
             "command": {field.name: getattr(self.command, field.name) for field in fields(Command)},
             "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
             "achieved": _list_achieved(self.achieved)
-            | {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope},
+            | {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope}
+            | self._prefilter_figures(),
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
@@ -345,6 +364,10 @@ class Controller:
             "notes": list(self.notes),
             "measured_responses": [one.to_dict() for one in self.measured],
         }
+
+    def _prefilter_figures(self) -> dict[str, float | None]:
+        """Return what is achieved without the prefilter, where there is one."""
+        return {} if self.prefilter is None else {WITHOUT_PREFILTER: self.bandwidth_without_prefilter_hz}
 
     def _heat_dict(self) -> dict[str, Any] | None:
         """Return what the motor can do without overheating, and what an exported law takes to keep to it."""
@@ -401,6 +424,7 @@ class Controller:
         check_achieved(content.get("achieved"), _list_achieved(achieved))
         check_friction_margin(content["achieved"].get(FRICTION_MARGIN), friction)
         controller = cls(**stored, achieved=achieved, design=(plant, params), friction=friction)
+        check_achieved(content["achieved"], controller._prefilter_figures())
         loops = [
             controller.measure(f"design plant{name}", figures) for name, figures in controller._measure_states().items()
         ]
@@ -424,6 +448,7 @@ class Controller:
         check_achieved(content.get("achieved"), _list_achieved(achieved))
         stored["command"] = replace(command, largest=find_range(measured.plant, params))
         controller = cls(**stored, achieved=achieved)
+        check_achieved(content["achieved"], controller._prefilter_figures())
         broken = tuple(list_broken_figures(spec, [controller.design_loop]) if controller.feasible else ())
         if not broken:
             return controller
@@ -482,7 +507,7 @@ class Controller:
     def _gain_lines(self) -> list[str]:
         if not self.gains:
             return [f"  a law of order {self.law.c.size}, {format_count(self.law.integrators, 'integrator')} in it"]
-        law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
+        law = {name: value for name, value in self.gains.items() if not name.startswith(("notch_", "prefilter_"))}
         units = name_gain_units(self.command)
         lines = [
             "  " + ", ".join(f"{name} = {value:.5g} {units.get(name, '')}".rstrip() for name, value in law.items()),
@@ -496,6 +521,14 @@ class Controller:
             f, width, depth = (self.gains[f"notch_{name}"] for name in ("frequency_hz", "width", "depth"))
             use = "" if depth < NO_NOTCH else ": of no use, tune without it"
             lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}{use}")
+        low_pass = self.prefilter
+        if low_pass is not None:
+            damping = "" if low_pass.damping is None else f", damping {low_pass.damping:.3g}"
+            bare = format_number(self.bandwidth_without_prefilter_hz, missing="none")
+            lines.append(
+                f"  prefilter of {low_pass.order.replace('_', ' ')}: {low_pass.corner_hz:.4g} Hz{damping}; without it "
+                f"the bandwidth is {bare} Hz"
+            )
         return lines
 
     def _outer_lines(self) -> list[str]:
@@ -539,11 +572,18 @@ class Controller:
         ]
         return [
             *limited,
+            *self._prefilter_rows(),
             ("tracking band", format_band(a.tracking_band_hz, "Hz", MISSING), ""),
             ("gain margin", format_figure(a.gain_margin_db, "dB"), ""),
             ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
             ("delay margin", format_figure(a.delay_margin_ms, "ms"), ""),
         ]
+
+    def _prefilter_rows(self) -> list[tuple[str, str, str]]:
+        """Return the row of the bandwidth without the prefilter, where there is one."""
+        if self.prefilter is None:
+            return []
+        return [("bandwidth without prefilter", format_figure(self.bandwidth_without_prefilter_hz, "Hz"), "")]
 
 
 def name_gain_units(command: Command) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any, Literal
 
@@ -11,9 +12,12 @@ from seaopt.control.laws.limits import BY_NAME, FIELDS, GIVEN_LAW_LIMITS, LIMITS
 from seaopt.control.laws.structures import (
     CASCADE,
     CUSTOM,
+    PREFILTER_ORDERS,
     REFERENCE_WEIGHTS,
     STRUCTURES,
     Notch,
+    Prefilter,
+    PrefilterOrder,
     ReferenceWeights,
     SpeedLoop,
     Structure,
@@ -29,6 +33,7 @@ LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
 LIFTABLE = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz")
 OPTIONAL = ("current_limit_A", "command_limit", "step_N")
 MAX_DELAY_SAMPLES = 1000
+HIGHEST_CORNER = 0.45  # of the sample rate: of a filter that is part of the law
 LOWEST_HZ = 1e-3  # limits are kept from here
 
 
@@ -50,6 +55,9 @@ class ControllerSpec:
         (`seaopt.assess`), which may have more than bandwidth_hz.
     notch : Notch, optional
         A notch in series; fields that are None are tuned.
+    prefilter : {"first_order", "second_order"} or Prefilter, optional
+        A low-pass of the reference alone, tuned with the gains; of a `Prefilter` fields that are None are. bandwidth_hz
+        and all limits hold with it.
     reference_weights : {"tuned", "error", "measurement"}
         k_r and c of `seaopt.control.laws.structures`: tuned with the gains; feedforward and feedback of the error,
         k_r = 1/P(0) + k_p and c = 1; or the derivative on the measurement alone, c = 0, with k_r tuned.
@@ -102,6 +110,7 @@ class ControllerSpec:
     bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
     structure: Structure = "pid"
     notch: Notch | None = None
+    prefilter: PrefilterOrder | Prefilter | None = None
     reference_weights: ReferenceWeights = "tuned"
     sample_rate_hz: float = 1000.0
     delay_samples: int | None = None
@@ -190,6 +199,7 @@ class ControllerSpec:
         for name in LIFTABLE:
             BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
         self._check_notch()
+        self._check_prefilter()
         self._check_band()
         if self.step_N is not None and not self.step_N > 0.0:
             raise ControlError(
@@ -217,12 +227,33 @@ class ControllerSpec:
             return
         if not isinstance(self.notch, Notch):
             raise ControlError(f"notch = {self.notch!r} is a {type(self.notch).__name__}; give a Notch")
-        top = {"frequency_hz": 0.45 * self.sample_rate_hz, "width": 10.0, "depth": 1.0}
-        for name, value in asdict(self.notch).items():
-            if value is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= top[name]:
-                raise ControlError(f"notch.{name} = {value!r} is not above 0 and up to {top[name]:g}")
+        top = {"frequency_hz": HIGHEST_CORNER * self.sample_rate_hz, "width": 10.0, "depth": 1.0}
+        _check_numbers("notch", asdict(self.notch), top)
+
+    def _check_prefilter(self) -> None:
+        given: Any = self.prefilter
+        if given is not None and not isinstance(given, Prefilter) and given not in PREFILTER_ORDERS:
+            raise ControlError(
+                f"prefilter = {given!r} is not known; {suggestion(str(given), PREFILTER_ORDERS)}; or give a Prefilter"
+            )
+        chosen = self.reference_filter
+        if chosen is None:
+            return
+        if chosen.order not in PREFILTER_ORDERS:
+            raise ControlError(f'prefilter.order = "{chosen.order}" is not known; use "first_order" or "second_order"')
+        if chosen.damping is not None and not chosen.is_second_order:
+            raise ControlError(
+                f"prefilter.damping = {chosen.damping!r} is of a filter of second order; leave it out, or give "
+                'order = "second_order"'
+            )
+        numbers = {"corner_hz": chosen.corner_hz, "damping": chosen.damping}
+        _check_numbers("prefilter", numbers, {"corner_hz": HIGHEST_CORNER * self.sample_rate_hz, "damping": 10.0})
+
+    @property
+    def reference_filter(self) -> Prefilter | None:
+        """The prefilter with its fields; None without one."""
+        given = self.prefilter
+        return Prefilter(order=given) if isinstance(given, str) else given
 
     @property
     def regulated(self) -> str:
@@ -293,8 +324,18 @@ class ControllerSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        notch = None if self.notch is None else asdict(self.notch)
-        return values | {"notch": notch, "delay_samples": self.loop_delay_samples}
+        filters = {"notch": self.notch, "prefilter": self.reference_filter}
+        stated = {name: None if one is None else asdict(one) for name, one in filters.items()}
+        return values | stated | {"delay_samples": self.loop_delay_samples}
+
+
+def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, float]) -> None:
+    """Refuse the numbers of a filter that are not above zero and up to the largest; what is None is tuned."""
+    for field, value in numbers.items():
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= largest[field]:
+            raise ControlError(f"{name}.{field} = {value!r} is not above 0 and up to {largest[field]:g}")
 
 
 def check_command_limits(current_limit_A: float | None, command_limit: float | None) -> None:

@@ -17,10 +17,12 @@ from seaopt.control.laws.structures import (
     CUSTOM,
     INNER_GAINS,
     LAW_GAINS,
+    PREFILTER,
     DisturbanceObserver,
     Gains,
     Nominal,
     Notch,
+    Prefilter,
 )
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
@@ -34,6 +36,7 @@ from seaopt.errors import ControlError, FileError
 from seaopt.files import plain
 
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
+PREFILTER_GAINS = {PREFILTER, "prefilter_damping"}
 FIGURES_AGREE = 1e-4  # a bandwidth where abs(F/F_ref) is flat is known to the root of rounding
 ROUNDINGS = 1024 * float(np.finfo(float).eps)
 TUNE_AGAIN = "tune again"
@@ -291,6 +294,8 @@ def _build_spec(stored: StoredSpec) -> tuple[ControllerSpec, tuple[str, ...]]:
     try:
         if fields.get("notch") is not None:
             fields["notch"] = Notch(**fields["notch"])
+        if isinstance(fields.get("prefilter"), Mapping):
+            fields["prefilter"] = Prefilter(**fields["prefilter"])
         return ControllerSpec(**fields), tuple(stored.robust_to)
     except (ControlError, TypeError, ValueError) as error:
         raise FileError(f"controller.json: spec: {error}; {TUNE_AGAIN}") from error
@@ -316,6 +321,8 @@ def _check_gains(
         *(NOTCH_GAINS if "notch_depth" in gains else ()),
         *(("T_q",) if observer is not None else ()),
     }
+    if spec.reference_filter is not None:
+        needed |= PREFILTER_GAINS if spec.reference_filter.is_second_order else {PREFILTER}
     if set(gains) != needed:
         raise _contradict("gains", f"has {', '.join(sorted(gains))} where the law has {', '.join(sorted(needed))}")
     if (observer is not None) != (spec.structure == "pid_dob") or (

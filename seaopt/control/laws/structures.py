@@ -57,7 +57,12 @@ The feedforward acts beside the speed loop, whose integral would otherwise sum i
 **Notch**, in series with all of it: a biquad :math:`(s^2 + 2 g \zeta \omega s + \omega^2)/(s^2 + 2 \zeta \omega s +
 \omega^2)` by Tustin's rule, prewarped to be exact at :math:`\omega`; :math:`\zeta` is its width, g its depth.
 
-At fixed T_f, T_q, T_v and notch, C_r, C_y and what feeds the speed back are affine in (k_p, k_i, k_d, k_r, c k_d, k_v).
+**Prefilter**, in series with C_r alone: a low-pass of first or second order, :math:`\omega/(s + \omega)` or
+:math:`\omega^2/(s^2 + 2\zeta\omega s + \omega^2)` by the same rule, whose static gain is 1. It takes from the reference
+what the feedback would make a peak of, so that the loop may be faster than the bandwidth asked.
+
+At fixed T_f, T_q, T_v, notch and prefilter, C_r, C_y and what feeds the speed back are affine in
+(k_p, k_i, k_d, k_r, c k_d, k_v).
 """
 
 from __future__ import annotations
@@ -79,6 +84,8 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
 Structure = Literal["pd", "pid", "pid_dob", "cascade", "custom"]
+PrefilterOrder = Literal["first_order", "second_order"]
+PREFILTER_ORDERS: tuple[PrefilterOrder, ...] = ("first_order", "second_order")
 ReferenceWeights = Literal["tuned", "error", "measurement"]
 REFERENCE_WEIGHTS: tuple[ReferenceWeights, ...] = ("tuned", "error", "measurement")
 CASCADE: Structure = "cascade"
@@ -86,6 +93,7 @@ TUNED: tuple[Structure, ...] = ("pd", "pid", "pid_dob", CASCADE)
 CUSTOM: Structure = "custom"  # a law that is given, and that no gains describe
 STRUCTURES = (*TUNED, CUSTOM)
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
+PREFILTER = "prefilter_corner_hz"  # the gain that every prefilter has
 LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
 INNER_GAINS = ("k_v", "k_ff")  # of a cascade besides; and T_v where its speed loop integrates
 SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms
@@ -122,6 +130,45 @@ class Notch:
             for damping in (2 * self.depth * self.width * w, 2 * self.width * w)
         )
         return num, den
+
+
+@record
+class Prefilter:
+    """A low-pass in series with the reference; what is None is tuned.
+
+    Parameters
+    ----------
+    order : {"first_order", "second_order"}
+        Its order.
+    corner_hz : float, optional
+        Where its asymptotes meet.
+    damping : float, optional
+        Damping ratio, of one of second order.
+
+    """
+
+    order: PrefilterOrder = "first_order"
+    corner_hz: float | None = None
+    damping: float | None = None
+
+    @property
+    def is_second_order(self) -> bool:
+        """Whether it has a damping."""
+        return self.order == "second_order"
+
+    def filters(self, sample_time_s: float) -> tuple[TransferFunction, TransferFunction]:
+        """Return F and (F - 1)/(1 - q) over one denominator; every field it uses must have a value."""
+        assert self.corner_hz is not None
+        w = math.tan(math.pi * self.corner_hz * sample_time_s)
+        if not self.is_second_order:
+            num, den, rest = [w, w], np.array([1 + w, w - 1]), [-1.0, 0.0]
+        else:
+            assert self.damping is not None
+            damping = 2 * self.damping * w
+            num, rest = [w * w, 2 * w * w, w * w], [-1 - damping, 1 - damping, 0.0]
+            den = np.array([1 + damping + w * w, 2 * (w * w - 1), 1 - damping + w * w])
+        over, left = (TransferFunction(num=np.array(top) / den[0], den=den / den[0]) for top in (num, rest))
+        return over, left
 
 
 @record(eq=False)
@@ -305,8 +352,8 @@ class Gains:
         Weight of the reference in what is differentiated.
     observer : DisturbanceObserver, optional
         Of a pid_dob.
-    notch : Notch, optional
-        With a value in every field.
+    notch, prefilter : Notch and Prefilter, optional
+        With a value in every field that they use.
     inner : InnerLoop, optional
         Of a cascade.
 
@@ -321,6 +368,7 @@ class Gains:
     observer: DisturbanceObserver | None = None
     notch: Notch | None = None
     inner: InnerLoop | None = None
+    prefilter: Prefilter | None = None
 
     @property
     def integral_rad_s(self) -> float:
@@ -330,7 +378,7 @@ class Gains:
         return self.k_i / (1.0 + self.k_p)
 
     def by_name(self) -> dict[str, float]:
-        """Return the numbers by name, those of observer and notch too."""
+        """Return the numbers by name, those of observer, notch and prefilter too."""
         out = {name: getattr(self, name) for name in LAW_GAINS}
         if self.observer is not None:
             out["T_q"] = self.observer.T_q
@@ -339,6 +387,9 @@ class Gains:
             out |= {"T_v": self.inner.T_v} if self.inner.integrates else {}
         if self.notch is not None:
             out |= {f"notch_{name}": value for name, value in asdict(self.notch).items()}
+        if self.prefilter is not None:
+            numbers = {name: getattr(self.prefilter, name) for name in ("corner_hz", "damping")}
+            out |= {f"prefilter_{name}": value for name, value in numbers.items() if value is not None}
         return out
 
     @classmethod
@@ -346,14 +397,21 @@ class Gains:
         cls, numbers: Mapping[str, float], observer: DisturbanceObserver | None = None, speed: SpeedLoop | None = None
     ) -> Gains:
         """Return the gains of `by_name`; those of an observer are its own, and what a speed loop reads is given."""
-        notch = inner = None
+        notch = inner = prefilter = None
+        if PREFILTER in numbers:
+            damping = numbers.get("prefilter_damping")
+            order = PREFILTER_ORDERS[damping is not None]
+            prefilter = Prefilter(order=order, corner_hz=numbers[PREFILTER], damping=damping)
         if speed is not None:
             inner = InnerLoop(
                 k_v=numbers["k_v"], k_ff=numbers["k_ff"], T_v=numbers.get("T_v", math.inf), speed=speed
             )  # fmt: skip
         if "notch_depth" in numbers:
             notch = Notch(**{field.name: numbers[f"notch_{field.name}"] for field in fields(Notch)})
-        return cls(**{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch, inner=inner)
+        return cls(
+            **{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch, inner=inner,
+            prefilter=prefilter,
+        )  # fmt: skip
 
     def makes(self, law: Law, structure: Structure) -> bool:
         """Tell whether these gains make a law: its responses, to a millionth, and its integrators."""
@@ -383,6 +441,8 @@ class Gains:
         if self.notch is not None:
             over, under = self.notch.biquad(sample_time_s)
             law = law.through(TransferFunction(num=over / under[0], den=under / under[0]))
+        if self.prefilter is not None:
+            law = law.with_reference_behind(*self.prefilter.filters(sample_time_s))
         return law.law(sample_time_s)
 
 
@@ -401,7 +461,8 @@ def _or_one(polynomial: Float[np.ndarray, " n"] | None) -> Float[np.ndarray, " m
 class LawTerms(NamedTuple):
     """What a law is made of at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer).
 
-    `ahead` is in series with feedforward: `series` but for the integral of a speed loop.
+    `ahead` is in series with feedforward: `series` but for the integral of a speed loop. C_r is behind the `prefilter`
+    besides.
     """
 
     series: Any
@@ -409,11 +470,12 @@ class LawTerms(NamedTuple):
     rate: Any
     observer: Any
     ahead: Any
+    prefilter: Any
 
 
 def evaluate_terms(
     q: Any, ts: Any, T_f: Any, observer: tuple[Any, Any, Any] | None = None,
-    notch: tuple[Any, Any, Any] | None = None, speed_rate: Any = 0.0,
+    notch: tuple[Any, Any, Any] | None = None, speed_rate: Any = 0.0, prefilter: tuple[Any, Any | None] | None = None,
 ) -> LawTerms:  # fmt: skip
     """Return the terms of a law at q, for numbers that may be arrays or symbols.
 
@@ -429,19 +491,25 @@ def evaluate_terms(
         w = tan(pi f T_s) of its frequency.
     speed_rate
         1/T_v of a speed loop, rad/s; 0 where it does not integrate.
+    prefilter : (w, damping), optional
+        The same w of its corner; the damping is None in one of first order.
 
     """
     series: Any = 1.0
     more: Any = 0.0
+    low_pass: Any = 1.0
+    s = (1.0 - q) / (1.0 + q)
     if observer is not None:
         T_q, kept, inverse = observer
         lag = ts / (T_q + ts - q * T_q)
         series, more = 1.0 / (1.0 - lag * lag * kept), lag * lag * inverse
     if notch is not None:
         w, width, depth = notch
-        s = (1.0 - q) / (1.0 + q)
         series = series * (s * s + s * (2.0 * depth * width * w) + w * w) / (s * s + s * (2.0 * width * w) + w * w)
+    if prefilter is not None:
+        w, damping = prefilter
+        low_pass = w / (s + w) if damping is None else (w * w) / (s * s + s * (2.0 * damping * w) + w * w)
     rate = (1.0 - q) / (T_f + ts - q * T_f)
     integral = (1.0 + q) / (1.0 - q) * (ts / 2)
     inside = series if isinstance(speed_rate, float) and not speed_rate else series * (integral * speed_rate + 1.0)
-    return LawTerms(series=inside, integral=integral, rate=rate, observer=more, ahead=series)
+    return LawTerms(series=inside, integral=integral, rate=rate, observer=more, ahead=series, prefilter=low_pass)

@@ -95,7 +95,7 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
         What is to be tuned.
     grid : Grid
         Frequencies that the limits are looked at on.
-    start : array, shape (12,)
+    start : array, shape (14,)
         Stable.
     steps : int
         Programs solved at most.
@@ -153,10 +153,10 @@ def _measure_merit(task: Task, grid: Grid, x: LawNumbers) -> float:
 
 def linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     """Return the law on a grid with its derivatives by the gains."""
-    series, integral, rate, _, _ = task.terms(grid, x)
+    series, integral, rate, _, _, prefilter = task.terms(grid, x)
     one, none, gains = np.ones_like(grid.q), np.zeros_like(grid.q), task.gains_tuned
     by_y = series * np.array([one, integral, rate, none, none, none])[gains]
-    by_r = series * np.array([one, integral, rate, -one, -rate, none])[gains]
+    by_r = series * prefilter * np.array([one, integral, rate, -one, -rate, none])[gains]
     by_speed = series * np.array([none, none, none, none, none, one])[gains]
     sensing = none if task.speed_loop is None else task.speed_loop.sense(grid.q, task.spec.sample_time_s)
     return _Affine(law=task.respond(grid, x), by_y=by_y, by_r=by_r, by_v=by_speed * sensing, by_speed=by_speed)

@@ -1,7 +1,7 @@
-r"""Refine all twelve numbers of a law at once by an interior-point method on exact derivatives, the tuner's third step.
+r"""Refine all numbers of a law at once by an interior-point method on exact derivatives, the tuner's third step.
 
 The quadratic programs leave filters where the scan put them and stop at a first-order step. Here gains, weights, T_f,
-T_q, T_v and notch move together: minimise the objective subject to
+T_q, T_v, notch and prefilter move together: minimise the objective subject to
 
 .. math:: \ln u_i(x) \le s, \qquad \ln (\sqrt2\,|P C_r| / |1 + L|)_{f_b} = 0
 
@@ -27,6 +27,7 @@ from seaopt.control.laws.structures import evaluate_terms
 from seaopt.control.loops.measured.loop import leave_positive
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
+    DAMPING,
     FRICTION,
     K_D,
     K_I,
@@ -36,6 +37,7 @@ from seaopt.control.tuning.optimisation_problem import (
     NOTCH_W,
     NOTCH_WIDTH,
     PASSIVE,
+    PREFILTER_W,
     SPEED_RATE,
     T_F,
     T_Q,
@@ -115,7 +117,7 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNum
         What is to be tuned.
     grid : Grid
         Frequencies that the limits are looked at on.
-    start : array, shape (12,)
+    start : array, shape (14,)
         Stable.
     rounds : int
         Solutions at most; each adds the points where the one before broke a limit.
@@ -182,7 +184,7 @@ class _Points(NamedTuple):
 @lru_cache(maxsize=32)
 def _build_program(
     quadrature: int, kinds: tuple[str, ...], observer: bool, notch: bool, noise: bool, discs: bool, paths: bool,
-    gains: int, inside: bool,
+    gains: int, inside: bool, prefilter: str,
 ) -> tuple[Any, list[str]]:  # fmt: skip
     """Return the IPOPT solver and the names of its data, in order."""
     passive = PASSIVE in kinds
@@ -190,23 +192,24 @@ def _build_program(
     total = n + quadrature * WORST_PLANTS * (not noise)
     complex_data = ("p", "q", "kept", "inverse", *(("fixed", "speed", "sense") if paths else ()))
     shapes = {f"{name}_{part}": total for name in complex_data for part in ("re", "im")} | {
-        "weight": quadrature, "ln_level": n, "at": 2 * len(complex_data), "ts": 1, "kff": 1, "scale": 12,
+        "weight": quadrature, "ln_level": n, "at": 2 * len(complex_data), "ts": 1, "kff": 1, "scale": 14,
         "linear": 3 * gains, "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
-    v, t, slack = ca.MX.sym("v", 12), ca.MX.sym("t"), ca.MX.sym("slack")
+    v, t, slack = ca.MX.sym("v", 14), ca.MX.sym("t"), ca.MX.sym("slack")
     x = v * data["scale"]
 
     def law(part: dict[str, Any]) -> _Points:
         """Return plants and law at some points."""
         at = {name: _Complex(part[f"{name}_re"], part[f"{name}_im"]) for name in complex_data}
-        series, integral, rate, more, ahead = evaluate_terms(
+        series, integral, rate, more, ahead, low_pass = evaluate_terms(
             at["q"], data["ts"], x[T_F], (x[T_Q], at["kept"], at["inverse"]) if observer else None,
             (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH]) if notch else None, x[SPEED_RATE] if inside else 0.0,
+            (x[PREFILTER_W], x[DAMPING] if prefilter == "second_order" else None) if prefilter else None,
         )  # fmt: skip
         both = integral * x[K_I] + x[K_P]
         c_y = (both + rate * x[K_D] + more) * series
-        c_r = (both - x[W_R] + rate * (x[K_D] - x[W_C])) * series + _Complex.of(ahead) * data["kff"]
+        c_r = ((both - x[W_R] + rate * (x[K_D] - x[W_C])) * series + _Complex.of(ahead) * data["kff"]) * low_pass
         loop, c_v = at["p"] * c_y, _Complex.of(0.0)
         if paths:
             through = _Complex.of(series) * x[K_V]
@@ -325,7 +328,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     sizes[[W_R, W_C]] = task.k_ff + start[K_P], start[K_D]
     least_v = LEAST_SPEED_GAIN / (float(np.abs(grid.speed[0, at])) or 1.0)
     scale = np.maximum(
-        sizes, [0.1, 0.1, 1e-4, 0.1, 1e-4, least_v, 0.1 * spec.sample_time_s, 1e-4, 1.0, 1e-3, 1e-2, 1e-2]
+        sizes, [0.1, 0.1, 1e-4, 0.1, 1e-4, least_v, 0.1 * spec.sample_time_s, 1e-4, 1.0, 1e-3, 1e-2, 1e-2, 1e-3, 1e-2]
     )  # fmt: skip
     (linear, least, largest), gains = task.linear_limits(start), task.gains_tuned
     rows = np.max(np.abs(linear * scale[gains]), axis=1)  # each in units of its largest term
@@ -352,6 +355,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     solver, _ = _build_program(
         weights.size, (*kinds, *([PASSIVE] * passive), *([FRICTION] * friction)), task.nominal is not None,
         spec.notch is not None, noise, radii.size > 0, paths, gains.stop, bool(start[SPEED_RATE] > 0.0),
+        "" if spec.reference_filter is None else spec.reference_filter.order,
     )  # fmt: skip
     used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
     value = task.objective(grid, start)

@@ -1,4 +1,4 @@
-r"""The optimisation problem of the tuner: plants, frequencies and limits as arrays, a law as twelve numbers.
+r"""The optimisation problem of the tuner: plants, frequencies and limits as arrays, a law as fourteen numbers.
 
 Every limit is one curve over frequency, its *usage*, which must not exceed 1 (`seaopt.control.laws.limits`):
 :math:`|X| / (m\,|1 + L|)`, or its inverse where abs(X) is to be above. As m is what the specification allows less the
@@ -19,10 +19,11 @@ taken off; and where a friction margin is asked for, one of each plant with fric
 The reference's weights are counted from feedforward and feedback of the error: with :math:`w_r = 1/P(0) + k_p - k_r`
 and :math:`w_c = (1 - c) k_d`,
 
-.. math:: C_r = h/P(0) + g \,(k_p - w_r + k_i I + (k_d - w_c) D), \qquad C_y = g \,(k_p + k_i I + k_d D + O)
+.. math:: C_r = F \,[h/P(0) + g \,(k_p - w_r + k_i I + (k_d - w_c) D)], \qquad C_y = g \,(k_p + k_i I + k_d D + O)
 
-(terms of `LawTerms`; h is g but for the integral of a speed loop) are affine in the gains, on which there are three
-linear limits besides: :math:`k_i \ge \omega_i (1 + k_p)`, :math:`w_r \le 1/P(0) + k_p`, :math:`w_c \le k_d`.
+(terms of `LawTerms`; h is g but for the integral of a speed loop, and F the prefilter) are affine in the gains, on
+which there are three linear limits besides: :math:`k_i \ge \omega_i (1 + k_p)`, :math:`w_r \le 1/P(0) + k_p`,
+:math:`w_c \le k_d`.
 
 **Further signals.** The loop is broken at the command: :math:`1 + L = B + P C_y` with
 :math:`B = 1 + \sum_i P_i C_i` over the signals that the law reads besides the regulated one. Of a given filter
@@ -45,7 +46,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, LimitCurve, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
-from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
+from seaopt.control.laws.spec import HIGHEST_CORNER, LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import (
     DisturbanceObserver,
     Gains,
@@ -53,6 +54,7 @@ from seaopt.control.laws.structures import (
     LawTerms,
     Nominal,
     Notch,
+    Prefilter,
     SpeedLoop,
     evaluate_terms,
 )
@@ -81,12 +83,14 @@ SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
 MORE_FREQUENCIES = 300  # about lightly damped modes
 LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
 NO_LIMIT = 1e9
+NO_FLOOR = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
 LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 NEARLY_KEPT = 1.001
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
 SLOWEST_SPEED_RATE = 4.0 * INTEGRAL_RAD_S  # 1/T_v, rad/s, of a speed loop that integrates
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
-HIGHEST_NOTCH = 0.45  # of the sample rate
+LOWEST_PREFILTER = 0.3  # of the bandwidth
+PREFILTER_DAMPING = (0.4, 2.0)
 CURVES = {limit.name: limit.curve for limit in LIMITS if limit.curve is not None}
 SCOPES: dict[Scope, tuple[str, ...]] = {
     scope: tuple(name for name in CURVES if BY_NAME[name].scope == scope) for scope in ("every plant", "design plant")
@@ -95,9 +99,9 @@ TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r") 
 PASSIVE, FRICTION = "passive_band_hz", "min_friction_margin"
 MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
 
-# k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth
-LawNumbers = Float[np.ndarray, " 12"]
-K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH = range(12)
+# k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
+LawNumbers = Float[np.ndarray, " 14"]
+K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH, PREFILTER_W, DAMPING = range(14)
 
 
 @record(eq=False)
@@ -272,7 +276,7 @@ class Task:
     def level(self, name: str, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return a curve's level, with the reserve taken off; one that is never reached where none is imposed."""
         curve, limit, keep = CURVES[name], BY_NAME[name], 1.0 - self.spec.reserve
-        allowed, never = self.spec.allowed(limit), 1.0 / NO_LIMIT if curve.floor else NO_LIMIT
+        allowed, never = self.spec.allowed(limit), NO_FLOOR if curve.floor else NO_LIMIT
         if allowed is None:
             return np.full(f.size, never)
         if limit.reserve == "figure":
@@ -293,12 +297,17 @@ class Task:
         fixed, free = (0.0, 0.0), (0.0, np.inf)
         notch = ((0.1, 0.1), (0.5, 0.5), (1.0, 1.0))
         if spec.notch is not None:
-            centre = _range(spec.notch.frequency_hz, LOWEST_NOTCH * spec.bandwidth_hz, HIGHEST_NOTCH / ts)
+            centre = _range(spec.notch.frequency_hz, LOWEST_NOTCH * spec.bandwidth_hz, HIGHEST_CORNER / ts)
             notch = (
                 (float(np.tan(np.pi * centre[0] * ts)), float(np.tan(np.pi * centre[1] * ts))),
                 _range(spec.notch.width, 0.02, 1.0),
                 _range(spec.notch.depth, 0.01, 1.0),
             )
+        low_pass, prefilter = spec.reference_filter, ((1.0, 1.0), (1.0, 1.0))
+        if low_pass is not None:
+            corner = _range(low_pass.corner_hz, LOWEST_PREFILTER * spec.bandwidth_hz, HIGHEST_CORNER / ts)
+            damping = _range(low_pass.damping, *PREFILTER_DAMPING) if low_pass.is_second_order else (1.0, 1.0)
+            prefilter = ((float(np.tan(np.pi * corner[0] * ts)), float(np.tan(np.pi * corner[1] * ts))), damping)
         ranges = [
             free, free if integrates else fixed, free,
             free if integrates and spec.reference_weights != "error" else fixed,
@@ -306,17 +315,22 @@ class Task:
             free if self.speed_loop is not None else fixed,
             ((spec.level("min_filter_samples") or 0.0) * ts, 4.0 / (2 * np.pi * spec.bandwidth_hz)),
             (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0),
-            (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed, *notch,
+            (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed,
+            *notch, *prefilter,
         ]  # fmt: skip
         low, high = (np.array(ends, dtype=float) for ends in zip(*ranges, strict=True))
         return low, high
 
     def gains(self, x: LawNumbers) -> Gains:
         """Return a vector's numbers by name."""
-        ts, notch = self.spec.sample_time_s, None
+        ts, notch, low_pass = self.spec.sample_time_s, None, self.spec.reference_filter
         if self.spec.notch is not None:
             centre = float(np.arctan(x[NOTCH_W]) / (np.pi * ts))
             notch = Notch(frequency_hz=centre, width=float(x[NOTCH_WIDTH]), depth=float(x[NOTCH_DEPTH]))
+        if low_pass is not None:
+            damping = float(x[DAMPING]) if low_pass.is_second_order else None
+            corner = float(np.arctan(x[PREFILTER_W]) / (np.pi * ts))
+            low_pass = Prefilter(order=low_pass.order, corner_hz=corner, damping=damping)
         k_p, k_d = float(x[K_P]), float(x[K_D])
         whole = self.spec.reference_weights != "measurement"
         inner = None
@@ -327,6 +341,7 @@ class Task:
             k_p=k_p, k_i=float(x[K_I]), k_d=k_d, T_f=float(x[T_F]),
             k_r=k_p - float(x[W_R]) + (self.k_ff if inner is None else 0.0),
             c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole), notch=notch, inner=inner,
+            prefilter=low_pass,
             observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[T_Q])),
         )  # fmt: skip
 
@@ -343,7 +358,8 @@ class Task:
 
     def is_stable(self, x: LawNumbers) -> bool:
         """Tell whether every plant's loop is stable: by its eigenvalues, or by the turns of a measured one."""
-        law = self.law_of(x)
+        loop_gains = replace(self.gains(x), prefilter=None)  # which is no part of the loop
+        law = loop_gains.law(self.spec.structure, self.spec.sample_time_s)
         return all(close_plant(plant, law).is_stable() for plant in self.plants)
 
     def grid(self, f: Float[np.ndarray, " m"], rows: Sequence[int] | None = None) -> Grid:
@@ -406,13 +422,15 @@ class Task:
         """Return the law's terms on a grid."""
         observer = None if self.nominal is None else (x[T_Q], grid.kept, grid.inverse)
         notch = None if self.spec.notch is None else (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH])
-        return evaluate_terms(grid.q, self.spec.sample_time_s, x[T_F], observer, notch, x[SPEED_RATE])
+        low_pass = self.spec.reference_filter
+        prefilter = None if low_pass is None else (x[PREFILTER_W], x[DAMPING] if low_pass.is_second_order else None)
+        return evaluate_terms(grid.q, self.spec.sample_time_s, x[T_F], observer, notch, x[SPEED_RATE], prefilter)
 
     def law(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
         """Return C_r and C_y on a grid."""
-        series, integral, rate, observer, ahead = self.terms(grid, x)
+        series, integral, rate, observer, ahead, prefilter = self.terms(grid, x)
         both = x[K_P] + x[K_I] * integral
-        c_r = ahead * self.k_ff + series * (both - x[W_R] + (x[K_D] - x[W_C]) * rate)
+        c_r = prefilter * (ahead * self.k_ff + series * (both - x[W_R] + (x[K_D] - x[W_C]) * rate))
         return c_r, series * (both + x[K_D] * rate + observer)
 
     def respond(self, grid: Grid, x: LawNumbers) -> LawResponse:

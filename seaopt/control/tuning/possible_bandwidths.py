@@ -41,7 +41,7 @@ def find_possible_bandwidths(
     ----------
     task : Task
         Of a bandwidth that does not keep them.
-    x : array, shape (12,)
+    x : array, shape (14,)
         The numbers that miss them least there.
     progress : callable, optional
         Called before each bandwidth that is tried.

@@ -27,8 +27,8 @@ from seaopt.control.tuning.optimisation_problem import FRICTION, Grid, LawNumber
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, count_off, divide, ignore
 
-STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
-STARTS_REFINED = 2  # one more with an observer, all with a notch
+STARTS_TRIED = 3  # two more where an observer, a notch or a prefilter makes more valleys
+STARTS_REFINED = 2  # one more with an observer or a prefilter, all with a notch
 RECHECKS = 3
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: less is not looked for
@@ -44,7 +44,7 @@ def solve(task: Task, warm: Sequence[LawNumbers] = (), progress: Progress = igno
     ----------
     task : Task
         What is to be tuned.
-    warm : sequence of arrays, shape (12,)
+    warm : sequence of arrays, shape (14,)
         Numbers to start from besides those of the scan, which then tries one less.
     progress : callable, optional
         Called as starts are refined.
@@ -140,7 +140,7 @@ def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress:
     """Find the best numbers on a grid."""
     scanning, improving, refining = divide(progress, SCAN, IMPROVEMENT, REFINEMENT)
     scanning("scanning gains", 0.0)
-    more = task.nominal is not None or task.spec.notch is not None
+    more = task.nominal is not None or task.spec.notch is not None or task.spec.reference_filter is not None
     warm = [task.tidy(x) for x in warm]
     first = [x for x in warm if task.is_stable(x)] + find_starts(task, grid, STARTS_TRIED + 2 * more - bool(warm))
     ranked = sorted((improve(task, grid, x) for x in count_off(first, "start", improving)), key=lambda pair: pair[0])

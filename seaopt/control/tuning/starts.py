@@ -1,18 +1,19 @@
 r"""Find starts for the tuner: a scan of laws that have the bandwidth exactly, and one that is always stable.
 
 With the other numbers given, the design plant's bandwidth is a quadratic equation in one of them. Let :math:`a = P g`
-with g the series part, B what further signals make of 1, :math:`Y = k_i I + k_d D + O` and
+with g the series part, F the prefilter, B what further signals make of 1, :math:`Y = k_i I + k_d D + O` and
 :math:`R = h/(g P(0)) + k_i I + (k_d - w_c) D` (terms of `LawTerms`). Where the reference's
 weight k_r is fixed, that number is k_p: at :math:`f_b`
 
 .. math::
-    2\,|a|^2 |k_p + R|^2 = |B + a Y + a k_p|^2 \iff
-    |a|^2 k_p^2 + 2\,\mathrm{Re}(2|a|^2 R - a\,\overline{(B + aY)})\,k_p + 2|a|^2|R|^2 - |B + aY|^2 = 0 .
+    2\,|aF|^2 |k_p + R|^2 &= |B + a Y + a k_p|^2 \iff \\
+    |a|^2 (2|F|^2 - 1) k_p^2 + 2\,\mathrm{Re}(2|aF|^2 R - a\,\overline{(B + aY)})\,k_p
+    + 2|aF|^2|R|^2 - |B + aY|^2 &= 0 .
 
 Where it is free, that number is w_r, which leaves the loop as it is:
 
 .. math::
-    |k_p + R - w_r| = \rho = \frac{|B + a (k_p + Y)|}{\sqrt2\,|a|} \iff
+    |k_p + R - w_r| = \rho = \frac{|B + a (k_p + Y)|}{\sqrt2\,|aF|} \iff
     w_r = k_p + \mathrm{Re}\,R \pm \sqrt{\rho^2 - (\mathrm{Im}\,R)^2} .
 
 The scan solves these over a grid of the others and ranks both roots by the largest usage of a limit on a coarse set of
@@ -31,9 +32,9 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S
+from seaopt.control.laws.spec import HIGHEST_CORNER
 from seaopt.control.laws.structures import CASCADE, LawTerms
 from seaopt.control.tuning.optimisation_problem import (
-    HIGHEST_NOTCH,
     K_D,
     K_I,
     K_P,
@@ -41,6 +42,7 @@ from seaopt.control.tuning.optimisation_problem import (
     LOWEST_NOTCH,
     NOTCH_W,
     OBJECTIVE_HZ,
+    PREFILTER_W,
     SCOPES,
     SPEED_RATE,
     T_F,
@@ -68,7 +70,11 @@ SCANNED_PLANTS = 4
 PASSIVE_FREQUENCIES = 20  # of the passive band
 SPEED_GAINS = (0.3, 1.0, 3.0, 10.0)  # of k_v, over the speed per command at the bandwidth
 SPEED_RATES = (0.0, 0.2)  # of 1/T_v, over the bandwidth's rad/s
-Shape = tuple[float, ...]  # k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth
+PREFILTERS = (0.7, 1.2, 2.0)  # corners over the bandwidth; and the highest, which is next to none
+PREFILTER_START = 0.8  # damping
+# k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
+Shape = tuple[float, ...]
+LEAST_LEAD = 1e-9  # of the bandwidth equation's leading coefficient
 LEAST_TURN = -0.3 * np.pi  # of 1 + L from the lowest frequency to the highest: less is an encirclement
 
 
@@ -105,18 +111,20 @@ def find_starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
 def make_rest_start(task: Task) -> LawNumbers:
     """Return the law with next to no feedback, stable because the plants are."""
     ts = task.spec.sample_time_s
-    return task.tidy(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, ts, 10.0, 0.0, 0.3, 0.5, 1.0]))
+    return task.tidy(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, ts, 10.0, 0.0, 0.3, 0.5, 1.0, 1.0, 1.0]))
 
 
 def _are_alike(task: Task, x: LawNumbers, other: LawNumbers) -> bool:
     """Tell whether two starts lead to the same place: valleys differ by notch, observer or integral."""
     apart = np.abs(np.log((x + 1e-4) / (other + 1e-4)))
     if task.spec.notch is not None:
-        apart = apart[NOTCH_W:]
+        apart = apart[NOTCH_W:PREFILTER_W]
     elif task.nominal is not None:
         apart = apart[[K_I, T_Q]]
     elif task.speed_loop is not None:
         apart = apart[[K_I, K_V, SPEED_RATE]]
+    elif task.spec.reference_filter is not None:
+        apart = apart[[K_I, PREFILTER_W]]
     elif task.spec.structure == "pid":
         apart = apart[K_I]
     return bool(np.max(apart) < 0.4)
@@ -145,7 +153,7 @@ def _thin_grid(task: Task, grid: Grid) -> Grid:
 
 
 def _list_shapes(task: Task, grid: Grid) -> Iterator[Shape]:
-    """Yield (k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth) to try."""
+    """Yield shapes to try."""
     low, high = task.bounds(make_rest_start(task))
     spec, ts = task.spec, task.spec.sample_time_s
     unit = 1 / (2 * np.pi * spec.bandwidth_hz)
@@ -153,9 +161,10 @@ def _list_shapes(task: Task, grid: Grid) -> Iterator[Shape]:
     filters = np.geomspace(max(0.15 * ts, low[T_F]), min(0.7 * unit, high[T_F]), 3 if few else 5)
     # An output that swings at a few tenths of a hertz bears only a slow observer.
     lags = [0.5 * unit, 2.0 * unit, 8.0 * unit, 0.5, 3.0] if task.nominal is not None else [1.0]
-    notches = _list_notches(task) if spec.notch is not None else [tuple(low[NOTCH_W:])]
-    for t_f, t_q, (k_v, speed_rate), notch in itertools.product(filters, lags, _list_speed_loops(task, grid), notches):
-        shape = np.clip((k_v, t_f, t_q, 0.0, *notch), low[K_V:], high[K_V:])
+    notches = _list_notches(task) if spec.notch is not None else [tuple(low[NOTCH_W:PREFILTER_W])]
+    every = itertools.product(filters, lags, _list_speed_loops(task, grid), notches, _list_prefilters(task))
+    for t_f, t_q, (k_v, speed_rate), notch, prefilter in every:
+        shape = np.clip((k_v, t_f, t_q, 0.0, *notch, *prefilter), low[K_V:], high[K_V:])
         shape[SPEED_RATE - K_V] = speed_rate
         yield (*shape,)
 
@@ -170,14 +179,23 @@ def _list_speed_loops(task: Task, grid: Grid) -> list[tuple[float, float]]:
     return [(0.0, 0.0), *itertools.product(map(float, gains), rates)]
 
 
+def _list_prefilters(task: Task) -> list[tuple[float, float]]:
+    """Return (prefilter_w, prefilter_damping) to try."""
+    if task.spec.reference_filter is None or task.spec.reference_filter.corner_hz is not None:
+        return [(1.0, 1.0)]
+    highest = HIGHEST_CORNER * task.spec.sample_rate_hz
+    corners = np.minimum([*(task.spec.bandwidth_hz * np.array(PREFILTERS)), highest], highest)
+    return [(float(w), PREFILTER_START) for w in np.tan(np.pi * corners * task.spec.sample_time_s)]
+
+
 def _list_notches(task: Task) -> list[tuple[float, float, float]]:
     """Return (notch_w, notch_width, notch_depth) to try: none, and some at light modes and above the bandwidth."""
     f_b, ts = task.spec.bandwidth_hz, task.spec.sample_time_s
     modes = [f for plant in task.plants[:SCANNED_PLANTS] for f, _ in find_light_modes(plant) if f > f_b]
-    centres = np.minimum(np.unique(np.round([*modes, 1.5 * f_b, 3.0 * f_b], 1)), HIGHEST_NOTCH / ts)
+    centres = np.minimum(np.unique(np.round([*modes, 1.5 * f_b, 3.0 * f_b], 1)), HIGHEST_CORNER / ts)
     shapes = ((0.2, 0.1), (0.6, 0.1), (0.6, 0.4))
     w = np.tan(np.pi * centres * ts)
-    least = float(np.tan(np.pi * min(LOWEST_NOTCH * f_b, HIGHEST_NOTCH / ts) * ts))
+    least = float(np.tan(np.pi * min(LOWEST_NOTCH * f_b, HIGHEST_CORNER / ts) * ts))
     return [
         (float(w[-1]), 0.5, 1.0),
         (least, 0.05, 0.05),
@@ -222,13 +240,17 @@ class _Scan:
         return k_p + k_i * self.terms.integral + k_d * self.terms.rate + self.terms.observer
 
     def reference(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
-        """Return C_r of laws, without the series part."""
+        """Return C_r of laws, without the series part and the prefilter."""
         k_p, k_i, k_d, w_r, w_c = gains.T[:, :, None]
         ahead = self.task.k_ff * self.terms.ahead / self.terms.series
         return ahead + k_p - w_r + k_i * self.terms.integral + (k_d - w_c) * self.terms.rate
 
+    def behind_prefilter(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
+        """Return C_r of laws."""
+        return self.terms.series * self.terms.prefilter * self.reference(gains)
 
-def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 12"]]:
+
+def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 14"]]:
     """Return merits (less is better) and numbers of the laws of one shape."""
     x = np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape])
     terms, (c_v, rest) = task.terms(grid, x), task.feed_speed(grid, x)
@@ -249,11 +271,12 @@ def _scan_fixed_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.n
     k_d, k_i, weight = (values.ravel() for values in grids)
     gains = np.column_stack([0.0 * k_d, k_i, k_d, 0.0 * k_d, weight * k_d])[(k_d > 0.0) | (weight == weight[0])]
     back = complex(scan.rest[0, scan.at]) + scan.through * scan.measurement(gains)[:, scan.at]
-    k_p = _solve_bandwidth(scan.through, scan.reference(gains)[:, scan.at], back)
+    low_pass = complex(scan.terms.prefilter[scan.at])
+    k_p = _solve_bandwidth(scan.through, low_pass, scan.reference(gains)[:, scan.at], back)
     gains = np.tile(gains, (2, 1))
     gains[:, K_P] = k_p
     gains = gains[np.isfinite(k_p) & (k_p >= 0.0)]
-    c_y, c_r = (scan.terms.series * law for law in (scan.measurement(gains), scan.reference(gains)))
+    c_y, c_r = scan.terms.series * scan.measurement(gains), scan.behind_prefilter(gains)
     return _judge_loops(scan, c_y) + _judge_tracking(scan, c_y, c_r) + _price_missing_integral(scan, gains), gains
 
 
@@ -272,12 +295,12 @@ def _scan_free_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.nd
     gains[:, W_C] = np.resize(weights, chosen.size) * gains[:, K_D]
     whole = scan.reference(gains)[:, scan.at]
     one = scan.rest[0, scan.at] + scan.grid.p[0, scan.at] * c_y[:, scan.at]
-    size = np.abs(one) / (np.sqrt(2.0) * abs(scan.through))
+    size = np.abs(one) / (np.sqrt(2.0) * abs(scan.through * scan.terms.prefilter[scan.at]))
     with np.errstate(invalid="ignore"):
         gains[:, W_R] = np.real(whole) + np.resize([-1.0, 1.0], chosen.size) * np.sqrt(size**2 - np.imag(whole) ** 2)
     keep = (gains[:, W_R] >= 0.0) & (gains[:, W_R] <= scan.task.k_ff + gains[:, K_P])
     gains, c_y, merit = gains[keep], c_y[keep], merit[keep]
-    return merit + _judge_tracking(scan, c_y, scan.terms.series * scan.reference(gains)), gains
+    return merit + _judge_tracking(scan, c_y, scan.behind_prefilter(gains)), gains
 
 
 def _choose_loops(merit: Float[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
@@ -311,15 +334,17 @@ def _price_missing_integral(scan: _Scan, gains: Float[np.ndarray, "n 5"]) -> Flo
 
 
 def _solve_bandwidth(
-    a: complex, slope: Complex[np.ndarray, " n"], one: Complex[np.ndarray, " n"]
+    a: complex, low_pass: complex, slope: Complex[np.ndarray, " n"], one: Complex[np.ndarray, " n"]
 ) -> Float[np.ndarray, " two_n"]:
     """Return both roots k_p of the bandwidth equation, `one` being B + aY; not a number where there is none."""
-    size = abs(a) ** 2
-    half = np.real(2.0 * size * slope - a * np.conj(one))
-    rest = 2.0 * size * np.abs(slope) ** 2 - np.abs(one) ** 2
+    size, passed = abs(a) ** 2, 2.0 * abs(a * low_pass) ** 2
+    half = np.real(passed * slope - a * np.conj(one))
+    rest = passed * np.abs(slope) ** 2 - np.abs(one) ** 2
+    lead = passed - size
+    lead = lead if abs(lead) > LEAST_LEAD * size else LEAST_LEAD * size  # at |F|^2 = 1/2 it is linear
     with np.errstate(invalid="ignore"):
-        root = np.sqrt(half**2 - size * rest)
-    return np.concatenate([(-half + root) / size, (-half - root) / size])
+        root = np.sqrt(half**2 - lead * rest)
+    return np.concatenate([(-half + root) / lead, (-half - root) / lead])
 
 
 def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:

@@ -1,9 +1,9 @@
 r"""Tune a controller: place a bandwidth under limits on several plants at once, for `so.tune`.
 
-The law is twelve numbers at most: gains k_p, k_i, k_d, and k_v of a speed loop; weights k_r, c of the reference;
-filters T_f, T_q; the speed loop's T_v; a notch's frequency, width and depth. Every limit is a curve over frequency on
-every plant (`seaopt.control.tuning.optimisation_problem`), and the design plant's bandwidth an equality. That is solved
-by `seaopt.control.tuning.solution`.
+The law is fourteen numbers at most: gains k_p, k_i, k_d, and k_v of a speed loop; weights k_r, c of the reference;
+filters T_f, T_q; the speed loop's T_v; a notch's frequency, width and depth; a prefilter's corner and damping. Every
+limit is a curve over frequency on every plant (`seaopt.control.tuning.optimisation_problem`), and the design plant's
+bandwidth an equality. That is solved by `seaopt.control.tuning.solution`.
 
 The result is then measured by `Loop.figures`, which uses none of these frequencies. What is returned as feasible has
 been measured to be so. Where limits cannot all be kept, the result misses them by one common factor, the least

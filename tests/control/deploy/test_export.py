@@ -19,7 +19,7 @@ from seaopt.control import Gains, Loop
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.laws.stored import read_controller
-from seaopt.control.laws.structures import DisturbanceObserver, Nominal, Notch
+from seaopt.control.laws.structures import DisturbanceObserver, Nominal, Notch, Prefilter
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from tests.c_code import STRICT, CompiledLaw
@@ -330,22 +330,25 @@ def test_an_edited_controller_json_is_refused_by_export_and_by_reading(place, va
 
 @pytest.fixture(scope="module")
 def with_everything(tuned):
-    """Return the controller.json of a pid with an observer and a notch, of numbers that nobody tuned."""
+    """Return the controller.json of a pid with an observer, a notch and a prefilter, of numbers that nobody tuned."""
     notch = Notch(frequency_hz=120.0, width=0.3, depth=0.2)
+    prefilter = Prefilter(order="second_order", corner_hz=60.0, damping=0.8)
     nominal = Nominal.of(tuned.close(*tuned.design).plant)
     observer = DisturbanceObserver(nominal=nominal, T_q=5e-3)
-    gains = Gains(k_p=0.4, k_i=6.0, k_d=4e-3, T_f=2e-3, k_r=1.3, c=0.7, observer=observer, notch=notch)
+    gains = Gains(
+        k_p=0.4, k_i=6.0, k_d=4e-3, T_f=2e-3, k_r=1.3, c=0.7, observer=observer, notch=notch, prefilter=prefilter
+    )
     controller = replace(
         tuned, structure="pid_dob", gains=gains.by_name(), observer=observer,
         law=gains.law("pid_dob", tuned.sample_time_s).balanced(),
-        spec=replace(tuned.spec, structure="pid_dob", notch=notch),
+        spec=replace(tuned.spec, structure="pid_dob", notch=notch, prefilter=prefilter),
     )  # fmt: skip
     return json.loads(to_json(controller.to_dict()))
 
 
 NUMBERS = [
     *[("gains", name) for name in ("k_p", "k_i", "k_d", "T_f", "k_r", "c", "T_q", "notch_frequency_hz", "notch_width",
-                                   "notch_depth")],
+                                   "notch_depth", "prefilter_corner_hz", "prefilter_damping")],
     *[("engineering", name, "value") for name in ("k_p", "k_i", "k_d", "k_r")],
     ("observer", "T_q"), ("observer", "bandwidth_hz"), ("observer", "kept", -1), ("observer", "inverse", 0, "num", 0),
     *[("observer", name, end, 0) for name in ("Q_over_P_n",) for end in ("num", "den")], ("observer", "Q", "den", 1),

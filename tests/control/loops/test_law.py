@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 
@@ -17,6 +18,7 @@ from seaopt.control import (
     Law,
     Loop,
     Notch,
+    Prefilter,
     SampledLoop,
     command_of,
     realise,
@@ -64,12 +66,23 @@ def exact_responses(gains, rate_hz, from_one):
     if gains.notch is not None:
         over, under = gains.notch.biquad(1 / rate_hz)
         ahead, back = (value * evaluate(over, q) / evaluate(under, q) for value in (ahead, back))
+    if gains.prefilter is not None:
+        s, w = (1 - q) / (1 + q), Fraction(math.tan(math.pi * gains.prefilter.corner_hz / rate_hz))
+        zeta = gains.prefilter.damping
+        ahead *= w / (s + w) if zeta is None else w**2 / (s**2 + 2 * Fraction(zeta) * w * s + w**2)
     return float(ahead), float(back)
 
 
 @pytest.mark.parametrize("rate_hz", RATES)
 @pytest.mark.parametrize(
-    "changes", [{}, {"T_q": 3.0}, {"k_i": 0.0, "notch": Notch(frequency_hz=30, width=0.3, depth=0.2)}]
+    "changes",
+    [
+        {},
+        {"T_q": 3.0},
+        {"k_i": 0.0, "notch": Notch(frequency_hz=30, width=0.3, depth=0.2)},
+        {"prefilter": Prefilter(corner_hz=25.0)},
+        {"prefilter": Prefilter(order="second_order", corner_hz=15.0, damping=0.5)},
+    ],
 )
 def test_it_is_the_written_law_in_rational_numbers(rate_hz, changes, thor, stand):
     """At real z from 1 + 1e-7 to 4, where a rational function is as well known by its values as on the circle."""

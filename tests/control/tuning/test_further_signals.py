@@ -25,10 +25,11 @@ LAG = TransferFunction(num=np.array([3e-3, -3e-3]), den=np.array([1.0, -0.8]))
 def make_case(structure: str) -> tuple[Task, LawNumbers]:
     """Return the knee's task with a filter that is given, or with a speed loop, and the numbers of a law."""
     spec = so.ControllerSpec(
-        measured=("tau_s", "thetad_m"), structure="cascade", bandwidth_hz=15.0, max_noise_gain=45.0
+        measured=("tau_s", "thetad_m"), structure="cascade", bandwidth_hz=15.0, max_noise_gain=45.0,
+        prefilter="second_order",
     )  # fmt: skip
     task = make_task(so.plants.rotary(link="locked"), VALUES, spec, {"swing": KNEE})
-    numbers = np.array([2.0, 30.0, 0.02, 0.5, 0.005, 0.0, 2e-3, 1.0, 0.0, 0.1, 0.5, 1.0])
+    numbers = np.array([2.0, 30.0, 0.02, 0.5, 0.005, 0.0, 2e-3, 1.0, 0.0, 0.1, 0.5, 1.0, 0.08, 0.7])
     if structure == "given":
         return replace(task, spec=replace(spec, structure="pid"), further=(LAG,)), numbers
     numbers[[K_V, SPEED_RATE]] = 0.3, 12.0 if structure == "pi" else 0.0
