@@ -17,7 +17,10 @@ TEXT_AS_TEXT: dict[Any, Any] = {"svg.fonttype": "none", "pdf.fonttype": 42, "svg
 
 
 def write_figure(figure: Figure, path: Path | str) -> list[Path]:
-    """Write a figure as SVG and PNG, whose suffixes are added to the path."""
+    """Write a finished figure as SVG and PNG, whose suffixes are added to the path."""
+    from seaopt.reporting.figures.ticks import simplify_ticks
+
+    simplify_ticks(figure.axes)
     return [write_bytes(f"{path}.{kind}", render_figure(figure, kind)) for kind in ("svg", "png")]
 
 

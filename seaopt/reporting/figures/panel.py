@@ -57,7 +57,7 @@ def fill_panel(panel: Panel, axes: Sequence[Axes], *, bare: bool = False) -> Non
 
     panel.draw(axes)
     if not bare:
-        axes[0].set_title(panel.title, loc="left", fontsize=FONT + 1)
+        axes[0].set_title(panel.title, loc="left", fontsize=FONT + 1, y=1.0)  # told where, nothing is measured
         add_legend(axes)
     take_literally(axes)
 

@@ -91,6 +91,7 @@ def make_id(name: str) -> str:
 
 def _make_chart(panel: Panel) -> Chart:
     from seaopt.reporting.figures.canvas import label_lines
+    from seaopt.reporting.figures.ticks import simplify_ticks
 
     name = make_id(panel.name)
     drawn: Any = draw_panel(panel, bare=True)
@@ -109,6 +110,7 @@ def _make_chart(panel: Panel) -> Chart:
                     artist.set_gid(f"mark{number}-{len(key)}-{index}")
                 key.setdefault(label, []).append((artist.get_gid(), artist))
         panes.append(_describe_axes(axis, figure, curves, str(figure.axes[-1].get_xlabel())))
+    simplify_ticks(figure.axes)
     svg = _fit_to_page(render_figure(figure, "svg").decode("utf-8"), name, f"{panel.title}. {panel.caption}")
     entries = tuple(_make_entry(label, artists, name) for label, artists in key.items())
     return Chart(

@@ -62,7 +62,7 @@ class Pane {
     this.box = box; this.x = new Side(x); this.y = new Side(y);
     this.group = svg.getElementById(`${name}-pane${number}`);
     this.ticks = [...this.group.querySelectorAll('[id*="-xtick_"], [id*="-ytick_"]')];
-    const own = (node) => !node.closest('[id*="matplotlib.axis"], [id*="-legend"]') && !node.closest("defs, clipPath");
+    const own = (node) => !this.ticks.some((tick) => tick.contains(node)) && !node.closest("defs, clipPath");
     this.paths = [...this.group.querySelectorAll("[clip-path]")].filter(own).flatMap((node) => {
       const paths = node.tagName === "path" ? [node] : [];
       for (const path of paths) { // the clip must not move with what it clips: it goes on a group around

@@ -1,0 +1,86 @@
+"""Ticks of finished drawings against matplotlib's own, on the same axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from seaopt.reporting.figures.canvas import add_axes, new_figure, scale_log
+from seaopt.reporting.figures.panel import Panel, draw_panel
+from seaopt.reporting.figures.ticks import simplify_ticks
+
+
+def draw_linear(axes):
+    axes[0].plot([-3.0, 7.0], [-120.0, 4e3])
+    axes[0].set_ylabel("force [N]")
+    axes[0].set_xlabel("time [s]")
+
+
+def draw_log(axes):
+    upper, lower = axes
+    upper.plot([0.02, 300.0], [1e-3, 40.0])
+    lower.plot([0.02, 300.0], [0.0, 1.0])
+    scale_log(axes)
+    scale_log([upper], "y")
+    upper.set_ylabel("gain")
+    lower.set_xlabel("frequency [Hz]")
+
+
+def draw_square(axes):
+    axes[0].plot([-1.0, 1.0], [-1.0, 1.0])
+    axes[0].set_aspect("equal", adjustable="box")
+
+
+def draw_names(axes):
+    axes[0].plot([0.0, 2.0], [0.0, 2.0])
+    axes[0].set_yticks([0, 1, 2], ["J", "b_r", "eta"])
+    axes[0].tick_params(length=0)
+
+
+def make_figures(draw):
+    """Return the same figure twice, the second with its ticks replaced."""
+    heights = (0.7, 0.6) if draw is draw_log else (1.0,)
+    plain, finished = (
+        draw_panel(
+            Panel(name="one", title="one", draw=draw, heights=heights), add_axes(new_figure(5.0, 4.0), heights, 0.8)
+        )
+        for _ in range(2)
+    )
+    plain, finished = (each.get_figure(root=True) if isinstance(each, Axes) else each for each in (plain, finished))
+    simplify_ticks(finished.axes)
+    return plain, finished
+
+
+def paint(figure):
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+
+
+@pytest.mark.parametrize("draw", [draw_linear, draw_log, draw_square, draw_names])
+def test_they_look_as_matplotlibs_own(draw):
+    figures = make_figures(draw)
+    for axis in (axis for figure in figures for axis in figure.axes):
+        axis.set(xlabel="", ylabel="")
+    before, after = map(paint, figures)
+    assert np.count_nonzero(before < 128) > 1000
+    np.testing.assert_allclose(before, after, atol=2)
+
+
+@pytest.mark.parametrize("draw", [draw_linear, draw_log])
+def test_labels_stand_beyond_the_numbers(draw):
+    figures = make_figures(draw)
+    for figure in figures:
+        paint(figure)
+    ours, theirs = (
+        [
+            side.label.get_window_extent().p0
+            for axis in figure.axes
+            for side in (axis.xaxis, axis.yaxis)
+            if side.label.get_text()
+        ]
+        for figure in figures
+    )
+    np.testing.assert_allclose(ours, theirs, atol=1.5)  # pixels
