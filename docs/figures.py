@@ -15,17 +15,21 @@ from matplotlib.figure import Figure
 import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.control import (
+    CompensateFriction,
     Frontier,
     Gains,
     Impedance,
     MPCSpec,
     NoiseModel,
     Notch,
+    SampledLoop,
+    add_compensation,
     close_loop,
     command_of,
     estimator,
     force_mpc,
     passive_region,
+    run_loop,
     sample,
     sweep,
 )
@@ -297,6 +301,35 @@ def predictive_control() -> None:
     save(figure, "mpc")
 
 
+def compensation() -> None:
+    """A slow sine with the link held, and zero torque while the link is driven, with friction compensated and not."""
+    held, free = so.plants.rotary(link="locked"), so.plants.rotary(link="free", external=True)
+    values = free.defaults.update(
+        N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, f_c=0.01, v_s=1.0, k_s=300.0, J_l=0.25, d_l=0.3
+    )
+    spec = so.ControllerSpec(
+        measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0
+    )
+    controller = so.tune(held, values, spec)
+    time = np.arange(8000) * 1e-3
+    slow, driven = 5.0 * np.sin(0.5 * np.pi * time), {"tau_e": 3.0 * np.sin(np.pi * time)}
+    figure, axes = new(["5 N m at 0.25 Hz, link held", "zero torque, link driven at 0.5 Hz"], "error [N m]", "time [s]")
+    asked = {
+        "none": None,
+        "from the reference": CompensateFriction(),
+        "from the speed": CompensateFriction(source="speed"),
+    }
+    for (name, friction), colour in zip(asked.items(), ("#777777", "#0072b2", "#d55e00"), strict=True):
+        law = runnable(add_compensation(controller, friction=friction))
+        for axis, plant, reference, external in ((axes[0], held, slow, {}), (axes[1], free, 0.0 * time, driven)):
+            loop = SampledLoop(plant=plant, law=law, measured="tau_s", delay_samples=1)
+            error = run_loop(loop, [values], reference, external=external).outputs["tau_s"][0] - reference
+            if axis is axes[0] or name != "from the reference":
+                axis.plot(time[4000:], error[4000:], color=colour, linewidth=1.2, label=name)
+    axes[0].legend(frameon=False, fontsize="x-small", title="compensated", title_fontsize="x-small")
+    save(figure, "compensation")
+
+
 def thor_frontiers() -> dict[str, Frontier]:
     """Sweep THOR's bandwidth at Ms 1.6, the swinging output in robust_to, as it is and with the screw's mode."""
     limits = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
@@ -352,6 +385,7 @@ if __name__ == "__main__":
     anti_windup()
     passivity()
     impedance()
+    compensation()
     experiment_design()
     state_estimator()
     predictive_control()

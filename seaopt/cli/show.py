@@ -103,6 +103,9 @@ def show_controller(console: Terminal, controller: Controller) -> None:
     ]  # fmt: skip
     _tabulate(console, gains, ("gain", "value", "", f"as {controller.command.word}", ""), "<><><")
     _tabulate(console, controller.list_achieved(), (controller.judged_on, "achieved", "asked"), "<><")
+    if controller.compensation is not None:
+        for line in controller.compensation.describe(controller.command.effort_unit):
+            console.wrap(f"compensates {line}", indent=2)
     _show_notes(console, controller.notes)
 
 

@@ -1,5 +1,6 @@
 """Loop algebra, controller structures, the tuner, laws that run, the state estimator and predictive control."""
 
+from seaopt.control.compensation.compensate import add_compensation
 from seaopt.control.deploy.export import export
 from seaopt.control.given.assessment import assess
 from seaopt.control.given.law_file import GivenLaw, read_law
@@ -15,6 +16,7 @@ from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch, Prefilter
+from seaopt.control.loops.compensation.terms import CompensateFriction, Compensation
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.margins import DiskMargin, Margins, margins, nu_gap
@@ -41,14 +43,14 @@ from seaopt.control.tuning.frontier import Frontier, sweep
 from seaopt.control.tuning.tuner import tune
 
 __all__ = [
-    "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
-    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "GainTable", "Gains",
-    "GateState", "GivenLaw", "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec",
-    "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate",
-    "Prefilter", "Rendering", "RunnableLaw", "RunnableSchedule", "SampledLoop", "ScheduleState", "ScheduledController",
-    "Score", "Scorecard", "TransferFunction", "add_impedance", "assess", "bound_free_law", "cascade_pid", "close_loop",
-    "command_of", "corners", "critical_impedance", "draw", "drive_pid", "estimate_noise", "estimator", "export",
-    "export_mpc", "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid", "passive_region", "passivity",
-    "passivity_rows", "read_law", "realise", "render", "run_loop", "runnable", "sample", "scorecard", "sweep",
-    "tune", "tune_schedule",
+    "Command", "CompensateFriction", "Compensation", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin",
+    "DisturbanceObserver", "Estimator", "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw",
+    "Frontier", "GainTable", "Gains", "GateState", "GivenLaw", "Impedance", "ImpedanceRegion", "Law", "LawState",
+    "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop",
+    "Passivity", "PlausibilityGate", "Prefilter", "Rendering", "RunnableLaw", "RunnableSchedule", "SampledLoop",
+    "ScheduleState", "ScheduledController", "Score", "Scorecard", "TransferFunction", "add_compensation",
+    "add_impedance", "assess", "bound_free_law", "cascade_pid", "close_loop", "command_of", "corners",
+    "critical_impedance", "draw", "drive_pid", "estimate_noise", "estimator", "export", "export_mpc", "force_mpc",
+    "ideal_pid", "margins", "nu_gap", "parallel_pid", "passive_region", "passivity", "passivity_rows", "read_law",
+    "realise", "render", "run_loop", "runnable", "sample", "scorecard", "sweep", "tune", "tune_schedule",
 ]  # fmt: skip

@@ -229,12 +229,21 @@ KEYS: dict[str, dict[str, str]] = {
         "corner_hz": "Where its asymptotes meet; tuned where left out.",
         "damping": "Of one of second order; tuned where left out.",
     },
+    "FrictionCompensationTable": {
+        "fraction": "Of the Coulomb friction of the design plant.",
+        "from": 'The motor speed that the "reference" asks for, outside the loop; or its measured "speed", inside.',
+        "speed": "At which it has its full size, m/s or rad/s at the friction; chosen where left out.",
+    },
+    "CompensationTable": {
+        "friction": "Coulomb friction at the motor.",
+    },
     "ControllerTable": {
         "plant": 'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.',
         "measured": "The output that is regulated; or a list, it and what else is fed back, such as the motor's speed.",
         "structure": "pid_dob adds a disturbance observer.",
         "notch": "Whether there is one, or which.",
         "prefilter": "A low-pass of the reference alone, of this order, or which; the bandwidth is placed with it.",
+        "compensate": 'What is added because the plant is known, ["friction"]; or a table, to say how much of it.',
         "reference_weights": '"tuned": of how the reference enters; "error", "measurement": fixed.',
         "bandwidth_range_hz": "Within which bandwidths are sensible; 15 to 60 where left out.",
         "sample_rate_hz": "At which it runs.",

@@ -649,7 +649,7 @@ def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
     fields = table.controller.model_dump(
-        exclude={"plant", "robust_to", "frf_confidence", "draws", "notch", "prefilter"}
+        exclude={"plant", "robust_to", "frf_confidence", "draws", "notch", "prefilter", "compensate"}
     )
     low_pass = table.controller.prefilter
     prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass

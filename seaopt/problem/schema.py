@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from seaopt.control.laws.limits import BY_NAME
+from seaopt.control.loops.compensation.terms import DEFAULT_FRACTION, FrictionSource
 from seaopt.documents import Flag, Number, Whole
 from seaopt.problem.key_descriptions import KEYS
 
@@ -397,6 +398,20 @@ def _limit(name: str) -> Any:
 Level = Number | Literal[False] | None  # of a limit: false lifts it
 
 
+class FrictionCompensationTable(_Strict):
+    """Compensation of friction."""
+
+    fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = DEFAULT_FRACTION
+    source: Annotated[FrictionSource, Field(alias="from")] = "reference"
+    speed: Annotated[Number, Field(gt=0.0)] | None = None
+
+
+class CompensationTable(_Strict):
+    """What is compensated, and how much of it."""
+
+    friction: FrictionCompensationTable | None = None
+
+
 class ControllerTable(_Strict):
     """What is asked of the controller."""
 
@@ -405,6 +420,7 @@ class ControllerTable(_Strict):
     structure: Literal["pd", "pid", "pid_dob"] = "pid"
     notch: Flag | NotchTable = False
     prefilter: Literal["first_order", "second_order"] | PrefilterTable | None = None
+    compensate: list[Literal["friction"]] | CompensationTable = []
     reference_weights: Literal["tuned", "error", "measurement"] = "tuned"
     bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
@@ -428,6 +444,13 @@ class ControllerTable(_Strict):
     command_limit: Number | None = None
     step_N: Number | None = None
     reserve: Number = 0.005
+
+    @property
+    def compensation(self) -> CompensationTable:
+        """What is compensated; of a list of names, each with its defaults."""
+        if isinstance(self.compensate, CompensationTable):
+            return self.compensate
+        return CompensationTable(friction=FrictionCompensationTable() if "friction" in self.compensate else None)
 
 
 class ImpedanceTable(_Strict):

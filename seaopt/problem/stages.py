@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from seaopt.control import (
+    CompensateFriction,
     Controller,
     GivenLaw,
     Impedance,
+    add_compensation,
     add_impedance,
     assess,
     command_of,
@@ -100,7 +102,7 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
     draws = problem.draws(source)
     if not table.retune:
         tuned = tune(design, problem.values(source), spec, robust_to, draws=draws, progress=progress)
-        return add_outer_loop(problem, tuned, source)
+        return complete_controller(problem, tuned, source)
     if problem.response_names:
         raise ProblemError(
             f"{problem.source}: retune = {table.retune} in [robustness] tunes again on models, and "
@@ -111,7 +113,24 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
         robust_to=problem.robust_to(problem.values(source)), draws=draws, others=problem.parameters,
         samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
     )  # fmt: skip
-    return replace(joint, controller=add_outer_loop(problem, joint.controller, source))
+    return replace(joint, controller=complete_controller(problem, joint.controller, source))
+
+
+def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
+    """Return a controller with the problem's outer loop, and with what it compensates.
+
+    Raises
+    ------
+    SeaoptError
+        As `add_outer_loop` and `seaopt.control.add_compensation`.
+
+    """
+    controller = add_outer_loop(problem, controller, source)
+    assert problem.table.controller is not None
+    friction = problem.table.controller.compensation.friction
+    if friction is None:
+        return controller
+    return add_compensation(controller, friction=CompensateFriction(**friction.model_dump()))
 
 
 def add_outer_loop(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
@@ -195,7 +214,7 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
     _, robust_to = list_plants(problem, source)
     law = given.to_effort(command_of(design, values, spec.regulated).per_effort)
     controller = assess(design, values, law, spec, robust_to, draws=problem.draws(source))
-    return add_outer_loop(problem, controller, source)
+    return complete_controller(problem, controller, source)
 
 
 def certify_problem(

@@ -34,6 +34,7 @@ REMEDIES = {
     "impedance_rest": "less stiffness, or more damping, in [impedance]",
     "impedance_draws": "less stiffness, or more damping, in [impedance]",
     "impedance_damper": "other stiffness, damping or velocity_filter_s in [impedance], inside the region of the report",
+    "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }
 

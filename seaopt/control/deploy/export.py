@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
@@ -233,6 +234,7 @@ def _law(
         tracking_time_s=tracking_time_s,
         gate=gate,
         heat=heat,
+        compensation=stored["compensation"],
     )
 
 
@@ -332,6 +334,8 @@ def _numbers(
             for key, value in stored["gains"].items()
         ],
         "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
+        "friction": _write_friction(law.compensation, number),
+        "further": _list_further(law.compensation, others),
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
             for key, tf in zip(
@@ -355,3 +359,25 @@ def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, 
         "shown_stiffness": f"{outer.stiffness:.6g}",
         "shown_damping": f"{outer.damping:.6g}",
     }
+
+
+def _write_friction(compensation: Compensation | None, number: Callable[[float], str]) -> dict[str, str]:
+    """Return the compensation of friction as text; empty where there is none."""
+    if compensation is None or compensation.friction is None:
+        return {}
+    term = compensation.friction
+    return {
+        "effort": number(term.effort),
+        "speed": number(term.speed),
+        "speed_unit": term.speed_unit,
+        "share": number(term.share_per_step(compensation.sample_time_s)),
+        "read": f"read_{identifier(term.reads)}" if term.reads else "",
+        "whence": f"the speed of {strip_markup(term.reads)}" if term.reads else "the rate of the reference",
+        "percent": f"{100.0 * term.fraction:.3g}",
+    }
+
+
+def _list_further(compensation: Compensation | None, others: Sequence[str]) -> list[dict[str, str]]:
+    """Return what the compensation reads and the law does not."""
+    reads = () if compensation is None else compensation.reads
+    return [{"output": name, "symbol": f"read_{identifier(name)}"} for name in reads if name not in others]

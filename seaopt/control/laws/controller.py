@@ -21,6 +21,7 @@ from seaopt.control.laws.verdict import (
     shorten_blocked,
 )
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
@@ -110,6 +111,9 @@ class Controller:
         What makes the reference of a stiffness and a damping at the link (`seaopt.control.add_impedance`).
     reads : tuple of str
         The outputs that the law reads, one for each of its columns; those of the specification where it is empty.
+    compensation : Compensation or None
+        What is added to its effort for the plant's friction (`seaopt.control.add_compensation`). The figures and the
+        friction margin are those of the law without it.
 
     """
 
@@ -134,6 +138,7 @@ class Controller:
     measured: tuple[MeasuredFigures, ...] = ()
     outer: OuterLoop | None = None
     reads: tuple[str, ...] = ()
+    compensation: Compensation | None = None
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -358,6 +363,7 @@ class Controller:
             "observer": self._observer_dict(),
             "heat": self._heat_dict(),
             "impedance": None if self.outer is None else asdict(self.outer),
+            "compensation": None if self.compensation is None else self.compensation.to_dict(),
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
             "possible": None if self.possible is None else asdict(self.possible),
@@ -469,6 +475,7 @@ class Controller:
                 *self._friction_lines(),
                 *self._force_lines(),
                 *self._outer_lines(),
+                *self._compensation_lines(),
                 *(f"  {line}" for line in (self.rating.describe() if self.rating is not None else ())),
                 f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
                 if self.feasible
@@ -540,6 +547,12 @@ class Controller:
             f"  renders {self.outer.stiffness:.4g} {called.stiffness} and {self.outer.damping:.4g} {called.damping} at "
             f"the link, the speed filtered with {1e3 * self.outer.velocity_filter_s:.3g} ms"
         ]
+
+    def _compensation_lines(self) -> list[str]:
+        """Say what is compensated."""
+        if self.compensation is None:
+            return []
+        return [f"  compensates {line}" for line in self.compensation.describe(self.command.effort_unit)]
 
     def _force_lines(self) -> list[str]:
         slow, fast = self.force_limit(0.0), self.force_limit(self.spec.bandwidth_hz)

@@ -30,6 +30,7 @@ the other poles of 1/(1 - Q), about as fast as Q, stay.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from types import NoneType
 
@@ -40,6 +41,7 @@ from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
 from seaopt.control.loops.law import Law
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.plants.motor.heat_guard import COLD, HeatGuard
@@ -66,6 +68,8 @@ class LawState:
         What the plausibility gate, where there is one, has seen.
     heat : (float, float)
         Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
+    memory : (float, float)
+        What the compensation, where there is one, keeps of the last sample.
 
     """
 
@@ -74,6 +78,7 @@ class LawState:
     held: int = 0
     gate: GateState = GateState()
     heat: tuple[float, float] = COLD
+    memory: Memory = FORGOTTEN
 
     @property
     def status(self) -> str:
@@ -109,6 +114,8 @@ class RunnableLaw:
         Name and unit of the input that is commanded.
     heat : HeatGuard, optional
         What lowers the limit as the winding warms up.
+    compensation : Compensation, optional
+        What is added to reference and effort; it may read further outputs.
 
     """
 
@@ -127,6 +134,7 @@ class RunnableLaw:
     gate: PlausibilityGate | None = None
     command: tuple[str, str] = ("I", "A")
     heat: HeatGuard | None = None
+    compensation: Compensation | None = None
 
     @property
     def measured(self) -> int:
@@ -206,22 +214,25 @@ class RunnableLaw:
         """Return the effort, not limited."""
         return float(self.c @ x) + self.d_reference * reference - float(np.dot(self.d_measurement, measurement))
 
-    def step(self, state: LawState, reference: float, measurement: Reading) -> tuple[float, LawState]:
+    def step(
+        self, state: LawState, reference: float, measurement: Reading, readings: Sequence[float] = ()
+    ) -> tuple[float, LawState]:
         """Return the command (a current in A, as a rule) of this sample, and the next state.
 
         A sample with a number that is not finite, in its inputs or in what would follow, is not used: the last command
         is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and takes the
         command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
+        `readings` are of the outputs that the compensation reads, in their order.
         """
         if self.heat is None:
-            return self._decide(state, reference, measurement, self.current_limit_A)
+            return self._decide(state, reference, measurement, readings, self.current_limit_A)
         limit = min(self.current_limit_A, self.heat.limit(state.heat))
-        current, following = self._decide(state, reference, measurement, limit)
+        current, following = self._decide(state, reference, measurement, readings, limit)
         current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
         return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
 
     def _decide(
-        self, state: LawState, reference: float, measurement: Reading, limit_A: float
+        self, state: LawState, reference: float, measurement: Reading, readings: Sequence[float], limit_A: float
     ) -> tuple[float, LawState]:
         """Return the command within a limit, and the next state."""
         seen, most = state.gate, limit_A / self.per_effort
@@ -230,30 +241,35 @@ class RunnableLaw:
             measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
             if seen.fault:
                 current = self.gate.ramp(state.current_A, self.sample_time_s)
-                return current, LawState(x=state.x, current_A=current, held=state.held, gate=seen)
+                return current, LawState(x=state.x, current_A=current, held=state.held, gate=seen, memory=state.memory)
+        added, memory = 0.0, state.memory
         with np.errstate(all="ignore"):
-            force = self._find_force(state.x, reference, measurement)
+            if self.compensation is not None:
+                reference, added, memory = self.compensation.step(state.memory, reference, readings)
+            force = self._find_force(state.x, reference, measurement) + added
             applied = min(max(force, -most), most)
             x = self.a @ state.x + self.b_reference * reference - np.dot(self.b_measurement, measurement)
             x += self.anti_windup * (applied - force)
-        if not (math.isfinite(force) and np.all(np.isfinite(x))):
-            return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1, gate=seen)
+        if not (math.isfinite(force) and math.isfinite(memory[1]) and np.all(np.isfinite(x))):
+            return state.current_A, replace(state, held=state.held + 1, gate=seen)
         current = applied * self.per_effort
         current = min(max(current, -limit_A), limit_A)  # a limit to the last bit
-        return current, LawState(x=x, current_A=current, gate=seen)
+        return current, LawState(x=x, current_A=current, gate=seen, memory=memory)
 
     def run(
         self,
         references: Float[np.ndarray, " samples"],
         measurements: Float[np.ndarray, "samples ..."],
         state: LawState | None = None,
+        readings: Float[np.ndarray, "samples r"] | None = None,
     ) -> tuple[Float[np.ndarray, " samples"], LawState]:
         """Return the commands of a sequence of samples, and the last state; it starts from zero if not given."""
         state = self.reset() if state is None else state
         out = np.zeros(references.size)
-        for i, (reference, measurement) in enumerate(zip(references, measurements, strict=True)):
+        further = np.zeros((references.size, 0)) if readings is None else readings
+        for i, (reference, measurement, more) in enumerate(zip(references, measurements, further, strict=True)):
             read = float(measurement) if self.measured == 1 else measurement
-            out[i], state = self.step(state, float(reference), read)
+            out[i], state = self.step(state, float(reference), read, more.tolist())
         return out, state
 
 
@@ -300,6 +316,7 @@ def runnable(
         tracking_time_s=tracking_time_s,
         gate=gate,
         heat=heat,
+        compensation=controller.compensation,
     )
 
 
@@ -313,6 +330,7 @@ def choose_limit(command: Command, spec: ControllerSpec, asked: float | None) ->
 def realise(
     law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None,
     gate: PlausibilityGate | None = None, command: tuple[str, str] = ("I", "A"), heat: HeatGuard | None = None,
+    compensation: Compensation | None = None,
 ) -> RunnableLaw:  # fmt: skip
     """Return a law with limit and anti-windup.
 
@@ -332,6 +350,8 @@ def realise(
         Name and unit of the input that is commanded.
     heat : HeatGuard, optional
         What lowers the limit as the winding warms up, of a command in A.
+    compensation : Compensation, optional
+        What is added to reference and effort.
 
     Raises
     ------
@@ -376,6 +396,7 @@ def realise(
         gate=gate,
         command=command,
         heat=heat,
+        compensation=compensation,
     )
 
 

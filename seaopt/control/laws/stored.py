@@ -26,6 +26,7 @@ from seaopt.control.laws.structures import (
 )
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
+from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.outer_loop import OuterLoop
@@ -203,6 +204,35 @@ class StoredOuterLoop(ResultTable):
     plant: str = ""
 
 
+class StoredFrictionTerm(ResultTable):
+    """Compensation of friction."""
+
+    effort: Annotated[Finite, Field(gt=0.0)]
+    speed: Annotated[Finite, Field(gt=0.0)]
+    speed_unit: str
+    fraction: Annotated[Finite, Field(gt=0.0)]
+    source: Literal["reference", "speed"]
+    reads: str
+    velocity_per_rate: Finite
+
+    @model_validator(mode="after")
+    def _require_reading(self) -> StoredFrictionTerm:
+        if bool(self.reads) != (self.source == "speed"):
+            raise ValueError('should have reads where source is "speed", and only there')
+        return self
+
+
+class StoredCompensation(ResultTable):
+    """What is added to reference and effort."""
+
+    friction: StoredFrictionTerm | None = None
+
+    def build(self, sample_time_s: float) -> Compensation:
+        """Return the compensation."""
+        friction = None if self.friction is None else FrictionTerm(**self.friction.model_dump())
+        return Compensation(sample_time_s=sample_time_s, friction=friction)
+
+
 class StoredController(ResultTable):
     """A controller.json."""
 
@@ -224,6 +254,7 @@ class StoredController(ResultTable):
     engineering: dict[str, StoredNumber] = {}
     measured_responses: list[StoredMeasured] = []
     impedance: StoredOuterLoop | None = None
+    compensation: StoredCompensation | None = None
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -263,6 +294,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "observer": observer, "reads": reads, "blocked_by": tuple(table.blocked_by),
         "measured": tuple(one.build() for one in table.measured_responses),
         "outer": outer,
+        "compensation": None if table.compensation is None else table.compensation.build(spec.sample_time_s),
         "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
 

@@ -148,10 +148,10 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
         obstacle = "unstable without friction"
     if obstacle:
         return replace(none, multiplier=f"none: {obstacle}")
-    responses = _respond(loop, _angles(loop))
+    responses = find_responses(loop, choose_angles(loop))
     bar = 1.0 / least if least else np.inf
     best = none
-    for name, multiplier in sorted(_multipliers(loop), key=lambda named: named[0] != first):
+    for name, multiplier in sorted(list_multipliers(loop), key=lambda named: named[0] != first):
         test = _weigh(responses, multiplier)
         inverse = _least_inverse(test, WORTHWHILE / best.factor if best.factor else bar)
         if inverse is None:
@@ -180,9 +180,9 @@ def _settle(
     """
     count = theta.size
     for _ in range(REFINEMENTS):
-        theta = _refine(theta, test(inverse, EVERY))
+        theta = refine_angles(theta, test(inverse, EVERY))
         count += theta.size
-        test = _weigh(_respond(loop, theta), multiplier)
+        test = _weigh(find_responses(loop, theta), multiplier)
         again = _least_inverse(test, LARGEST_INVERSE)
         if again is None:
             return theta, test, np.inf, count
@@ -193,7 +193,7 @@ def _settle(
 
 
 @record(eq=False)
-class _Responses:
+class LoopResponses:
     """The loop's responses at m angles and k aliases, efforts in units that make each curve's steepest slope 1."""
 
     theta: Angles
@@ -205,7 +205,7 @@ class _Responses:
     order: Float[np.ndarray, " m"]
 
 
-def _respond(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> _Responses:
+def find_responses(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> LoopResponses:
     """Return G_v, a (without M) and b at angles; a per unit of K without the feedback."""
     period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
     orders = np.arange(-ALIASES, ALIASES + 1)
@@ -215,7 +215,7 @@ def _respond(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> _Re
     by_friction = root * response.by_friction
     gains = loop.feedback(theta) if feedback else np.ones((len(rows), theta.size))
     read = by_friction[..., ports:, :] + through * root
-    return _Responses(
+    return LoopResponses(
         theta=theta, s=1j * (theta[:, None] + 2 * np.pi * orders) / period, mobility=by_friction[..., :ports, :],
         command=-response.by_motor[..., :ports], sensed=np.conj(np.einsum("ym,mkyp->mkp", gains, read)),
         tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
@@ -223,7 +223,7 @@ def _respond(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> _Re
     )  # fmt: skip
 
 
-def _weigh(at: _Responses, multiplier: Multiplier) -> Test:
+def _weigh(at: LoopResponses, multiplier: Multiplier) -> Test:
     """Return the test of one multiplier."""
     form = _form_terms(at, multiplier(at.s))
 
@@ -234,7 +234,7 @@ def _weigh(at: _Responses, multiplier: Multiplier) -> Test:
     return test
 
 
-def _form_terms(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
+def _form_terms(at: LoopResponses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
     """Return what gives, for 1/kappa, where all D_k are positive, and the terms of alpha, beta and gamma there."""
     if at.mobility.shape[-1] == 1:
         return _form_terms_of_one(at, weight)
@@ -251,7 +251,7 @@ def _form_terms(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
     return form
 
 
-def _form_terms_of_one(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
+def _form_terms_of_one(at: LoopResponses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
     """Return `_form_terms` where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
     mobility, slope = np.real(weight * at.mobility[..., 0, 0]), np.real(weight)
     command, sensed = weight * at.command[..., 0], at.sensed[..., 0]
@@ -270,21 +270,21 @@ def _square(values: Complex[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
 
 
 def _compare(
-    at: _Responses, angles: Places, alpha: Float[np.ndarray, "a n"], beta: Float[np.ndarray, "a n"],
+    at: LoopResponses, angles: Places, alpha: Float[np.ndarray, "a n"], beta: Float[np.ndarray, "a n"],
     gamma: Complex[np.ndarray, "a n"],
 ) -> Angles:  # fmt: skip
     """Return |2 + gamma|^2 - alpha beta of the terms at the aliases, scaled, with what is beyond them against it.
 
     The terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
     """
-    product = np.sum(alpha, axis=1) + _bound_rest(at, alpha, angles)
-    product = product * (np.sum(beta, axis=1) + _bound_rest(at, beta, angles))
-    least = np.abs(2.0 + np.sum(gamma, axis=1)) - _bound_rest(at, gamma, angles)
+    product = np.sum(alpha, axis=1) + bound_rest(at, alpha, angles)
+    product = product * (np.sum(beta, axis=1) + bound_rest(at, beta, angles))
+    least = np.abs(2.0 + np.sum(gamma, axis=1)) - bound_rest(at, gamma, angles)
     return (np.sign(least) * least**2 - product) / (4.0 + np.abs(product))
 
 
-def _bound_rest(
-    at: _Responses, terms: Complex[np.ndarray, "a n"] | Float[np.ndarray, "a n"], angles: Places = EVERY
+def bound_rest(
+    at: LoopResponses, terms: Complex[np.ndarray, "a n"] | Float[np.ndarray, "a n"], angles: Places = EVERY
 ) -> Angles:
     """Return a bound on what is beyond the last aliases of terms that fall like 1/omega^2."""
     reach = TAIL_GROWTH * at.order[angles] ** 2 * at.tail[angles]
@@ -323,7 +323,7 @@ def _least_inverse(test: Test, bar: float) -> float | None:
         low, high = high, top  # the bound on what is beyond the aliases need not fall as the rest does
 
 
-def _angles(loop: FrictionLoop) -> Angles:
+def choose_angles(loop: FrictionLoop) -> Angles:
     """Return angles from nearly static to the Nyquist frequency, close about the modes of plant and closed loop."""
     period = loop.plant.sample_time_s
     even = np.concatenate([np.geomspace(LOWEST_ANGLE, 0.1, ANGLES // 2), np.linspace(0.1, np.pi, ANGLES)])
@@ -334,7 +334,7 @@ def _angles(loop: FrictionLoop) -> Angles:
     return np.unique(np.concatenate([even, folded[folded >= LOWEST_ANGLE]]))
 
 
-def _refine(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
+def refine_angles(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
     """Return new angles, about the least values of a test."""
     beside = np.concatenate([values[:1], values, values[-1:]])
     dips = np.flatnonzero(values <= np.minimum(beside[:-2], beside[2:]))
@@ -343,7 +343,7 @@ def _refine(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
     return np.unique(np.linspace(theta[low], theta[high], POINTS_PER_DIP))
 
 
-def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
+def list_multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
     """Yield multipliers by name: none, Popov's, and those of Zames and Falb, over corner frequencies."""
     yield SIMPLEST, np.ones_like
     rates = np.geomspace(0.02, 2.0, MULTIPLIER_POINTS) * np.pi / loop.plant.sample_time_s
@@ -400,10 +400,10 @@ def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: f
         Of the curves' own steepest slopes.
 
     """
-    at = _respond(loop, theta, feedback=False)
+    at = find_responses(loop, theta, feedback=False)
     through = loop.plant.response(theta / (2 * np.pi * loop.plant.sample_time_s))
-    weight = dict(_multipliers(loop))[multiplier](at.s)
+    weight = dict(list_multipliers(loop))[multiplier](at.s)
     possible, alpha, beta, gamma = _form_terms(at, weight)(1.0 / factor, EVERY)
-    alpha, beta = (np.sum(terms, axis=1) + _bound_rest(at, terms) for terms in (alpha, beta))
-    size = np.sqrt(alpha * beta) + _bound_rest(at, gamma)
+    alpha, beta = (np.sum(terms, axis=1) + bound_rest(at, terms) for terms in (alpha, beta))
+    size = np.sqrt(alpha * beta) + bound_rest(at, gamma)
     return FeedbackLimit(plant=through + 0.5 * np.sum(gamma, axis=1), level=np.where(possible, 2.0 / size, 0.0))

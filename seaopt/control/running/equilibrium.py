@@ -88,15 +88,16 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
     observe = _observe(plant)
     names, rows = list(plant.outputs), [find_rest(plant, values) for values in params]
     figures = np.zeros((len(params), 4))
-    z = np.zeros((len(params), law.c.size + loop.waiting))
+    z = np.zeros((len(params), loop.law_states + loop.waiting))
     for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):
         if not (np.any(x) or np.any(u)):
             continue
         y = np.array(observe(x, u, values.vector)).ravel()
-        read = y[[names.index(name) for name in loop.signals]]
+        read = y[[names.index(name) for name in loop.fed_back]]
         force = float(read[0])
         inner, reference = _law_at_rest(law, read if law.measured > 1 else force, float(u[0]), plant, loop.regulated)
-        z[run] = np.concatenate([inner, np.full(loop.waiting, u[0])])
+        forgotten = np.zeros(loop.law_states - inner.size)
+        z[run] = np.concatenate([inner, forgotten, np.full(loop.waiting, u[0])])
         figures[run] = reference, force, u[0], y[-1]
     reference, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
+from seaopt.control.loops.compensation.terms import CompensationShape, compensate
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_names
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
@@ -93,6 +94,7 @@ class _Structure:
     """What the functions of a loop depend on besides its plant; all else is data."""
 
     measured: tuple[str, ...]
+    fed_back: int
     law_states: int
     waiting: int
     rounds_current: bool
@@ -100,15 +102,23 @@ class _Structure:
     encoders: tuple[tuple[str, _Device], ...]  # with errors, of those that the reading is computed from
     limits_current: bool
     sticks: bool
+    compensation: CompensationShape
+
+    @property
+    def kept(self) -> int:
+        """How many numbers law and compensation keep from one sample to the next."""
+        return self.law_states + self.compensation.remembered
 
 
 def _structure_of(loop: SampledLoop) -> _Structure:
     sensors, names = loop.sensors, loop.signals
     return _Structure(
-        measured=names, law_states=loop.law.c.size, waiting=loop.waiting, rounds_current=bool(loop.current_step_A),
+        measured=names, fed_back=loop.law.measured, law_states=loop.law.c.size, waiting=loop.waiting,
+        rounds_current=bool(loop.current_step_A),
         devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
         limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
+        compensation=CompensationShape() if loop.law.compensation is None else loop.law.compensation.shape,
     )  # fmt: skip
 
 
@@ -117,13 +127,15 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
 
     `u` holds the current in force at first, `late` is the one after it.
     """
-    n, queue, measured = structure.law_states, structure.waiting, len(structure.measured)
-    z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w", measured)
+    n, queue, measured, fed_back = structure.law_states, structure.waiting, len(structure.measured), structure.fed_back
+    kept = structure.kept
+    z, r, w = ca.SX.sym("z", kept + queue), ca.SX.sym("r"), ca.SX.sym("w", measured)
     e, devices = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("devices", 3, measured + len(structure.encoders))
-    numbers = ca.SX.sym("c", n * n + (3 + measured) * n + 5 + measured)
-    c = ca.vertcat(numbers, ca.vec(devices))
+    numbers = ca.SX.sym("c", n * n + (3 + fed_back) * n + 5 + fed_back)
+    added = ca.SX.sym("added", structure.compensation.size)
+    c = ca.vertcat(numbers, ca.vec(devices), added)
     observe = _observe(plant, structure.sticks)
-    lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
+    lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[kept:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
     waiting = ca.densify(ca.mtimes(ca.reshape(first[1:], queue, 1).T, behind))
     outputs = dict(
@@ -136,19 +148,23 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
             if name in weights:
                 reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
         readings.append(device.read(reading, devices[:, column]))
-    read = ca.vertcat(*readings)
-    sizes = [n * n, n, measured * n, n, n, 1, measured, 1, 1, 1, 1]
+    read = ca.vertcat(*readings[:fed_back])
+    sizes = [n * n, n, fed_back * n, n, n, 1, fed_back, 1, 1, 1, 1]
     a, b_r, b_y, out, windup, d_r, d_y, limit, gain, step, most = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
-    a, b_y, x = ca.reshape(a, n, n), ca.reshape(b_y, n, measured), ca.reshape(z[:n], n, 1)
-    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - ca.dot(d_y, read)
+    a, b_y, x = ca.reshape(a, n, n), ca.reshape(b_y, n, fed_back), ca.reshape(z[:n], n, 1)
+    further = [readings[structure.measured.index(name)] for name in structure.compensation.reads]
+    r_law, effort, memory = compensate(
+        structure.compensation, ca.vertsplit(added), ca.vertsplit(z[n:kept]), r, further, ca
+    )
+    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r_law - ca.dot(d_y, read) + effort
     limited = ca.fmin(ca.fmax(force, -limit), limit) if structure.limits_current else force
-    after = ca.mtimes(a, x) + b_r * r - ca.mtimes(b_y, read) + windup * (limited - force)
+    after = ca.mtimes(a, x) + b_r * r_law - ca.mtimes(b_y, read) + windup * (limited - force)
     current = gain * limited
     if structure.rounds_current:
         current = step * ca.floor(current / step + 0.5)
         if structure.limits_current:
             current = ca.fmin(ca.fmax(current, -most), most)
-    moved = ca.vertcat(after, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
+    moved = ca.vertcat(after, *memory, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
     known = ca.vertcat(current, behind)
     u, late = ca.vertcat(ca.dot(first, known), e), ca.dot(second, known)
     arguments = [plant.t, plant.x, z, e, r, w, plant.p, c, lag]
@@ -161,6 +177,8 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     numbers = [law.d_reference, *np.ravel(law.d_measurement), limit, law.per_effort, loop.current_step_A, most]
     for name in (*loop.signals, *loop.encoders):
         numbers += _describe_device(loop.sensors, name)[1]
+    if law.compensation is not None:
+        numbers += law.compensation.numbers
     return np.concatenate(
         [law.a.ravel("F"), law.b_reference, law.b_measurement.ravel("F"), law.c, law.anti_windup, numbers]
     )
@@ -212,7 +230,8 @@ def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
 def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: ca.Function) -> str:
     constants = {
         "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1, "NW": len(structure.measured),
-        "NY": len(channel_names(plant)), "NZ": structure.law_states + structure.waiting, "INSTANT": INSTANT,
+        "NY": len(channel_names(plant)), "NZ": structure.kept + structure.waiting,
+        "INSTANT": INSTANT,
     }  # fmt: skip
     template = files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8")
     return "\n".join((define_constants(constants), generate_code(sample, advance), template))
@@ -306,7 +325,7 @@ def _period_function(
 ) -> Any:  # fmt: skip
     """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s) -> (the same a sample later, y, current, x)."""
     sample, advance, _ = _kernel(plant, structure)
-    sizes = [len(plant.states), structure.law_states + structure.waiting, len(channel_names(plant))]
+    sizes = [len(plant.states), structure.kept + structure.waiting, len(channel_names(plant))]
     state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
     t, r, late_s = (ca.MX.sym(name) for name in ("t", "r", "late_s"))
     e, w, p, c, lag = (

@@ -70,9 +70,9 @@ class SampledLoop:
                 raise SimulationError(
                     f'measured = "{name}" is not an output of {plant.name}; ' + suggestion(name, plant.outputs)
                 )
-        if len(self.signals) != self.law.measured:
+        if len(self.fed_back) != self.law.measured:
             raise SimulationError(
-                f"measured = {list(self.signals)} are {len(self.signals)} outputs, and the law reads "
+                f"measured = {list(self.fed_back)} are {len(self.fed_back)} outputs, and the law reads "
                 f"{self.law.measured}; give as many"
             )
         if self.law.gate is not None:
@@ -104,9 +104,21 @@ class SampledLoop:
                 )
 
     @property
-    def signals(self) -> tuple[str, ...]:
-        """The outputs that the law reads, the regulated one first."""
+    def fed_back(self) -> tuple[str, ...]:
+        """The outputs that the law feeds back, the regulated one first."""
         return (self.measured,) if isinstance(self.measured, str) else self.measured
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The outputs that are read: what is fed back, and what the law's compensation reads besides."""
+        further = () if self.law.compensation is None else self.law.compensation.reads
+        return tuple(dict.fromkeys((*self.fed_back, *further)))
+
+    @property
+    def law_states(self) -> int:
+        """How many numbers the law keeps: its states, and what its compensation remembers."""
+        remembered = 0 if self.law.compensation is None else self.law.compensation.shape.remembered
+        return self.law.c.size + remembered
 
     @property
     def regulated(self) -> str:
@@ -146,7 +158,7 @@ class LoopState:
     Parameters
     ----------
     x : array, shape (runs, nx)
-    z : array, shape (runs, n + waiting)
+    z : array, shape (runs, law_states + waiting)
 
     """
 
@@ -157,7 +169,7 @@ class LoopState:
 def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None = None) -> LoopState:
     """Return `runs` loops whose law is at zero and whose plant is in state x, zero if left out."""
     start = np.zeros(len(loop.plant.states)) if x is None else x
-    return LoopState(x=np.tile(start, (runs, 1)), z=np.zeros((runs, loop.law.c.size + loop.waiting)))
+    return LoopState(x=np.tile(start, (runs, 1)), z=np.zeros((runs, loop.law_states + loop.waiting)))
 
 
 def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:

@@ -13,6 +13,7 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import BY_NAME, BY_REQUIREMENT
 from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
@@ -32,6 +33,12 @@ from seaopt.plants.friction import friction_slopes, remembers, split_friction
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.bounds.bracket import Bracket
+from seaopt.robustness.certificate.compensation import (
+    CompensationDraws,
+    describe_compensation,
+    find_nominal_compensation,
+    list_compensation,
+)
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import CertifiedImpedance, ImpedanceDraws, certify_impedance
 from seaopt.robustness.certificate.simulated import (
@@ -207,6 +214,10 @@ class Certificate:
         Of each model with friction: for how steep a friction stability is shown, between sliding and stuck.
     friction_draws : mapping of name to FrictionDraws
         The same over draws, of those models for which it is shown at the nominal parameters, or that have none there.
+    compensation : mapping of name to CompensationMargin
+        Of each model, where friction is compensated from the speed: for how steep a compensation stability is shown.
+    compensation_draws : mapping of name to CompensationDraws
+        The same over draws, of those models for which it is shown at the nominal parameters.
     impedance : CertifiedImpedance or None
         What the controller's outer loop renders, where it has one.
     remarks : tuple of str
@@ -235,6 +246,8 @@ class Certificate:
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
     friction_draws: Mapping[str, FrictionDraws] = field(default_factory=dict[str, FrictionDraws])
+    compensation: Mapping[str, CompensationMargin] = field(default_factory=dict[str, CompensationMargin])
+    compensation_draws: Mapping[str, CompensationDraws] = field(default_factory=dict[str, CompensationDraws])
     impedance: CertifiedImpedance | None = None
     remarks: tuple[str, ...] = ()
     drawn_ms: Mapping[str, Float[np.ndarray, " n"]] = field(
@@ -413,6 +426,12 @@ class Certificate:
                     for name, one in stored.friction.items()
                     if one.draws is not None
                 },
+                compensation=find_nominal_compensation(controller, models, parameters),
+                compensation_draws={
+                    name: CompensationDraws(**one.draws.model_dump())
+                    for name, one in stored.compensation.items()
+                    if one.draws is not None
+                },
                 impedance=certify_impedance(
                     controller,
                     models,
@@ -443,6 +462,7 @@ class Certificate:
                 for name, figures in self.plants.items()
             },
             "friction": {name: self._friction_dict(name) for name in self._frictions},
+            "compensation": list_compensation(self.compensation, self.compensation_draws),
             "monte_carlo": _list_fields(self.monte_carlo),
             "varied": [_list_fields(varied) for varied in self.varied],
             "remarks": list(self.remarks),
@@ -479,8 +499,9 @@ class Certificate:
             else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
         )
         return (
-            *self.remarks, *warn_unidentified(self.parameters, used), *friction, *self._ideal_notes(), *outside,
-            *little, *lifted,
+            *self.remarks, *warn_unidentified(self.parameters, used), *friction,
+            *describe_compensation(self.controller, self.compensation, self.compensation_draws),
+            *self._ideal_notes(), *outside, *little, *lifted,
         )  # fmt: skip
 
     def _ideal_notes(self) -> tuple[str, ...]:

@@ -43,9 +43,11 @@ from seaopt.robustness.certificate.certificate import (
     Requirement,
     plant_margins,
 )
+from seaopt.robustness.certificate.compensation import find_compensation_at_draws, find_nominal_compensation
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
 from seaopt.robustness.certificate.requirements import (
+    compensation_requirements,
     design_requirements,
     draw_requirements,
     friction_requirements,
@@ -254,11 +256,14 @@ def certify(
     impedance = certify_impedance(controller, models, nominal)
     if impedance is not None and impedance.safe:
         impedance = replace(impedance, draws=draw_impedance(controller, models, unknown, samples, rng, rendering))
+    compensation = find_nominal_compensation(controller, models, nominal)
+    compensation_draws = find_compensation_at_draws(controller, models, unknown, compensation, samples, rng)
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin),
+        *compensation_requirements(compensation, compensation_draws),
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
         *impedance_requirements(impedance),
     )
@@ -266,7 +271,8 @@ def certify(
         passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
-        brackets=brackets, friction=friction, friction_draws=friction_draws, impedance=impedance, drawn_ms=drawn_ms,
+        brackets=brackets, friction=friction, friction_draws=friction_draws, compensation=compensation,
+        compensation_draws=compensation_draws, impedance=impedance, drawn_ms=drawn_ms,
         remarks=(
             *_remark_measured(controller, measured or {}), *_remark_delay(controller, parameters),
             *_remark_amplitude(controller, models, nominal),

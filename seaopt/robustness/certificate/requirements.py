@@ -12,6 +12,7 @@ from seaopt.control.laws.limits import LIMIT_ROUNDING, MeasuredLoop, PortFigures
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import Verdict, judge
 from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.port import port_of
 from seaopt.formatting import format_values
@@ -19,12 +20,14 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, MonteCarlo, Requirement
+from seaopt.robustness.certificate.compensation import CompensationDraws
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.impedance_steps import AT_REST
 
+FRICTION_COMPENSATION = "friction_compensation"
 NO_FRICTION = "no friction: any margin holds"
 WITNESS_REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
@@ -139,6 +142,22 @@ def friction_requirements(
             value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
         met = bool(value >= least * (1.0 - LIMIT_ROUNDING))
         rows.append(Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=value, met=met, where=where))
+    return rows
+
+
+def compensation_requirements(
+    margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
+) -> list[Requirement]:
+    """Return that stability is shown with friction compensated from the speed, at nominal values and over draws."""
+    rows: list[Requirement] = []
+    for name, margin in margins.items():
+        value, where = margin.slope, f"{name}: {margin.multiplier}"
+        where += f" at {margin.frequency_hz:.4g} Hz" if margin.slope else ""
+        drawn = draws.get(name)
+        if drawn is not None and drawn.least_slope < value:
+            value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
+        met = bool(value >= margin.asked * (1.0 - LIMIT_ROUNDING))
+        rows.append(Requirement(name=FRICTION_COMPENSATION, limit=margin.asked, value=value, met=met, where=where))
     return rows
 
 

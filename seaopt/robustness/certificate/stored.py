@@ -134,6 +134,21 @@ class StoredImpedance(ResultTable):
     draws: StoredImpedanceDraws | None = None
 
 
+class StoredCompensationDraws(ResultTable):
+    """For how many draws stability is shown with friction compensated, and the least slope for which it is."""
+
+    samples: Whole
+    shown: Whole
+    least_slope: NullIsInfinite
+    parameters: dict[str, Number]
+
+
+class StoredCompensation(ResultTable):
+    """The margin of a plant whose friction is compensated from the speed, of which all but the draws is found again."""
+
+    draws: StoredCompensationDraws | None = None
+
+
 class StoredCertificate(ResultTable):
     """A robustness.json."""
 
@@ -145,6 +160,7 @@ class StoredCertificate(ResultTable):
     remarks: list[str] = []
     friction: dict[str, StoredFriction] = {}
     impedance: StoredImpedance | None = None
+    compensation: dict[str, StoredCompensation] = {}
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:

@@ -99,7 +99,7 @@ def test_the_test_agrees_with_a_fine_lifted_discretisation(gains):
     law = pid(*gains)
     loop = loop_of(law)
     theta = np.array([0.02, 0.1, 0.3, 0.8, 1.5, 2.5, 3.1])
-    responses = proof._respond(loop, theta)
+    responses = proof.find_responses(loop, theta)
     transition, effort, state, direct, _ = closed_loop_matrices(law, 120)
     compared = 0
     for i, angle in enumerate(theta):
@@ -182,12 +182,12 @@ def test_one_friction_is_tested_as_many_are():
     law = pid(0.53, 0.018)
     loop = loop_of(law, slope=6250.0)
     theta = np.array([0.02, 0.3, 1.5, 3.0])
-    one = proof._respond(loop, theta)
+    one = proof.find_responses(loop, theta)
     wide = np.zeros((*one.s.shape, 2, 2), dtype=complex)
     wide[..., :1, :1] = one.mobility
     wide[..., 1, 1] = 1.0  # moves itself alone
     still = np.zeros((*one.s.shape, 1))
-    two = proof._Responses(
+    two = proof.LoopResponses(
         theta=theta, s=one.s, mobility=wide, command=np.concatenate([one.command, still], axis=-1),
         sensed=np.concatenate([one.sensed, still], axis=-1), tail=one.tail, order=one.order,
     )  # fmt: skip
@@ -243,7 +243,7 @@ def test_what_a_multiplier_asks_of_the_feedback_is_the_circle_criterion(factor):
     for _ in range(5):
         law = pid(rng.uniform(0.1, 4.0), rng.uniform(0.0, 0.04), k_i=rng.uniform(0.3, 200.0))
         loop, c_y = loop_of(law, slope=6250.0), law.measurement_response(theta / (2 * np.pi * PERIOD))
-        for name, multiplier in list(proof._multipliers(loop))[::7]:
+        for name, multiplier in list(proof.list_multipliers(loop))[::7]:
             limit = proof.limit_feedback(loop, theta, name, factor)
             kept = np.abs(c_y) < limit.level * np.abs(1.0 + limit.plant * c_y)
             value = evaluate_circle(c_y, multiplier, factor * 6250.0, theta)

@@ -1,0 +1,1 @@
+"""Controllers that also compensate what is known of their plant."""

@@ -1,0 +1,111 @@
+"""A controller that also compensates what is known of its plant, and whether it stays stable with that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from seaopt.control.compensation.friction import find_motor_friction, find_reading, make_friction_term
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.friction_margin import take_friction_out
+from seaopt.control.loops.compensation.stability import CompensationMargin, SpeedReading, compensation_margin
+from seaopt.control.loops.compensation.terms import CompensateFriction, Compensation, FrictionTerm
+from seaopt.control.loops.friction_loop import FrictionLoop
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+
+ENOUGH = 1.5  # times the slope asked for: at the nominal parameters no better multiplier is looked for
+
+
+def add_compensation(controller: Controller, *, friction: CompensateFriction | None = None) -> Controller:
+    """Return a controller that also compensates its design plant's friction, at its parameters.
+
+    The law, its figures and its friction margin stay what they are; what is added acts between the law and the limit
+    of the command, in every simulation and in exported code.
+
+    Parameters
+    ----------
+    controller : Controller
+        As tuned or read; it knows its design plant.
+    friction : CompensateFriction, optional
+        What is asked for friction; left out, none of it is compensated.
+
+    Raises
+    ------
+    ControlError
+        The controller does not know its design plant; no friction is where the motor acts; the reference is that of an
+        outer loop, and friction would be compensated from it; or nothing is shown to be stable for the measured speed.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control import CompensateFriction, add_compensation
+    >>> stand, params = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
+    >>> controller = so.tune(stand, params, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
+    >>> round(add_compensation(controller, friction=CompensateFriction(fraction=0.8)).compensation.friction.effort, 6)
+    40.0
+
+    """
+    if controller.design is None:
+        raise ControlError(
+            "compensate: the controller does not know its design plant, whose friction it would compensate; tune it on "
+            "a model, or read it with Controller.from_dict"
+        )
+    if friction is None:
+        return replace(controller, compensation=None)
+    if friction.source == "reference" and controller.outer is not None:
+        raise ControlError(
+            'compensate.friction: from = "reference" with [impedance] would be a feedback of the link, for which '
+            'stability is not shown; take from = "speed"'
+        )
+    plant, params = controller.design
+    loop = None
+    if friction.source == "speed" and friction.speed is None:
+        (loop,) = take_friction_out(controller, plant, [params])
+    term = make_friction_term(plant, params, controller.spec.regulated, friction, loop)
+    return replace(controller, compensation=Compensation(sample_time_s=controller.sample_time_s, friction=term))
+
+
+def find_compensation_margins(
+    controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", enough: float = 1.0
+) -> list[CompensationMargin]:
+    """Return how steep a compensation from the measured speed stability is shown for, at sets of parameters.
+
+    Parameters
+    ----------
+    controller : Controller
+        With a compensation of friction from the measured speed.
+    plant : Plant
+        Any on which it runs, with its own friction.
+    sets : sequence of ParameterSet
+        All with the same conditions among them.
+    first : str, optional
+        A multiplier that is tried first.
+    enough : float
+        A margin of so many times what is asked ends the search for a better one.
+
+    """
+    term = None if controller.compensation is None else controller.compensation.friction
+    assert term is not None
+    loops = take_friction_out(controller, plant, sets)
+    return [_find_margin(term, plant, params, loop, first, enough) for params, loop in zip(sets, loops, strict=True)]
+
+
+def _find_margin(
+    term: FrictionTerm, plant: Plant, params: ParameterSet, loop: FrictionLoop | None, first: str, enough: float
+) -> CompensationMargin:
+    def refuse(why: str) -> CompensationMargin:
+        return CompensationMargin(slope=0.0, asked=term.slope, frequency_hz=0.0, multiplier=why)
+
+    if loop is None:
+        return refuse("the plant has no friction to compensate")
+    try:
+        found = find_motor_friction(plant, params)
+        per_rate = find_reading(plant, params, term.reads, found)
+    except ControlError as error:
+        return refuse(str(error))
+    # What the law takes for the velocity, of this plant's own.
+    velocity = loop.velocity[found.index] * term.velocity_per_rate / per_rate
+    reading = SpeedReading(velocity=velocity, differenced=True)
+    return compensation_margin(loop, reading, term.slope, first, enough)

@@ -1,0 +1,257 @@
+r"""What a law adds because the plant is known, as it runs: once a sample, in Python, in simulation and in C.
+
+Friction is met with an effort of the size of a fraction of Coulomb friction and of the sign of a velocity,
+
+.. math:: c_k = \gamma F_c\, \mathrm{sat}(v_k / v_0), \qquad \mathrm{sat}(x) = \min(\max(x, -1), 1),
+
+where :math:`v_k` is the velocity at the friction: the one that the reference asks for with the link at rest,
+:math:`v_k = g (r_k - r_{k-1})/T_s`, which is outside every loop, or the one that is measured,
+:math:`v_k = g (\theta_k - \theta_{k-1})/T_s` of an encoder at the motor, which is a feedback
+(`seaopt.control.loops.compensation.stability`). The saturation has the slope of a hyperbolic tangent at rest, needs no
+library on a target, and is monotone and odd, which is all that the test of stability asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, Literal
+
+from seaopt.errors import ControlError, require_number
+from seaopt.records import record
+
+FrictionSource = Literal["reference", "speed"]
+SOURCES: tuple[FrictionSource, ...] = ("reference", "speed")
+DEFAULT_FRACTION = 0.8
+Memory = tuple[float, float]  # whether there was a sample before, and what it had of what is differenced
+FORGOTTEN: Memory = (0.0, 0.0)
+
+
+@record
+class CompensateFriction:
+    """What is asked of a compensation of friction.
+
+    Parameters
+    ----------
+    fraction : float
+        Of Coulomb friction, above 0 and up to 1.5; above 1 is more than there is.
+    source : {"reference", "speed"}
+        The velocity that the reference asks for, or the motor's as measured.
+    speed : float, optional
+        v_0, over which the compensation rises to its full size, m/s or rad/s at the friction. Left out: the plant's own
+        smoothing; of the measured speed at least twice what stability is shown for on the design plant.
+
+    Raises
+    ------
+    ControlError
+        A value is out of range.
+
+    Examples
+    --------
+    >>> CompensateFriction(fraction=0.9).source
+    'reference'
+
+    """
+
+    fraction: float = DEFAULT_FRACTION
+    source: FrictionSource = "reference"
+    speed: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < require_number(self.fraction, "compensate.friction.fraction", ControlError) <= 1.5:
+            raise ControlError(
+                f"compensate.friction.fraction = {self.fraction:g} is not above 0 and up to 1.5; give "
+                f"fraction = {DEFAULT_FRACTION}"
+            )
+        if self.source not in SOURCES:
+            raise ControlError(
+                f'compensate.friction: from = "{self.source}" is not known; give from = "reference" or from = "speed"'
+            )
+        if self.speed is not None and not 0.0 < require_number(
+            self.speed, "compensate.friction.speed", ControlError
+        ) < float("inf"):
+            raise ControlError(f"compensate.friction.speed = {self.speed:g} is not positive; leave it out, or give one")
+
+
+@record
+class FrictionTerm:
+    """Compensation of friction as it runs.
+
+    Parameters
+    ----------
+    effort : float
+        Its full size, fraction times Coulomb friction, in the command's unit of effort.
+    speed : float
+        v_0, at the friction.
+    speed_unit : str
+        m/s or rad/s.
+    fraction : float
+        Of the Coulomb friction of the design plant.
+    source : {"reference", "speed"}
+        Where the velocity is from.
+    reads : str
+        The output that is differenced, a position of the motor; empty where it is the reference.
+    velocity_per_rate : float
+        g, the velocity at the friction per rate of what is differenced.
+
+    """
+
+    effort: float
+    speed: float
+    speed_unit: str
+    fraction: float
+    source: FrictionSource
+    reads: str
+    velocity_per_rate: float
+
+    @property
+    def slope(self) -> float:
+        """Effort over velocity at rest, its steepest, N s/m (N m s/rad)."""
+        return self.effort / self.speed
+
+    def share_per_step(self, sample_time_s: float) -> float:
+        """Return what the difference of two samples is multiplied with, v/v_0."""
+        return self.velocity_per_rate / (self.speed * sample_time_s)
+
+    def describe(self, effort_unit: str) -> str:
+        """Return what it does in words."""
+        whence = "the reference's rate" if self.source == "reference" else f"the speed of {self.reads}"
+        return (
+            f"{100.0 * self.fraction:.3g} % of Coulomb friction, {self.effort:.4g} {effort_unit} at the spring, from "
+            f"{whence}, at full size from {self.speed:.3g} {self.speed_unit}"
+        )
+
+
+@record
+class Compensation:
+    """What a law adds to its effort and to its reference.
+
+    Parameters
+    ----------
+    sample_time_s : float
+        Seconds.
+    friction : FrictionTerm, optional
+
+    Examples
+    --------
+    >>> term = FrictionTerm(
+    ...     effort=40.0, speed=0.01, speed_unit="m/s", fraction=0.8, source="speed", reads="q", velocity_per_rate=1.0
+    ... )
+    >>> compensation = Compensation(sample_time_s=1e-3, friction=term)
+    >>> _, _, memory = compensation.step((0.0, 0.0), 0.0, [0.2])
+    >>> round(compensation.step(memory, 0.0, [0.200005])[1], 9)  # 5 mm/s of 10 mm/s
+    20.0
+
+    """
+
+    sample_time_s: float
+    friction: FrictionTerm | None = None
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The outputs that it reads, besides what the law does."""
+        return (self.friction.reads,) if self.friction is not None and self.friction.reads else ()
+
+    @property
+    def numbers(self) -> list[float]:
+        """Its numbers, in the order in which `compensate` takes them."""
+        if self.friction is None:
+            return []
+        return [self.friction.effort, self.friction.share_per_step(self.sample_time_s)]
+
+    @property
+    def shape(self) -> CompensationShape:
+        """What of it is no number."""
+        return CompensationShape(
+            friction=None if self.friction is None else self.friction.source, reads=self.reads,
+        )  # fmt: skip
+
+    def step(self, memory: Memory, reference: float, readings: Sequence[float]) -> tuple[float, float, Memory]:
+        """Return the reference that the law gets, the effort that is added to its own, and the next memory.
+
+        Parameters
+        ----------
+        memory : (float, float)
+            Of the last sample; `FORGOTTEN` at the first, which counts as at rest.
+        reference : float
+            Of this sample.
+        readings : sequence of float
+            Of `reads`, in their order.
+
+        Raises
+        ------
+        ControlError
+            There are not as many readings as outputs.
+
+        """
+        if len(readings) != len(self.reads):
+            raise ControlError(
+                f"readings: the compensation reads {', '.join(self.reads) or 'nothing'}, and got {len(readings)}; give "
+                "one reading for each"
+            )
+        asked, effort, kept = compensate(self.shape, self.numbers, memory, reference, readings, _Floats)
+        return asked, effort, (kept[0], kept[1])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its terms, for controller.json."""
+        return {"friction": None if self.friction is None else asdict(self.friction)}
+
+    def describe(self, effort_unit: str) -> list[str]:
+        """Return what it does, one line for each term."""
+        return [] if self.friction is None else [f"friction: {self.friction.describe(effort_unit)}"]
+
+
+@record
+class CompensationShape:
+    """Which terms a compensation has, and what they read; all else is numbers."""
+
+    friction: FrictionSource | None = None
+    reads: tuple[str, ...] = ()
+
+    @property
+    def remembered(self) -> int:
+        """How many numbers it keeps from one sample to the next."""
+        return 0 if self.friction is None else 2
+
+    @property
+    def size(self) -> int:
+        """How many numbers it takes."""
+        return 0 if self.friction is None else 2
+
+
+class _Floats:
+    """The operations of `compensate` on floats; what is not a number stays so."""
+
+    @staticmethod
+    def fmin(a: float, b: float) -> float:
+        return b if b < a else a
+
+    @staticmethod
+    def fmax(a: float, b: float) -> float:
+        return b if b > a else a
+
+
+def compensate(
+    shape: CompensationShape, numbers: Sequence[Any], memory: Sequence[Any], reference: Any, readings: Sequence[Any],
+    operations: Any,
+) -> tuple[Any, Any, list[Any]]:  # fmt: skip
+    """Return the law's reference, the effort that is added, and the next memory, of floats or expressions.
+
+    Parameters
+    ----------
+    shape, numbers
+        Of a `Compensation`.
+    memory : sequence
+        As many as the shape remembers.
+    reference, readings
+        Of this sample.
+    operations
+        What has fmin and fmax for them: the module casadi for expressions.
+
+    """
+    if shape.friction is None:
+        return reference, 0.0, []
+    effort, share_per_step = numbers[:2]
+    now = reference if shape.friction == "reference" else readings[0]
+    share = memory[0] * share_per_step * (now - memory[1])
+    return reference, effort * operations.fmax(operations.fmin(share, 1.0), -1.0), [1.0, now]
