@@ -412,6 +412,17 @@ class CompensationTable(_Strict):
     friction: FrictionCompensationTable | None = None
 
 
+def _tell_list(value: Any) -> str:
+    """Tell a list of names from a table, so that what is wrong in one is not reported of the other."""
+    return "names" if isinstance(value, list) else "table"
+
+
+Compensated = Annotated[
+    Annotated[list[Literal["friction"]], Tag("names")] | Annotated[CompensationTable, Tag("table")],
+    Discriminator(_tell_list),
+]
+
+
 class ControllerTable(_Strict):
     """What is asked of the controller."""
 
@@ -420,7 +431,7 @@ class ControllerTable(_Strict):
     structure: Literal["pd", "pid", "pid_dob"] = "pid"
     notch: Flag | NotchTable = False
     prefilter: Literal["first_order", "second_order"] | PrefilterTable | None = None
-    compensate: list[Literal["friction"]] | CompensationTable = []
+    compensate: Compensated = []
     reference_weights: Literal["tuned", "error", "measurement"] = "tuned"
     bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)

@@ -37,6 +37,7 @@ from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_template
 from seaopt.reporting.verdict import UNMET, judge_results
 from seaopt.robustness import Certificate
+from seaopt.robustness.certificate.compensation import FRICTION_COMPENSATION
 from seaopt.robustness.certificate.failures import group_failures
 from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.judgement import Outcome
@@ -425,7 +426,8 @@ class RequirementRow:
 def group_requirements(certificate: Certificate) -> list[RequirementRow]:
     """Return what is missed, each kind once with its count, and then what is met."""
     units = {name: limit.unit for name, limit in BY_REQUIREMENT.items()}
-    units["max_noise_gain"] = certificate.controller.command.gain_unit
+    command = certificate.controller.command
+    units |= {"max_noise_gain": command.gain_unit, FRICTION_COMPENSATION: command.mechanics.damping}
     groups = [(one.worst, one.count) for one in group_failures(certificate.requirements)]
     groups += [(row, 1) for row in certificate.requirements if row.met]
     return [

@@ -34,6 +34,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.compensation import (
+    FRICTION_COMPENSATION,
     CompensationDraws,
     describe_compensation,
     find_nominal_compensation,
@@ -81,7 +82,9 @@ class Requirement:
     @property
     def sense(self) -> str:
         """What the value must be to the limit, as a sign; of draws and worst cases it is at most that."""
-        return BY_REQUIREMENT[self.name].symbol if self.name in BY_REQUIREMENT else "≤"
+        if self.name in BY_REQUIREMENT:
+            return BY_REQUIREMENT[self.name].symbol
+        return "≥" if self.name == FRICTION_COMPENSATION else "≤"
 
 
 @record

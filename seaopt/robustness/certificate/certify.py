@@ -263,7 +263,7 @@ def certify(
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin),
-        *compensation_requirements(compensation, compensation_draws),
+        *compensation_requirements(controller, compensation, compensation_draws),
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
         *impedance_requirements(impedance),
     )

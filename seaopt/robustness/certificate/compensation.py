@@ -24,6 +24,7 @@ from seaopt.robustness.certificate.friction import MARGIN_DRAWS
 from seaopt.robustness.uncertainty.draws import Uncertainty
 from seaopt.robustness.uncertainty.worst import place_values
 
+FRICTION_COMPENSATION = "friction_compensation"
 FROM_REFERENCE = "friction is compensated from the reference, outside the loop: its stability is the law's without it"
 
 

@@ -20,14 +20,13 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, MonteCarlo, Requirement
-from seaopt.robustness.certificate.compensation import CompensationDraws
+from seaopt.robustness.certificate.compensation import FRICTION_COMPENSATION, CompensationDraws
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.impedance_steps import AT_REST
 
-FRICTION_COMPENSATION = "friction_compensation"
 NO_FRICTION = "no friction: any margin holds"
 WITNESS_REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
@@ -146,9 +145,12 @@ def friction_requirements(
 
 
 def compensation_requirements(
-    margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
+    controller: Controller, margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
 ) -> list[Requirement]:
-    """Return that stability is shown with friction compensated from the speed, at nominal values and over draws."""
+    """Return that stability is shown with friction compensated from the speed, at nominal values and over draws.
+
+    Where it is, or is not, says the largest fraction of Coulomb friction that is shown at the compensation's speed.
+    """
     rows: list[Requirement] = []
     for name, margin in margins.items():
         value, where = margin.slope, f"{name}: {margin.multiplier}"
@@ -157,6 +159,10 @@ def compensation_requirements(
         if drawn is not None and drawn.least_slope < value:
             value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
         met = bool(value >= margin.asked * (1.0 - LIMIT_ROUNDING))
+        if controller.compensation is not None and controller.compensation.friction is not None and value:
+            where += (
+                f"; shown up to {value / margin.asked * controller.compensation.friction.fraction:.3g} of the friction"
+            )
         rows.append(Requirement(name=FRICTION_COMPENSATION, limit=margin.asked, value=value, met=met, where=where))
     return rows
 

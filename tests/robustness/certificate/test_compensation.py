@@ -37,6 +37,8 @@ def test_stability_is_required_with_less_friction_than_is_compensated(controller
     assert row.met
     assert row.limit == pytest.approx(chosen.compensation.friction.slope)
     assert certificate.compensation_draws["stand"].shown == 10
+    shown = float(row.where.split("shown up to ")[1].split(" ")[0])
+    assert shown == pytest.approx(row.value * chosen.compensation.friction.speed / 100.0, rel=1e-2)
     assert row.value == certificate.compensation_draws["stand"].least_slope < certificate.compensation["stand"].slope
     stored = json.loads(to_json(certificate.to_dict()))
     again = type(certificate).from_dict(stored, chosen, {"stand": STAND}, PARAMETERS)
@@ -49,6 +51,7 @@ def test_what_is_too_steep_is_not_met(controller):
     certificate = certify(steep)
     (row,) = find(certificate)
     assert not row.met
+    assert row.sense == "≥"
     assert not certificate.passed
     assert 0.0 < row.value < row.limit
     assert not certificate.compensation_draws

@@ -1,0 +1,73 @@
+"""`compensate` in a problem file: through tuning to controller.json and back."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import seaopt as so
+from seaopt.control import Controller
+from seaopt.files import to_json
+from seaopt.problem.stages import tune_problem
+
+TEXT = """
+schema = 1
+[parameters]
+f_c = 100.0
+[plant.stand]
+kind = "high_impedance"
+[controller]
+plant = "stand"
+bandwidth_hz = 20
+max_sensitivity = 1.6
+compensate = %s
+"""
+
+
+@pytest.mark.parametrize(
+    ("asked", "fraction", "source"),
+    [
+        ('["friction"]', 0.8, "reference"),
+        ('{ friction = { fraction = 0.5, from = "speed", speed = 0.05 } }', 0.5, "speed"),
+    ],
+)
+def test_what_the_file_asks_is_what_runs(tmp_path, asked, fraction, source):
+    path = tmp_path / "problem.toml"
+    path.write_text(TEXT % asked, encoding="utf-8")
+    problem = so.read_problem(path)
+    controller = tune_problem(problem, problem.parameters)
+    term = controller.compensation.friction
+    assert (term.fraction, term.source) == (fraction, source)
+    assert term.effort == pytest.approx(fraction * 100.0)
+    content = json.loads(to_json(controller.to_dict()))
+    assert (
+        Controller.from_dict(content, problem.design_plant, problem.parameters).compensation == controller.compensation
+    )
+    content["compensation"]["friction"]["reads"] = "" if source == "speed" else "q"
+    with pytest.raises(so.SeaoptError, match="reads"):
+        Controller.from_dict(content, problem.design_plant, problem.parameters)
+
+
+@pytest.mark.parametrize(
+    ("asked", "named"),
+    [
+        ('["frictoin"]', "friction"),
+        ("{ friction = { fraction = 2.0 } }", "fraction"),
+        ('{ friction = { from = "encoder" } }', "speed"),
+        ("{ friction = { speed = 0.0 } }", "speed"),
+    ],
+)
+def test_what_is_not_there_to_be_asked_is_named(tmp_path, asked, named):
+    path = tmp_path / "problem.toml"
+    path.write_text(TEXT % asked, encoding="utf-8")
+    with pytest.raises(so.SeaoptError, match=named):
+        so.read_problem(path)
+
+
+def test_without_friction_there_is_nothing_to_compensate(tmp_path):
+    path = tmp_path / "problem.toml"
+    path.write_text((TEXT % '["friction"]').replace("f_c = 100.0", ""), encoding="utf-8")
+    problem = so.read_problem(path)
+    with pytest.raises(so.SeaoptError, match="no Coulomb friction at the motor"):
+        tune_problem(problem, problem.parameters)
