@@ -2,11 +2,14 @@
 
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, PlantMargins, Requirement, plant_margins
-from seaopt.robustness.certificate.certify import certify, failure_bound
+from seaopt.robustness.certificate.certify import certify
+from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
+from seaopt.robustness.certificate.predictive import certify_mpc, linear_controller
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value
+from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import Witness, Worst
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import Outcome
@@ -15,9 +18,9 @@ from seaopt.robustness.verification.scenarios import Phase, Scenario, default_sc
 from seaopt.robustness.verification.verification import Verification, verify
 
 __all__ = [
-    "BatchFigures", "Bracket", "Budget", "Certificate", "JointTuning", "LargeSignal", "MonteCarlo", "Outcome", "Phase",
-    "PlantMargins", "Requirement", "Round", "Scenario", "Simulated", "StabilityMap", "Uncertainty", "Verification",
-    "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges", "combine_uncertainty",
-    "coupled_stability", "default_scenarios", "failure_bound", "large_signal", "place_value", "plant_margins",
-    "run_simulations", "tune_certified", "verify",
+    "BatchFigures", "Bracket", "Budget", "Certificate", "ConstrainedRuns", "JointTuning", "LargeSignal", "MonteCarlo",
+    "Outcome", "Phase", "PlantMargins", "Requirement", "Round", "Scenario", "Simulated", "StabilityMap", "Uncertainty",
+    "Verification", "Witness", "Worst", "batch_figures", "bracket", "certify", "certify_mpc", "check_ranges",
+    "combine_uncertainty", "coupled_stability", "default_scenarios", "failure_bound", "large_signal",
+    "linear_controller", "place_value", "plant_margins", "run_simulations", "tune_certified", "verify",
 ]  # fmt: skip

@@ -40,6 +40,7 @@ from seaopt.robustness.certificate.compensation import (
     find_nominal_compensation,
     list_compensation,
 )
+from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import CertifiedImpedance, ImpedanceDraws, certify_impedance
 from seaopt.robustness.certificate.simulated import (
@@ -223,6 +224,8 @@ class Certificate:
         The same over draws, of those models for which it is shown at the nominal parameters.
     impedance : CertifiedImpedance or None
         What the controller's outer loop renders, where it has one.
+    constrained : ConstrainedRuns or None
+        Of predictive control: runs with its limits active; all else is of its linear region.
     remarks : tuple of str
         What is found once, one sentence each: a delay of the fit that the controller does not count on; with friction,
         the bandwidth at amplitudes of use.
@@ -252,6 +255,7 @@ class Certificate:
     compensation: Mapping[str, CompensationMargin] = field(default_factory=dict[str, CompensationMargin])
     compensation_draws: Mapping[str, CompensationDraws] = field(default_factory=dict[str, CompensationDraws])
     impedance: CertifiedImpedance | None = None
+    constrained: ConstrainedRuns | None = None
     remarks: tuple[str, ...] = ()
     drawn_ms: Mapping[str, Float[np.ndarray, " n"]] = field(
         default_factory=dict[str, Float[np.ndarray, " n"]], repr=False
@@ -441,6 +445,7 @@ class Certificate:
                     parameters,
                     None if drawn is None else ImpedanceDraws(**drawn.model_dump()),
                 ),
+                constrained=stored.read_constrained(),
                 remarks=tuple(stored.remarks),
             )
             certificate = certificate.play_steps()
@@ -471,6 +476,7 @@ class Certificate:
             "remarks": list(self.remarks),
             "notes": list(self.notes),
             "impedance": None if self.impedance is None else self.impedance.to_dict(),
+            "constrained": None if self.constrained is None else self.constrained.to_dict(),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
@@ -501,8 +507,9 @@ class Certificate:
             if peak or not self.models
             else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
         )
+        constrained = () if self.constrained is None else self.constrained.notes
         return (
-            *self.remarks, *warn_unidentified(self.parameters, used), *friction,
+            *constrained, *self.remarks, *warn_unidentified(self.parameters, used), *friction,
             *describe_compensation(self.controller, self.compensation, self.compensation_draws),
             *self._ideal_notes(), *outside, *little, *lifted,
         )  # fmt: skip

@@ -58,6 +58,7 @@ from seaopt.robustness.certificate.requirements import (
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty
+from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
 from seaopt.robustness.uncertainty.worst import combine_worst, find_worst, measure_worst
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
@@ -340,7 +341,7 @@ def _check_arguments(
     controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float,
     max_failure_probability: float | None, min_friction_margin: float | None,
 ) -> None:  # fmt: skip
-    require_type(controller, Controller, "controller", "give a Controller", ControlError)
+    require_type(controller, Controller, "controller", "give a Controller; a ForceMPC to certify_mpc", ControlError)
     if not isinstance(plants, Mapping):
         raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
     if not plants and controller.design is not None:
@@ -463,23 +464,6 @@ def _measure_draws(
         failures.add(unstable, over_ms, over_mt)
     drawn = {name: np.unique(np.vstack([tally.points for tally in own]), axis=0) for name, own in tallies.items()}
     return failures, drawn, {name: np.concatenate(parts) for name, parts in first.items() if parts}
-
-
-def failure_bound(samples: int, failures: int, confidence: float) -> float:
-    """Return the upper Clopper-Pearson bound of a failure probability (Biometrika 26, 1934).
-
-    Examples
-    --------
-    >>> round(failure_bound(1375, 0, 1 - 1e-6), 4)
-    0.01
-
-    """
-    if failures >= samples:
-        return 1.0
-    # scipy.stats.binomtest searches for the same number, to 2e-12, and costs as much to import as 1,000 draws take.
-    from scipy.special import betaincinv
-
-    return float(betaincinv(failures + 1, samples - failures, confidence))
 
 
 def _design_requirements(controller: Controller, nominal: ParameterSet, varied: Collection[str]) -> list[Requirement]:

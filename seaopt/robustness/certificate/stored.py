@@ -11,6 +11,7 @@ from typing import Any
 
 from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
 from seaopt.files import plain
+from seaopt.robustness.certificate.constrained import ConstrainedRuns
 
 CERTIFY_AGAIN = "certify again"
 
@@ -149,6 +150,27 @@ class StoredCompensation(ResultTable):
     draws: StoredCompensationDraws | None = None
 
 
+class StoredConstrained(ResultTable):
+    """Runs of predictive control with its limits active, the fields of `ConstrainedRuns`."""
+
+    runs: Whole
+    failures: Whole
+    seed: Whole
+    diverged: Whole
+    over_bound: Whole
+    not_settled: Whole
+    confidence: Number
+    failure_probability_bound: Number
+    bound_tolerance: Number
+    largest_violation: Number
+    at_limit: Number
+    fallback: Number
+    iterations: Whole
+    sensor_std: Number
+    where: str
+    left_out: tuple[str, ...]
+
+
 class StoredCertificate(ResultTable):
     """A robustness.json."""
 
@@ -161,6 +183,11 @@ class StoredCertificate(ResultTable):
     friction: dict[str, StoredFriction] = {}
     impedance: StoredImpedance | None = None
     compensation: dict[str, StoredCompensation] = {}
+    constrained: StoredConstrained | None = None
+
+    def read_constrained(self) -> ConstrainedRuns | None:
+        """Return the runs with limits active, of a certificate of predictive control."""
+        return None if self.constrained is None else ConstrainedRuns(**self.constrained.model_dump())
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:

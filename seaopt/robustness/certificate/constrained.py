@@ -1,0 +1,271 @@
+"""Simulate predictive control with its limits active, over draws of parameters, steps and disturbances.
+
+Each run is the law as it runs, solver and fallback included, on the nonlinear plants:
+
+    rest, a step, the step reversed, the disturbance with the reference held.
+
+Sizes and signs are drawn, from steps that stay within the limits to those that take all that the command holds. A run
+fails where it diverges or grows, breaks a bound of an output by more than a tolerance, or, on a plant whose link does
+not move, does not settle. With n runs and f failures the probability that a run drawn so fails is below Clopper's and
+Pearson's bound; nothing is claimed beyond that distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control import ForceMPC, ForceRun, MPCStep, close_loop
+from seaopt.control.loops.sampled_plant import DELAY, conditions
+from seaopt.errors import SeaoptError
+from seaopt.formatting import format_count, format_values
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.plant import deflection_row, output_function
+from seaopt.progress import Progress, count_off, ignore
+from seaopt.records import record
+from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.uncertainty.failure_probability import failure_bound
+from seaopt.robustness.uncertainty.worst import place_values
+
+CONSTRAINED_STREAM = 0x3C  # the runs' own stream of random numbers, whatever the seed
+STEP_SHARES = (0.3, 1.0)  # of the force that the limits hold, of the steps
+DISTURBANCE_SHARE = 0.1  # of the limit of the command, at most
+PERIODS, LEAST_PHASE_S, REST_S = 3.0, 0.1, 0.02  # of the bandwidth that a phase lasts, at least so long; before it
+LAST_SHARE, SETTLED = 0.2, 0.1  # of a phase, over which the force is off by at most this share of the step
+RUNAWAY, GROWTH = 3.0, 1.5  # times what the limits hold; second half of the last phase over its first
+DIVERGED, OVER_BOUND, UNSETTLED = "diverged", "over a bound", "not settled"
+
+
+
+
+@record
+class ConstrainedRuns:
+    """Runs with limits active: how many failed, by what, and the worst of them.
+
+    Parameters
+    ----------
+    runs, failures, seed : int
+        A run is one draw on every plant; it fails if it fails on one.
+    diverged, over_bound, not_settled : int
+        The failures by their first reason.
+    confidence, failure_probability_bound : float
+        With that confidence the probability of failure is below the bound.
+    bound_tolerance, largest_violation : float
+        By how much a bounded signal may leave its bounds, and did, as a share of half their width.
+    at_limit, fallback : float
+        Share of the samples with the command at its limit or its slew limit, and without a plan that keeps the limits.
+    iterations : int
+        The most of any step.
+    sensor_std : float
+        Noise of the measurement.
+    where : str
+        The worst run, with its parameters; "" where none failed.
+    left_out : tuple of str
+        Bounded signals that a plant does not have, and conditions that are not drawn.
+
+    """
+
+    runs: int
+    failures: int
+    seed: int
+    diverged: int
+    over_bound: int
+    not_settled: int
+    confidence: float
+    failure_probability_bound: float
+    bound_tolerance: float
+    largest_violation: float
+    at_limit: float
+    fallback: float
+    iterations: int
+    sensor_std: float
+    where: str = ""
+    left_out: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as they stand in robustness.json under "constrained"."""
+        return asdict(self) | {"left_out": list(self.left_out)}
+
+    def __str__(self) -> str:
+        kinds = ((self.diverged, DIVERGED), (self.over_bound, OVER_BOUND), (self.not_settled, UNSETTLED))
+        counts = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
+        return (
+            f"with limits active: {format_count(self.failures, 'failure')} in {format_count(self.runs, 'simulated run')}"
+            f"{f' ({counts})' if counts else ''}, failure probability below {self.failure_probability_bound:.2g} at a "
+            f"confidence of {100 * self.confidence:.6g} %; the command at a limit in {self.at_limit:.0%} of the samples, "
+            f"no new plan in {self.fallback:.2%}, {self.iterations} iterations at most"
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a certificate remarks of these runs."""
+        return (
+            "margins, worst cases and draws are of the linear region, in which no limit of the plan is active", str(self),
+            *self.left_out,
+        )  # fmt: skip
+
+
+@record(eq=False)
+class _Outcome:
+    """One run on one plant: its first fault ("" if none), and what it did."""
+
+    kind: str
+    text: str
+    violation: float
+    steps: tuple[MPCStep, ...]
+    at_limit: int
+
+
+def run_constrained(
+    mpc: ForceMPC, plants: Mapping[str, Plant], unknown: Uncertainty, *, runs: int, seed: int, confidence: float,
+    tolerance: float, sensor_std: float, progress: Progress = ignore,
+) -> ConstrainedRuns:  # fmt: skip
+    """Draw and simulate runs with limits active.
+
+    Parameters
+    ----------
+    mpc : ForceMPC
+    plants : mapping of name to Plant
+        Each is played at every draw.
+    unknown : Uncertainty
+        What is drawn of the parameters.
+    runs, seed, confidence, tolerance, sensor_std, progress
+        As in `certify_mpc`.
+
+    """
+    rng = np.random.default_rng([seed, CONSTRAINED_STREAM])
+    drawn = unknown.values(unknown.draw(runs, rng))
+    placed = {name for plant in plants.values() for name in conditions((plant,)) if name != DELAY}
+    kinds: list[str] = []
+    worst, outcomes = "", list[_Outcome]()
+    for k in count_off(range(runs), "limits active, run", progress):
+        draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
+        reference, disturbance = _draw_references(mpc, rng)
+        first = ""
+        for name, plant in plants.items():
+            values = place_values(plant, unknown.nominal, draw)
+            outcome = _play(mpc, plant, values, reference, disturbance, tolerance, sensor_std, seed + k)
+            outcomes.append(outcome)
+            if outcome.kind and not first:
+                first = outcome.kind
+                at = format_values({key: value for key, value in draw.items() if key in values})
+                worst = worst or f"{name}, run {k}, seed {seed}: {outcome.text}{f'; {at}' if at else ''}"
+        kinds.append(first)
+    failures, steps = sum(map(bool, kinds)), [step for one in outcomes for step in one.steps]
+    missing = (
+        f"{name} has no {signal}: its bounds are not checked there"
+        for name, plant in plants.items()
+        for signal in mpc.spec.bounds
+        if not _has(plant, signal)
+    )
+    kept = (f"runs with limits active start at rest at zero: {name} is not drawn there" for name in placed & {*drawn})
+    return ConstrainedRuns(
+        runs=runs, failures=failures, seed=seed, diverged=kinds.count(DIVERGED), over_bound=kinds.count(OVER_BOUND),
+        not_settled=kinds.count(UNSETTLED), confidence=confidence,
+        failure_probability_bound=failure_bound(runs, failures, confidence), bound_tolerance=tolerance,
+        largest_violation=max(one.violation for one in outcomes),
+        at_limit=sum(one.at_limit for one in outcomes) / max(len(steps), 1),
+        fallback=float(np.mean([not step.solved for step in steps])) if steps else 0.0,
+        iterations=max((step.iterations for step in steps), default=0), sensor_std=sensor_std, where=worst,
+        left_out=(*missing, *kept),
+    )  # fmt: skip
+
+
+def _draw_references(
+    mpc: ForceMPC, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:  # fmt: skip
+    """Return the reference of a run, and the disturbance of its command: each of its phases is as long."""
+    rest, phase = (round(seconds * mpc.spec.sample_rate_hz) for seconds in (REST_S, _phase_s(mpc)))
+    force = rng.choice([-1.0, 1.0]) * rng.uniform(*STEP_SHARES) * abs(mpc.static_gain) * mpc.command_limit
+    disturbance = rng.uniform(-1.0, 1.0) * DISTURBANCE_SHARE * mpc.command_limit
+    reference = np.concatenate([np.zeros(rest), np.full(phase, force), np.full(2 * phase, -force)])
+    return reference, np.concatenate([np.zeros(rest + 2 * phase), np.full(phase, disturbance)])
+
+
+def _phase_s(mpc: ForceMPC) -> float:
+    return max(LEAST_PHASE_S, PERIODS / mpc.spec.bandwidth_hz)
+
+
+def _play(
+    mpc: ForceMPC, plant: Plant, values: ParameterSet, reference: Float[np.ndarray, " n"],
+    disturbance: Float[np.ndarray, " n"], tolerance: float, sensor_std: float, seed: int,
+) -> _Outcome:  # fmt: skip
+    """Simulate one run on one plant, and judge it."""
+    steps: list[MPCStep] = []
+
+    def law(state: Any, r: Any, y: float) -> tuple[float, Any]:
+        steps.append(mpc.step(state, r, y))
+        return steps[-1].current_A, steps[-1].state
+
+    try:
+        run = close_loop(
+            law, mpc.start, plant, values, reference, measured=mpc.measured, sample_time_s=mpc.sample_time_s,
+            delay_samples=mpc.delay_samples, preview_samples=mpc.spec.preview_samples, sensor_std=sensor_std,
+            disturbance_A=disturbance, seed=seed,
+        )  # fmt: skip
+    except SeaoptError as error:
+        return _Outcome(kind=DIVERGED, text=str(error), violation=0.0, steps=tuple(steps), at_limit=0)
+    violation, signal = _find_violation(mpc, plant, values, run, disturbance)
+    kind, text = _judge(mpc, plant, run, np.array([step.target_N for step in steps]))
+    if not kind and violation > tolerance:
+        kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
+    slews = np.abs(np.diff(run.current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
+    at_limit = int(np.count_nonzero(slews | (np.abs(run.current) > mpc.command_limit * (1.0 - 1e-6))))
+    return _Outcome(kind=kind, text=text, violation=violation, steps=tuple(steps), at_limit=at_limit)
+
+
+def _judge(mpc: ForceMPC, plant: Plant, run: ForceRun, target: Float[np.ndarray, " n"]) -> tuple[str, str]:
+    """Return what is wrong with the force of a run, a kind and a sentence; "" twice where nothing is."""
+    held, phase = abs(mpc.static_gain) * mpc.command_limit, round(_phase_s(mpc) * mpc.spec.sample_rate_hz)
+    peak = float(np.max(np.abs(run.force)))
+    if not peak < RUNAWAY * held:
+        return DIVERGED, f"{peak:.4g} {run.unit}, and the limits hold {held:.4g} {run.unit}"
+    off = np.abs(run.force - target)
+    first, second = np.max(off[-phase : -phase // 2]), np.max(off[-phase // 2 :])
+    if second > GROWTH * first + SETTLED * held:
+        return DIVERGED, f"the error grows to {second:.4g} {run.unit} over the last phase"
+    if plant.moves:
+        return "", ""
+    last = max(round(LAST_SHARE * phase), 1)
+    for end in range(run.time.size, phase, -phase):
+        error = float(np.mean(off[end - last : end]))
+        if error > SETTLED * abs(run.reference[-1]):
+            return UNSETTLED, f"{error:.4g} {run.unit} off {end / run.time.size:.0%} into the run"
+    return "", ""
+
+
+def _has(plant: Plant, name: str) -> bool:
+    return name in plant.outputs or name in plant.states or (name.startswith("spring_") and plant.spring is not None)
+
+
+def _find_violation(
+    mpc: ForceMPC, plant: Plant, values: ParameterSet, run: ForceRun, disturbance: Float[np.ndarray, " n"]
+) -> tuple[float, str]:
+    """Return by how much a bounded signal of a run leaves its bounds at most, over half their width, and which."""
+    worst, signal = 0.0, ""
+    completed = plant.complete(values)
+    applied = np.append(np.zeros(mpc.delay_samples), run.current)[: run.time.size] + disturbance
+    inputs = np.zeros((run.time.size, len(plant.inputs)))
+    inputs[:, 0] = applied
+    whole = output_function(plant).map(run.time.size)
+    outputs = np.array(whole(run.time[None], run.state.T, inputs.T, ca.DM(completed.vector)))
+    for name, (low, high) in mpc.spec.bounds.items():
+        if not _has(plant, name):
+            continue
+        if name in plant.outputs:
+            trace = outputs[list(plant.outputs).index(name)]
+        elif name in plant.states:
+            trace = run.state[:, list(plant.states).index(name)]
+        else:
+            trace = run.state @ deflection_row(plant, completed)
+            trace = np.gradient(trace, mpc.sample_time_s) if name == "spring_rate" else trace
+        beyond = float(np.max(np.maximum(low - trace, trace - high))) / (0.5 * (high - low))
+        if beyond > worst:
+            worst, signal = beyond, name
+    return worst, signal
