@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from seaopt.cli.session import SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.verdict import join_labels
+from seaopt.control.mpc.export import SOURCES, write_code
+from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
 from seaopt.reporting.verdict import UNMET
@@ -44,7 +47,8 @@ def export_controller(
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
         options["derate"] = read_guard(content, derate_margin_K) or True
-    written = [str(file) for file in export(content, target, **options)]
+    write = _write_plan if "mpc" in content else export
+    written = [str(file) for file in write(content, target, **options)]
     met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, results / FILES["certify"])
     certified = broken is not None
     if json:
@@ -68,6 +72,23 @@ def export_controller(
         for note in content.get("notes") or () if amount == "verbose" else ():
             console.wrap(f"note: {note}", indent=2)
     return content["feasible"] and met and not broken
+
+
+def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tuple[Path, ...]:
+    """Write the C code of predictive control; limits and names are those that it was designed with."""
+    if not content["feasible"] and not options.pop("allow_infeasible", False):
+        missed = join_labels(content["active_constraints"])
+        raise ProblemError(f"the controller misses {missed}; tune one that does not, or type --allow-infeasible")
+    given = {name for name, value in options.items() if value not in (None, False)} - {"precision", "name"}
+    if given or options["name"] != "force_law":
+        raise ProblemError(
+            "the C code of predictive control has the limits and the names that it was designed with: force_mpc_...; "
+            "leave out all options but --precision"
+        )
+    if options["precision"] not in ("double", "float"):
+        raise ProblemError(f'precision = "{options["precision"]}" is not known; use "double" or "float"')
+    folder = write_code(read_code(content["mpc"]["code"]), target, single_precision=options["precision"] == "float")
+    return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h"))
 
 
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:

@@ -115,6 +115,8 @@ def _read_by_design(problem: Problem) -> dict[str, Any]:
     if problem.table.impedance is not None:
         out["impedance"] = problem.table.impedance.model_dump(mode="json")
         names.add(problem.table.impedance.plant)
+    if problem.table.mpc is not None:
+        out["mpc"] = problem.table.mpc.model_dump(mode="json")
     responses = {
         f"frf:{one.name}": one.model_dump(mode="json")
         for one in problem.table.experiment

@@ -22,9 +22,9 @@ from seaopt import __version__
 from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
-from seaopt.cli.show import show_certificate, show_controller, show_fit, show_verdicts
+from seaopt.cli.show import show_certificate, show_controller, show_fit, show_plan, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
-from seaopt.control import Controller, ControllerSpec, read_law, sweep
+from seaopt.control import Controller, ControllerSpec, ForceMPC, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.errors import ProblemError
@@ -41,6 +41,8 @@ from seaopt.problem.stages import (
     assess_problem,
     can_design,
     certify_problem,
+    describe_mpc,
+    design_mpc,
     fit_problem,
     list_plants,
     score_problem,
@@ -56,6 +58,7 @@ from seaopt.reporting.verdict import (
     judge_controller,
     judge_expectations,
     judge_fit,
+    judge_mpc,
     name_guesses,
 )
 from seaopt.robustness import Certificate, JointTuning
@@ -319,11 +322,22 @@ class Session:
             self.results["tune"] = controller
         return self.results["tune"]
 
+    def plan(self) -> ForceMPC:
+        """Return the predictive controller that the problem asks for, designed once."""
+        if "mpc" not in self.results:
+            self.results["mpc"] = design_mpc(self.problem, self.parameters())
+        return self.results["mpc"]
+
     def take_law(self, path: Path) -> None:
         """Take a law of the user's own in place of a tuned one, and write it as the folder's controller.
 
         A controller that was tuned there is kept: the law then needs another folder.
         """
+        if self.problem.mpc is not None:
+            raise ProblemError(
+                f'{self.problem.source}: [controller] has structure = "mpc", and a law of one\'s own is no plan; write '
+                'structure = "pid" for its limits'
+            )
         given = read_law(path)
         controller = assess_problem(self.problem, given, self.parameters())
         target = self.folder / FILES["tune"]
@@ -467,12 +481,21 @@ class Session:
         self._design_values(design, *(plant for plant, _ in robust_to.values()))
         self._spec()
         result = tune_problem(self.problem, self.parameters(), tell)
+        if self.problem.mpc is not None and isinstance(result, Controller):
+            self.results["tune"] = result
+            self._write("tune", result.to_dict() | {"mpc": describe_mpc(self.plan())})
+            return
         if isinstance(result, JointTuning):
             self.results["joint"], result = result, result.controller
         self.results["tune"] = result
         self._write("tune", result.to_dict())
 
     def _sweep(self, tell: Progress) -> None:
+        if self.problem.mpc is not None:
+            raise ProblemError(
+                f'{self.problem.source}: a sweep tunes gains, and [controller] has structure = "mpc"; for a sweep write '
+                'structure = "pid"'
+            )
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
         design, robust_to = list_plants(self.problem, self.parameters())
@@ -512,7 +535,8 @@ class Session:
                     )
                 results.append(fitted)
         if self.problem.spec is not None and ("tune" in self.results or (self.folder / FILES["tune"]).exists()):
-            results.append(self.controller())
+            controller = self.controller()
+            results.append(controller if self.problem.mpc is None else self.plan())
             if "certify" not in self.results and (self.folder / FILES["certify"]).exists():
                 plants = self.problem.certified_plants()
                 simulating("simulating again", 0.0)
@@ -560,7 +584,7 @@ class Session:
             joint, sweep = self.results.get("joint"), f"{self._spell('tune')} --sweep"
             if joint is not None:
                 verdicts.append(StageVerdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
-            verdicts.append(judge_controller(result, sweep))
+            verdicts.append(judge_controller(result, sweep) if self.problem.mpc is None else judge_mpc(self.plan()))
         if stage == "certify" and result is not None:
             again = self._spell("run" if self.problem.table.experiment else "tune")
             verdicts.append(judge_certificate(result, again, f"{self._spell('tune')} --sweep"))
@@ -615,6 +639,8 @@ class Session:
                 show_fit(console, self.results[stage], self.results.get("scores", ()))
             case "tune":
                 show_controller(console, self.results[stage])
+                if self.problem.mpc is not None:
+                    show_plan(console, self.plan())
             case "certify":
                 show_certificate(console, self.results[stage])
             case _:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from seaopt.cli.terminal import Terminal
-from seaopt.control import Controller
+from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.controller import name_gain_units
 from seaopt.estimation import Fit, ModelledOutputs
 from seaopt.formatting import MISSING, format_count, format_number, printable
@@ -107,6 +107,14 @@ def show_controller(console: Terminal, controller: Controller) -> None:
         for line in controller.compensation.describe(controller.command.effort_unit):
             console.wrap(f"compensates {line}", indent=2)
     _show_notes(console, controller.notes)
+
+
+def show_plan(console: Terminal, mpc: ForceMPC) -> None:
+    """Print the limits that a predictive controller plans within."""
+    console.wrap(f"plans within {mpc.describe_limits()}; the figures are those while no limit is active", indent=2)
+    for name, (low, high) in mpc.spec.bounds.items():
+        unit = mpc.kalman.units[mpc.kalman.names.index(name)]
+        console.wrap(f"{name} within {low:g} and {high:g} {unit}".rstrip(), indent=2)
 
 
 def show_certificate(console: Terminal, certificate: Certificate) -> None:

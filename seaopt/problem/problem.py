@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
-from seaopt.control import ControllerSpec, Notch, Prefilter
+from seaopt.control import ControllerSpec, MPCSpec, Notch, Prefilter
 from seaopt.control import draw as draw_values
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.documents import check_table
@@ -39,6 +39,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Difference, Plant, known_parameters, plant_of_kind
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.equations import list_partners, list_unused, make_plant, order_plants
+from seaopt.problem.predictive import make_mpc_spec
 from seaopt.problem.references import RESPONSE, check_references, range_remarks
 from seaopt.problem.schema import (
     AnyPlant,
@@ -57,6 +58,7 @@ from seaopt.problem.schema import (
 )
 from seaopt.records import record
 from seaopt.robustness import place_value
+from seaopt.robustness.certificate.predictive import linear_spec
 from seaopt.signals import Signal
 from seaopt.simulation import Clock
 from seaopt.units import ROTARY, factor, same_dimension, unit_after
@@ -83,7 +85,9 @@ class Problem:
     table : ProblemTable
         The validated file.
     spec : ControllerSpec or None
-        What is asked of the controller.
+        What is asked of the controller; of predictive control while no limit of its plan is active.
+    mpc : MPCSpec or None
+        What is asked of predictive control, with structure = "mpc".
 
     """
 
@@ -94,6 +98,7 @@ class Problem:
     plants: Mapping[str, Plant]
     table: ProblemTable
     spec: ControllerSpec | None
+    mpc: MPCSpec | None = None
 
     @property
     def fit_options(self) -> dict[str, Any]:
@@ -513,11 +518,19 @@ def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
         plants = _make_plants(table.plant)
         parameters = _make_parameters(table, plants)
         check_references(table, plants, parameters)
-        spec = _make_spec(table)
+        mpc = make_mpc_spec(table)
+        spec = _make_spec(table) if mpc is None else linear_spec(mpc)
     except SeaoptError as error:
         raise type(error)(f"{source}: {error}") from error
     return Problem(
-        title=table.title, source=source, folder=folder, parameters=parameters, plants=plants, table=table, spec=spec
+        title=table.title,
+        source=source,
+        folder=folder,
+        parameters=parameters,
+        plants=plants,
+        table=table,
+        spec=spec,
+        mpc=mpc,
     )
 
 

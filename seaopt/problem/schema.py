@@ -396,6 +396,7 @@ def _limit(name: str) -> Any:
 
 
 Level = Number | Literal[False] | None  # of a limit: false lifts it
+MPC = "mpc"  # the structure that plans
 
 
 class FrictionCompensationTable(_Strict):
@@ -428,7 +429,7 @@ class ControllerTable(_Strict):
 
     plant: PlantOrResponse
     measured: str | tuple[str, ...] = "F1"
-    structure: Literal["pd", "pid", "pid_dob"] = "pid"
+    structure: Literal["pd", "pid", "pid_dob", "mpc"] = "pid"
     notch: Flag | NotchTable = False
     prefilter: Literal["first_order", "second_order"] | PrefilterTable | None = None
     compensate: Compensated = []
@@ -464,6 +465,29 @@ class ControllerTable(_Strict):
         return CompensationTable(friction=FrictionCompensationTable() if "friction" in self.compensate else None)
 
 
+class NoiseModelTable(_Strict):
+    """What the Kalman filter of predictive control counts on, by name of output and input."""
+
+    sensor_std: dict[str, NotNegative]
+    input_noise: dict[str, NotNegative] = {}
+    input_drift: dict[str, NotNegative] = {}
+    offset: dict[str, Number] = {}
+
+
+class MPCTable(_Strict):
+    """What only predictive control has; the rest is in [controller]."""
+
+    current_slew_A_per_s: Number | None = None
+    decay: Number = 0.8
+    horizon_s: Number = 0.05
+    moves: Whole = 12
+    largest_force_N: Number | None = None
+    bounds: dict[str, tuple[Number, Number]] = {}
+    preview_samples: Whole = 0
+    max_iterations: Whole = 500
+    noise: NoiseModelTable | None = None
+
+
 class ImpedanceTable(_Strict):
     """Stiffness and damping at the link, around the force loop."""
 
@@ -484,6 +508,8 @@ class RobustnessTable(_Strict):
     bounds: Flag = False
     max_failure_probability: Annotated[Number, Field(gt=0, le=1)] | None = None
     min_friction_margin: Annotated[Number, Field(gt=0)] | None = None
+    constrained_runs: Annotated[Whole, Field(ge=1, le=100_000)] = 100
+    bound_tolerance: NotNegative = 0.1
     sensors: SensorsTable = SensorsTable()
     current_step_A: NotNegative = 0.0
     command_step: NotNegative = 0.0
@@ -593,6 +619,7 @@ class ProblemTable(_Strict):
     fit: FitTable = FitTable()
     controller: ControllerTable | None = None
     impedance: ImpedanceTable | None = None
+    mpc: MPCTable | None = None
     robustness: RobustnessTable | None = None
     expect: ExpectTable | None = Field(None, description="What `seaopt run` and pytest check of the results.")
 

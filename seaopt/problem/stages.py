@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from seaopt.control import (
     CompensateFriction,
     Controller,
+    ForceMPC,
     GivenLaw,
     Impedance,
     add_compensation,
@@ -18,10 +19,12 @@ from seaopt.control import (
     assess,
     command_of,
     critical_impedance,
+    force_mpc,
     tune,
 )
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.loops.sampled_plant import list_names
+from seaopt.control.mpc.export import collect_code
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
@@ -30,7 +33,15 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.problem import WRITE_ONE, Problem
 from seaopt.progress import Progress, ignore
-from seaopt.robustness import Budget, Certificate, JointTuning, certify, tune_certified
+from seaopt.robustness import (
+    Budget,
+    Certificate,
+    JointTuning,
+    certify,
+    certify_mpc,
+    linear_controller,
+    tune_certified,
+)
 
 
 def fit_problem(
@@ -83,8 +94,35 @@ def can_design(problem: Problem, result: Fit) -> bool:
     return all(np.isfinite(covariance.std(name)) or name in problem.ranges for name in covariance.names)
 
 
+def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
+    """Design the predictive controller that a problem asks for.
+
+    Parameters
+    ----------
+    problem : Problem
+        With `mpc`.
+    source : Fit or ParameterSet
+        The fit; or values, of a problem without experiments.
+
+    """
+    assert problem.mpc is not None
+    if problem.designs_on_response:
+        raise ProblemError(
+            f"{problem.source}: predictive control takes a model, and [controller] is designed on "
+            f"{problem.response_names[0]}; name a plant there"
+        )
+    return force_mpc(problem.design_plant, source, problem.mpc)
+
+
+def describe_mpc(mpc: ForceMPC) -> dict[str, Any]:
+    """Return what controller.json says of a plan beside its linear law: its specification, and its C code's numbers."""
+    return {"spec": asdict(mpc.spec), "code": collect_code(mpc).to_dict()}
+
+
 def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore) -> Controller | JointTuning:
     """Tune the problem's controller, as `seaopt tune` does; with `retune`, until it is certified.
+
+    Of predictive control it is the law while no limit is active; `design_mpc` returns all of it.
 
     Parameters
     ----------
@@ -96,6 +134,8 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
         As in `seaopt.tune`.
 
     """
+    if problem.mpc is not None:
+        return linear_controller(design_mpc(problem, source))
     design, robust_to = list_plants(problem, source)
     assert problem.spec is not None
     spec, table = settle_delay(problem.spec, problem.design_plant, source), problem.robustness
@@ -240,6 +280,15 @@ def certify_problem(
     table, measured = problem.robustness, problem.measure_responses(source)
     if problem.designs_on_response:
         return certify(controller, problem.certified_plants(), source, seed=table.seed, measured=measured)
+    if problem.mpc is not None:
+        return certify_mpc(
+            design_mpc(problem, source), problem.certified_plants(), source, ranges=problem.ranges,
+            others=problem.parameters, samples=table.samples, seed=table.seed,
+            bounds=Budget() if table.bounds else None,
+            max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
+            runs=table.constrained_runs, bound_tolerance=table.bound_tolerance,
+            sensor_std=problem.sensors.noise_std.get(problem.mpc.measured, 0.0), progress=progress,
+        )  # fmt: skip
     return certify(
         controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
         samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,

@@ -35,6 +35,8 @@ REMEDIES = {
     "impedance_draws": "less stiffness, or more damping, in [impedance]",
     "impedance_damper": "other stiffness, damping or velocity_filter_s in [impedance], inside the region of the report",
     "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
+    "constrained_failures": "a larger max_iterations or wider bounds in [mpc], or bound_tolerance in [robustness]",
+    "constrained_failure_probability": "more constrained_runs in [robustness]",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }
 
@@ -88,7 +90,7 @@ def judge_results(
     if controller is not None:
         designs.append(judge_controller(controller))
     if mpc is not None:
-        designs.append(_judge_mpc(mpc))
+        designs.append(judge_mpc(mpc))
     if certificate is not None:
         designs.append(judge_certificate(certificate))
     if verification is not None:
@@ -202,7 +204,8 @@ def _range_about(asked: float) -> str:
     return f"{step * math.floor(low / step):.4g}:{step * math.ceil(high / step):.4g}:{step:.4g}"
 
 
-def _judge_mpc(mpc: ForceMPC) -> StageVerdict:
+def judge_mpc(mpc: ForceMPC) -> StageVerdict:
+    """Return the verdict on a predictive controller: the limits of its loop while none of its plan is active."""
     name = f"Predictive control: {mpc.measured}, {mpc.spec.bandwidth_hz:g} Hz"
     if mpc.feasible:
         return StageVerdict(met=True, text=f"{name}, every limit met")
@@ -243,11 +246,11 @@ def judge_certificate(certificate: Certificate, again: str = "", sweep: str = ""
     remedies = [_advise(row.name) for row in broken]
     first = next((text for text in remedies if text), "")
     command = f"type {again}" if not first else f"{first}; then type {again}"
+    near, swept = _range_about(certificate.controller.spec.bandwidth_hz), certificate.constrained is None
     return StageVerdict(
         met=False, text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
         reasons=tuple(reasons),
-        next=(command, f"to see what other bandwidths cost type {sweep} "
-              f"{_range_about(certificate.controller.spec.bandwidth_hz)}"),
+        next=(command, *([f"to see what other bandwidths cost type {sweep} {near}"] if swept else ())),
     )  # fmt: skip
 
 

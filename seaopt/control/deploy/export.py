@@ -136,6 +136,11 @@ def export(
     else:
         from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
+        if "mpc" in controller:
+            raise ControlError(
+                "the controller plans, and its law here is that of no active limit; write its C code with export_mpc, "
+                "or type seaopt export DIR"
+            )
         stored, figures, heat = read_controller(controller), _stated(controller), read_guard(controller)
         fit_met = controller.get("fit_met", True) is True if fit_met is None else fit_met
     if not stored["feasible"] and not allow_infeasible:

@@ -2,20 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
-from seaopt.control.mpc.quadratic_program import PENALTY, RHO, WIDE, make_solver
+from seaopt.control.mpc.quadratic_program import PENALTY, RHO, WIDE, make_solver, stack_hessian
 from seaopt.errors import FileError
 from seaopt.files import write_text
+from seaopt.records import record
 
 SOURCES = ("force_mpc.h", "force_mpc.c", "example.c")
 LEFT_OUT = ("emosqp.c", "Makefile")  # OSQP's demonstration, which has a main of its own
+
+
+@record(eq=False)
+class MPCCode:
+    """All numbers of a controller's C code; `collect_code` takes them from one.
+
+    Parameters
+    ----------
+    sizes, numbers, arrays, units : mapping of name to value
+        Of ``force_mpc_data.h``.
+    hessian, rows : arrays, shapes (nv, nv) and (r, nv)
+        Of the program, which OSQP is generated for.
+    max_iterations : int
+
+    """
+
+    sizes: Mapping[str, int]
+    numbers: Mapping[str, float]
+    arrays: Mapping[str, Float[np.ndarray, "..."]]
+    units: Mapping[str, str]
+    hessian: Float[np.ndarray, "nv nv"]
+    rows: Float[np.ndarray, "r nv"]
+    max_iterations: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as they stand in controller.json."""
+        return {
+            "sizes": dict(self.sizes), "numbers": dict(self.numbers), "units": dict(self.units),
+            "arrays": {name: value.tolist() for name, value in self.arrays.items()},
+            "hessian": self.hessian.tolist(), "rows": self.rows.tolist(), "max_iterations": self.max_iterations,
+        }  # fmt: skip
 
 
 def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = False) -> Path:
@@ -39,10 +73,15 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
         The folder cannot be written.
 
     """
+    return write_code(collect_code(mpc), folder, single_precision=single_precision)
+
+
+def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = False) -> Path:
+    """Write a controller's C code, as `export_mpc`."""
     target = Path(folder)
     try:
         target.mkdir(parents=True, exist_ok=True)
-        make_solver(mpc.prediction, mpc.spec.max_iterations).codegen(
+        make_solver(code.hessian, code.rows, code.max_iterations).codegen(
             str(target), parameters="matrices", extension_name=None, force_rewrite=True, use_float=single_precision,
             prefix="force_mpc_",
         )  # fmt: skip
@@ -52,11 +91,12 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
         raise FileError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
     for name in SOURCES:
         write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
-    write_text(target / "force_mpc_data.h", _format_data(mpc))
+    write_text(target / "force_mpc_data.h", _format_data(code))
     return target
 
 
-def _format_data(mpc: ForceMPC) -> str:
+def collect_code(mpc: ForceMPC) -> MPCCode:
+    """Return the numbers of a controller's C code."""
     kalman, prediction, spec, outputs = mpc.kalman, mpc.prediction, mpc.spec, mpc.prediction.outputs
     sizes = {
         "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": mpc.delay_samples,
@@ -68,8 +108,7 @@ def _format_data(mpc: ForceMPC) -> str:
     numbers = {
         "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
         "offset": float(kalman.offset[0]), "violation": VIOLATION, "rho": RHO, "penalty": PENALTY, "wide": WIDE,
-        "slack_unit": SLACK_UNIT,
-        "lag": spec.lag_s / spec.sample_time_s,
+        "slack_unit": SLACK_UNIT, "lag": spec.lag_s / spec.sample_time_s,
     }  # fmt: skip
     if mpc.gate is not None:
         (numbers["low"], numbers["high"]), numbers["step"] = mpc.gate.range_N, mpc.gate.max_step_N
@@ -84,11 +123,18 @@ def _format_data(mpc: ForceMPC) -> str:
         "COMMAND_UNIT": mpc.actuation.unit,
         "UNIT": mpc.design[0].outputs[mpc.measured],
     }
-    lines = [f"#define FORCE_MPC_{name} {value}" for name, value in sizes.items()]
-    lines += [f'#define FORCE_MPC_{name} "{text}"' for name, text in units.items()]
-    lines += [f"static const OSQPFloat mpc_{name} = {_format_number(value)};" for name, value in numbers.items() if
-              np.isfinite(value)]  # fmt: skip
-    lines += [_format_array(name, value) for name, value in arrays.items() if value.size]
+    return MPCCode(
+        sizes=sizes, numbers={name: value for name, value in numbers.items() if np.isfinite(value)}, units=units,
+        arrays={name: value for name, value in arrays.items() if value.size}, hessian=stack_hessian(prediction),
+        rows=prediction.rows, max_iterations=spec.max_iterations,
+    )  # fmt: skip
+
+
+def _format_data(code: MPCCode) -> str:
+    lines = [f"#define FORCE_MPC_{name} {value}" for name, value in code.sizes.items()]
+    lines += [f'#define FORCE_MPC_{name} "{text}"' for name, text in code.units.items()]
+    lines += [f"static const OSQPFloat mpc_{name} = {_format_number(value)};" for name, value in code.numbers.items()]
+    lines += [_format_array(name, value) for name, value in code.arrays.items()]
     return "\n".join(
         ["/* Sizes and numbers of one controller. */", "#ifndef FORCE_MPC_DATA_H", "#define FORCE_MPC_DATA_H",
          '#include "osqp_api_types.h"', *lines, "#endif", ""]

@@ -46,7 +46,7 @@ from seaopt.control.mpc.knots import interpolate_knots, spread_knots
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.output_bounds import SLACK_UNIT, bound_outputs
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, tune_regulator
-from seaopt.control.mpc.quadratic_program import PENALTY, SOLVED, WIDE, make_solver, solve_program
+from seaopt.control.mpc.quadratic_program import PENALTY, SOLVED, WIDE, make_solver, solve_program, stack_hessian
 from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.mpc.step import MPCState, MPCStep
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
@@ -541,7 +541,7 @@ def _design(
     return ForceMPC(
         spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift,
-        solver=make_solver(prediction, spec.max_iterations),
+        solver=make_solver(stack_hessian(prediction), prediction.rows, spec.max_iterations),
         gate=gate, warnings=warnings,
     )  # fmt: skip
 

@@ -26,18 +26,22 @@ SETTINGS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def make_solver(prediction: HorizonProgram, max_iterations: int) -> Any:
-    """Return OSQP set up with the program's matrices, and bounds that have no effect yet."""
+def stack_hessian(prediction: HorizonProgram) -> Float[np.ndarray, "nv nv"]:
+    """Return the Hessian over knots and slacks."""
+    n, k = prediction.knots.size, len(prediction.outputs.names)
+    return np.block([[prediction.H, np.zeros((n, k))], [np.zeros((k, n)), CURVATURE * np.eye(k)]])
+
+
+def make_solver(hessian: Float[np.ndarray, "nv nv"], rows: Float[np.ndarray, "r nv"], max_iterations: int) -> Any:
+    """Return OSQP set up with a program's matrices, and bounds that have no effect yet."""
     import osqp  # deferred: scipy.sparse and jinja2 are slow to load
     from scipy.sparse import csc_matrix
 
-    n, k = prediction.knots.size, len(prediction.outputs.names)
-    rows = prediction.rows
-    hessian = np.block([[prediction.H, np.zeros((n, k))], [np.zeros((k, n)), CURVATURE * np.eye(k)]])
     solver = osqp.OSQP(algebra="builtin")
     P, wide = csc_matrix(np.triu(hessian)), np.full(len(rows), 10.0)
-    low = np.where(np.arange(len(rows)) < len(rows) - k, -wide, 0.0)
-    solver.setup(P=P, q=np.zeros(n + k), A=csc_matrix(rows), l=low, u=wide, max_iter=max_iterations, **SETTINGS)
+    solver.setup(
+        P=P, q=np.zeros(len(hessian)), A=csc_matrix(rows), l=-wide, u=wide, max_iter=max_iterations, **SETTINGS
+    )  # fmt: skip
     return solver
 
 

@@ -36,12 +36,10 @@ from seaopt.robustness.uncertainty.worst import place_values
 CONSTRAINED_STREAM = 0x3C  # the runs' own stream of random numbers, whatever the seed
 STEP_SHARES = (0.3, 1.0)  # of the force that the limits hold, of the steps
 DISTURBANCE_SHARE = 0.1  # of the limit of the command, at most
-PERIODS, LEAST_PHASE_S, REST_S = 3.0, 0.1, 0.02  # of the bandwidth that a phase lasts, at least so long; before it
+PERIODS, LEAST_PHASE_S, REST_S = 3.0, 0.1, 0.02  # of the bandwidth that a phase lasts besides a preview; before it
 LAST_SHARE, SETTLED = 0.2, 0.1  # of a phase, over which the force is off by at most this share of the step
 RUNAWAY, GROWTH = 3.0, 1.5  # times what the limits hold; second half of the last phase over its first
 DIVERGED, OVER_BOUND, UNSETTLED = "diverged", "over a bound", "not settled"
-
-
 
 
 @record
@@ -95,19 +93,20 @@ class ConstrainedRuns:
     def __str__(self) -> str:
         kinds = ((self.diverged, DIVERGED), (self.over_bound, OVER_BOUND), (self.not_settled, UNSETTLED))
         counts = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
+        failures, runs = format_count(self.failures, "failure"), format_count(self.runs, "simulated run")
         return (
-            f"with limits active: {format_count(self.failures, 'failure')} in {format_count(self.runs, 'simulated run')}"
-            f"{f' ({counts})' if counts else ''}, failure probability below {self.failure_probability_bound:.2g} at a "
-            f"confidence of {100 * self.confidence:.6g} %; the command at a limit in {self.at_limit:.0%} of the samples, "
-            f"no new plan in {self.fallback:.2%}, {self.iterations} iterations at most"
+            f"with limits active: {failures} in {runs}{f' ({counts})' if counts else ''}, failure probability below "
+            f"{self.failure_probability_bound:.2g} at a confidence of {100 * self.confidence:.6g} %; the command at a "
+            f"limit in {self.at_limit:.0%} of the samples, no new plan in {self.fallback:.2%}, {self.iterations} "
+            "iterations at most"
         )
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a certificate remarks of these runs."""
         return (
-            "margins, worst cases and draws are of the linear region, in which no limit of the plan is active", str(self),
-            *self.left_out,
+            "margins, worst cases and draws are of the linear region, in which no limit of the plan is active",
+            str(self), *self.left_out,
         )  # fmt: skip
 
 
@@ -131,6 +130,7 @@ def run_constrained(
     Parameters
     ----------
     mpc : ForceMPC
+        The law.
     plants : mapping of name to Plant
         Each is played at every draw.
     unknown : Uncertainty
@@ -189,7 +189,7 @@ def _draw_references(
 
 
 def _phase_s(mpc: ForceMPC) -> float:
-    return max(LEAST_PHASE_S, PERIODS / mpc.spec.bandwidth_hz)
+    return max(LEAST_PHASE_S, PERIODS / mpc.spec.bandwidth_hz) + mpc.spec.preview_samples * mpc.sample_time_s
 
 
 def _play(
@@ -233,7 +233,8 @@ def _judge(mpc: ForceMPC, plant: Plant, run: ForceRun, target: Float[np.ndarray,
     if plant.moves:
         return "", ""
     last = max(round(LAST_SHARE * phase), 1)
-    for end in range(run.time.size, phase, -phase):
+    known = mpc.spec.preview_samples  # before the end of a phase the next one is known
+    for end in (run.time.size, run.time.size - phase - known, run.time.size - 2 * phase - known):
         error = float(np.mean(off[end - last : end]))
         if error > SETTLED * abs(run.reference[-1]):
             return UNSETTLED, f"{error:.4g} {run.unit} off {end / run.time.size:.0%} into the run"

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control import Controller, ControllerSpec, ForceMPC, assess
+from seaopt.control import Controller, ControllerSpec, ForceMPC, MPCSpec, assess
+from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
@@ -44,19 +45,21 @@ def linear_controller(mpc: ForceMPC) -> Controller:
     ('custom', True)
 
     """
-    spec = mpc.spec
+    return assess(*mpc.design, mpc.law, linear_spec(mpc.spec))
+
+
+def linear_spec(spec: MPCSpec) -> ControllerSpec:
+    """Return the limits of a predictive controller's loop while no limit of its plan is active, as those of a law."""
     levels: dict[str, Any] = {
         limit.name: getattr(spec, limit.name)
         for limit in MPC_LIMITS
         if limit.has_field and limit.name != "bandwidth_hz"
     }
     bandwidth = spec.bandwidth_hz * (1.0 - MPC_BANDWIDTH_TOLERANCE)
-    return assess(
-        *mpc.design, mpc.law,
-        ControllerSpec(
-            measured=spec.measured, bandwidth_hz=bandwidth, bandwidth_range_hz=(min(15.0, bandwidth), max(60.0, bandwidth)),
-            sample_rate_hz=spec.sample_rate_hz, delay_samples=spec.loop_delay_samples, min_filter_samples=False, **levels,
-        ),
+    return ControllerSpec(
+        structure=CUSTOM, measured=spec.measured, bandwidth_hz=bandwidth, sample_rate_hz=spec.sample_rate_hz,
+        bandwidth_range_hz=(min(15.0, bandwidth), max(60.0, bandwidth)), delay_samples=spec.delay_samples,
+        min_filter_samples=False, **levels,
     )  # fmt: skip
 
 
@@ -90,8 +93,8 @@ def certify_mpc(
     max_failure_probability : float, optional
         Required of the bounds of both, so that too few draws or runs do not pass.
     bound_tolerance : float
-        By how much a bounded signal may leave its bounds, as a share of half their width: a wrong model, and noise, make
-        the estimate of it wrong.
+        By how much a bounded signal may leave its bounds, as a share of half their width: a wrong model, and noise,
+        make the estimate of it wrong.
     sensor_std : float
         White noise of the measured output in the runs.
     progress : callable, optional

@@ -1,0 +1,94 @@
+"""Certificates of predictive control: its linear region by python-control, its limits by runs that are played again."""
+
+from __future__ import annotations
+
+import json
+
+import control
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+import seaopt as so
+from seaopt.control import MPCSpec, close_loop, force_mpc
+from seaopt.errors import ControlError
+from seaopt.files import to_json
+from seaopt.robustness import certify_mpc, linear_controller
+
+TS = 1e-3
+SPEED_LIMIT = {"qd": (-0.08, 0.08)}
+HERE = {"J": (3.2e-6, 3.4e-6)}
+
+
+@pytest.fixture(scope="module")
+def mpc(stand, thor):
+    spec = MPCSpec(current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, bounds=SPEED_LIMIT)
+    return force_mpc(stand, thor, spec)
+
+
+@pytest.fixture(scope="module")
+def certificate(mpc, stand, thor):
+    return certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=200, runs=3)
+
+
+def find_ms(mpc, params, inertia):
+    """Return Ms of the law on the stand with an inertia, by python-control."""
+    v = {name: params[name].value for name in params} | {"J": inertia}
+    r = v["l"] / (2 * np.pi * v["N_p"])
+    mass, b = v["J"] / r**2, v["b_r"] / r**2
+    a = np.array([[0.0, 1.0], [-v["k"] / mass, -b / mass]])
+    plant = cont2discrete((a, np.array([[0.0], [1.0 / mass]]), np.array([[v["k"], 0.0]]), np.zeros((1, 1))), TS)[:3]
+    back = control.ss(mpc.law.a, -mpc.law.b[:, 1:], mpc.law.c[None], -mpc.law.d[1], TS)
+    z = np.exp(2j * np.pi * np.geomspace(0.01, 499.0, 4000) * TS)
+    gain = (control.ss(*plant, 0, TS) * control.ss(control.tf([1.0], [1.0, 0.0], TS)) * back)(z)
+    return np.max(np.abs(1.0 / (1.0 + gain)))
+
+
+def test_the_linear_region_is_certified_as_a_law(certificate, mpc, thor):
+    assert certificate.plants["stand"].ms == pytest.approx(find_ms(mpc, thor, thor["J"].value), rel=1e-3)
+    ends = [find_ms(mpc, thor, inertia) for inertia in HERE["J"]]
+    assert certificate.worst["stand"].ms == pytest.approx(max(ends), rel=2e-3)
+    assert certificate.monte_carlo.samples == 200 and certificate.monte_carlo.failures == 0
+    assert linear_controller(mpc).feasible == mpc.feasible
+    assert any("linear region" in note for note in certificate.notes)
+
+
+def test_runs_that_keep_everything_pass_with_the_bound_of_clopper_and_pearson(certificate):
+    runs = certificate.constrained
+    assert certificate.passed and (runs.runs, runs.failures) == (3, 0)
+    assert runs.failure_probability_bound == pytest.approx(1.0 - 1e-6 ** (1 / 3), rel=1e-9)  # no failure: (1 - p)^n
+    assert 0.0 < runs.at_limit < 1.0  # the limits were active
+    assert 0.0 < runs.iterations <= 500 and runs.largest_violation <= runs.bound_tolerance
+    rows = {row.name: row for row in certificate.requirements}
+    assert rows["constrained_failures"].met
+
+
+def test_a_motor_much_stronger_than_its_model_fails_and_its_run_can_be_played_again(mpc, stand, thor):
+    strong = {"K_tau": (1.45 * thor["K_tau"].value, 1.5 * thor["K_tau"].value)}
+    failed = certify_mpc(mpc, {"stand": stand}, thor, ranges=strong, samples=1, runs=2, max_failure_probability=0.5)
+    runs = failed.constrained
+    assert not failed.passed and runs.failures == 2 and runs.failure_probability_bound == 1.0
+    broken = {row.name for row in failed.requirements if not row.met}
+    assert {"constrained_failures", "constrained_failure_probability"} <= broken
+    assert runs.over_bound + runs.not_settled + runs.diverged == 2
+    torque = float(runs.where.split("K_tau = ")[1])
+    run = close_loop(mpc.command, mpc.start, stand, thor.update(K_tau=torque), np.full(100, 2000.0))
+    assert np.max(np.abs(run.state[:, 1])) > 1.05 * SPEED_LIMIT["qd"][1]
+
+
+def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, stand, thor):
+    late = certify_mpc(mpc, {"stand": stand}, thor, ranges={"delay_s": (9e-3, 10e-3)}, samples=1, runs=1)
+    assert late.constrained.failures == 1 and not late.passed
+    assert late.constrained.diverged + late.constrained.not_settled == 1
+
+
+def test_it_comes_back_from_its_file(certificate, mpc, stand, thor):
+    content = json.loads(to_json(certificate.to_dict()))
+    again = so.Certificate.from_dict(content, certificate.controller, {"stand": stand}, thor)
+    assert again.constrained == certificate.constrained and again.passed
+
+
+def test_what_cannot_be_is_said_in_one_line(mpc, stand, thor):
+    for options, said in (({"runs": 0}, "runs = 0"), ({"bound_tolerance": -1.0}, "bound_tolerance = -1")):
+        with pytest.raises(ControlError, match=said):
+            certify_mpc(mpc, {"stand": stand}, thor, **options)
