@@ -493,7 +493,7 @@ class Session:
     def _sweep(self, tell: Progress) -> None:
         if self.problem.mpc is not None:
             raise ProblemError(
-                f'{self.problem.source}: a sweep tunes gains, and [controller] has structure = "mpc"; for a sweep write '
+                f'{self.problem.source}: a sweep tunes gains, and [controller] has structure = "mpc"; to sweep write '
                 'structure = "pid"'
             )
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
