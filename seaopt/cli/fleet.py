@@ -7,33 +7,51 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from seaopt.cli.session import show_progress
-from seaopt.cli.show import heading, show_verdicts
+from seaopt.cli.show import MOST_REASONS, heading, show_verdicts
 from seaopt.cli.terminal import Terminal
-from seaopt.errors import LogError
-from seaopt.files import to_json
-from seaopt.formatting import format_count
+from seaopt.errors import LogError, SeaoptError
+from seaopt.files import read_json, to_json, write_json
+from seaopt.formatting import format_count, printable
+from seaopt.records import record
 from seaopt.reporting.verdict import Reason, StageVerdict
+
+if TYPE_CHECKING:
+    from seaopt.fleet import Drift, Fleet, FleetLog, Population
+
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+PAGE, ACTUATORS = "fleet.html", "actuators.parquet"
+
+
+@record
+class DriftOptions:
+    """What is asked of drift: columns of time and actuator, where it starts, and how often it may be wrong."""
+
+    time: Sequence[str] | None
+    actuator: Sequence[str] | None
+    since: str | None
+    false_alarms: float
 
 
 def run_fleet(
     problem: Path, names: Sequence[str], folder: Path, *, manifest: Path | None, identity: str | None,
-    scheduler: str | None, workers: int | None, like: str | None, time_limit_s: float | None, json: bool, quiet: bool,
-    verbose: bool,
+    scheduler: str | None, workers: int | None, like: str | None, time_limit_s: float | None, drift: DriftOptions,
+    json: bool, quiet: bool, verbose: bool,
 ) -> bool:  # fmt: skip
-    """Fit the logs, and print verdict and spread; return whether every log is met."""
+    """Fit the logs, write tables and page, and print verdict and spread; return whether every log is met."""
     # Before workers start, who inherit it: threads of BLAS would fight over cores that all have a log.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS"):
+    for name in THREADS:
         os.environ.setdefault(name, "1")
     from seaopt.executors import Processes, connect_dask
-    from seaopt.fleet import fit_fleet, read_manifest
-    from seaopt.fleet.result import ALIGN, HEAD, list_cells
+    from seaopt.fleet import find_logs, fit_fleet, read_manifest
 
     if (manifest is None) == (not names):
         raise LogError("give the logs either as LOGS, files or patterns in quotes, or as --manifest FILE")
     errors = Terminal(stderr=True)
-    logs = list(names) if manifest is None else read_manifest(manifest)
+    logs = find_logs(names, identity) if manifest is None else read_manifest(manifest)
+    _check_options(logs, drift)
     with ExitStack() as stack:
         if scheduler is not None:
             executor = stack.enter_context(connect_dask(scheduler))
@@ -43,25 +61,103 @@ def run_fleet(
         try:
             with show_progress(errors, "fitting the fleet", errors.say) as tell:
                 fleet = fit_fleet(
-                    problem, logs, folder, executor=executor, like=like, identity=identity, time_limit_s=time_limit_s,
-                    progress=tell,
-                )  # fmt: skip
+                    problem, logs, folder, executor=executor, like=like, time_limit_s=time_limit_s, progress=tell
+                )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"what was finished is in {folder}; the same command goes on from there") from None
+    found, population, missing = _summarise(fleet, drift)
+    content = _write(fleet, found, population, folder, problem)
     if json:
-        sys.stdout.write(to_json(fleet.to_dict()))
+        sys.stdout.write(to_json(content))
         return fleet.met
     console = Terminal()
+    _show(console, fleet, found, verbose=verbose)
+    if not quiet:
+        _show_tables(console, fleet, population, missing)
+        console.wrap(
+            f"wrote {folder / 'fleet'} (Parquet, a row a log), {folder / ACTUATORS} (a row an actuator), "
+            f"{folder / 'fleet.json'}, {folder / PAGE}"
+        )
+    return fleet.met
+
+
+def _check_options(logs: Sequence[FleetLog], drift: DriftOptions) -> None:
+    """Refuse before any log is fitted what drift could not be told with."""
+    import polars as pl
+
+    from seaopt.fleet import Fleet, order_runs
+    from seaopt.fleet.cusum import choose_threshold
+    from seaopt.fleet.drift import PER_RUNS
+    from seaopt.fleet.history import parse_time
+
+    names = tuple(logs[0].identity)
+    rows = pl.DataFrame({"log": [log.path for log in logs], **{n: [log.identity[n] for log in logs] for n in names}})
+    history = order_runs(Fleet(rows=rows, units={}, identity=names), drift.actuator, drift.time)
+    choose_threshold(drift.false_alarms, PER_RUNS, 1)
+    if drift.since is not None:
+        parse_time(drift.since, history)
+
+
+def _summarise(fleet: Fleet, options: DriftOptions) -> tuple[Drift, Population | None, str]:
+    """Return drift and population of a fleet, and why there is no population, if there is none."""
+    from seaopt.fleet import estimate_population, find_drift
+
+    found = find_drift(
+        fleet, actuator=options.actuator, time=options.time, since=options.since, false_alarms=options.false_alarms
+    )
+    try:
+        return found, estimate_population(fleet, actuator=options.actuator, time=options.time), ""
+    except SeaoptError as error:
+        return found, None, str(error)
+
+
+def _write(fleet: Fleet, drift: Drift, population: Population | None, folder: Path, problem: Path) -> dict[str, Any]:
+    """Write the table of the actuators, the page, and what fleet.json has of both; return its content."""
+    from seaopt.fleet import tabulate_actuators, write_actuators, write_fleet_page
+    from seaopt.fleet.result import FLEET_SCHEMA
+
+    content = fleet.to_dict() | {
+        "drift": drift.to_dict(), "population": None if population is None else population.to_dict()
+    }  # fmt: skip
+    made_from = read_json(folder / "fleet.json", FLEET_SCHEMA)
+    write_json(folder / "fleet.json", made_from | content)
+    write_actuators(tabulate_actuators(fleet, drift, population), folder / ACTUATORS)
+    write_fleet_page(
+        fleet, drift, folder / PAGE, population=population, title=f"Fleet: {problem.stem}", files=[problem],
+        command=" ".join(["seaopt", *sys.argv[1:]]),
+    )  # fmt: skip
+    return content
+
+
+def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> None:
+    """Print the verdict on the logs, and which actuators have an alarm."""
     reasons = tuple(Reason(what=f"{text} ({log})", where="", count=count) for text, count, log in fleet.reasons)
     again = () if fleet.met else ("mend what failed, then type the same command: only that is fitted again",)
-    show_verdicts(
-        console,
-        [StageVerdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=again)],
-        verbose=verbose,
-    )
-    if quiet:
-        return fleet.met
+    verdict = StageVerdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=again)
+    show_verdicts(console, [verdict], verbose=verbose)
+    if drift.missing:
+        console.wrap(f"Drift: {drift.verdict}", indent=9)
+        return
+    word, colour = ("alarm  ", "red") if drift.alarms else ("steady ", "green")
+    console.label(word, f"Drift: {drift.verdict}", style=colour, indent=9)
+    shown = drift.alarms if verbose else drift.alarms[:MOST_REASONS]
+    for alarm in shown:
+        console.wrap(printable(f"{alarm.actuator}: {alarm.describe()}"), indent=9)
+    if len(drift.alarms) > len(shown):
+        console.wrap(f"and {len(drift.alarms) - len(shown)} more: --verbose prints them", indent=9)
+    if drift.history.warning:
+        console.wrap(f"warning: {drift.history.warning}", indent=9)
+
+
+def _show_tables(console: Terminal, fleet: Fleet, population: Population | None, missing: str) -> None:
+    from seaopt.fleet.population import ALIGN as POPULATION_ALIGN
+    from seaopt.fleet.population import HEAD as POPULATION_HEAD
+    from seaopt.fleet.result import ALIGN, HEAD, list_cells
+
     heading(console, "Fleet", f"{format_count(len(fleet.rows), 'log')}, {fleet.unchanged} done before")
     console.tabulate(list_cells(fleet.spreads), HEAD, ALIGN)
-    console.wrap(f"wrote {folder / 'fleet'} (Parquet, a row a log), {folder / 'fleet.json'}")
-    return fleet.met
+    if population is None:
+        console.wrap(f"no population: {missing}", indent=2)
+        return
+    heading(console, "Population", format_count(len(population.table), "actuator"))
+    console.tabulate(population.describe(), POPULATION_HEAD, POPULATION_ALIGN)

@@ -397,16 +397,36 @@ def fleet(
         typer.Option(metavar="EXPERIMENT", help="Which says how logs are read; the first with one, if left out."),
     ] = None,
     time_limit: Annotated[float, typer.Option(metavar="SECONDS", min=0.1, help="For one log.")] = 600.0,
+    time: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLUMNS", help="Of the identity, that say when; those called date, run, ... if left out."
+        ),
+    ] = None,
+    actuator: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMNS", help="Of the identity, that name an actuator; the others, if left out."),
+    ] = None,
+    since: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Earlier logs are left out of drift, as after a repair.")
+    ] = None,
+    false_alarms: Annotated[
+        float, typer.Option(metavar="P", help="Probability that a healthy actuator raises an alarm within 100 runs.")
+    ] = 0.01,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Fit each of many logs by itself; write a table in DIR, and go on there after a stop."""
-    from seaopt.cli.fleet import run_fleet
+    """Fit each of many logs by itself; write tables and a page in DIR, and go on there after a stop."""
+    from seaopt.cli.fleet import DriftOptions, run_fleet
 
+    options = DriftOptions(
+        time=None if time is None else time.split(","), actuator=None if actuator is None else actuator.split(","),
+        since=since, false_alarms=false_alarms,
+    )  # fmt: skip
     if not run_fleet(
         problem, logs or [], output, manifest=manifest, identity=identity, scheduler=scheduler, workers=workers,
-        like=like, time_limit_s=time_limit, json=json, quiet=quiet, verbose=verbose,
+        like=like, time_limit_s=time_limit, drift=options, json=json, quiet=quiet, verbose=verbose,
     ):  # fmt: skip
         raise typer.Exit(1)
 

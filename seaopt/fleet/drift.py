@@ -48,6 +48,8 @@ class Alarm:
         The log from which on the value is likely to differ, and the one at which that was sure.
     since_time, raised_time : str
         When these were.
+    begun : float
+        The time of `since`, in the unit of the history.
     before, before_std, after, after_std : float
         Weighted means of the runs before and from then on, and their standard deviations.
     runs : int
@@ -65,6 +67,7 @@ class Alarm:
     raised: str
     since_time: str
     raised_time: str
+    begun: float
     before: float
     before_std: float
     after: float
@@ -440,6 +443,7 @@ def _list_alarms(
                 raised=then["log"],
                 since_time=format_time(first[TIME], history.unit),
                 raised_time=format_time(then[TIME], history.unit),
+                begun=first[TIME],
                 before=before,
                 before_std=float(weights[:start].sum() ** -0.5),
                 after=after,

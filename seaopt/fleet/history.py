@@ -20,7 +20,7 @@ from seaopt.formatting import join_words
 from seaopt.records import record
 
 DATES = ("date", "day", "when", "datetime", "timestamp", "time", "clock")
-ORDERS = ("run", "cycle", "cycles", "hours", "number", "session", "trial", "take", "n", "i")
+ORDERS = ("run", "cycle", "cycles", "hours", "session", "trial", "take")
 LABEL, TIME = "actuator:", "time:"  # columns that are added; no identity has a colon in its name
 FORMATS = (
     "%Y-%m-%d", "%Y%m%d", "%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%SZ", "%Y-%m-%dT%H:%M:%S%z", "%Y-%m-%d %H:%M:%S",
@@ -120,10 +120,8 @@ def _check_columns(names: Sequence[str], identity: Sequence[str], argument: str)
     chosen = (names,) if isinstance(names, str) else tuple(names)
     for name in chosen:
         if name not in identity:
-            known = f"it has {join_words(identity)}" if identity else "it has none: give --identity or --manifest"
-            raise SeaoptError(
-                f'{argument} = "{name}" is no column of the identity; {suggestion(name, identity) or known}'
-            )
+            known = suggestion(name, identity) if identity else "give --identity or --manifest, which make columns"
+            raise SeaoptError(f'{argument} = "{name}" is no column of the identity; {known}')
     return chosen
 
 

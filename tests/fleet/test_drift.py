@@ -58,11 +58,11 @@ def test_innovations_are_recursive_residuals() -> None:
     assert np.isnan(innovations[0])
 
 
-def test_one_percent_of_a_thousand_healthy_actuators_have_an_alarm() -> None:
-    drift = find_drift(make_fleet(1000, 5))
-    assert len({one.actuator for one in drift.alarms}) in range(2, 20)  # 10 expected, at most
-    assert drift.expected == pytest.approx(10.0, rel=1e-3)
-    assert drift.between["J"].std == pytest.approx(1.0, rel=0.02)
+def test_one_percent_of_healthy_actuators_have_an_alarm() -> None:
+    drift = find_drift(make_fleet(300, 5))  # of 1,000: benchmarks/bench_fleet_drift.py
+    assert len({one.actuator for one in drift.alarms}) < 9  # 3 expected, at most: once in 250 seeds there are more
+    assert drift.expected == pytest.approx(3.0, rel=1e-3)
+    assert drift.between["J"].std == pytest.approx(1.0, rel=0.03)
 
 
 def test_what_drifts_is_told_with_since_when_and_how_much() -> None:

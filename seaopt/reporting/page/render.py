@@ -12,6 +12,8 @@ from seaopt.estimation.advice.forecasts import Percent
 from seaopt.formatting import MISSING, format_band, format_number, printable
 from seaopt.units import unit_after
 
+FIXED = {"style": "style.css", "script": "script.js", "table_script": "table.js"}  # files that pages take as they are
+
 
 def render_template(name: str, **values: Any) -> str:
     """Return a template of this package with its values filled in, every text escaped."""
@@ -27,8 +29,8 @@ def render_template(name: str, **values: Any) -> str:
         "unit": _format_unit, "slug": make_slug,
     }  # fmt: skip
     folder = files("seaopt.reporting.page").joinpath("templates")
-    fixed = {kind: Markup(folder.joinpath(kind).read_text(encoding="utf-8")) for kind in ("style.css", "script.js")}  # noqa: S704
-    return environment.get_template(name).render(**values, style=fixed["style.css"], script=fixed["script.js"])
+    fixed = {name: Markup(folder.joinpath(file).read_text(encoding="utf-8")) for name, file in FIXED.items()}  # noqa: S704
+    return environment.get_template(name).render(**values, **fixed)
 
 
 def make_slug(text: str) -> str:
