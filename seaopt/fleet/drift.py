@@ -427,11 +427,8 @@ def _list_alarms(
     for own in np.flatnonzero(charts.alarm >= 0):
         raised, runs = int(charts.alarm[own]), int(np.isfinite(batch.values[own]).sum())
         weights = 1.0 / (batch.variances[own, :runs] + spread.std**2)
-        start = find_change(batch.values[own, : raised + 1], weights[: raised + 1])
-        before, after = (
-            float(np.average(batch.values[own, part], weights=weights[part]))
-            for part in (slice(0, start), slice(start, runs))
-        )
+        rises = bool(charts.upper[own, raised] > charts.lower[own, raised])
+        start, end, before, after = _measure_change(batch.values[own, :runs], weights, raised, rises=rises)
         first, then = (history.rows.row(int(batch.places[own, run]), named=True) for run in (start, raised))
         alarms.append(
             Alarm(
@@ -447,12 +444,28 @@ def _list_alarms(
                 before=before,
                 before_std=float(weights[:start].sum() ** -0.5),
                 after=after,
-                after_std=float(weights[start:].sum() ** -0.5),
-                runs=runs - start,
+                after_std=float(weights[start:end].sum() ** -0.5),
+                runs=end - start,
                 level=float(max(charts.upper[own].max(), charts.lower[own].max()) / threshold),
             )
         )
     return alarms
+
+
+def _measure_change(
+    values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], raised: int, *, rises: bool
+) -> tuple[int, int, float, float]:
+    """Return the runs of a change, first and one past the last, and the means before it and of these.
+
+    They go on to the last run, unless the value has come back since, further than it was: then to the alarm.
+    """
+    start = find_change(values[: raised + 1], weights[: raised + 1])
+    before = float(np.average(values[:start], weights=weights[:start]))
+    for end in (len(values), raised + 1):
+        after = float(np.average(values[start:end], weights=weights[start:end]))
+        if (after > before) == rises:
+            return start, end, before, after
+    return start, raised + 1, before, after
 
 
 def _order_alarms(alarms: Sequence[Alarm]) -> tuple[Alarm, ...]:
