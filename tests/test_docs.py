@@ -22,6 +22,7 @@ from typer.main import get_command
 import seaopt as so
 from seaopt.cli import main
 from seaopt.cli.main import app
+from seaopt.control import passive_region
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.passivity import passivity
 from seaopt.simulation.native import find_compiler
@@ -189,11 +190,30 @@ def check_elastic_joint(found):
     assert ratio["b_r"] > 2.2 and ratio["c_s"] > 1.2 and ratio["k_s"] < 0.5
 
 
+def check_impedance(found):
+    text = read_page("howto/impedance.md")
+    stated = re.search(r"passive up to ([\d.]+) N m/rad, .* with a damping of ([\d.]+) N m s/rad", text)
+    assert stated is not None
+    assert float(stated[1]) == pytest.approx(found["region"].stiffest.stiffness, rel=0.01)
+    assert float(stated[2]) == pytest.approx(found["region"].stiffest.damping, rel=0.02)
+    assert "takes a damper of 2.569 N m s/rad" in text
+    assert found["hard"].needed_damper == pytest.approx(2.569, rel=0.01)
+    assert not found["hard"].stable
+    assert found["soft"].passive
+    assert "take a damper of 0.52 N m s/rad" in text
+    assert found["rendering"].needed_damper == pytest.approx(0.52, abs=0.01)
+    for filter_s, stiffest in ((None, 163.0), (0.01, 225.0)):
+        other = passive_region(found["force"], found["knee"], found["values"], velocity_filter_s=filter_s, points=2)
+        assert other.stiffest is not None
+        assert other.stiffest.stiffness == pytest.approx(stiffest, rel=0.01)
+
+
 CHECKS = {
     "evidence/elastic_joint.md": check_elastic_joint,
     "howto/choose_bandwidth.md": check_choose_bandwidth,
     "howto/experiment_design.md": check_experiment_design,
     "howto/friction.md": check_friction,
+    "howto/impedance.md": check_impedance,
     "howto/log_quality.md": check_log_quality,
     "howto/log_to_parameters.md": check_log_to_parameters,
     "howto/many_logs.md": check_many_logs,

@@ -82,12 +82,27 @@ def test_a_tune_that_is_not_possible_tells_the_bandwidths_that_it_tries(heard):
     heard.check("Hz instead", "refining start")
 
 
-def test_a_friction_margin_that_cannot_be_had_is_told_as_it_is_raised(heard):
+NO_MARGIN = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, min_friction_margin=10.0)
+
+
+def rub():
     plant = so.plants.rotary(link="locked")
-    params = plant.defaults.update(f_c=0.005, v_s=1.0)
-    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, min_friction_margin=10.0)
-    assert not so.tune(plant, params, spec, progress=heard).feasible
+    return plant, plant.defaults.update(f_c=0.005, v_s=1.0)
+
+
+@pytest.mark.slow
+def test_a_friction_margin_that_cannot_be_had_is_told_as_it_is_raised(heard):
+    assert not so.tune(*rub(), NO_MARGIN, progress=heard).feasible
     heard.check("friction margin")
+
+
+def test_what_a_friction_margin_takes_is_told_before_it_is_over():
+    def stop(note, share=None, /):
+        if "friction margin" in note:
+            raise InterruptedError(note)
+
+    with pytest.raises(InterruptedError, match="friction margin"):
+        so.tune(*rub(), NO_MARGIN, progress=stop)
 
 
 def test_a_sweep_tells_its_bandwidths(heard):

@@ -18,6 +18,7 @@ KNEE = Path(__file__).resolve().parents[2] / "problems" / "knee.toml"
 TRUTH = {"J_m": 2.4e-5, "b_r": 1e-4, "f_c": 0.005, "k_s": 300.0, "J_l": 0.25, "d_l": 0.3}
 
 
+@pytest.mark.slow
 def test_short_logs_of_the_knee_are_fitted_and_tuned(tmp_path):
     """The file as it is, with logs of a few seconds: the truth within its interval, and every limit met."""
     text = KNEE.read_text(encoding="utf-8").replace("duration_s = 30", "duration_s = 3")

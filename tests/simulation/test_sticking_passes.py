@@ -117,6 +117,7 @@ def test_friction_that_grows_with_the_load_slides_and_holds_as_in_closed_form():
     assert state_space(block, values)[0][1, 1] == pytest.approx(-3.0 / 2.0 / 1e-3)  # at rest there is no load
 
 
+@pytest.mark.slow
 def test_fit_finds_an_actuator_that_truly_sticks_and_says_met():
     """Coulomb's jump by the tests' own simulator: found within four standard deviations, without smoothing."""
     stand = so.plants.let_stick(so.plants.high_impedance())

@@ -108,7 +108,8 @@ def test_what_is_not_met_says_what_was_found_what_was_asked_and_what_to_do(pytes
     result.stdout.no_fnmatch_line("*Traceback*")
 
 
-@pytest.mark.parametrize("dist", ["load", pytest.param("loadfile", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dist", ["load", "loadfile"])
 def test_two_workers_each_make_the_fit_at_most_once(pytester, dist):
     pytest.importorskip("xdist")
     write(pytester, BENCH + EXPECT)

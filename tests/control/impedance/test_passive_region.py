@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import re
 import time
 from dataclasses import replace
 from typing import Any
@@ -20,7 +17,6 @@ from seaopt.control.impedance.region import needed_damper
 from seaopt.control.impedance.rendering import find_breaking
 from seaopt.control.impedance.sampled_port import SampledPort
 from seaopt.control.loops.port import PortModel
-from tests.pages import blocks, read_page
 from tests.sampled_links import find_radius
 
 FREE, HELD = so.plants.rotary(), so.plants.rotary("locked")
@@ -230,29 +226,6 @@ def test_a_held_link_is_refused(controller: so.Controller) -> None:
         render(controller, HELD, KNEE, Impedance(stiffness=1.0, damping=0.0))
     with pytest.raises(so.SeaoptError, match="stiffness = -1"):
         Impedance(stiffness=-1.0, damping=0.0)
-
-
-def test_the_page_prints_what_comes_out() -> None:
-    names: dict[str, Any] = {}
-    pages = blocks("howto/impedance.md", "python")
-    with contextlib.redirect_stdout(io.StringIO()):
-        for code in pages[:3]:
-            exec(compile(code, "howto/impedance.md", "exec"), names)
-    text = read_page("howto/impedance.md")
-    stated = re.search(r"passive up to ([\d.]+) N m/rad, .* with a damping of ([\d.]+) N m s/rad", text)
-    assert stated is not None
-    assert float(stated[1]) == pytest.approx(names["region"].stiffest.stiffness, rel=0.01)
-    assert float(stated[2]) == pytest.approx(names["region"].stiffest.damping, rel=0.02)
-    assert "takes a damper of 2.569 N m s/rad" in text
-    assert names["hard"].needed_damper == pytest.approx(2.569, rel=0.01)
-    assert not names["hard"].stable
-    assert names["soft"].passive
-    assert "take a damper of 0.52 N m s/rad" in text
-    assert names["rendering"].needed_damper == pytest.approx(0.52, abs=0.01)
-    for filter_s, stiffest in ((None, 163.0), (0.01, 225.0)):
-        other = passive_region(names["force"], names["knee"], names["values"], velocity_filter_s=filter_s, points=2)
-        assert other.stiffest is not None
-        assert other.stiffest.stiffness == pytest.approx(stiffest, rel=0.01)
 
 
 def test_the_free_link_is_that_of_its_own_plant() -> None:

@@ -91,7 +91,7 @@ def test_a_spring_that_starts_at_nothing_holds():
     assert leave_out_drift(plant, "spring") is plant
 
 
-@pytest.mark.parametrize(("structure", "damping"), [("pd", 0.0), ("pid", 0.1)])
+@pytest.mark.parametrize(("structure", "damping"), [pytest.param("pd", 0.0, marks=pytest.mark.slow), ("pid", 0.1)])
 def test_a_free_joint_is_tuned_and_certified(structure, damping):
     locked, free = so.plants.rotary(link="locked"), so.plants.rotary(link="free")
     params = so.ParameterSet.of(

@@ -41,7 +41,10 @@ def real_part(controller, thor, f):
             {"bandwidth_hz": 30, "max_sensitivity": 2.2, "delay_samples": 2, **LIFTED}, marks=pytest.mark.slow
         ),
         pytest.param({"bandwidth_hz": 15, "max_sensitivity": 2.5, "max_noise_gain": 10}, marks=pytest.mark.slow),
-        {"bandwidth_hz": 30, "max_sensitivity": 1.6, "objective": "noise", "structure": "pid_dob"},
+        pytest.param(
+            {"bandwidth_hz": 30, "max_sensitivity": 1.6, "objective": "noise", "structure": "pid_dob"},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_what_was_not_passive_becomes_so(stand, thor, spec):

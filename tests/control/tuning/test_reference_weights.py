@@ -45,6 +45,7 @@ def test_the_actuator_with_friction_has_every_bandwidth(bench, bandwidth_hz):
     assert value[0] <= 1.02 * SEARCHED[bandwidth_hz]
 
 
+@pytest.mark.slow
 def test_neighbours_of_an_impossible_bandwidth_are_named(bench):
     """Below its resonance this actuator needs the weights: without them only what is well above it is possible."""
     case = bench.Case(bench.ISSUE, 25.0)

@@ -170,7 +170,8 @@ def test_it_names_fits_and_can_be_written(stand, thor, short_log):
     assert f"{stand.name} is preferred" in ranking._repr_html_()
 
 
-@pytest.mark.parametrize("recorded", ["simulated", pytest.param("measured", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("recorded", ["simulated", "measured"], indirect=True)
+@pytest.mark.slow
 def test_a_two_mass_drive_prefers_a_soft_coupling_at_its_resonance(recorded):
     """Three seconds of a two-mass drive: its coupling softens with twist, seen at 76 Hz (problems/twomass.py)."""
     spec = importlib.util.spec_from_file_location("twomass", ROOT / "problems" / "twomass.py")

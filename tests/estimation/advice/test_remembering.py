@@ -61,7 +61,9 @@ def are_near(fit, truth):
                for name, value in truth.items() if name in fit.parameters.free_names)  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize(
+    "kind", ["friction", *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS if kind != "friction")]
+)
 def test_compare_names_what_the_log_has_on_samples_held_out(kind):
     ranking = rank(kind, seed=1, others_search=False)  # which takes long; over many seeds all of them search
     assert ranking.preferred == kind, str(ranking)
@@ -76,6 +78,7 @@ def test_compare_is_right_over_many_seeds():
     assert right == dict.fromkeys(KINDS, 10)
 
 
+@pytest.mark.slow
 def test_bristles_are_told_from_friction_that_is_a_curve_and_found():
     """A motor that turns back before it slides shows the springs of its bristles."""
     truth = {"f_c": 0.012, "f_s": 0.018, "v_st": 2.0, "sigma_0": 8.0, "sigma_1": 4e-3}
