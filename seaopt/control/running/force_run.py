@@ -106,9 +106,11 @@ def close_loop(
     sensor_std: float = 0.0,
     disturbance_A: float | Float[np.ndarray, " n"] = 0.0,
     seed: int = 0,
+    start_state: Float[np.ndarray, " nx"] | None = None,
+    start_command: float = 0.0,
     rtol: float = RTOL,
 ) -> ForceRun:
-    """Run a law on a plant from rest at zero.
+    """Run a law on a plant, from rest at zero where no other start is given.
 
     Parameters
     ----------
@@ -137,6 +139,10 @@ def close_loop(
         Added to the current inside the plant.
     seed : int
         Of the noise.
+    start_state : array, shape (nx,), optional
+        Of the plant, at the first sample.
+    start_command : float
+        What acts until the first command does.
     rtol : float
         Of the integration, of each state's largest value so far.
 
@@ -159,11 +165,12 @@ def close_loop(
     row, others = list(plant.outputs).index(measured), [0.0] * (len(plant.inputs) - 1)
     noise = sensor_std * np.random.default_rng(seed).normal(size=n)
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
-    x, law, time_s = np.zeros(len(plant.states)), start, sample_time_s * np.arange(n)
+    x = np.zeros(len(plant.states)) if start_state is None else start_state
+    law, time_s = start, sample_time_s * np.arange(n)
     force, current, law_time_s, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
 
     def inputs(k: int, sample: int) -> list[float]:
-        return [(current[sample] if sample >= 0 else 0.0) + disturbance[k], *others]
+        return [(current[sample] if sample >= 0 else start_command) + disturbance[k], *others]
 
     for k in range(n):
         older = k - newer - (rest_s > 0.0)

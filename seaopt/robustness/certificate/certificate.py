@@ -85,7 +85,7 @@ class Requirement:
         """What the value must be to the limit, as a sign; of draws and worst cases it is at most that."""
         if self.name in BY_REQUIREMENT:
             return BY_REQUIREMENT[self.name].symbol
-        return "≥" if self.name == FRICTION_COMPENSATION else "≤"
+        return "≥" if self.name == FRICTION_COMPENSATION or self.name.startswith("min_") else "≤"
 
 
 @record

@@ -1,0 +1,510 @@
+"""Certify a schedule: with its variable standing still at the points, between them, and in sweeps.
+
+What is said, and how it is known:
+
+- **at the points and at three values in every stretch between two** (checked): the limits at the nominal parameters, on
+  every plant; draws of what is uncertain, spread evenly over these values; at the points also the worst case that a
+  search finds, and `seaopt.certify` with its simulations on the plants that hold the variable by themselves;
+- **at every value of the table** (proved, rounding estimated, of the nominal parameters): each frozen loop is stable,
+  and its Ms below a bound (`seaopt.robustness.bounds.stretch`);
+- **while the variable moves** (simulated): sweeps at growing rates with the law as it is exported
+  (`seaopt.robustness.verification.schedule_sweep`). That the variable moves slowly is an assumption of all the rest,
+  and the fastest sweep that keeps its judgement puts a number to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from hashlib import sha256
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from seaopt.bench import Sensors
+from seaopt.control import Controller, LoopFigures, ScheduledController
+from seaopt.control.loops.loop import STABLE
+from seaopt.control.loops.sampled_plant import conditions
+from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
+from seaopt.errors import ControlError, require_number, require_type
+from seaopt.estimation import Fit
+from seaopt.formatting import format_count, html_text
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import split_friction
+from seaopt.progress import Progress, count_off, divide, ignore
+from seaopt.records import record
+from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
+from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, Requirement
+from seaopt.robustness.certificate.certify import CONFIDENCE, certify, failure_bound
+from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
+from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty, find_modes
+from seaopt.robustness.uncertainty.severity import limits
+from seaopt.robustness.uncertainty.worst import Worst, find_worst
+from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps, find_fastest, sweep_schedule
+from seaopt.units import unit_after
+
+SCHEDULE_ROBUSTNESS_SCHEMA = "seaopt/schedule_robustness/1"
+DESIGN = "design"  # the design plant's name where the caller does not list it
+POINT, BOUND, SWEEP = 4.0, 0.2, 5.0  # seconds that a part takes as a rule: of a point, a stretch, the sweeps of a plant
+
+
+@record(eq=False)
+class PlaceCertificate:
+    """What was found with the variable standing at one value.
+
+    Parameters
+    ----------
+    value : float
+        Of the variable.
+    point : bool
+        Whether the gains were tuned there.
+    plants : mapping of name to LoopFigures
+        At the nominal parameters; one with friction twice.
+    worst : mapping of name to Worst
+        The worst case found; empty between the points.
+    draws, unstable, over_ms, over_mt : int
+        Draws there, and how many of them fail in which way.
+    requirements : tuple of Requirement
+        Of the nominal parameters, and of what was simulated.
+    simulated : Certificate or None
+        What `certify` found on the plants that hold the variable; None between the points, or where there is none.
+
+    """
+
+    value: float
+    point: bool
+    plants: Mapping[str, LoopFigures]
+    worst: Mapping[str, Worst]
+    draws: int
+    unstable: int
+    over_ms: int
+    over_mt: int
+    requirements: tuple[Requirement, ...]
+    simulated: Certificate | None = None
+
+    @property
+    def ms(self) -> float:
+        """The largest Ms of its plants at the nominal parameters."""
+        return max(one.ms for one in self.plants.values())
+
+    @property
+    def worst_ms(self) -> float | None:
+        """The largest Ms of the worst cases that were searched for; None between the points."""
+        return max((one.ms for one in self.worst.values()), default=None)
+
+
+@record(eq=False, repr=False)
+class ScheduleCertificate:
+    """What `certify_schedule` returns.
+
+    Parameters
+    ----------
+    schedule : ScheduledController
+        What was certified.
+    places : tuple of PlaceCertificate
+        At the points and between them, ascending.
+    monte_carlo : MonteCarlo
+        All draws, spread evenly over the places.
+    stretches : tuple of StretchBound
+        What is proved between neighbouring places.
+    sweeps : mapping of name to tuple of Sweep
+        Of each plant that has the variable.
+    requirements : tuple of Requirement
+        All of them.
+
+    """
+
+    schedule: ScheduledController
+    places: tuple[PlaceCertificate, ...]
+    monte_carlo: MonteCarlo
+    stretches: tuple[StretchBound, ...]
+    sweeps: Mapping[str, tuple[Sweep, ...]]
+    requirements: tuple[Requirement, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every requirement is met."""
+        return all(row.met for row in self.requirements)
+
+    @property
+    def fastest(self) -> float:
+        """The largest rate of the variable at which every plant keeps its judgement in a sweep; zero for none."""
+        return min((find_fastest(sweeps) for sweeps in self.sweeps.values()), default=0.0)
+
+    @property
+    def rate_unit(self) -> str:
+        """Unit of `fastest`."""
+        return f"{unit_after(self.schedule.unit).strip()}/s"
+
+    @property
+    def assumption(self) -> str:
+        """What is assumed of the variable's motion, with the number that the simulations give it."""
+        over, rate = self.schedule.over, f"{self.fastest:.3g} {self.rate_unit}"
+        if not self.fastest:
+            return f"{over} is assumed to stand still: the slowest sweep that was simulated does not keep its judgement"
+        return (
+            f"{over} is assumed to move slowly: the limits hold with it standing still, and sweeps of up to {rate} keep "
+            "the judgement of a step in simulation"
+        )
+
+    @property
+    def proof(self) -> str:
+        """What is proved between the points, and what is not."""
+        over, first, last = self.schedule.over, self.schedule.points[0], self.schedule.points[-1]
+        missing = [one for one in self.stretches if not one.shown]
+        shown = [one.ms for one in self.stretches if one.shown]
+        if not missing:
+            return (
+                f"for every {over} from {first:g} to {last:g}, standing still, at the nominal parameters: stable, Ms "
+                f"below {_round_up(max(shown))}, proved"
+            )
+        spans = ", ".join(f"{one.low:.4g} to {one.high:.4g} ({one.plant})" for one in missing[:3])
+        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        return (
+            f"between the values that were looked at nothing is proved of {format_count(len(missing), 'stretch')[:-1]}"
+            f"{'es' if len(missing) > 1 else 'h'}: {over} = {spans}{more}, {missing[0].reason}"
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is proved, assumed and simulated, one sentence each."""
+        swept = (describe_sweeps(sweeps, self.schedule.unit) for sweeps in self.sweeps.values())
+        return (self.proof, self.assumption, *swept)
+
+    def list_rows(self) -> list[tuple[str, ...]]:
+        """Return the points as text: value, largest Ms and Mt nominal, worst Ms found, draws that fail."""
+        rows: list[tuple[str, ...]] = []
+        for place in self.places:
+            failed = place.unstable + place.over_ms + place.over_mt
+            rows.append((
+                f"{place.value:.4g}", "point" if place.point else "between",
+                f"{place.ms:.3f}", f"{max(one.mt for one in place.plants.values()):.3f}",
+                "" if place.worst_ms is None else f"{place.worst_ms:.3f}", f"{failed} of {place.draws}",
+            ))  # fmt: skip
+        return rows
+
+    @property
+    def row_heads(self) -> tuple[str, ...]:
+        """What stands above the columns of `list_rows`."""
+        return (f"{self.schedule.over}{unit_after(self.schedule.unit)}", "", "Ms", "Mt", "worst Ms", "draws that fail")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of schedule_robustness.json (schema seaopt/schedule_robustness/1)."""
+        return {
+            "schema": SCHEDULE_ROBUSTNESS_SCHEMA,
+            "passed": self.passed,
+            "over": self.schedule.over,
+            "unit": self.schedule.unit,
+            "requirements": [_list_fields(row) for row in self.requirements],
+            "places": [
+                {
+                    "value": place.value,
+                    "point": place.point,
+                    "plants": {
+                        name: {key: getattr(one, key) for key in ("stable", "bandwidth_hz", "ms", "mt", "disk_margin")}
+                        for name, one in place.plants.items()
+                    },
+                    "worst": {
+                        name: {"parameters": one.parameters, "ms": one.ms, "mt": one.mt}
+                        for name, one in place.worst.items()
+                    },
+                    "draws": place.draws, "unstable": place.unstable, "over_ms": place.over_ms,
+                    "over_mt": place.over_mt,
+                    "simulated": None if place.simulated is None else place.simulated.to_dict(),
+                }
+                for place in self.places
+            ],
+            "monte_carlo": _list_fields(self.monte_carlo),
+            "stretches": [_list_fields(one) for one in self.stretches],
+            "sweeps": {name: [_list_fields(one) for one in sweeps] for name, sweeps in self.sweeps.items()},
+            "fastest_rate": self.fastest,
+            "rate_unit": self.rate_unit,
+            "proof": self.proof,
+            "assumption": self.assumption,
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+    def __repr__(self) -> str:
+        broken = [row for row in self.requirements if not row.met]
+        verdict = "passed" if self.passed else f"FAILED, {len(broken)} of {len(self.requirements)} requirements not met"
+        rows = [self.row_heads, *self.list_rows()]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+        return "\n".join(
+            [
+                f"ScheduleCertificate over {self.schedule.over}: {verdict}",
+                *("  " + "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows),
+                f"  {self.monte_carlo}",
+                *(f"  {note}" for note in self.notes),
+                *(f"  not met: {row.name} {row.value:.4g} of {row.limit:.4g}: {row.where}" for row in broken),
+            ]
+        )
+
+    _repr_html_ = html_text
+
+
+def certify_schedule(
+    schedule: ScheduledController,
+    plants: Mapping[str, Plant],
+    parameters: Fit | ParameterSet,
+    *,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    others: ParameterSet | None = None,
+    samples: int = 1375,
+    seed: int = 1,
+    confidence: float = CONFIDENCE,
+    max_failure_probability: float | None = None,
+    min_rate: float | None = None,
+    simulations: bool = True,
+    sensors: Sensors | None = None,
+    current_step_A: float = 0.0,
+    progress: Progress = ignore,
+) -> ScheduleCertificate:
+    """Check a schedule against plants, with its variable standing still and in sweeps.
+
+    Parameters
+    ----------
+    schedule : ScheduledController
+        The gains.
+    plants : mapping of name to Plant
+        Plants on which it must pass; the design plant is certified too.
+    parameters, ranges, others, samples, seed, confidence, max_failure_probability, sensors, current_step_A
+        As in `seaopt.certify`; the draws are spread evenly over the points and the values between them. What the
+        schedule is over has no range: its points are it.
+    min_rate : float, optional
+        Required of the fastest sweep that keeps its judgement, in the variable's unit per second; if left out, the
+        rate is stated, not required.
+    simulations : bool
+        Simulate the points on the plants that hold the variable, and the sweeps.
+    progress : callable, optional
+        Called with what is done and the share of it that is done.
+
+    Raises
+    ------
+    ControlError
+        As `seaopt.certify`; the variable has a range, or is estimated by the fit.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.robustness import certify_schedule
+    >>> from seaopt.control import tune_schedule
+    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+    >>> spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6)
+    >>> schedule = tune_schedule(stand, thor, spec, "k", [5e5, 6e5])
+    >>> certificate = certify_schedule(schedule, {"stand": stand}, thor, simulations=False)
+    >>> certificate.passed, all(one.shown for one in certificate.stretches)
+    (True, True)
+
+    """
+    require_type(schedule, ScheduledController, "schedule", "give a ScheduledController", ControlError)
+    require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
+    if min_rate is not None and not require_number(min_rate, "min_rate", ControlError) > 0.0:
+        raise ControlError(f"min_rate = {min_rate:g} is not positive; give a rate in {schedule.unit}/s")
+    ranges, others = dict(ranges or {}), others or ParameterSet()
+    _check_variable(schedule, parameters, ranges)
+    models = _with_design(schedule, plants)
+    values = sorted({*schedule.points, *list_inner(schedule.points, PARTS)})
+    standing, proving, sweeping = divide(
+        progress, POINT * len(schedule.points), BOUND * len(values) * len(models), SWEEP * len(models) * simulations
+    )
+    count = -(-samples // len(values))
+    rng = np.random.default_rng([seed, *_digest(schedule)])
+    places: list[PlaceCertificate] = []
+    nominal = ParameterSet()
+    for value in count_off(values, f"value of {schedule.over}", standing):
+        source, rest = _place_source(schedule, parameters, others, value)
+        unknown = combine_uncertainty(source, rest, ranges, models)
+        nominal = unknown.nominal
+        place = _certify_place(schedule, models, unknown, value, count, rng)
+        if place.point:
+            options = {"sensors": sensors, "current_step_A": current_step_A} if simulations else {}
+            place = _add_simulations(
+                schedule, place, models, source,
+                {"ranges": ranges, "others": rest, "samples": count, "seed": seed, "simulations": simulations} | options,
+            )  # fmt: skip
+        places.append(place)
+    stretches = [
+        bound for low, high in count_off(list(pairwise(values)), "stretch", proving)
+        for bound in _bound_plants(schedule, models, nominal, low, high)
+    ]  # fmt: skip
+    sweeps: dict[str, tuple[Sweep, ...]] = {}
+    for name in count_off(list(models), "sweeps, plant", sweeping) if simulations else ():
+        found = sweep_schedule(schedule, name, models[name], nominal)
+        sweeps |= {name: found} if found else {}
+    draws = _count_draws(places, seed, confidence)
+    certificate = ScheduleCertificate(
+        schedule=schedule, places=tuple(places), monte_carlo=draws, stretches=tuple(stretches), sweeps=sweeps,
+        requirements=(
+            *(row for place in places for row in place.requirements),
+            *_require_limits_between(schedule), *_require_draws(places, draws, max_failure_probability),
+        ),
+    )  # fmt: skip
+    progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
+    rate = _require_rate(certificate, min_rate) if simulations else []
+    return replace(certificate, requirements=(*certificate.requirements, *rate))
+
+
+def _check_variable(
+    schedule: ScheduledController, parameters: Fit | ParameterSet, ranges: Mapping[str, tuple[float, float]]
+) -> None:
+    over = schedule.over
+    if over in ranges:
+        raise ControlError(f"range of {over}: the schedule is over it, and its points are its range; take it out")
+    if isinstance(parameters, Fit) and over in parameters.covariance.names:
+        raise ControlError(
+            f"{over} is estimated by the fit, and the schedule is over it; fix it in the experiments that are fitted"
+        )
+
+
+def _with_design(schedule: ScheduledController, plants: Mapping[str, Plant]) -> dict[str, Plant]:
+    design, _ = schedule.design
+    return dict(plants) if design in plants.values() else {DESIGN: design, **plants}
+
+
+def _place_source(
+    schedule: ScheduledController, parameters: Fit | ParameterSet, others: ParameterSet, value: float
+) -> tuple[Fit | ParameterSet, ParameterSet]:
+    """Return what is known of the parameters, and the others, with the variable at a value."""
+    here = Parameter(name=schedule.over, value=value, unit=schedule.unit)
+    if isinstance(parameters, ParameterSet):
+        return parameters.with_parameters(here), others
+    if schedule.over in parameters.parameters:
+        return replace(parameters, parameters=parameters.parameters.with_parameters(here)), others
+    return parameters, others.with_parameters(here)
+
+
+def _certify_place(
+    schedule: ScheduledController, models: Mapping[str, Plant], unknown: Uncertainty, value: float, count: int,
+    rng: np.random.Generator,
+) -> PlaceCertificate:  # fmt: skip
+    """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case."""
+    controller, point = schedule.at(value), value in schedule.points
+    plants = split_friction(models, unknown.nominal, [row.name for row in unknown.varied()])
+    figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
+    count = count if unknown.size else 0
+    points = unknown.draw(count, rng)
+    drawn = unknown.values(points)
+    unstable, over_ms, over_mt = (np.zeros(count, dtype=bool) for _ in range(3))
+    ms, mt = limits(controller)
+    for plant in plants.values() if count else ():
+        batch = batch_figures(controller, plant, unknown.nominal, drawn)
+        unstable |= batch.spectral_radius >= STABLE
+        over_ms |= batch.ms > ms
+        over_mt |= batch.mt > mt
+    over_ms &= ~unstable
+    over_mt &= ~(unstable | over_ms)
+    rows = [row for name in plants for row in plant_requirements(controller, name, figures[name])]
+    if point:
+        design, _ = schedule.design
+        rows += design_requirements(controller, split_friction({DESIGN: design}, unknown.nominal), unknown.nominal)
+    return PlaceCertificate(
+        value=value, point=point, plants=figures,
+        worst={name: find_worst(controller, plant, unknown, points) for name, plant in plants.items()} if point else {},
+        draws=count, unstable=int(np.sum(unstable)), over_ms=int(np.sum(over_ms)), over_mt=int(np.sum(over_mt)),
+        requirements=_name_place(schedule, value, rows),
+    )  # fmt: skip
+
+
+def _name_place(schedule: ScheduledController, value: float, rows: Sequence[Requirement]) -> tuple[Requirement, ...]:
+    return tuple(replace(row, where=f"{schedule.over} = {value:.4g}, {row.where}") for row in rows)
+
+
+def _add_simulations(
+    schedule: ScheduledController, place: PlaceCertificate, models: Mapping[str, Plant], source: Fit | ParameterSet,
+    options: Mapping[str, Any],
+) -> PlaceCertificate:  # fmt: skip
+    """Return a point with what `certify` finds on the plants that hold the variable, where the design plant does.
+
+    Where a plant moves it, a law that is frozen there is not what runs.
+    """
+    if schedule.over in schedule.design[0].states:
+        return place
+    held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
+    varied = {*conditions(tuple(held.values())), *find_modes(held)}.union(
+        *(plant.parameters for plant in held.values())
+    )
+    ranges = {name: ends for name, ends in options["ranges"].items() if name in varied}
+    certificate = certify(schedule.at(place.value), held, source, **{**options, "ranges": ranges})
+    known = {(row.name, row.where) for row in place.requirements}
+    rows = _name_place(schedule, place.value, certificate.requirements)
+    new = [row for row in rows if (row.name, row.where) not in known]
+    return replace(place, simulated=certificate, requirements=(*place.requirements, *new))
+
+
+def _bound_plants(
+    schedule: ScheduledController, models: Mapping[str, Plant], nominal: ParameterSet, low: float, high: float
+) -> list[StretchBound]:
+    """Return what is proved of every plant on the stretch between two neighbouring values."""
+    middle = schedule.at(0.5 * (low + high))
+    out: list[StretchBound] = []
+    for name, plant in split_friction(models, nominal).items():
+        values = place_variable(plant, nominal, schedule.over, 0.5 * (low + high))
+        out.append(bound_stretch(name, middle, schedule.table, plant, values, low, high))
+    return out
+
+
+def _count_draws(places: Sequence[PlaceCertificate], seed: int, confidence: float) -> MonteCarlo:
+    unstable, over_ms, over_mt, samples = (
+        sum(getattr(place, name) for place in places) for name in ("unstable", "over_ms", "over_mt", "draws")
+    )
+    failures = unstable + over_ms + over_mt
+    return MonteCarlo(
+        samples=samples, failures=failures, seed=seed, confidence=confidence, unstable=unstable, over_ms=over_ms,
+        over_mt=over_mt, failure_probability_bound=failure_bound(samples, failures, confidence),
+    )  # fmt: skip
+
+
+def _require_draws(
+    places: Sequence[PlaceCertificate], draws: MonteCarlo, max_failure_probability: float | None
+) -> list[Requirement]:
+    """Return what the draws require, the worst case found at a point beside them."""
+    worst = {
+        f"{name} at {place.value:.4g}": case for place in places for name, case in place.worst.items()
+    }  # fmt: skip
+    return draw_requirements(draws, worst, max_failure_probability)
+
+
+def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
+    """Return that the design plant's limits hold between the points, 0.9 of the bandwidth asked among them."""
+    return [
+        Requirement(
+            name="limits_between_points", limit=0.0, value=float(len(place.broken)), met=not place.broken,
+            where=f"{schedule.over} = {place.value:.4g}"
+            + (f": {', '.join(place.broken)}; {schedule.remedy}" if place.broken else ""),
+        )
+        for place in schedule.between
+    ]  # fmt: skip
+
+
+def _require_rate(certificate: ScheduleCertificate, least: float | None) -> list[Requirement]:
+    """Return that sweeps keep their judgement: the slowest at all, and as fast as asked."""
+    rows: list[Requirement] = []
+    for sweeps in certificate.sweeps.values():
+        fastest, faults = find_fastest(sweeps), [sweep.fault for sweep in sweeps if sweep.fault]
+        asked = sweeps[0].rate if least is None else least
+        short = f", the fastest tried is {sweeps[-1].rate:.3g}" if not faults else f": {faults[0]}"
+        rows.append(
+            Requirement(
+                name="min_schedule_rate", limit=asked, value=fastest, met=fastest >= asked,
+                where=f"{sweeps[0].plant}, {certificate.rate_unit} in a sweep{short}",
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _digest(schedule: ScheduledController) -> tuple[int, ...]:
+    """Return numbers of the law's own, so that another law meets other draws at the same seed."""
+    text = " ".join(f"{value:.6g}" for row in schedule.table.gains.values() for value in row)
+    return tuple(int(word) for word in np.frombuffer(sha256(text.encode()).digest()[:16], dtype=np.uint32))
+
+
+def _list_fields(row: Any) -> dict[str, Any]:
+    return {field.name: getattr(row, field.name) for field in fields(row)}
+
+
+def _round_up(value: float) -> str:
+    """Return a number with three decimals, rounded up."""
+    return f"{np.ceil(1e3 * value) / 1e3:.3f}"

@@ -1,0 +1,316 @@
+r"""How fast a scheduling variable may move, by simulation: sweeps of growing speed on the nonlinear plant.
+
+The limits of a schedule are judged with the variable standing still. Here it moves, imposed from outside as
+
+.. math:: s(t) = s_0 + \tfrac12 (s_1 - s_0)(1 - \cos \omega t),
+
+through the whole table and back, at a peak rate of :math:`\tfrac12 (s_1 - s_0)\,\omega`: in place of a parameter, or in
+place of a state, whose own rate then is ds/dt. The law runs as it is exported, and reads s in the same sample as the
+regulated output.
+
+Each sweep is simulated twice, with pulses of the reference and without, and what is judged is the difference: the motion
+itself stretches the spring, which disturbs every law alike. The difference must keep the reference peak that a step is
+allowed (and 10 % grace), both ways, and be settled to a tenth of the step in the last quarter of every pulse and pause,
+or to twice what the law leaves there while s stands still. The command may not saturate: beyond that the motion asks
+for more than the drive has, whatever the gains.
+
+This finds where a sweep of this shape goes wrong. It proves nothing of other motions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.running.force_run import close_loop
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
+from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
+from seaopt.errors import ControlError, SimulationError
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.memo import memo
+from seaopt.plants.plant import output_function
+from seaopt.progress import Progress, ignore
+from seaopt.records import record
+from seaopt.robustness.verification.scenarios import PEAK_GRACE, SETTLED
+from seaopt.units import unit_after
+
+SLOWEST, FASTEST = 1.0 / 128.0, 0.5  # of the least bandwidth: frequencies of the sweeps
+PULSE_PERIODS = 10.0  # of the least bandwidth, that a pulse lasts, and a pause
+LEAST_PULSES = 4
+STEP_SHARE = 0.1  # of the effort that the command's limit leaves
+DEFAULT_PEAK = 1.3  # of a reference peak, where the specification lifts its limit
+JUDGED_FROM = 0.75  # of a pulse or pause: its end
+SWEEP = ("sweep_from", "sweep_to", "sweep_rad_s")  # parameters of a swept plant
+
+
+@record
+class Sweep:
+    """What one sweep found.
+
+    Parameters
+    ----------
+    plant : str
+        Its name.
+    rate : float
+        The largest rate of the variable, in its unit per second.
+    frequency_hz : float
+        Of the sweep through the table and back.
+    peak : float
+        Largest of the response to the pulses, over their size.
+    left : float
+        How far off it still was in the last quarter of a pulse or a pause, over their size.
+    fault : str
+        Why it does not keep the judgement; empty where it does.
+
+    """
+
+    plant: str
+    rate: float
+    frequency_hz: float
+    peak: float
+    left: float
+    fault: str
+
+
+@record(eq=False)
+class _Pulses:
+    """The pulses of the reference: their size, the samples of one, and what is allowed of the response."""
+
+    size: float
+    samples: int
+    allowed_peak: float
+    allowed_left: float
+
+
+def sweep_schedule(
+    schedule: ScheduledController, name: str, plant: Plant, params: ParameterSet, progress: Progress = ignore
+) -> tuple[Sweep, ...]:
+    """Sweep a plant's scheduling variable at growing rates, up to the first that does not keep the judgement.
+
+    Parameters
+    ----------
+    schedule : ScheduledController
+        The law.
+    name : str
+        The plant's, for the result.
+    plant, params
+        Which has the variable, as a parameter or as a state.
+    progress : callable, optional
+        Called before each sweep.
+
+    Returns
+    -------
+    tuple of Sweep
+        By rate; all but the last keep the judgement. Empty of a plant that does not have the variable.
+
+    Raises
+    ------
+    ControlError
+        The plant cannot rest at the first point.
+
+    """
+    if schedule.over not in plant.parameters and schedule.over not in plant.states:
+        return ()
+    law, least = schedule.runnable(), min(schedule.bandwidths_hz)
+    pulses = _choose_pulses(schedule, plant, params)
+    sweeps: list[Sweep] = []
+    frequencies = [least * share for share in _list_shares()]
+    for number, frequency in enumerate(frequencies):
+        progress(f"sweep at {frequency:.3g} Hz", number / len(frequencies))
+        sweeps.append(_run_sweep(schedule, law, name, plant, params, pulses, frequency))
+        if sweeps[-1].fault:
+            break
+    return tuple(sweeps)
+
+
+def _list_shares() -> Iterator[float]:
+    share = SLOWEST
+    while share <= FASTEST:
+        yield share
+        share *= 2.0
+
+
+def find_fastest(sweeps: Sequence[Sweep]) -> float:
+    """Return the largest rate up to which every sweep keeps the judgement; zero where the slowest does not."""
+    kept = [sweep.rate for sweep in sweeps if not sweep.fault]
+    return max(kept, default=0.0)
+
+
+def describe_sweeps(sweeps: Sequence[Sweep], unit: str) -> str:
+    """Return what the sweeps of one plant found, in one line."""
+    rate, per = find_fastest(sweeps), f"{unit_after(unit).strip()}/s"
+    head = f"{sweeps[0].plant}: keeps its judgement in sweeps of up to {rate:.3g} {per}"
+    last = sweeps[-1]
+    return f"{head}, the fastest tried" if not last.fault else f"{head}; at {last.rate:.3g} {per} {last.fault}"
+
+
+def _choose_pulses(schedule: ScheduledController, plant: Plant, params: ParameterSet) -> _Pulses:
+    """Return pulses small enough for the command's limit at every point, and what is allowed of their response."""
+    spec, ts = schedule.spec, schedule.spec.sample_time_s
+    limits = [one.force_limit(0.0) for one in schedule.controllers]
+    fast = [one.force_limit(one.spec.bandwidth_hz) for one in schedule.controllers]
+    known = [abs(value) for value in (*limits, *fast) if value is not None and math.isfinite(value)]
+    samples = math.ceil(PULSE_PERIODS / min(schedule.bandwidths_hz) / ts)
+    left = max(
+        abs(loop.measure_step_left(JUDGED_FROM * samples * ts)) / max(abs(loop.tracking(np.zeros(1))[0]), 1e-9)
+        for point, one in zip(schedule.points, schedule.controllers, strict=True)
+        for loop in [one.close(plant, place_variable(plant, params, schedule.over, point))]
+    )
+    return _Pulses(
+        size=STEP_SHARE * min(known, default=1.0 / STEP_SHARE), samples=samples,
+        allowed_peak=PEAK_GRACE * (spec.level("max_reference_peak") or DEFAULT_PEAK),
+        allowed_left=max(SETTLED, 2.0 * left),
+    )  # fmt: skip
+
+
+def _run_sweep(
+    schedule: ScheduledController, law: RunnableSchedule, name: str, plant: Plant, params: ParameterSet,
+    pulses: _Pulses, frequency_hz: float,
+) -> Sweep:  # fmt: skip
+    """Simulate one sweep with pulses and without, and judge the difference."""
+    low, high, ts = schedule.points[0], schedule.points[-1], schedule.spec.sample_time_s
+    omega = 2.0 * math.pi * frequency_hz
+    count = max(LEAST_PULSES, math.ceil(1.0 / frequency_hz / (2 * pulses.samples * ts)))
+    pulse = np.tile(np.repeat([1.0, 0.0], pulses.samples), count)
+    place = low + 0.5 * (high - low) * (1.0 - np.cos(omega * ts * np.arange(pulse.size)))
+    start = _Start.at_rest(schedule, plant, params)
+    swept = make_swept_plant(plant, schedule.over)
+    values = start.params.with_parameters(
+        *(Parameter(name=key, value=value, unit=unit) for key, value, unit in zip(
+            SWEEP, (low, high, omega), (schedule.unit, schedule.unit, "rad/s"), strict=True
+        ))
+    )  # fmt: skip
+
+    def run(size: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        out = close_loop(
+            _follow(law, place), (0, law.reset(start.output, start.output, low, start.command)), swept, values,
+            start.output + size * pulse, measured=schedule.spec.regulated, sample_time_s=ts,
+            delay_samples=schedule.spec.loop_delay_samples, start_state=start.take(swept), start_command=start.command,
+        )  # fmt: skip
+        return out.force, out.current
+
+    rate = 0.5 * (high - low) * omega
+    try:
+        (calm, first), (moved, second) = run(0.0), run(pulses.size)
+    except (ControlError, SimulationError) as error:
+        return Sweep(
+            plant=name, rate=rate, frequency_hz=frequency_hz, peak=math.inf, left=math.inf, fault=f"is lost: {error}"
+        )
+    response = (moved - calm) / pulses.size
+    peak = float(max(np.max(response), 1.0 - np.min(response)))
+    ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
+    left = float(np.max(np.abs(response - pulse)[ends]))
+    largest = max(float(np.max(np.abs(first))), float(np.max(np.abs(second))))
+    fault = _find_fault(pulses, peak, left, saturated=largest >= law.limit)
+    return Sweep(plant=name, rate=rate, frequency_hz=frequency_hz, peak=peak, left=left, fault=fault)
+
+
+def _find_fault(pulses: _Pulses, peak: float, left: float, *, saturated: bool) -> str:
+    if saturated:
+        return "the motion takes the command to its limit"
+    if not peak <= pulses.allowed_peak:
+        return f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
+    if not left <= pulses.allowed_left:
+        return f"a step is still {100 * left:.3g} % off at its end, {100 * pulses.allowed_left:.3g} % allowed"
+    return ""
+
+
+def _follow(law: RunnableSchedule, place: Float[np.ndarray, " n"]) -> Callable[..., Any]:
+    """Return the law as a function of reference and measurement, whose state counts the samples of a sweep."""
+
+    def step(
+        state: tuple[int, ScheduleState], reference: float, measurement: float
+    ) -> tuple[float, tuple[int, ScheduleState]]:
+        number, before = state
+        command, after = law.step(before, reference, measurement, float(place[number]))
+        return command, (number + 1, after)
+
+    return step
+
+
+@record(eq=False)
+class _Start:
+    """Where a sweep starts: the plant at rest at the first point, what it measures there, and what holds it."""
+
+    params: ParameterSet
+    states: dict[str, float]
+    output: float
+    command: float
+
+    @classmethod
+    def at_rest(cls, schedule: ScheduledController, plant: Plant, params: ParameterSet) -> _Start:
+        placed = plant.complete(place_variable(plant, params, schedule.over, schedule.points[0]))
+        x, u = find_rest(plant, placed)
+        row = list(plant.outputs).index(schedule.spec.regulated)
+        output = float(output_function(plant)(0.0, x, u, placed.vector)[row])
+        return cls(
+            params=placed.drop_conditions(), states=dict(zip(plant.states, x.tolist(), strict=True)), output=output,
+            command=float(u[0]),
+        )  # fmt: skip
+
+    def take(self, plant: Plant) -> Float[np.ndarray, " nx"]:
+        """Return the states that a plant still has."""
+        return np.array([self.states[name] for name in plant.states])
+
+
+@memo
+def make_swept_plant(plant: Plant, over: str) -> Plant:
+    """Return a plant in which a parameter, or a state with its rate, follows a sweep of time.
+
+    Its parameters are those of the plant, and sweep_from, sweep_to and sweep_rad_s.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> make_swept_plant(so.plants.moving_output(), "phi").states.keys()
+    dict_keys(['q', 'qd'])
+
+    """
+    unit = plant.parameter_unit(over) if over in plant.parameters else plant.states[over]
+    rate = _find_rate(plant, over)
+    kept = {name: unit for name, unit in plant.states.items() if name not in (over, rate)}
+    equations = ca.Function("plant", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics, plant.output])
+
+    def evaluate(t: Any, x: Any, u: Any, p: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        half, phase = 0.5 * (p.sweep_to - p.sweep_from), p.sweep_rad_s * t
+        moved = {over: p.sweep_from + half * (1.0 - ca.cos(phase))}
+        moved |= {rate: half * p.sweep_rad_s * ca.sin(phase)} if rate else {}
+        states, values = ({**vars(space), **moved} for space in (x, p))
+        slopes, outputs = equations(
+            t, ca.vertcat(*(states[name] for name in plant.states)), ca.vertcat(*(getattr(u, n) for n in plant.inputs)),
+            ca.vertcat(*(values[name] for name in plant.parameters)),
+        )  # fmt: skip
+        return (
+            dict(zip(plant.states, ca.vertsplit(slopes), strict=True)),
+            dict(zip(plant.outputs, ca.vertsplit(outputs), strict=True)),
+        )
+
+    def f(t: Any, x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> dict[str, Any]:
+        return {name: slope for name, slope in evaluate(t, x, u, p)[0].items() if name in kept}
+
+    def h(t: Any, x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> dict[str, Any]:
+        return evaluate(t, x, u, p)[1]
+
+    return Plant(
+        name=f"{plant.name}, {over} swept", states=kept, inputs=plant.inputs, outputs=plant.outputs,
+        parameters={**plant.parameters, **dict(zip(SWEEP, (unit, unit, "rad/s"), strict=True))}, f=f, h=h,
+    )  # fmt: skip
+
+
+def _find_rate(plant: Plant, over: str) -> str:
+    """Return the state that is the rate of a state; empty where there is none, or it is a parameter that moves."""
+    if over not in plant.states:
+        return ""
+    slope = plant.dynamics[list(plant.states).index(over)]
+    for name, symbol in zip(plant.states, ca.vertsplit(plant.x), strict=True):
+        if ca.is_equal(slope, symbol, 2):
+            return name
+    return ""
