@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from seaopt.cli.provenance import FILES, check_unedited, digest
-from seaopt.cli.session import SCHEMAS
+from seaopt.cli.provenance import FILES, SCHEDULE_FILES, check_unedited, digest
+from seaopt.cli.session import SCHEDULE_SCHEMAS, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
+from seaopt.control.deploy.schedule_export import is_schedule
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.mpc.export import SOURCES, write_code
 from seaopt.control.mpc.stored import read_code
@@ -34,12 +35,12 @@ def export_controller(
         There is no controller, it was edited, or made from another fit than the one beside it, or it cannot be written.
 
     """
-    path = results / FILES["tune"]
+    path, schema, certificate = _find_law(results)
     if not path.is_file():
         raise ProblemError(
             f"{path}: no such file; give the folder of results, or make them: seaopt run PROBLEM -o {results}"
         )
-    content = read_json(path, SCHEMAS["tune"], remedy=f"run seaopt tune PROBLEM -o {results}")
+    content = read_json(path, schema, remedy=f"run seaopt tune PROBLEM -o {results}")
     fitted, made_from = results / FILES["fit"], content.get("made_from")
     check_unedited(path, content, "run seaopt tune again")
     expected = None if made_from is None else made_from.get(fitted.name)
@@ -49,7 +50,7 @@ def export_controller(
         options["derate"] = read_guard(content, derate_margin_K) or True
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
-    met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, results / FILES["certify"])
+    met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, certificate)
     certified = broken is not None
     if json:
         result = {
@@ -62,7 +63,8 @@ def export_controller(
         if not met:
             console.wrap(f"not met: {UNMET}")
         if not content["feasible"]:
-            console.wrap(f"not met: {join_labels(content['active_constraints'])}")
+            missed = content["broken"] if is_schedule(content) else [join_labels(content["active_constraints"])]
+            console.wrap(f"not met: {'; '.join(missed)}")
         if broken:
             console.wrap(f"not met: the certificate of this controller FAILED: {', '.join(broken)}")
         if not certified:
@@ -91,11 +93,32 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
     return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h"))
 
 
+def _find_law(results: Path) -> tuple[Path, str, Path]:
+    """Return the file of the law or of the schedule in a folder, its schema, and the file of its certificate.
+
+    Raises
+    ------
+    ProblemError
+        The folder has both.
+
+    """
+    one, scheduled = results / FILES["tune"], results / SCHEDULE_FILES["tune"]
+    if not scheduled.is_file():
+        return one, SCHEMAS["tune"], results / FILES["certify"]
+    if one.is_file():
+        raise ProblemError(
+            f"{results}: has {one.name} and {scheduled.name}, and one of them is of an earlier run; make the one that "
+            "is meant in a folder of its own: seaopt tune PROBLEM -o DIR"
+        )
+    return scheduled, SCHEDULE_SCHEMAS["tune"], results / SCHEDULE_FILES["certify"]
+
+
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
     """Return the requirements that the certificate of this very controller says are not met; None without one."""
     if not certificate.is_file():
         return None
-    content = read_json(certificate, SCHEMAS["certify"])
+    scheduled = certificate.name == SCHEDULE_FILES["certify"]
+    content = read_json(certificate, (SCHEDULE_SCHEMAS if scheduled else SCHEMAS)["certify"])
     made_from = content.get("made_from")
     if made_from is not None and made_from.get(controller.name) != digest(controller):
         return None  # of another controller, and says nothing of this one

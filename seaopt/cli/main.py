@@ -434,7 +434,8 @@ def fleet(
 @app.command()
 def schema(
     document: Annotated[
-        str, typer.Argument(metavar="problem|fit|controller|robustness", help="Whose schema.", show_default=False)
+        str,
+        typer.Argument(metavar="problem|fit|controller|schedule|robustness", help="Whose schema.", show_default=False),
     ],
 ) -> None:
     """Print the JSON Schema of a file that seaopt reads, for editors."""

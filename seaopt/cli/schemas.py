@@ -15,6 +15,7 @@ DOCUMENTS = {  # the module and model of each, its title, and the version that i
     "problem": ("seaopt.problem.schema", "ProblemTable", "seaopt problem file", 1),
     "fit": ("seaopt.estimation.result.stored", "StoredFit", "seaopt fit.json", 2),
     "controller": ("seaopt.control.laws.stored", "StoredController", "seaopt controller.json", 2),
+    "schedule": ("seaopt.control.scheduling.stored", "StoredSchedule", "seaopt schedule.json", 1),
     "robustness": ("seaopt.robustness.certificate.stored", "StoredCertificate", "seaopt robustness.json", 2),
 }
 

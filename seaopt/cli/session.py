@@ -20,11 +20,18 @@ from rich.progress import Progress as Bar
 
 from seaopt import __version__
 from seaopt.cli.frontier import print_frontier
-from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
+from seaopt.cli.provenance import (
+    FILES,
+    ROBUSTNESS,
+    check_unedited,
+    digest_content,
+    digest_sources,
+    name_file,
+)
 from seaopt.cli.responses import estimate_responses
-from seaopt.cli.show import show_certificate, show_controller, show_fit, show_plan, show_verdicts
+from seaopt.cli.show import show_certified, show_designed, show_fit, show_plan, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
-from seaopt.control import Controller, ControllerSpec, ForceMPC, read_law, sweep
+from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.errors import ProblemError
@@ -41,12 +48,14 @@ from seaopt.problem.stages import (
     assess_problem,
     can_design,
     certify_problem,
+    certify_schedule_problem,
     describe_mpc,
     design_mpc,
     fit_problem,
     list_plants,
     score_problem,
     tune_problem,
+    tune_schedule_problem,
 )
 from seaopt.progress import Progress, count_off, divide
 from seaopt.reporting import write_frontier_figure, write_report
@@ -59,9 +68,11 @@ from seaopt.reporting.verdict import (
     judge_expectations,
     judge_fit,
     judge_mpc,
+    judge_schedule,
+    judge_schedule_certificate,
     name_guesses,
 )
-from seaopt.robustness import Certificate, JointTuning
+from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 from seaopt.testing.expectations import list_expectations
@@ -73,6 +84,7 @@ SCHEMAS = {
     "sweep": "seaopt/frontier/1",
     "certify": "seaopt/robustness/2",
 }
+SCHEDULE_SCHEMAS = {"tune": "seaopt/schedule/1", "certify": "seaopt/schedule_robustness/1"}
 LABELS = {
     "simulate": "simulating",
     "frf": "frequency responses",
@@ -241,7 +253,7 @@ class Session:
 
     def name_leftovers(self, stages: list[str]) -> list[str]:
         """Return the results in the folder that an earlier run left and this one does not replace."""
-        paths = [self.folder / FILES[stage] for stage in ("fit", "tune", "certify") if stage not in stages]
+        paths = [self._path(stage) for stage in ("fit", "tune", "certify") if stage not in stages]
         return [f"{path} is of an earlier run, and no part of this report" for path in paths if path.exists()]
 
     def say(self, text: str) -> None:
@@ -346,8 +358,34 @@ class Session:
         self.results["tune"] = controller
         self._write("tune", controller.to_dict())
 
+    def schedule(self) -> ScheduledController:
+        """Return the schedule of this run or of the folder; one for other limits than the problem's is refused."""
+        if "tune" not in self.results:
+            schedule = ScheduledController.from_dict(
+                self._read("tune"), self.problem.design_plant, self.values(), self.problem.robust_to(self.values())
+            )
+            asked = self.problem.schedule
+            if asked is None or (schedule.over, list(schedule.points)) != (asked.over, asked.points):
+                raise ProblemError(
+                    f"{self._path('tune')}: is over other points than [controller.schedule] of {self.problem.source}; "
+                    f"run {self._spell('tune')} again"
+                )
+            self._check_spec(replace(schedule.spec, bandwidth_hz=self._spec().bandwidth_hz))
+            self.results["tune"] = schedule
+        return self.results["tune"]
+
+    def _designed(self) -> Controller | ScheduledController:
+        """Return what was tuned: one law, or a schedule."""
+        return self.controller() if self.problem.schedule is None else self.schedule()
+
+    def _path(self, stage: str) -> Path:
+        return self.folder / name_file(self.problem, stage)
+
+    def _schema(self, stage: str) -> str:
+        return (SCHEDULE_SCHEMAS if self.problem.schedule is not None else SCHEMAS).get(stage, SCHEMAS[stage])
+
     def _check_spec(self, stored: ControllerSpec) -> None:
-        asked, path = self._spec().to_dict(), self.folder / FILES["tune"]
+        asked, path = self._spec().to_dict(), self._path("tune")
         given = OF_THE_LAW if stored.structure == CUSTOM else ()
         for name, value in stored.to_dict().items():
             if name not in given and value != asked[name]:
@@ -368,7 +406,7 @@ class Session:
         if stage not in ("fit", "frf"):
             content = content | {"fit_met": self.fit_met(), "guessed": self.problem.table.guessed}
         made_from = digest_sources(self.problem, stage, self.folder) | {"content": digest_content(content)}
-        self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": made_from}))
+        self.written.append(write_json(self._path(stage), content | {"made_from": made_from}))
 
     def _read(self, stage: str) -> dict[str, Any]:
         """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused.
@@ -376,10 +414,10 @@ class Session:
         A file that does not say what it was made from (written by hand) is taken as it is; and a controller made for
         another [robustness], which a certificate may ask about.
         """
-        path, again = self.folder / FILES[stage], f"run {self._spell(stage)}"
+        path, again = self._path(stage), f"run {self._spell(stage)}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
-        content = read_json(path, SCHEMAS[stage], remedy=again)
+        content = read_json(path, self._schema(stage), remedy=again)
         check_unedited(path, content, f"{again} again")
         made_from = content.get("made_from")
         if made_from is None:
@@ -480,7 +518,8 @@ class Session:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         self._design_values(design, *(plant for plant, _ in robust_to.values()))
         self._spec()
-        result = tune_problem(self.problem, self.parameters(), tell)
+        make = tune_problem if self.problem.schedule is None else tune_schedule_problem
+        result = make(self.problem, self.parameters(), tell)
         if self.problem.mpc is not None and isinstance(result, Controller):
             self.results["tune"] = result
             self._write("tune", result.to_dict() | {"mpc": describe_mpc(self.plan())})
@@ -495,6 +534,11 @@ class Session:
             raise ProblemError(
                 f'{self.problem.source}: a sweep tunes gains, and [controller] has structure = "mpc"; to sweep write '
                 'structure = "pid"'
+            )
+        if self.problem.schedule is not None:
+            raise ProblemError(
+                f"{self.problem.source}: a sweep is of one law, and [controller.schedule] asks for one at every point; "
+                "take it out"
             )
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
@@ -515,9 +559,12 @@ class Session:
 
     def _certify(self, tell: Progress) -> None:
         plants = self.problem.certified_plants()
-        controller, source = self.controller(), self.parameters()
+        law, source = self._designed(), self.parameters()
         self._design_values(*plants.values())
-        result = certify_problem(self.problem, controller, source, tell)
+        if isinstance(law, ScheduledController):
+            result = certify_schedule_problem(self.problem, law, source, tell)
+        else:
+            result = certify_problem(self.problem, law, source, tell)
         for remark in self.problem.remarks(self.values()):
             self._note(remark)
         self.results["certify"] = result
@@ -534,15 +581,12 @@ class Session:
                         fitted, experiments=self.problem.choose_fitted(self.experiments())
                     )
                 results.append(fitted)
-        if self.problem.spec is not None and ("tune" in self.results or (self.folder / FILES["tune"]).exists()):
-            controller = self.controller()
-            results.append(controller if self.problem.mpc is None else self.plan())
-            if "certify" not in self.results and (self.folder / FILES["certify"]).exists():
-                plants = self.problem.certified_plants()
+        if self.problem.spec is not None and ("tune" in self.results or self._path("tune").exists()):
+            designed = self._designed()
+            results.append(designed if self.problem.mpc is None else self.plan())
+            if "certify" not in self.results and self._path("certify").exists():
                 simulating("simulating again", 0.0)
-                self.results["certify"] = Certificate.from_dict(
-                    self._read("certify"), self.controller(), plants, self.values()
-                )
+                self._read_certificate(simulating)
             results += [self.results["certify"]] if "certify" in self.results else []
         page = write_report(
             results, self.folder / "report.html", title=self.problem.title, progress=drawing,
@@ -550,6 +594,15 @@ class Session:
         )  # fmt: skip
         self.results["report"] = page
         self.written.append(page)
+
+    def _read_certificate(self, tell: Progress) -> None:
+        """Take the folder's certificate; what it simulated is simulated again."""
+        content, source = self._read("certify"), self.parameters()
+        if self.problem.schedule is not None:
+            self.results["certify"] = certify_schedule_problem(self.problem, self.schedule(), source, tell)
+            return
+        plants = self.problem.certified_plants()
+        self.results["certify"] = Certificate.from_dict(content, self.controller(), plants, self.values())
 
     def met(self, stages: list[str]) -> bool:
         """Tell whether everything that these stages require is met."""
@@ -566,9 +619,12 @@ class Session:
             self.results["scores"] = score_problem(self.problem, fit, self.experiments())
         results = Stages(
             self.problem, fit=self.results.get("fit"), scores=self.results.get("scores", []),
-            controller=self.results.get("tune"), certificate=self.results.get("certify"),
+            **({} if self.problem.schedule is not None else self._design_results()),
         )  # fmt: skip
         return [expectation.check(results) for expectation in expectations]
+
+    def _design_results(self) -> dict[str, Any]:
+        return {"controller": self.results.get("tune"), "certificate": self.results.get("certify")}
 
     def _verdicts(self, stage: str) -> list[StageVerdict]:
         """Return what to say of a stage that has run; a design on a fit that is not met is not met either."""
@@ -584,10 +640,16 @@ class Session:
             joint, sweep = self.results.get("joint"), f"{self._spell('tune')} --sweep"
             if joint is not None:
                 verdicts.append(StageVerdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
-            verdicts.append(judge_controller(result, sweep) if self.problem.mpc is None else judge_mpc(self.plan()))
+            if isinstance(result, ScheduledController):
+                verdicts.append(judge_schedule(result))
+            else:
+                verdicts.append(judge_controller(result, sweep) if self.problem.mpc is None else judge_mpc(self.plan()))
         if stage == "certify" and result is not None:
             again = self._spell("run" if self.problem.table.experiment else "tune")
-            verdicts.append(judge_certificate(result, again, f"{self._spell('tune')} --sweep"))
+            if isinstance(result, ScheduleCertificate):
+                verdicts.append(judge_schedule_certificate(result, again))
+            else:
+                verdicts.append(judge_certificate(result, again, f"{self._spell('tune')} --sweep"))
         if stage not in ("tune", "certify", "sweep") or self.fit_met():
             return self._name_guesses(verdicts)
         if stage == "sweep":
@@ -638,11 +700,11 @@ class Session:
             case "fit":
                 show_fit(console, self.results[stage], self.results.get("scores", ()))
             case "tune":
-                show_controller(console, self.results[stage])
+                show_designed(console, self.results[stage])
                 if self.problem.mpc is not None:
                     show_plan(console, self.plan())
             case "certify":
-                show_certificate(console, self.results[stage])
+                show_certified(console, self.results[stage])
             case _:
                 pass
 
@@ -667,4 +729,4 @@ class Session:
             return {"schema": "seaopt/simulation/1", "files": [str(path) for path in self.written]}
         if stage == "report":
             return {"schema": "seaopt/report/1", "file": str(self.results[stage])}
-        return json.loads((self.folder / FILES[stage]).read_text(encoding="utf-8"))
+        return json.loads(self._path(stage).read_text(encoding="utf-8"))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from seaopt.cli.terminal import Terminal
-from seaopt.control import Controller, ForceMPC
+from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.laws.controller import name_gain_units
 from seaopt.estimation import Fit, ModelledOutputs
 from seaopt.formatting import MISSING, format_count, format_number, printable
 from seaopt.parameters import Parameter
 from seaopt.reporting.verdict import Reason, StageVerdict
-from seaopt.robustness import Certificate
+from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.units import unit_after
 
 MOST_ROWS = 14  # of a table; --verbose prints them all
@@ -115,6 +115,41 @@ def show_plan(console: Terminal, mpc: ForceMPC) -> None:
     for name, (low, high) in mpc.spec.bounds.items():
         unit = mpc.kalman.units[mpc.kalman.names.index(name)]
         console.wrap(f"{name} within {low:g} and {high:g} {unit}".rstrip(), indent=2)
+
+
+def show_designed(console: Terminal, result: Controller | ScheduledController) -> None:
+    """Print what was tuned: one law, or the gains at the points of a schedule."""
+    if isinstance(result, Controller):
+        show_controller(console, result)
+        return
+    spec = result.spec
+    heading(
+        console, "Schedule", f"{spec.structure} on {spec.regulated} over {result.over}, {spec.sample_rate_hz:g} Hz, "
+        f"{format_count(spec.loop_delay_samples, 'sample')} late"
+    )  # fmt: skip
+    rows, heads, gains = result.list_rows(), result.row_heads, len(result.table.gains) + 1
+    _tabulate(console, [row[:gains] for row in rows], heads[:gains], ">" * gains)
+    _tabulate(console, [(row[0], *row[gains:]) for row in rows], (heads[0], *heads[gains:]), ">>>><")
+    console.wrap(result.describe_between(), indent=2)
+    _show_notes(console, result.notes)
+
+
+def show_certified(console: Terminal, result: Certificate | ScheduleCertificate) -> None:
+    """Print what was certified: one law, or a schedule at its points, between them and in sweeps."""
+    if isinstance(result, Certificate):
+        show_certificate(console, result)
+        return
+    heading(console, "Certificate", str(result.monte_carlo).split(":")[0])
+    rows = [row for row, place in zip(result.list_rows(), result.places, strict=True) if place.point]
+    _tabulate(console, rows, result.row_heads, "><>>><")
+    between = [place for place in result.places if not place.point]
+    if between:
+        console.wrap(
+            f"between the points, at {format_count(len(between), 'value')}: Ms up to "
+            f"{max(place.ms for place in between):.3f}", indent=2,
+        )  # fmt: skip
+    for note in result.notes:
+        console.wrap(note, indent=2)
 
 
 def show_certificate(console: Terminal, certificate: Certificate) -> None:

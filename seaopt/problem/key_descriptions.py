@@ -257,6 +257,13 @@ KEYS: dict[str, dict[str, str]] = {
         "command_limit": "The same of another command: V, or a duty.",
         "step_N": "Size of the step that is judged.",
         "reserve": "Share of each limit that is kept free.",
+        "schedule": "One controller per point of a variable, with lines between their gains, in place of one for all.",
+    },
+    "ScheduleTable": {
+        "over": "A state that is measured, such as an angle; or a parameter known as the law runs, such as a load.",
+        "points": "Its values, ascending, in its SI unit; the ends are the range.",
+        "bandwidth_hz": "One per point, in place of the controller's.",
+        "min_rate": "That sweeps must reach, in its unit per second; only stated where left out.",
     },
     "MPCTable": {
         "current_slew_A_per_s": "Largest rate of the command, in its unit per second; no limit where left out.",

@@ -52,6 +52,7 @@ from seaopt.problem.schema import (
     PrefilterTable,
     ProblemTable,
     RobustnessTable,
+    ScheduleTable,
     SensorsTable,
     UnknownTable,
     VirtualTable,
@@ -124,6 +125,11 @@ class Problem:
         name = self.table.controller.plant
         on_bench = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in self.table.experiment}
         return self.plants[on_bench.get(name, name)]
+
+    @property
+    def schedule(self) -> ScheduleTable | None:
+        """What the controller's gains are scheduled over; None for one law for all."""
+        return None if self.table.controller is None else self.table.controller.schedule
 
     @property
     def designs_on_response(self) -> bool:
@@ -662,7 +668,7 @@ def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
     fields = table.controller.model_dump(
-        exclude={"plant", "robust_to", "frf_confidence", "draws", "notch", "prefilter", "compensate"}
+        exclude={"plant", "robust_to", "frf_confidence", "draws", "notch", "prefilter", "compensate", "schedule"}
     )
     low_pass = table.controller.prefilter
     prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass

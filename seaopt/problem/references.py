@@ -6,7 +6,11 @@ import math
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
+import numpy as np
+
 from seaopt.control.loops.sampled_plant import DELAY, find_signals, list_names
+from seaopt.control.scheduling.gain_table import check_points
+from seaopt.control.scheduling.scheduled_controller import find_unit
 from seaopt.errors import ControlError, ProblemError, SeaoptError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -49,6 +53,7 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
             raise ProblemError(
                 f'{place} = "{name}" is not a [plant] of this file ({suggestion(name, plants)}); write {line}'
             )
+    _check_schedule(table, plants)
     _check_measured(table, plants)
     _check_link(table, plants)
     _check_ranges(table, plants, parameters)
@@ -63,6 +68,49 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
         _check_experiment(experiment, plants[experiment.plant])
     if table.expect is not None:
         _check_expected(table, table.expect, plants, parameters)
+
+
+def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
+    """Refuse a schedule over what no plant has, and what is not made of a schedule."""
+    asked = None if table.controller is None else table.controller.schedule
+    if asked is None or table.controller is None:
+        return
+    named = [table.controller.plant, *table.controller.robust_to]
+    responses = [name for name in named if name.startswith(RESPONSE)]
+    if responses:
+        raise ProblemError(
+            f"controller.schedule is there, and {responses[0]} is a measured response, which stands at one value of "
+            f"{asked.over}; name plants, or leave the schedule out"
+        )
+    try:
+        check_points(asked.over, np.array(asked.points))
+        find_unit(asked.over, {name: plants[name] for name in named})
+    except ControlError as error:
+        raise ProblemError(f"controller.schedule: {error}") from error
+    if asked.bandwidth_hz is not None and len(asked.bandwidth_hz) != len(asked.points):
+        raise ProblemError(
+            f"controller.schedule.bandwidth_hz has {len(asked.bandwidth_hz)} values and points {len(asked.points)}; "
+            "give one per point, or leave it out"
+        )
+    _check_beside_schedule(table, asked.over)
+
+
+def _check_beside_schedule(table: ProblemTable, over: str) -> None:
+    """Refuse a range of what is scheduled over, and what is made of one law alone."""
+    robustness, expect = table.robustness, table.expect
+    if robustness is not None and over in robustness.parameters:
+        raise ProblemError(
+            f"robustness.parameters.{over} is a range of what controller.schedule is over, whose points are its range; "
+            "take it out"
+        )
+    for key, there in (
+        ("impedance", table.impedance is not None),
+        ("robustness.retune", robustness is not None and robustness.retune),
+        ("expect.controller", expect is not None and expect.controller is not None),
+        ("expect.certificate", expect is not None and expect.certificate is not None),
+    ):
+        if there:
+            raise ProblemError(f"{key} is there, and is not made of a controller.schedule; leave one of them out")
 
 
 def _check_responses(table: ProblemTable, controller: ControllerTable) -> None:

@@ -424,6 +424,15 @@ Compensated = Annotated[
 ]
 
 
+class ScheduleTable(_Strict):
+    """Gains over a state that is measured, or over a parameter that is known as the law runs."""
+
+    over: Name
+    points: Annotated[list[Number], Field(min_length=2, max_length=100)]
+    bandwidth_hz: list[Number] | None = None
+    min_rate: Annotated[Number, Field(gt=0)] | None = None
+
+
 class ControllerTable(_Strict):
     """What is asked of the controller."""
 
@@ -456,6 +465,7 @@ class ControllerTable(_Strict):
     command_limit: Number | None = None
     step_N: Number | None = None
     reserve: Number = 0.005
+    schedule: ScheduleTable | None = None
 
     @property
     def compensation(self) -> CompensationTable:

@@ -14,6 +14,7 @@ from seaopt.control import (
     ForceMPC,
     GivenLaw,
     Impedance,
+    ScheduledController,
     add_compensation,
     add_impedance,
     assess,
@@ -21,6 +22,7 @@ from seaopt.control import (
     critical_impedance,
     force_mpc,
     tune,
+    tune_schedule,
 )
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.loops.sampled_plant import list_names
@@ -37,8 +39,10 @@ from seaopt.robustness import (
     Budget,
     Certificate,
     JointTuning,
+    ScheduleCertificate,
     certify,
     certify_mpc,
+    certify_schedule,
     linear_controller,
     tune_certified,
 )
@@ -134,6 +138,7 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
         As in `seaopt.tune`.
 
     """
+    _refuse_schedule(problem, "tuned")
     if problem.mpc is not None:
         return linear_controller(design_mpc(problem, source))
     design, robust_to = list_plants(problem, source)
@@ -171,6 +176,65 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     if friction is None:
         return controller
     return add_compensation(controller, friction=CompensateFriction(**friction.model_dump()))
+
+
+def _refuse_schedule(problem: Problem, done: str) -> None:
+    """Refuse to make one law of a problem that asks for a schedule."""
+    if problem.schedule is not None:
+        raise ProblemError(
+            f"{problem.source}: has a [controller.schedule], of which no one law is {done}; take it out for one law "
+            "for all"
+        )
+
+
+def tune_schedule_problem(
+    problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore
+) -> ScheduledController:
+    """Tune the problem's schedule, as `seaopt tune` does where there is a [controller.schedule].
+
+    Parameters
+    ----------
+    problem : Problem
+        With a schedule.
+    source : Fit or ParameterSet
+        The fit; or values, of a problem without experiments.
+    progress : callable, optional
+        As in `seaopt.control.tune_schedule`.
+
+    """
+    assert problem.spec is not None and problem.schedule is not None
+    spec, asked = settle_delay(problem.spec, problem.design_plant, source), problem.schedule
+    values = problem.values(source)
+    return tune_schedule(
+        problem.design_plant, values, spec, asked.over, asked.points, problem.robust_to(values),
+        bandwidths_hz=asked.bandwidth_hz, draws=problem.draws(source), progress=progress,
+    )  # fmt: skip
+
+
+def certify_schedule_problem(
+    problem: Problem, schedule: ScheduledController, source: Fit | ParameterSet, progress: Progress = ignore
+) -> ScheduleCertificate:
+    """Certify a schedule on the problem's plants, simulations included, as `seaopt certify` does.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a schedule.
+    schedule : ScheduledController
+        The gains.
+    source : Fit or ParameterSet
+        The fit; or values, of a problem without experiments.
+    progress : callable, optional
+        As in `seaopt.robustness.certify_schedule`.
+
+    """
+    table = problem.robustness
+    assert problem.schedule is not None
+    return certify_schedule(
+        schedule, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
+        samples=table.samples, seed=table.seed, max_failure_probability=table.max_failure_probability,
+        min_rate=problem.schedule.min_rate, sensors=problem.sensors, current_step_A=table.step, progress=progress,
+    )  # fmt: skip
 
 
 def add_outer_loop(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
@@ -231,6 +295,7 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
         The problem has no [controller], or the law measures something else than it does.
 
     """
+    _refuse_schedule(problem, "measured")
     if problem.spec is None:
         raise ProblemError(
             f"{problem.source}: has no [controller], whose limits a law is measured against; add one: bandwidth_hz = 30"
@@ -349,7 +414,11 @@ class Stages:
         return self._keep("experiments", self.problem.experiments)
 
     def _tune(self) -> Controller | None:
-        if self.problem.spec is None or (self.fit is not None and not can_design(self.problem, self.fit)):
+        if (
+            self.problem.spec is None
+            or self.problem.schedule is not None
+            or (self.fit is not None and not can_design(self.problem, self.fit))
+        ):
             return None
         tuned = tune_problem(self.problem, self.fit or self.problem.parameters)
         return tuned.controller if isinstance(tuned, JointTuning) else tuned

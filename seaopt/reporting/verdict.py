@@ -6,14 +6,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from seaopt.control import Controller, ForceMPC
+from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.laws.verdict import join_labels
 from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.formatting import format_count, format_number
 from seaopt.records import record
-from seaopt.robustness import Certificate
+from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.failures import Failure, group_failures
 from seaopt.robustness.verification.verification import Verification
@@ -63,9 +63,9 @@ class StageVerdict:
 def judge_results(
     *,
     fit: Fit | None = None,
-    controller: Controller | None = None,
+    controller: Controller | ScheduledController | None = None,
     mpc: ForceMPC | None = None,
-    certificate: Certificate | None = None,
+    certificate: Certificate | ScheduleCertificate | None = None,
     verification: Verification | None = None,
     expectations: Sequence[tuple[bool, str]] = (),
 ) -> list[StageVerdict]:
@@ -88,11 +88,13 @@ def judge_results(
     """
     designs: list[StageVerdict] = []
     if controller is not None:
-        designs.append(judge_controller(controller))
+        scheduled = isinstance(controller, ScheduledController)
+        designs.append(judge_schedule(controller) if scheduled else judge_controller(controller))
     if mpc is not None:
         designs.append(judge_mpc(mpc))
     if certificate is not None:
-        designs.append(judge_certificate(certificate))
+        swept = isinstance(certificate, ScheduleCertificate)
+        designs.append(judge_schedule_certificate(certificate) if swept else judge_certificate(certificate))
     if verification is not None:
         designs.append(_judge_verification(verification))
     first = [] if fit is None else [judge_fit(fit)]
@@ -182,6 +184,44 @@ def judge_controller(controller: Controller, sweep: str = "") -> StageVerdict:
     return StageVerdict(
         met=False, text=f"{name}, {format_count(len(reasons), 'limit')} not met", reasons=tuple(reasons),
         next=_advise_bandwidth(controller, sweep),
+    )  # fmt: skip
+
+
+def judge_schedule(schedule: ScheduledController) -> StageVerdict:
+    """Return the verdict on a schedule."""
+    bands = sorted({f"{band:g}" for band in schedule.bandwidths_hz}, key=float)
+    name = (
+        f"Schedule: {schedule.spec.structure} on {schedule.spec.regulated} over {schedule.over} = "
+        f"{schedule.points[0]:g} to {schedule.points[-1]:g}, {format_count(len(schedule.points), 'point')}, "
+        f"{' to '.join(dict.fromkeys((bands[0], bands[-1])))} Hz"
+    )
+    if schedule.feasible:
+        return StageVerdict(met=True, text=f"{name}, every limit met at the points and between them")
+    reasons = tuple(Reason(what=text, where="") for text in schedule.broken)
+    return StageVerdict(
+        met=False, text=f"{name}, {format_count(len(reasons), 'limit')} not met", reasons=reasons,
+        next=(schedule.remedy,),
+    )  # fmt: skip
+
+
+def judge_schedule_certificate(certificate: ScheduleCertificate, again: str = "") -> StageVerdict:
+    """Return the verdict on a schedule's certificate, with its assumption; `again` is the command that repeats it."""
+    draws = certificate.monte_carlo
+    if certificate.passed:
+        drawn = (
+            f"{format_count(draws.failures, 'failure')} in {draws.samples} draws"
+            if draws.samples else "nothing was uncertain, so that nothing was drawn"
+        )  # fmt: skip
+        rate = f"{certificate.fastest:.3g} {certificate.rate_unit}"
+        swept = f"; {certificate.schedule.over} up to {rate} in sweeps" if certificate.sweeps else ""
+        still = f"{certificate.schedule.over} standing still"
+        return StageVerdict(met=True, text=f"Certificate: passed with {still}, {drawn}{swept}")
+    broken = [row for row in certificate.requirements if not row.met]
+    reasons = tuple(explain_failure(one) for one in group_failures(broken))
+    command = f"type {again}" if again else "tune again"
+    return StageVerdict(
+        met=False, text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
+        reasons=reasons, next=(certificate.schedule.remedy or f"raise reserve, or add points; then {command}",),
     )  # fmt: skip
 
 

@@ -1,11 +1,13 @@
 """One controller, many plants: margins, worst case and Monte Carlo certificate."""
 
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
+from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, PlantMargins, Requirement, plant_margins
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
 from seaopt.robustness.certificate.predictive import certify_mpc, linear_controller
+from seaopt.robustness.certificate.scheduled import PlaceCertificate, ScheduleCertificate, certify_schedule
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value
@@ -15,12 +17,15 @@ from seaopt.robustness.verification.environments import StabilityMap, coupled_st
 from seaopt.robustness.verification.judgement import Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
+from seaopt.robustness.verification.schedule_sweep import Sweep, sweep_schedule
 from seaopt.robustness.verification.verification import Verification, verify
 
 __all__ = [
-    "BatchFigures", "Bracket", "Budget", "Certificate", "ConstrainedRuns", "JointTuning", "LargeSignal", "MonteCarlo",
-    "Outcome", "Phase", "PlantMargins", "Requirement", "Round", "Scenario", "Simulated", "StabilityMap", "Uncertainty",
-    "Verification", "Witness", "Worst", "batch_figures", "bracket", "certify", "certify_mpc", "check_ranges",
+    "BatchFigures", "Bracket", "Budget", "Certificate", "ConstrainedRuns", "JointTuning", "LargeSignal",
+    "MonteCarlo", "Outcome", "Phase", "PlaceCertificate", "PlantMargins", "Requirement", "Round", "Scenario",
+    "ScheduleCertificate", "Simulated", "StabilityMap", "StretchBound", "Sweep", "Uncertainty", "Verification",
+    "Witness", "Worst", "batch_figures", "bracket", "certify", "certify_mpc", "certify_schedule", "check_ranges",
     "combine_uncertainty", "coupled_stability", "default_scenarios", "failure_bound", "large_signal",
-    "linear_controller", "place_value", "plant_margins", "run_simulations", "tune_certified", "verify",
+    "linear_controller", "place_value", "plant_margins", "run_simulations", "sweep_schedule", "tune_certified",
+    "verify",
 ]  # fmt: skip

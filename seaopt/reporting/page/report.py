@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from seaopt.control import Controller, ForceMPC, Scorecard, scorecard
+from seaopt.control import Controller, ForceMPC, ScheduledController, Scorecard, scorecard
 from seaopt.control.deploy.export import export
 from seaopt.control.impedance.scorecard import HEADS
 from seaopt.control.laws.controller import name_gain_units
@@ -32,11 +32,12 @@ from seaopt.reporting.figures import simulation as simulations
 from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.panel import Panel, compose_sheet
 from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
+from seaopt.reporting.figures.schedule import schedule_panels
 from seaopt.reporting.page.chart import Chart, make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_template
 from seaopt.reporting.verdict import UNMET, judge_results
-from seaopt.robustness import Certificate
+from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.robustness.certificate.compensation import FRICTION_COMPENSATION
 from seaopt.robustness.certificate.failures import group_failures
 from seaopt.robustness.verification.environments import StabilityMap
@@ -44,9 +45,24 @@ from seaopt.robustness.verification.judgement import Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.verification import Verification, describe_witness
 
-Result = Fit | Ranking | Controller | ForceMPC | Certificate | Verification | StabilityMap | LargeSignal
-KINDS = (Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap)
-FILED = ("controller", "fit", "ranking", "certificate", "amplitude", "contact")  # parts with figures as files
+Result = (
+    Fit | Ranking | Controller | ForceMPC | Certificate | Verification | StabilityMap | ScheduledController
+    | ScheduleCertificate | LargeSignal
+)  # fmt: skip
+KINDS = (
+    Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, ScheduledController,
+    ScheduleCertificate,
+)  # fmt: skip
+# Parts with figures as files.
+FILED = (
+    "controller",
+    "schedule",
+    "fit",
+    "ranking",
+    "certificate",
+    "amplitude",
+    "contact",
+)
 FIGURES_SCHEMA = "seaopt/figures/1"
 DESIGN_PLANT = "design plant"
 LAW_NAME = "force_law"  # of the C header that can be copied
@@ -66,6 +82,8 @@ class Material:
     large: tuple[LargeSignal, ...]
     surveys: Mapping[str, Survey]
     diagnostics: Diagnostics | None
+    schedule: ScheduledController | None = None
+    swept: ScheduleCertificate | None = None
 
 
 @record(eq=False)
@@ -104,8 +122,9 @@ def write_report(
     Parameters
     ----------
     results : sequence of Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, LargeSignal
-        At most one of each, of the last any number; sections without a result are left out. A fit that was not
-        read from a file has a section of diagnostics. A certificate's simulations need not be listed.
+        And ScheduledController, ScheduleCertificate. At most one of each, of LargeSignal any number; sections without a
+        result are left out. A fit that was not read from a file has a section of diagnostics. A certificate's
+        simulations need not be listed.
     path : path
         The page; figures go to the folder ``figures`` beside it, with a list of them; those of an earlier page of that
         name which this one does not have are removed.
@@ -181,7 +200,9 @@ def _list_figures(page: Path, figures: Sequence[Path]) -> None:
 
 def _sort_results(results: Sequence[Result]) -> Material:
     """Return the results by their kind, with what a certificate brings besides."""
-    fit, ranking, controller, mpc, certificate, verification, coupled = (_select(results, kind) for kind in KINDS)
+    fit, ranking, controller, mpc, certificate, verification, coupled, schedule, swept = (
+        _select(results, kind) for kind in KINDS
+    )
     large = tuple(result for result in results if isinstance(result, LargeSignal))
     if not results:
         raise SeaoptError(
@@ -197,6 +218,7 @@ def _sort_results(results: Sequence[Result]) -> Material:
         fit=fit, ranking=ranking, controller=controller, mpc=mpc, certificate=certificate, verification=verification,
         coupled=coupled, large=large, surveys=fit_surveys(fit) if fit is not None else {},
         diagnostics=diagnose(fit) if fit is not None and fit.minimum is not None else None,
+        schedule=schedule if swept is None else swept.schedule, swept=swept,
     )  # fmt: skip
 
 
@@ -212,7 +234,8 @@ def _select(results: Sequence[Result], kind: type) -> Any:
 def list_plates(material: Material) -> list[Plate]:
     """Return every figure that the results allow, in the order of the page."""
     return [
-        *_plates_of_controller(material), *_plates_of_fit(material), *_plates_of_certificate(material),
+        *_plates_of_controller(material), *_plates_of_schedule(material), *_plates_of_fit(material),
+        *_plates_of_certificate(material),
         *_plates_of_simulation(material), *_plates_of_parameters(material), *_plates_of_logs(material),
     ]  # fmt: skip
 
@@ -225,6 +248,13 @@ def _plates_of_controller(material: Material) -> list[Plate]:
     names = ("step", "bode", "tracking", "sensitivity", "nyquist", "noise")
     panels = tuple(loops.LOOP_PANELS[name](controller, plants) for name in names)
     return [Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)]
+
+
+def _plates_of_schedule(material: Material) -> list[Plate]:
+    if material.schedule is None:
+        return []
+    panels = schedule_panels(material.schedule, material.swept)
+    return [Plate(name="schedule", part="schedule", heading="", panels=tuple(panels))]
 
 
 def _plates_of_fit(material: Material) -> list[Plate]:
@@ -338,8 +368,8 @@ def _render(
     runs = material.verification
     apart = runs if certificate is None or runs is not certificate.runs else None  # else the certificate speaks of them
     judged = judge_results(
-        fit=fit, controller=controller, mpc=material.mpc, certificate=certificate, verification=apart,
-        expectations=expectations,
+        fit=fit, controller=controller or material.schedule, mpc=material.mpc,
+        certificate=certificate or material.swept, verification=apart, expectations=expectations,
     )  # fmt: skip
     sound = fit is None or fit.met
     return render_template(
@@ -349,6 +379,7 @@ def _render(
         mpc=material.mpc, certificate=certificate, verification=material.verification, large=material.large,
         coupled=material.coupled, simulated=None if certificate is None else certificate.simulated,
         limited=[] if controller is None else list_design_figures(controller.spec, controller.design_loop),
+        schedule=material.schedule, swept=material.swept,
         units={} if controller is None else name_gain_units(controller.command),
         card=_score(controller), card_heads=HEADS,
         header=None if controller is None else write_header(controller, fit_met=sound),

@@ -2,8 +2,8 @@ r"""Ms of a scheduled law from above, on a whole stretch of its variable: the pl
 
 On a stretch with the middle :math:`\bar s` the loop of the middle's law, :math:`\bar C`, is bounded by branch and bound
 for every plant of the stretch: it is stable there, with :math:`|S| \le M_S` and :math:`|T| \le M_T`
-(`seaopt.robustness.bounds.bracket`). The law itself changes by no more than :math:`|C_s/\bar C - 1| \le \epsilon` at any
-frequency (`GainTable.bound_change`), and
+(`seaopt.robustness.bounds.bracket`). The law itself changes by no more than :math:`|C_s/\bar C - 1| \le \epsilon` at
+any frequency (`GainTable.bound_change`), and
 
 .. math::
     1 + P_s C_s = (1 + P_s \bar C)\Big(1 + T\,\frac{C_s - \bar C}{\bar C}\Big), \qquad

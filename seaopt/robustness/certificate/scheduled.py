@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.bench import Sensors
-from seaopt.control import Controller, LoopFigures, ScheduledController
+from seaopt.control import LoopFigures, ScheduledController
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
@@ -146,8 +146,8 @@ class ScheduleCertificate:
         if not self.fastest:
             return f"{over} is assumed to stand still: the slowest sweep that was simulated does not keep its judgement"
         return (
-            f"{over} is assumed to move slowly: the limits hold with it standing still, and sweeps of up to {rate} keep "
-            "the judgement of a step in simulation"
+            f"{over} is assumed to move slowly: the limits hold with it standing still, and sweeps of up to {rate} "
+            "keep the judgement of a step in simulation"
         )
 
     @property
@@ -319,12 +319,15 @@ def certify_schedule(
         unknown = combine_uncertainty(source, rest, ranges, models)
         nominal = unknown.nominal
         place = _certify_place(schedule, models, unknown, value, count, rng)
-        if place.point:
-            options = {"sensors": sensors, "current_step_A": current_step_A} if simulations else {}
-            place = _add_simulations(
-                schedule, place, models, source,
-                {"ranges": ranges, "others": rest, "samples": count, "seed": seed, "simulations": simulations} | options,
+        held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
+        if place.point and schedule.design[0] in held.values():
+            # Where a plant moves the variable, a law that is frozen there is not what runs.
+            simulated = certify(
+                schedule.at(value), held, source, ranges=_choose_ranges(ranges, held), others=rest, samples=count,
+                seed=seed, simulations=simulations, sensors=sensors if simulations else None,
+                current_step_A=current_step_A if simulations else 0.0,
             )  # fmt: skip
+            place = _add_simulations(schedule, place, simulated)
         places.append(place)
     stretches = [
         bound for low, high in count_off(list(pairwise(values)), "stretch", proving)
@@ -412,25 +415,23 @@ def _name_place(schedule: ScheduledController, value: float, rows: Sequence[Requ
     return tuple(replace(row, where=f"{schedule.over} = {value:.4g}, {row.where}") for row in rows)
 
 
-def _add_simulations(
-    schedule: ScheduledController, place: PlaceCertificate, models: Mapping[str, Plant], source: Fit | ParameterSet,
-    options: Mapping[str, Any],
-) -> PlaceCertificate:  # fmt: skip
-    """Return a point with what `certify` finds on the plants that hold the variable, where the design plant does.
-
-    Where a plant moves it, a law that is frozen there is not what runs.
-    """
-    if schedule.over in schedule.design[0].states:
-        return place
-    held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
-    varied = {*conditions(tuple(held.values())), *find_modes(held)}.union(
-        *(plant.parameters for plant in held.values())
+def _choose_ranges(
+    ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant]
+) -> dict[str, tuple[float, float]]:
+    """Return the ranges of what some of these plants have."""
+    known = {*conditions(tuple(plants.values())), *find_modes(plants)}.union(
+        *(one.parameters for one in plants.values())
     )
-    ranges = {name: ends for name, ends in options["ranges"].items() if name in varied}
-    certificate = certify(schedule.at(place.value), held, source, **{**options, "ranges": ranges})
+    return {name: ends for name, ends in ranges.items() if name in known}
+
+
+def _add_simulations(
+    schedule: ScheduledController, place: PlaceCertificate, certificate: Certificate
+) -> PlaceCertificate:
+    """Return a point with the certificate of the plants that hold the variable there."""
     known = {(row.name, row.where) for row in place.requirements}
     rows = _name_place(schedule, place.value, certificate.requirements)
-    new = [row for row in rows if (row.name, row.where) not in known]
+    new = tuple(row for row in rows if (row.name, row.where) not in known)
     return replace(place, simulated=certificate, requirements=(*place.requirements, *new))
 
 

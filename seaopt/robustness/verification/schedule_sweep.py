@@ -8,11 +8,11 @@ through the whole table and back, at a peak rate of :math:`\tfrac12 (s_1 - s_0)\
 place of a state, whose own rate then is ds/dt. The law runs as it is exported, and reads s in the same sample as the
 regulated output.
 
-Each sweep is simulated twice, with pulses of the reference and without, and what is judged is the difference: the motion
-itself stretches the spring, which disturbs every law alike. The difference must keep the reference peak that a step is
-allowed (and 10 % grace), both ways, and be settled to a tenth of the step in the last quarter of every pulse and pause,
-or to twice what the law leaves there while s stands still. The command may not saturate: beyond that the motion asks
-for more than the drive has, whatever the gains.
+Each sweep is simulated twice, with pulses of the reference and without, and what is judged is the difference: the
+motion itself stretches the spring, which disturbs every law alike. The difference must keep the reference peak that a
+step is allowed (and 10 % grace), both ways, and be settled to a tenth of the step in the last quarter of every pulse
+and pause, or to twice what the law leaves there while s stands still. The command may not saturate: beyond that the
+motion asks for more than the drive has, whatever the gains.
 
 This finds where a sweep of this shape goes wrong. It proves nothing of other motions.
 """

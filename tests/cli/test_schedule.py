@@ -1,0 +1,75 @@
+"""A schedule as a user makes one: tune, certify, report, export; and what is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+KNEE = Path(__file__).resolve().parents[2] / "problems" / "lever_knee.toml"
+SHORTER = {
+    "points = [0.0, 0.3, 0.55, 0.75, 0.9, 1.05, 1.15]": "points = [0.0, 0.35]",
+    "[robustness]": "[robustness]\nsamples = 50",
+}
+
+
+@pytest.fixture(scope="module")
+def text():
+    text = KNEE.read_text(encoding="utf-8")
+    for long, short in SHORTER.items():
+        assert long in text
+        text = text.replace(long, short)
+    return text
+
+
+@pytest.fixture
+def knee(folder, text):
+    (folder / "knee.toml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_tune_writes_a_schedule_that_export_takes(knee, seaopt):
+    out = seaopt("tune", "knee.toml")
+    assert out.returncode == 0, out.stderr
+    content = json.loads((knee / "out" / "schedule.json").read_text(encoding="utf-8"))
+    assert content["schema"] == "seaopt/schedule/1" and content["points"] == [0.0, 0.35]
+    assert not (knee / "out" / "controller.json").exists()
+    written = seaopt("export", "out", "--c", "c", "--name", "knee")
+    assert written.returncode == 0 and {path.name for path in (knee / "c").iterdir()} == {"knee.h", "knee.c"}
+    assert "not certified" in written.stdout
+    (knee / "out" / "controller.json").write_text("{}", encoding="utf-8")  # whichever of both is meant
+    assert seaopt("export", "out", "--c", "c").returncode == 2
+
+
+@pytest.mark.slow
+def test_a_whole_run_is_met_and_its_report_has_the_schedule(knee, seaopt):
+    out = seaopt("run", "knee.toml")
+    assert out.returncode == 0, out.stdout
+    assert "phi is assumed to move slowly" in out.stdout
+    page = (knee / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Gains at the points" in page and "proved" in page
+    assert seaopt("report", "knee.toml").returncode == 0
+    assert "not certified" not in seaopt("export", "out", "--c", "c").stdout
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('over = "phi"', 'over = "ph"', 'did you mean "phi"'),
+        ("points = [0.0, 0.35]", "points = [0.35, 0.0]", "do not ascend"),
+        ("min_rate = 2.0", "bandwidth_hz = [30.0]", "give one per point"),
+        ("I_p = [0.3, 0.42]", "phi = [0.3, 0.42]", "robustness.parameters.phi"),
+        ("samples = 50", "retune = 2", "robustness.retune"),
+        ("[robustness]", "[expect.controller]\n[robustness]", "expect.controller"),
+        ('structure = "pid"', 'structure = "pid_dob"', "cannot be scheduled"),
+    ],
+)
+def test_what_cannot_be_scheduled_is_one_line(knee, seaopt, text, old, new, words):
+    assert old in text
+    (knee / "knee.toml").write_text(text.replace(old, new), encoding="utf-8")
+    out = seaopt("tune", "knee.toml")
+    assert out.returncode == 2 and words in out.stderr and len(out.stderr.strip().splitlines()) == 1
+
+
+def test_a_sweep_of_bandwidths_is_refused(knee, seaopt):
+    out = seaopt("tune", "knee.toml", "--sweep", "20:30:10")
+    assert out.returncode == 2 and "controller.schedule" in out.stderr
