@@ -640,7 +640,7 @@ class Session:
             joint, sweep = self.results.get("joint"), f"{self._spell('tune')} --sweep"
             if joint is not None:
                 verdicts.append(StageVerdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
-            if isinstance(result, ScheduledController):
+            if self.problem.schedule is not None:
                 verdicts.append(judge_schedule(result))
             else:
                 verdicts.append(judge_controller(result, sweep) if self.problem.mpc is None else judge_mpc(self.plan()))

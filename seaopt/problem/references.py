@@ -103,7 +103,11 @@ def _check_beside_schedule(table: ProblemTable, over: str) -> None:
             f"robustness.parameters.{over} is a range of what controller.schedule is over, whose points are its range; "
             "take it out"
         )
+    law = table.controller
     for key, there in (
+        ('controller.structure = "mpc"', law is not None and law.structure == "mpc"),
+        ("controller.prefilter", law is not None and law.prefilter is not None),
+        ("controller.compensate", law is not None and bool(law.compensate)),
         ("impedance", table.impedance is not None),
         ("robustness.retune", robustness is not None and robustness.retune),
         ("expect.controller", expect is not None and expect.controller is not None),

@@ -142,11 +142,12 @@ def tune_schedule(
 
 
 def _check_structure(spec: ControllerSpec) -> None:
-    if spec.structure not in STRUCTURES or spec.notch is not None:
-        what = "a notch" if spec.notch is not None else f'structure = "{spec.structure}"'
+    parts = {"a notch": spec.notch, "a prefilter": spec.prefilter}
+    if spec.structure not in STRUCTURES or any(part is not None for part in parts.values()):
+        what = next((name for name, part in parts.items() if part is not None), f'structure = "{spec.structure}"')
         raise ControlError(
             f'{what} cannot be scheduled: its states change their meaning from point to point; use structure = "pid" '
-            "without a notch"
+            'or "pd" without it'
         )
     if not isinstance(spec.measured, str):
         raise ControlError(f"measured = {list(spec.measured)}: a schedule feeds back one output; name one")
