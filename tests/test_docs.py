@@ -29,8 +29,8 @@ from seaopt.simulation.native import find_compiler
 from tests.pages import blocks, list_pages, read_page, unbroken
 
 SLOW = {  # whole certificates, sweeps, searches for causes, bootstrap: 5 to 20 s of processor time each
-    "howto/choose_bandwidth.md", "howto/figures.md", "howto/friction.md", "howto/read_certificate.md",
-    "theory/certificate.md", "theory/diagnostics.md", "tutorial/ten_minutes.md",
+    "howto/choose_bandwidth.md", "howto/figures.md", "howto/friction.md", "howto/impedance.md",
+    "howto/read_certificate.md", "theory/certificate.md", "theory/diagnostics.md", "tutorial/ten_minutes.md",
 }  # fmt: skip
 
 

@@ -228,6 +228,7 @@ def test_a_cascade_is_its_difference_equation(T_v):
     np.testing.assert_allclose(found, wanted, atol=1e-8 * np.max(np.abs(wanted)))
 
 
+@pytest.mark.slow
 def test_a_cascade_is_measured_like_any_law():
     law = cascade_pid(k_v=0.3, k_p=2.0, k_i=30.0, T_v=0.1, feedforward=1.0, sample_time_s=TS)
     measured = assess(STAND, VALUES, law, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "thetad_m")}))

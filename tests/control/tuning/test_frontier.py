@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.cli import main
 from seaopt.cli.frontier import parse_bandwidths
 from seaopt.control import sweep
 from seaopt.errors import ControlError
@@ -62,13 +62,15 @@ def test_a_row_says_what_friction_costs(stand, thor):
     assert "cost of friction" in table and "%" in table
 
 
-def test_the_command_writes_table_json_and_figure(tmp_path):
+def test_the_command_writes_table_json_and_figure(tmp_path, monkeypatch, capsys):
     problem = tmp_path / "p.toml"
     problem.write_text(PROBLEM)
-    command = [sys.executable, "-m", "seaopt.cli", "tune", str(problem), "-o", str(tmp_path / "out")]
-    result = subprocess.run([*command, "--sweep", "40:60:20", "--json"], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    content = json.loads(result.stdout)
+    command = ["seaopt", "tune", str(problem), "-o", str(tmp_path / "out"), "--sweep", "40:60:20", "--json"]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    content = json.loads(capsys.readouterr().out)
     assert content["schema"] == "seaopt/frontier/1"
     assert [row["bandwidth_hz"] for row in content["rows"]] == [40, 60]
     assert [row["feasible"] for row in content["rows"]] == [True, False]

@@ -192,6 +192,7 @@ def test_laws_tuned_on_logs_keep_their_limits_on_the_plant(bench, rate):
         assert bench.keeps(bench.judge(controller), bench.SPEC)
 
 
+@pytest.mark.slow
 def test_wide_discs_cost():
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
     narrow, wide = (so.tune(exact(1e-3, relative=r), THOR, spec) for r in (1e-3, 0.015))

@@ -165,7 +165,7 @@ def test_what_is_no_range_is_told_in_one_line(swing, ranges, words):
 
 
 def test_an_unidentifiable_fit_is_not_certified(controller, stand, short_log, thor):
-    fit = so.fit([so.Experiment(plant=stand, log=short_log)], thor.free("J", "eta", "K_tau"))
+    fit = so.fit([so.Experiment(plant=stand, log=short_log)], thor.free("J", "eta", "K_tau"), diagnostics=False)
     with pytest.raises(ControlError, match="not identifiable"):
         so.certify(controller, {"stand": stand}, fit)
 
