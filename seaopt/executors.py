@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections import deque
@@ -16,16 +17,18 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from typing import Any, TypeVar
+from functools import lru_cache
+from typing import Any, Generic, TypeVar
 
 from seaopt.errors import SeaoptError
 
-__all__ = ["Processes", "connect_dask", "count_cores", "count_workers", "map_ordered"]
+__all__ = ["Processes", "Shared", "connect_dask", "count_cores", "count_workers", "map_ordered"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 QUEUED = 2  # parts in flight per worker: the next one lies ready while one is worked on
+RESTORED = 8  # shared objects that a worker keeps
 
 
 class Processes(Executor):
@@ -200,3 +203,39 @@ def map_ordered(
     finally:
         for future in flying:
             future.cancel()
+
+
+class Shared(Generic[Item]):
+    """What every part of some work needs: pickled once, and restored once in each process that works on it.
+
+    A plant that is restored for every part would each time build again what it remembers: its linearisations and
+    its kernels.
+
+    Parameters
+    ----------
+    value : object
+        That pickles. It must not be changed.
+
+    Examples
+    --------
+    >>> class Scale:
+    ...     def __init__(self, shared): self.shared = shared
+    ...     def __call__(self, x): return self.shared.value["factor"] * x
+    >>> list(map_ordered(Scale(Shared({"factor": 3})), [1, 2]))
+    [3, 6]
+
+    """
+
+    def __init__(self, value: Item) -> None:
+        self.value = value
+        self._packed: bytes | None = None
+
+    def __reduce__(self) -> tuple[Callable[[bytes], Shared[Any]], tuple[bytes]]:
+        if self._packed is None:
+            self._packed = pickle.dumps(self.value)
+        return _restore, (self._packed,)
+
+
+@lru_cache(maxsize=RESTORED)
+def _restore(packed: bytes) -> Shared[Any]:
+    return Shared(pickle.loads(packed))  # noqa: S301  (what the client packed, over the executor's own connection)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
+from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import (
     MISSING,
     format_band,
@@ -268,7 +271,7 @@ class Certificate:
 
     def with_simulation(
         self, *, sensors: Sensors | None = None, current_step_A: float = 0.0, seed: int = 1,
-        progress: Progress = ignore,
+        executor: Executor | None = None, progress: Progress = ignore,
     ) -> Certificate:  # fmt: skip
         """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
 
@@ -284,6 +287,8 @@ class Certificate:
             What the current is rounded to; 0 for not at all.
         seed : int
             Of noise and random excitations.
+        executor : concurrent.futures.Executor, optional
+            As in `certify`.
         progress : callable, optional
             Called with what is simulated and the share of it that is done (`seaopt.progress.Progress`).
 
@@ -300,20 +305,20 @@ class Certificate:
         """
         if not self.models:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
-        simulations = self._simulate(sensors, current_step_A, seed, progress)
+        simulations = self._simulate(sensors, current_step_A, seed, executor, progress)
         runs = simulations.verification or simulations.left_out["simulation"]
         others = (row for row in self.requirements if row.name not in (SIMULATION_FAILURES, *NAMED_FAULTS.values()))
         requirements = (*others, *_require_runs(runs))
         passed = all(row.met for row in requirements)
         return replace(self, simulated=simulations, requirements=requirements, passed=passed)
 
-    def with_steps(self, progress: Progress = ignore) -> Certificate:
+    def with_steps(self, progress: Progress = ignore, executor: Executor | None = None) -> Certificate:
         """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
 
         Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
         reference; nothing may oscillate. `certify` always does this; `with_simulation` plays all other scenarios too.
         """
-        played = self.play_steps(progress)
+        played = self.play_steps(progress, executor)
         requirements = (*self.requirements, *played._require_cycles(), *_require_runs(played.steps or ""))
         return replace(played, requirements=requirements, passed=all(row.met for row in requirements))
 
@@ -329,16 +334,16 @@ class Certificate:
             return self.simulated.verification
         return self.steps if isinstance(self.steps, Verification) else None
 
-    def play_steps(self, progress: Progress = ignore) -> Certificate:
+    def play_steps(self, progress: Progress = ignore, executor: Executor | None = None) -> Certificate:
         """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
         if not self.models:
             return replace(self, steps=NO_MODEL)
-        steps = simulate_steps(self.controller, self.models, self.parameters, self._draws(), progress)
+        steps = simulate_steps(self.controller, self.models, self.parameters, self._draws(), executor, progress)
+        shown_of = {name: name not in self.friction or self.friction[name].shown for name in self.models}
+        seek = partial(_seek_cycles, Shared((self.controller, self.models, self.parameters)))
         cycles: dict[str, tuple[FoundCycle, ...]] = {}
-        for name, model in self.models.items():
-            shown = name not in self.friction or self.friction[name].shown
-            found = seek_limit_cycles(self.controller, model, self.parameters, shown=shown)
-            if found or not shown:
+        for name, found in zip(shown_of, map_ordered(seek, shown_of.items(), executor), strict=True):
+            if found or not shown_of[name]:
                 ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
                 cycles[name] = (*found, *ends)
         return replace(self, steps=steps, cycles=cycles)
@@ -364,12 +369,13 @@ class Certificate:
         return draws
 
     def _simulate(
-        self, sensors: Sensors | None, current_step_A: float, seed: int, progress: Progress = ignore
-    ) -> Simulated:
+        self, sensors: Sensors | None, current_step_A: float, seed: int, executor: Executor | None = None,
+        progress: Progress = ignore,
+    ) -> Simulated:  # fmt: skip
         return run_simulations(
             self.controller, self.models, self.parameters, draws=self._draws(), sensors=sensors,
             current_step_A=current_step_A, seed=seed,
-            steps=self.steps if isinstance(self.steps, Verification) else None, progress=progress,
+            steps=self.steps if isinstance(self.steps, Verification) else None, executor=executor, progress=progress,
         )  # fmt: skip
 
     @classmethod
@@ -617,6 +623,15 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         return format_certificate(self) + self.plot.to_html()
+
+
+def _seek_cycles(
+    loops: Shared[tuple[Controller, Mapping[str, Plant], ParameterSet]], model: tuple[str, bool]
+) -> tuple[FoundCycle, ...]:
+    """Return the limit cycles of one model, whose friction is shown to be harmless or is not."""
+    controller, models, parameters = loops.value
+    name, shown = model
+    return seek_limit_cycles(controller, models[name], parameters, shown=shown)
 
 
 def _require_runs(runs: Verification | str) -> tuple[Requirement, ...]:

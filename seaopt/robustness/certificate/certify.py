@@ -8,22 +8,21 @@ and with failures the bound is Clopper's and Pearson's. Draws are made and measu
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from concurrent.futures import Executor
+from dataclasses import replace
 from hashlib import sha256
 from types import NoneType
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.delay import warn_short_delay
-from seaopt.control.laws.limits import LIMIT_ROUNDING
-from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.measured.figures import measure_discs
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
+from seaopt.executors import Shared
 from seaopt.formatting import format_count
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
@@ -31,9 +30,8 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, split_friction
 from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
 from seaopt.plants.plant import require_plant
-from seaopt.progress import Progress, count_off, divide, ignore, prefix
-from seaopt.records import record
-from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
+from seaopt.progress import Progress, divide, ignore
+from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.certificate.certificate import (
     DESIGN_NAMES,
     MIN_FRICTION_MARGIN,
@@ -46,6 +44,7 @@ from seaopt.robustness.certificate.certificate import (
 from seaopt.robustness.certificate.compensation import find_compensation_at_draws, find_nominal_compensation
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
+from seaopt.robustness.certificate.measured_draws import Loops, measure_draws, search_worst
 from seaopt.robustness.certificate.requirements import (
     compensation_requirements,
     design_requirements,
@@ -56,57 +55,17 @@ from seaopt.robustness.certificate.requirements import (
     measured_requirements,
     plant_requirements,
 )
-from seaopt.robustness.uncertainty.batch import batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty
+from seaopt.robustness.uncertainty.draws import check_ranges, combine_uncertainty
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
-from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
-from seaopt.robustness.uncertainty.worst import combine_worst, find_worst, measure_worst
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
 
 CONFIDENCE = 1.0 - 1e-6
 AMPLITUDES = 9  # looked at for the remark on bandwidth
-DRAWS_PER_BLOCK = 50_000
-DRAWS_KEPT = 5000  # of which Ms is kept, to be drawn
 MOST_DELAY_SAMPLES = 20  # samples
-WORST_KEPT = 64  # worst draws kept of each plant
 # Seconds that a part takes as a rule: of each draw and plant, or of each plant.
 DRAW, SEARCH, BOUND, FRICTION, IMPEDANCE, STEPS, SIMULATIONS = 1.5e-4, 0.3, 0.4, 0.3, 0.05, 1.0, 3.5
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
-
-
-@record(eq=False)
-class _Tally:
-    """The worst draws of a plant so far by one figure, as coordinates."""
-
-    points: Float[np.ndarray, "n k"]
-    severity: Float[np.ndarray, " n"]
-
-    def add(self, points: Float[np.ndarray, "m k"], severity: Float[np.ndarray, " m"]) -> _Tally:
-        """Return the worst of these and of new draws."""
-        points, severity = np.vstack([self.points, points]), np.concatenate([self.severity, severity])
-        worst = np.argsort(severity)[::-1][:WORST_KEPT]
-        return _Tally(points=points[worst], severity=severity[worst])
-
-
-@dataclass(slots=True, kw_only=True)  # counts up, block by block
-class _Failures:
-    """Draws that are unstable on some plant; of the others, over Ms on one; of the others, over Mt on one."""
-
-    unstable: int = 0
-    over_ms: int = 0
-    over_mt: int = 0
-
-    def add(
-        self, unstable: Bool[np.ndarray, " n"], over_ms: Bool[np.ndarray, " n"], over_mt: Bool[np.ndarray, " n"]
-    ) -> None:
-        self.unstable += int(np.count_nonzero(unstable))
-        self.over_ms += int(np.count_nonzero(over_ms & ~unstable))
-        self.over_mt += int(np.count_nonzero(over_mt & ~over_ms & ~unstable))
-
-    @property
-    def count(self) -> int:
-        return self.unstable + self.over_ms + self.over_mt
 
 
 def certify(
@@ -126,6 +85,7 @@ def certify(
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
     measured: Mapping[str, MeasuredResponse] | None = None,
+    executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Certificate:
     """Check a controller against plants: at the nominal parameters, over draws, and simulated on the nonlinear plants.
@@ -174,6 +134,8 @@ def certify(
         Measured frequency responses on which stability, Ms, Mt and disk margin are required too, of every response in
         the discs. Draws and simulations are of the models. Of a controller designed on a measured response the first
         is that one, on which all limits are required; nothing is drawn or simulated.
+    executor : concurrent.futures.Executor, optional
+        Where parts of the work are done (`seaopt.executors`); here, if left out. The result is the same, bit for bit.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
@@ -208,6 +170,7 @@ def certify(
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
     require_type(simulations, bool, "simulations", "give True or False", ControlError)
+    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", ControlError)
     if not simulations and (sensors is not None or current_step_A):
         raise ControlError(
             "sensors and current_step_A are of the simulations, which are left out; give simulations=True"
@@ -224,26 +187,14 @@ def certify(
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
-    drawing, searching, bounding, rubbing, rendering, stepping, simulating = divide(
-        progress, DRAW * samples * len(plants), SEARCH * len(plants), BOUND * len(plants) * (bounds is not None),
+    drawing, searching, rubbing, rendering, stepping, simulating = divide(
+        progress, DRAW * samples * len(plants), (SEARCH + BOUND * (bounds is not None)) * len(plants),
         FRICTION * len(plants), IMPEDANCE * min(samples, IMPEDANCE_DRAWS) * (controller.outer is not None),
         STEPS * len(models), SIMULATIONS * len(models) * simulations,
     )  # fmt: skip
-    failures, drawn, drawn_ms = _measure_draws(controller, plants, unknown, samples, rng, drawing)
-    worst = {
-        name: find_worst(controller, plants[name], unknown, drawn[name])
-        for name in count_off(list(plants), "worst case, plant", searching)
-    }
-    brackets: dict[str, Bracket] = {}
-    if bounds is not None:
-        brackets = {
-            name: bracket(controller, plants[name], unknown, worst[name], bounds)
-            for name in count_off(list(plants), "bounds, plant", bounding)
-        }
-    for name, bounded in brackets.items():
-        if bounded.parameters:
-            case = measure_worst(controller, plants[name], nominal, bounded.parameters)
-            worst[name] = combine_worst([worst[name], case])
+    loops = Shared(Loops(controller=controller, plants=plants, unknown=unknown, bounds=bounds))
+    failures, drawn, drawn_ms = measure_draws(loops, samples, rng, executor, drawing)
+    worst, brackets = search_worst(loops, drawn, executor, searching)
     monte_carlo = MonteCarlo(
         samples=samples, failures=failures.count, seed=seed, confidence=confidence,
         failure_probability_bound=failure_bound(samples, failures.count, confidence),
@@ -279,10 +230,10 @@ def certify(
             *_remark_amplitude(controller, models, nominal),
         ),
     )  # fmt: skip
-    certificate = certificate.with_steps(stepping)
+    certificate = certificate.with_steps(stepping, executor)
     if simulations:
         certificate = certificate.with_simulation(
-            sensors=sensors, current_step_A=current_step_A, seed=seed, progress=simulating
+            sensors=sensors, current_step_A=current_step_A, seed=seed, executor=executor, progress=simulating
         )
     progress(f"{samples} draws, {format_count(failures.count, 'failure')}", 1.0)
     return certificate
@@ -432,38 +383,6 @@ def _digest(controller: Controller) -> int:
         f"{value:.6g}" for part in (controller.reference, controller.measurement) for value in (*part.num, *part.den)
     )
     return int.from_bytes(sha256(" ".join(coefficients).encode()).digest()[:8], "big")
-
-
-def _measure_draws(
-    controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
-    progress: Progress,
-) -> tuple[_Failures, dict[str, Float[np.ndarray, "n k"]], dict[str, Float[np.ndarray, " m"]]]:  # fmt: skip
-    """Draw and measure in blocks: the draws that fail on some plant, the worst of each plant, and Ms of the first."""
-    none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
-    tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
-    ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
-    failures = _Failures()
-    sizes = [min(DRAWS_PER_BLOCK, samples - start) for start in range(0, samples, DRAWS_PER_BLOCK)]
-    hooks = iter(divide(progress, *(float(size) for size in sizes for _ in plants)))
-    first: dict[str, list[Float[np.ndarray, " m"]]] = {name: [] for name in plants}
-    for number, size in enumerate(sizes):
-        points = unknown.draw(size, rng)
-        values = unknown.values(points)
-        unstable, over_ms, over_mt = (np.zeros(len(points), dtype=bool) for _ in range(3))
-        for name, plant in plants.items():
-            batch = batch_figures(controller, plant, unknown.nominal, values, prefix(next(hooks), name))
-            unstable |= batch.spectral_radius >= STABLE
-            over_ms |= batch.ms > ms
-            over_mt |= batch.mt > mt
-            if number == 0:
-                first[name].append(batch.ms[:DRAWS_KEPT])
-            tallies[name] = [
-                tally.add(points, severities(controller, batch, by))
-                for tally, by in zip(tallies[name], (LARGEST_MS, LARGEST_MT), strict=True)
-            ]
-        failures.add(unstable, over_ms, over_mt)
-    drawn = {name: np.unique(np.vstack([tally.points for tally in own]), axis=0) for name, own in tallies.items()}
-    return failures, drawn, {name: np.concatenate(parts) for name, parts in first.items() if parts}
 
 
 def _design_requirements(controller: Controller, nominal: ParameterSet, varied: Collection[str]) -> list[Requirement]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -13,11 +14,12 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
+from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_band, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
-from seaopt.progress import Progress, count_off, divide, ignore
+from seaopt.progress import Progress, divide, ignore
 from seaopt.records import record
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
@@ -128,6 +130,7 @@ def run_simulations(
     current_step_A: float = 0.0,
     seed: int = 1,
     steps: Verification | None = None,
+    executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Simulated:
     """Run scenarios, large signals, passivity and environments, as far as plants and controller allow.
@@ -138,6 +141,8 @@ def run_simulations(
         As in `verify`; the controller knows its design plant.
     steps : Verification, optional
         What `simulate_steps` played: on the same devices it is not played again.
+    executor : concurrent.futures.Executor, optional
+        As in `verify`.
     progress : callable, optional
         Called before each of them.
 
@@ -159,37 +164,52 @@ def run_simulations(
     check_plants(plants, draws or {}, {})
     plant, values = controller.design
     device = sensors or Sensors()
-    left_out: dict[str, str] = {}
-
-    def attempt(what: str, verb: Callable[[], Result]) -> Result | None:
-        try:
-            return verb()
-        except SeaoptError as error:
-            left_out[what] = str(error)
-        except np.linalg.LinAlgError as error:
-            left_out[what] = f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
-        return None
-
     swept = _list_sweeps(controller, plants, parameters)
-    sweeping, playing, coupling = divide(progress, SWEEP * len(swept), SCENARIOS * len(plants), PORT)
-    sweeps = [
-        attempt(what, partial(_sweep, controller, name, *on))
-        for name, on, what in count_off(swept, "large signals, plant", sweeping)
-    ]
-    verification = attempt(
-        "simulation",
+    jobs: dict[str, Callable[[], Any]] = {what: partial(_sweep, controller, name, *on) for name, on, what in swept}
+    jobs |= {
+        "passivity": partial(passivity, controller, plant, values),
+        "environments": partial(coupled_stability, controller, plant, values),
+    }
+    sweeping, playing = divide(progress, SWEEP * len(swept) + PORT, SCENARIOS * len(plants))
+    attempts = map_ordered(partial(_attempt_job, Shared(tuple(jobs.values()))), range(len(jobs)), executor)
+    done: dict[str, tuple[Any, str]] = {}
+    for number, what in enumerate(jobs):
+        sweeping(what, number / len(jobs))
+        done[what] = next(attempts)
+    done["simulation"] = verification, _ = _attempt(
         lambda: verify(
-            controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed,
-            known=steps, progress=playing,
-        ),
-    )  # fmt: skip
-    coupling("port and environments", 0.0)
+            controller,
+            plants,
+            parameters,
+            draws=draws,
+            sensors=device,
+            current_step_A=current_step_A,
+            seed=seed,
+            known=steps,
+            executor=executor,
+            progress=playing,
+        )
+    )
     return Simulated(
-        verification=verification, large_signal=tuple(sweep for sweep in sweeps if sweep is not None),
-        passivity=attempt("passivity", lambda: passivity(controller, plant, values)),
-        environments=attempt("environments", lambda: coupled_stability(controller, plant, values)),
-        left_out=left_out, sensors=device, current_step_A=current_step_A, seed=seed,
+        verification=verification, large_signal=tuple(done[what][0] for _, _, what in swept if not done[what][1]),
+        passivity=done["passivity"][0], environments=done["environments"][0],
+        left_out={what: reason for what, (_, reason) in done.items() if reason},
+        sensors=device, current_step_A=current_step_A, seed=seed,
     )  # fmt: skip
+
+
+def _attempt_job(jobs: Shared[tuple[Callable[[], Any], ...]], number: int) -> tuple[Any, str]:
+    return _attempt(jobs.value[number])
+
+
+def _attempt(verb: Callable[[], Result]) -> tuple[Result | None, str]:
+    """Return what a verb returns, or None and why it cannot be had."""
+    try:
+        return verb(), ""
+    except SeaoptError as error:
+        return None, str(error)
+    except np.linalg.LinAlgError as error:
+        return None, f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
 
 
 def simulate_steps(
@@ -197,11 +217,14 @@ def simulate_steps(
     plants: Mapping[str, Plant],
     parameters: ParameterSet,
     draws: Mapping[str, Sequence[ParameterSet]],
+    executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Verification | str:
     """Play the steps of `step_scenarios` on every plant, on ideal devices; return why not where that cannot be done."""
     try:
-        return verify(controller, plants, parameters, scenarios=step_scenarios, draws=draws, progress=progress)
+        return verify(
+            controller, plants, parameters, scenarios=step_scenarios, draws=draws, executor=executor, progress=progress
+        )
     except SeaoptError as error:
         return str(error)
 

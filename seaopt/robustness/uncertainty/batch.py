@@ -11,7 +11,7 @@ parabola in the angle: Newton's method on its derivative, kept between the neigh
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -48,6 +48,14 @@ class BatchFigures:
     spectral_radius: Float[np.ndarray, " n"]
     ms: Float[np.ndarray, " n"]
     mt: Float[np.ndarray, " n"]
+
+
+def join_figures(parts: Sequence[BatchFigures]) -> BatchFigures:
+    """Return the figures of draws that were measured in parts."""
+    return BatchFigures(
+        spectral_radius=np.concatenate([part.spectral_radius for part in parts]),
+        ms=np.concatenate([part.ms for part in parts]), mt=np.concatenate([part.mt for part in parts]),
+    )  # fmt: skip
 
 
 def batch_figures(

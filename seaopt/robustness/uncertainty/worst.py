@@ -89,6 +89,10 @@ class Worst(tuple[Plant, ParameterSet]):
         self.witness, self.limited, self.largest = witness, limited, largest or (witness, witness)
         return self
 
+    def on(self, plant: Plant) -> Worst:
+        """Return the same of a plant that equals its own: one that went to another process and back is a copy."""
+        return Worst(plant, self[1], self.witness, limited=self.limited, largest=self.largest)
+
     def __getnewargs_ex__(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Return what a copy, or one that is unpickled, is made of."""
         return (*self, self.witness), {"limited": self.limited, "largest": self.largest}

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.command import Command
 from seaopt.errors import ControlError, StepSizeError, suggestion
+from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.impacts import check_held
-from seaopt.progress import Progress, count_off, divide, ignore
+from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
@@ -201,6 +204,7 @@ def verify(
     partners: Mapping[str, Plant] | None = None,
     seed: int = 1,
     known: Verification | None = None,
+    executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Verification:
     """Simulate a controller, as exported, on nonlinear plants.
@@ -229,6 +233,8 @@ def verify(
         Seed of noise and random excitations.
     known : Verification, optional
         What was played before: a scenario that it has, on the same stage at the same draws, is not played again.
+    executor : concurrent.futures.Executor, optional
+        Where scenarios are played (`seaopt.executors`); here, if left out. The outcomes are the same, bit for bit.
     progress : callable, optional
         Called before each scenario (`seaopt.progress.Progress`).
 
@@ -267,41 +273,43 @@ def verify(
     skipped: list[tuple[str, str, str]] = []
     sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
     choose = default_scenarios if scenarios is None or isinstance(scenarios, Sequence) else scenarios
-    rows: list[Outcome] = []
-    speeds: dict[str, float] = {}
-    error = 0.0
-    for (name, stage), part in zip(stages.items(), divide(progress, *(1.0 for _ in stages)), strict=True):
+    parts: dict[str, list[tuple[Scenario, list[Outcome]]]] = {}  # with what is known of each
+    for name, stage in stages.items():
         chosen = tuple(scenarios if isinstance(scenarios, Sequence) else choose(controller, stage.plant, sets[name]))
         obstacles = [(scenario, scenario.obstacle(stage.plant, stage.partner)) for scenario in chosen]
-        possible = [scenario for scenario, obstacle in obstacles if obstacle is None]
-        done: list[Scenario] = []
         if scenarios is None:
             reason = "nothing saturates without a limit of the command"
             skipped += [(scenario, name, reason) for scenario in list_left_out(controller, stage.plant)]
         skipped += [(scenario.name, name, obstacle) for scenario, obstacle in obstacles if obstacle is not None]
+        parts[name] = [
+            (scenario, [] if known is None else known.recall(stage, name, scenario, sets[name], seed))
+            for scenario, obstacle in obstacles
+            if obstacle is None
+        ]
+    unknown = [(name, scenario) for name, part in parts.items() for scenario, before in part if not before]
+    names = {name: {scenario.name for scenario, _ in part} for name, part in parts.items()}
+    play_part = partial(_play_part, Shared((stages, sets, names, seed)))
+    results, total = map_ordered(play_part, unknown, executor), sum(map(len, parts.values()))
+    rows: list[Outcome] = []
+    speeds: dict[str, float] = {}
+    error, number = 0.0, 0
+    for name, part in parts.items():
+        done: list[Scenario] = []
         simulated = wall = 0.0
-        for scenario in count_off(possible, f"{name}, scenario", part):
-            before = [] if known is None else known.recall(stage, name, scenario, sets[name], seed)
+        for k, (scenario, before) in enumerate(part):
+            progress(f"{name}, scenario {k + 1} of {len(part)}", number / total)
+            number += 1
             if before:
                 rows, error = rows + before, max(error, known.error if known is not None else 0.0)
                 done.append(scenario)
                 continue
-            actual = scenario
-            try:
-                outcomes, traces = _run_scenario(stage, name, actual, sets[name], seed)
-            except StepSizeError:
-                actual = make_sticking(scenario)
-                if scenario.friction == "sticking" or actual.obstacle(stage.plant, stage.partner):
-                    raise
+            runs = next(results)
+            if runs.actual != scenario:
                 skipped.append((scenario.name, name, TOO_STEEP))
-                if any(other.name == actual.name for other in possible):
-                    continue
-                outcomes, traces = _run_scenario(stage, name, actual, sets[name], seed)
-            rows += outcomes
-            done.append(actual)
-            for one in traces:
-                simulated += len(sets[name]) * one.time.size * controller.sample_time_s
-                wall, error = wall + one.wall_s, max(error, one.error)
+            if runs.outcomes:
+                rows += runs.outcomes
+                done.append(runs.actual)
+            simulated, wall, error = simulated + runs.simulated_s, wall + runs.wall_s, max(error, runs.error)
         played[name] = tuple(done)
         speeds[name] = simulated / wall if wall else math.nan
     return Verification(
@@ -314,17 +322,50 @@ def verify(
     )  # fmt: skip
 
 
-def _run_scenario(
-    stage: Stage, name: str, scenario: Scenario, sets: Sequence[ParameterSet], seed: int
-) -> tuple[list[Outcome], list[Playback]]:
-    """Play and judge one scenario at every set of parameters; return the outcomes and what was simulated for them."""
+@record
+class _Runs:
+    """A scenario as it was played, with its outcomes, none where another one is the same; what it took and missed."""
+
+    actual: Scenario
+    outcomes: list[Outcome]
+    simulated_s: float = 0.0
+    wall_s: float = 0.0
+    error: float = 0.0
+
+
+_Staged = tuple[dict[str, Stage], dict[str, tuple[ParameterSet, ...]], dict[str, set[str]], int]
+
+
+def _play_part(staged: Shared[_Staged], part: tuple[str, Scenario]) -> _Runs:
+    """Play a scenario on one stage; with friction that sticks, where its smoothed curve is too steep to simulate."""
+    stages, sets, names, seed = staged.value
+    name, scenario = part
+    stage = stages[name]
+    try:
+        return _run_scenario(stage, name, scenario, sets[name], seed)
+    except StepSizeError:
+        actual = make_sticking(scenario)
+        if scenario.friction == "sticking" or actual.obstacle(stage.plant, stage.partner):
+            raise
+        if actual.name in names[name]:
+            return _Runs(actual=actual, outcomes=[])
+        return _run_scenario(stage, name, actual, sets[name], seed)
+
+
+def _run_scenario(stage: Stage, name: str, scenario: Scenario, sets: Sequence[ParameterSet], seed: int) -> _Runs:
+    """Play and judge one scenario at every set of parameters."""
     trace = play(stage, scenario, sets, seed=seed)
     ideal = trace if stage.is_ideal else play(stage.ideal, scenario, sets, seed=seed)
     unlimited = None
     if overshoots_at_limit(stage, scenario, ideal):
         unlimited = play(stage.ideal.unlimited, scenario, sets, seed=seed)
-    outcomes = [judge_run(stage, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))]
-    return outcomes, [trace] if ideal is trace else [trace, ideal]
+    traces = [trace] if ideal is trace else [trace, ideal]
+    return _Runs(
+        actual=scenario,
+        outcomes=[judge_run(stage, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))],
+        simulated_s=sum(len(sets) * one.time.size * stage.controller.sample_time_s for one in traces),
+        wall_s=sum(one.wall_s for one in traces), error=max(one.error for one in traces),
+    )  # fmt: skip
 
 
 def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:

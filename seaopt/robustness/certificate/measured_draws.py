@@ -1,0 +1,175 @@
+"""A controller's loops at draws of what is uncertain, and the worst case of each plant, for the certificate.
+
+Draws are made and measured in blocks, so that any number of them fits in memory; only the worst are kept. Parts of a
+block, and searches of the plants, are independent of each other: an executor may do them in any order, and what comes
+of them is the same, as nothing is cut or drawn by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.control import Controller
+from seaopt.control.laws.limits import LIMIT_ROUNDING
+from seaopt.control.loops.loop import STABLE
+from seaopt.executors import Shared, map_ordered
+from seaopt.plants import Plant
+from seaopt.progress import Progress, divide
+from seaopt.records import record
+from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
+from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures, join_figures
+from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
+from seaopt.robustness.uncertainty.worst import Worst, combine_worst, find_worst, measure_worst
+
+DRAWS_PER_BLOCK = 50_000
+DRAWS_KEPT = 5000  # of which Ms is kept, to be drawn
+WORST_KEPT = 64  # worst draws kept of each plant
+
+
+@record(eq=False)
+class Loops:
+    """What is measured at draws: a controller on its plants, what is uncertain of them, and how much work to bound it.
+
+    Parameters
+    ----------
+    controller : Controller
+    plants : mapping of name to Plant
+        Without friction that sticks: sliding or stuck.
+    unknown : Uncertainty
+    bounds : Budget or None
+        None for no bounds.
+
+    """
+
+    controller: Controller
+    plants: Mapping[str, Plant]
+    unknown: Uncertainty
+    bounds: Budget | None
+
+
+@record(eq=False)
+class _Tally:
+    """The worst draws of a plant so far by one figure, as coordinates."""
+
+    points: Float[np.ndarray, "n k"]
+    severity: Float[np.ndarray, " n"]
+
+    def add(self, points: Float[np.ndarray, "m k"], severity: Float[np.ndarray, " m"]) -> _Tally:
+        """Return the worst of these and of new draws."""
+        points, severity = np.vstack([self.points, points]), np.concatenate([self.severity, severity])
+        worst = np.argsort(severity)[::-1][:WORST_KEPT]
+        return _Tally(points=points[worst], severity=severity[worst])
+
+
+@dataclass(slots=True, kw_only=True)  # counts up, block by block
+class Failures:
+    """Draws that are unstable on some plant; of the others, over Ms on one; of the others, over Mt on one."""
+
+    unstable: int = 0
+    over_ms: int = 0
+    over_mt: int = 0
+
+    def add(
+        self, unstable: Bool[np.ndarray, " n"], over_ms: Bool[np.ndarray, " n"], over_mt: Bool[np.ndarray, " n"]
+    ) -> None:
+        """Count draws of a block."""
+        self.unstable += int(np.count_nonzero(unstable))
+        self.over_ms += int(np.count_nonzero(over_ms & ~unstable))
+        self.over_mt += int(np.count_nonzero(over_mt & ~over_ms & ~unstable))
+
+    @property
+    def count(self) -> int:
+        """How many draws fail."""
+        return self.unstable + self.over_ms + self.over_mt
+
+
+def measure_draws(
+    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None, progress: Progress
+) -> tuple[Failures, dict[str, Float[np.ndarray, "n k"]], dict[str, Float[np.ndarray, " m"]]]:
+    """Draw and measure in blocks: the draws that fail on some plant, the worst of each plant, and Ms of the first."""
+    controller, plants, unknown = loops.value.controller, loops.value.plants, loops.value.unknown
+    none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
+    tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
+    ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
+    failures = Failures()
+    sizes = [min(DRAWS_PER_BLOCK, samples - start) for start in range(0, samples, DRAWS_PER_BLOCK)]
+    hooks = iter(divide(progress, *(float(size) for size in sizes)))
+    first: dict[str, Float[np.ndarray, " m"]] = {}
+    for size in sizes:
+        points = unknown.draw(size, rng)
+        unstable, over_ms, over_mt = (np.zeros(size, dtype=bool) for _ in range(3))
+        for name, batch in _measure_block(loops, unknown.values(points), size, executor, next(hooks)):
+            unstable |= batch.spectral_radius >= STABLE
+            over_ms |= batch.ms > ms
+            over_mt |= batch.mt > mt
+            first.setdefault(name, batch.ms[:DRAWS_KEPT])
+            tallies[name] = [
+                tally.add(points, severities(controller, batch, by))
+                for tally, by in zip(tallies[name], (LARGEST_MS, LARGEST_MT), strict=True)
+            ]
+        failures.add(unstable, over_ms, over_mt)
+    drawn = {name: np.unique(np.vstack([tally.points for tally in own]), axis=0) for name, own in tallies.items()}
+    return failures, drawn, first
+
+
+def _measure_block(
+    loops: Shared[Loops], values: Mapping[str, Float[np.ndarray, " n"]], size: int, executor: Executor | None,
+    progress: Progress,
+) -> Iterator[tuple[str, BatchFigures]]:  # fmt: skip
+    """Yield the figures of every plant at draws, which are cut where no executor has a say in it."""
+    names, slices = list(loops.value.plants), [slice(k, k + DRAW_BLOCK) for k in range(0, size, DRAW_BLOCK)]
+    threads = 2 if executor is None else 1
+    parts = (
+        (name, {key: column[piece] for key, column in values.items()}, threads) for name in names for piece in slices
+    )
+    measured = map_ordered(partial(_measure_part, loops), parts, executor)
+    for number, name in enumerate(names):
+        pieces: list[BatchFigures] = []
+        for k, piece in enumerate(slices):
+            pieces.append(next(measured))
+            share = (number + (k + 1) / len(slices)) / len(names)
+            progress(f"{name}, {min(piece.stop, size)} of {size} draws", share)
+        yield name, join_figures(pieces)
+
+
+def _measure_part(loops: Shared[Loops], part: tuple[str, Mapping[str, Float[np.ndarray, " n"]], int]) -> BatchFigures:
+    """Return the figures of one plant at some draws."""
+    name, values, threads = part
+    known = loops.value
+    return batch_figures(known.controller, known.plants[name], known.unknown.nominal, values, threads=threads)
+
+
+def search_worst(
+    loops: Shared[Loops], drawn: Mapping[str, Float[np.ndarray, "n k"]], executor: Executor | None, progress: Progress
+) -> tuple[dict[str, Worst], dict[str, Bracket]]:
+    """Return the worst case found of every plant, from its worst draws, and the bounds where they are asked for."""
+    worst: dict[str, Worst] = {}
+    brackets: dict[str, Bracket] = {}
+    searched = map_ordered(partial(_search_plant, loops), drawn.items(), executor)
+    for number, (name, plant) in enumerate(loops.value.plants.items()):
+        progress(f"worst case, plant {number + 1} of {len(drawn)}", number / len(drawn))
+        found, bounded = next(searched)
+        worst[name] = found.on(plant)
+        if bounded is not None:
+            brackets[name] = bounded
+    return worst, brackets
+
+
+def _search_plant(loops: Shared[Loops], part: tuple[str, Float[np.ndarray, "n k"]]) -> tuple[Worst, Bracket | None]:
+    """Return the worst case found of one plant, from its worst draws, and the bounds where they are asked for."""
+    name, drawn = part
+    controller, plant, unknown = loops.value.controller, loops.value.plants[name], loops.value.unknown
+    worst = find_worst(controller, plant, unknown, drawn)
+    if loops.value.bounds is None:
+        return worst, None
+    bounded = bracket(controller, plant, unknown, worst, loops.value.bounds)
+    if bounded.parameters:
+        worst = combine_worst([worst, measure_worst(controller, plant, unknown.nominal, bounded.parameters)])
+    return worst, bounded
