@@ -29,6 +29,7 @@ Result = TypeVar("Result")
 
 QUEUED = 2  # parts in flight per worker: the next one lies ready while one is worked on
 RESTORED = 8  # shared objects that a worker keeps
+IPOPT = threading.Lock()  # held while it solves: MUMPS, in it, has state that all threads of a process share
 
 
 class Processes(Executor):

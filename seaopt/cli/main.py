@@ -62,6 +62,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON and 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the verdict only, or the files written.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print all figures, notes and failures.")]
 
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", metavar="N", min=1, help="Processes for certificates and sweeps; none but this, if left out."
+    ),
+]
+
 
 def _version(wanted: bool) -> bool:
     if wanted:
@@ -106,12 +113,12 @@ def demo(output: Folder = Path("out/demo"), json: Json = False, quiet: Quiet = F
 @app.command()
 def run(
     problem: ProblemFile, output: Folder = Path("out"), json: Json = False, quiet: Quiet = False,
-    verbose: Verbose = False,
+    verbose: Verbose = False, workers: Workers = None,
 ) -> None:  # fmt: skip
     """Fit, tune, certify and report."""
     from seaopt.cli.session import Session
 
-    session = Session(problem, output)
+    session = Session(problem, output, workers=workers)
     stages = session.plan_stages()
     done = list[str]()
     try:
@@ -247,6 +254,7 @@ def tune(
     free_law: Annotated[
         bool, typer.Option("--free-law", help="With --sweep: also the best that any linear law could do.")
     ] = False,
+    workers: Workers = None,
 ) -> None:
     """Tune the controller with the fit in DIR; write controller.json."""
     from seaopt.cli.frontier import parse_bandwidths
@@ -256,7 +264,7 @@ def tune(
     if free_law and sweep is None:
         raise ControlError("--free-law: is of a sweep; give --sweep LOW:HIGH:STEP too")
     bandwidths = () if sweep is None else parse_bandwidths(sweep)
-    session = Session(problem, output, bandwidths_hz=bandwidths, free_law=free_law)
+    session = Session(problem, output, bandwidths_hz=bandwidths, free_law=free_law, workers=workers)
     session.run(stage)
     _finish(session, json, [stage], quiet, verbose)
 
@@ -313,11 +321,12 @@ def certify(
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    workers: Workers = None,
 ) -> None:
     """Certify the controller in DIR; write robustness.json."""
     from seaopt.cli.session import Session
 
-    session = Session(problem, output)
+    session = Session(problem, output, workers=workers)
     if controller is not None:
         session.take_law(controller)
     session.run("certify")

@@ -8,6 +8,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +38,7 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentified
 from seaopt.estimation.result.findings import state_guesses
+from seaopt.executors import Processes
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.formatting import printable
 from seaopt.logs import Log, write_log
@@ -103,6 +105,7 @@ MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 OF_THE_LAW = ("structure", "notch", "prefilter", "reference_weights", "sample_rate_hz", "delay_samples")
+IN_PARTS = ("tune", "sweep", "certify")  # stages that several processes can work on
 SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
     "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
@@ -211,6 +214,7 @@ class Session:
         bandwidths_hz: tuple[float, ...] = (),
         *,
         free_law: bool = False,
+        workers: int | None = None,
     ) -> None:
         check_folder(folder)
         self.problem: Problem = read_problem(problem)
@@ -222,6 +226,8 @@ class Session:
         self.stretch_s = stretch_s
         self.bandwidths_hz = bandwidths_hz
         self.free_law = free_law
+        self.workers = workers
+        self.executor: Executor | None = None
         self.results: dict[str, Any] = {}
         self.written: list[Path] = []
         self._experiments: tuple[Experiment, ...] | None = None
@@ -271,10 +277,23 @@ class Session:
             "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
         try:
-            with self._progress(LABELS[stage]) as tell:
+            with self._progress(LABELS[stage]) as tell, self._start_workers(stage):
                 stages[stage](tell)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
+
+    @contextmanager
+    def _start_workers(self, stage: str) -> Generator[None]:
+        """Have processes for a stage that has parts for them, where they are asked for."""
+        if self.workers is None or stage not in IN_PARTS:
+            yield
+            return
+        self.executor = Processes(self.workers)
+        try:
+            yield
+        finally:
+            self.executor.shutdown(cancel_futures=True)
+            self.executor = None
 
     def _progress(self, label: str) -> AbstractContextManager[Progress]:
         return show_progress(self._console, label, self._note)
@@ -518,8 +537,10 @@ class Session:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         self._design_values(design, *(plant for plant, _ in robust_to.values()))
         self._spec()
-        make = tune_problem if self.problem.schedule is None else tune_schedule_problem
-        result = make(self.problem, self.parameters(), tell)
+        if self.problem.schedule is not None:
+            result = tune_schedule_problem(self.problem, self.parameters(), tell)
+        else:
+            result = tune_problem(self.problem, self.parameters(), tell, self.executor)
         if self.problem.mpc is not None and isinstance(result, Controller):
             self.results["tune"] = result
             self._write("tune", result.to_dict() | {"mpc": describe_mpc(self.plan())})
@@ -551,7 +572,7 @@ class Session:
         draws = self.problem.draws(self.parameters())
         result = sweep(
             design, values, self._spec(), self.bandwidths_hz, robust_to, draws=draws, free_law=self.free_law,
-            progress=tell,
+            executor=self.executor, progress=tell,
         )  # fmt: skip
         self.results["sweep"] = result
         self._write("sweep", result.to_dict())
@@ -564,7 +585,7 @@ class Session:
         if isinstance(law, ScheduledController):
             result = certify_schedule_problem(self.problem, law, source, tell)
         else:
-            result = certify_problem(self.problem, law, source, tell)
+            result = certify_problem(self.problem, law, source, tell, self.executor)
         for remark in self.problem.remarks(self.values()):
             self._note(remark)
         self.results["certify"] = result

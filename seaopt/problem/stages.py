@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -123,7 +124,9 @@ def describe_mpc(mpc: ForceMPC) -> dict[str, Any]:
     return {"spec": asdict(mpc.spec), "code": collect_code(mpc).to_dict()}
 
 
-def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore) -> Controller | JointTuning:
+def tune_problem(
+    problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore, executor: Executor | None = None
+) -> Controller | JointTuning:
     """Tune the problem's controller, as `seaopt tune` does; with `retune`, until it is certified.
 
     Of predictive control it is the law while no limit is active; `design_mpc` returns all of it.
@@ -136,6 +139,8 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
         The fit; or values, of a problem without experiments.
     progress : callable, optional
         As in `seaopt.tune`.
+    executor : concurrent.futures.Executor, optional
+        Of the certificates, with `retune`; as in `seaopt.certify`.
 
     """
     _refuse_schedule(problem, "tuned")
@@ -156,7 +161,8 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
     joint = tune_certified(
         problem.design_plant, source, spec, problem.certified_plants(), ranges=problem.ranges,
         robust_to=problem.robust_to(problem.values(source)), draws=draws, others=problem.parameters,
-        samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
+        samples=table.samples, seed=table.seed + 1, rounds=table.retune, executor=executor,
+        progress=progress,
     )  # fmt: skip
     return replace(joint, controller=complete_controller(problem, joint.controller, source))
 
@@ -327,6 +333,7 @@ def certify_problem(
     controller: Controller,
     source: Fit | ParameterSet,
     progress: Progress = ignore,
+    executor: Executor | None = None,
 ) -> Certificate:
     """Certify a controller on the problem's plants, simulations included, as `seaopt certify` does.
 
@@ -338,7 +345,7 @@ def certify_problem(
         The law, which knows its design plant.
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
-    progress : callable, optional
+    progress, executor
         As in `seaopt.certify`.
 
     """
@@ -358,7 +365,7 @@ def certify_problem(
         controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
         samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
         max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
-        sensors=problem.sensors, current_step_A=table.step, progress=progress,
+        sensors=problem.sensors, current_step_A=table.step, executor=executor, progress=progress,
         measured=measured,
     )  # fmt: skip
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, replace
+from functools import partial
+from types import NoneType
 from typing import Any
 
 from seaopt.control.laws.controller import Controller
@@ -18,6 +21,7 @@ from seaopt.control.tuning.solution import solve
 from seaopt.control.tuning.tuner import RobustTo, disturbance, make_controller, make_task, name_design
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
+from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_table
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
@@ -29,6 +33,7 @@ from seaopt.units import LINEAR, Mechanics
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
 MOST_ROWS = 1000
+CHAIN = 4  # bandwidths of which each starts from the one before: chains are independent, whatever works on them
 
 
 @record
@@ -162,9 +167,12 @@ def sweep(
     *,
     draws: Sequence[Mapping[str, float]] = (),
     free_law: bool = False,
+    executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Frontier:
-    """Tune at each of several bandwidths, also starting from the one before; an infeasible row is a result.
+    """Tune at each of several bandwidths, but for every fourth also starting from the one before.
+
+    An infeasible row is a result.
 
     Parameters
     ----------
@@ -175,6 +183,9 @@ def sweep(
     free_law : bool
         Also compute, for each bandwidth, the best that any linear law could do on the design plant under these limits
         (`seaopt.control.bound_free_law`), which takes about two seconds; not where the design plant is measured.
+    executor : concurrent.futures.Executor, optional
+        Where bandwidths are tuned, four by four (`seaopt.executors`); here, if left out. The result is the same, bit
+        for bit.
     progress : callable, optional
         Called with the bandwidth that is tuned and the share of all that is done (`seaopt.progress.Progress`).
 
@@ -194,6 +205,7 @@ def sweep(
 
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
+    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", ControlError)
     design = name_design(plant)
     require_type(bandwidths_hz, Collection, "bandwidths_hz", "give a sequence of frequencies in Hz", ControlError)
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
@@ -203,26 +215,81 @@ def sweep(
     # What is wrong with any row is said before the first is tuned.
     specs = [replace(spec, bandwidth_hz=require_number(f, "bandwidths_hz", ControlError)) for f in bandwidths_hz]
     robust_to = robust_to or {}
-    task = make_task(plant, params, specs[0], robust_to, draws)
-    sliding = _make_sliding_task(plant, params, specs[0], robust_to, draws)
-    sticks = len(sliding.plants) < len(task.plants)
+    swept = _Sweep(
+        task=make_task(plant, params, specs[0], robust_to, draws),
+        sliding=_make_sliding_task(plant, params, specs[0], robust_to, draws), design=(plant, params),
+        free_law=free_law,
+    )  # fmt: skip
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
-    warm: tuple[LawNumbers, ...] = ()
-    for one, part in zip(specs, divide(progress, *(1.0 for _ in specs)), strict=True):
-        whole, sliding_alone = divide(prefix(part, f"{one.bandwidth_hz:g} Hz"), 1.0, float(sticks))
-        present = replace(task, spec=one)
-        x, loops = solve(present, warm, whole)
-        controller = make_controller(present, x, loops, (plant, params))
-        alone = _tune_sliding(replace(sliding, spec=one), x, sliding_alone) if sticks else None
-        row = replace(_row(present, x, loops, controller), without_sticking=alone)
-        if free_law and isinstance(task.plants[0], DigitalPlant):
-            row = replace(row, free_law=bound_free_law(task.plants[0], one, [controller.law]))
-        rows.append(row)
+    for one, solved in zip(specs, _solve_chains(swept, specs, executor, progress), strict=True):
+        task = replace(swept.task, spec=one)
+        controller = make_controller(task, solved.x, solved.loops, swept.design)
+        row = _row(task, solved.x, solved.loops, controller)
+        rows.append(replace(row, without_sticking=solved.without_sticking, free_law=solved.free_law))
         controllers.append(controller)
-        warm = (x,)
     progress(f"{spec.structure}, {len(rows)} bandwidths", 1.0)
     return Frontier(rows=tuple(rows), controllers=tuple(controllers))
+
+
+@record(eq=False)
+class _Sweep:
+    """What is tuned at every bandwidth, and on the sliding plants alone."""
+
+    task: Task
+    sliding: Task
+    design: tuple[Plant | MeasuredResponse, ParameterSet]
+    free_law: bool
+
+    @property
+    def sticks(self) -> bool:
+        """Whether there is friction that a plant sticks with."""
+        return len(self.sliding.plants) < len(self.task.plants)
+
+
+@record(eq=False)
+class _Solved:
+    """The numbers of one bandwidth's law, its loops, and what it is compared with."""
+
+    x: LawNumbers
+    loops: list[MeasuredLoop]
+    without_sticking: SlidingAlone | None
+    free_law: FreeLaw | None
+
+
+def _solve_chains(
+    swept: _Sweep, specs: Sequence[ControllerSpec], executor: Executor | None, progress: Progress
+) -> Iterator[_Solved]:
+    """Yield the solution of each specification, in their order."""
+    chains = [specs[k : k + CHAIN] for k in range(0, len(specs), CHAIN)]
+    parts = divide(progress, *(float(len(chain)) for chain in chains))
+    if executor is None:
+        for chain, part in zip(chains, parts, strict=True):
+            yield from _solve_chain(swept, chain, part)
+        return
+    done = map_ordered(partial(_solve_part, Shared(swept)), chains, executor)
+    for chain, part, solved in zip(chains, parts, done, strict=True):
+        part(f"{chain[-1].bandwidth_hz:g} Hz", 1.0)
+        yield from solved
+
+
+def _solve_part(swept: Shared[_Sweep], chain: Sequence[ControllerSpec]) -> list[_Solved]:
+    return list(_solve_chain(swept.value, chain, ignore))
+
+
+def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progress) -> Iterator[_Solved]:
+    """Yield the solution of each specification; every one but the first also starts from the one before."""
+    warm: tuple[LawNumbers, ...] = ()
+    for one, part in zip(chain, divide(progress, *(1.0 for _ in chain)), strict=True):
+        whole, sliding_alone = divide(prefix(part, f"{one.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
+        task = replace(swept.task, spec=one)
+        x, loops = solve(task, warm, whole)
+        alone = _tune_sliding(replace(swept.sliding, spec=one), x, sliding_alone) if swept.sticks else None
+        free = None
+        if swept.free_law and isinstance(task.plants[0], DigitalPlant):
+            free = bound_free_law(task.plants[0], one, [task.law_of(x).balanced()])
+        yield _Solved(x=x, loops=loops, without_sticking=alone, free_law=free)
+        warm = (x,)
 
 
 def _make_sliding_task(

@@ -48,6 +48,7 @@ from seaopt.control.tuning.optimisation_problem import (
     Task,
     choose_prominent,
 )
+from seaopt.executors import IPOPT
 
 POINTS_PER_LIMIT = 24  # of each kind of limit
 SPREAD_POINTS = 10  # of them, at even distances
@@ -364,11 +365,12 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     lower, upper = np.full(count, -np.inf), np.zeros(count)
     lower[0] = 0.0
     lower[1:4], upper[1:4] = least / rows, largest / rows
-    answer = solver(
-        x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,
-        lbx=[*(near / scale), -np.inf, 0.0],
-        ubx=[*(far / scale), np.inf, np.inf],
-    )  # fmt: skip
+    with IPOPT:
+        answer = solver(
+            x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,
+            lbx=[*(near / scale), -np.inf, 0.0],
+            ubx=[*(far / scale), np.inf, np.inf],
+        )  # fmt: skip
     x = np.array(answer["x"]).ravel()[: start.size] * scale
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 

@@ -13,6 +13,7 @@ that the one which passes holds at `confidence`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from types import NoneType
 from typing import Literal
 
@@ -130,6 +131,7 @@ def tune_certified(
     seed: int = 1,
     confidence: float = CONFIDENCE,
     rounds: int = MOST_ROUNDS,
+    executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> JointTuning:
     """Tune, certify, and tune again with the worst cases found, until the certificate passes.
@@ -156,6 +158,8 @@ def tune_certified(
         Of the certificate that passes, over all rounds.
     rounds : int
         Largest number of rounds.
+    executor : concurrent.futures.Executor, optional
+        Of the certificates, as in `certify`.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
@@ -196,7 +200,7 @@ def tune_certified(
         if controller.feasible:
             certificate = certify(
                 controller, plants, parameters, ranges=ranges, others=others, samples=samples, seed=seed + number - 1,
-                confidence=share, simulations=False, progress=certifying,
+                confidence=share, simulations=False, executor=executor, progress=certifying,
             )  # fmt: skip
         added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
         done.append(

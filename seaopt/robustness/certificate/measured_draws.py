@@ -92,7 +92,7 @@ class Failures:
 
 def measure_draws(
     loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None, progress: Progress
-) -> tuple[Failures, dict[str, Float[np.ndarray, "n k"]], dict[str, Float[np.ndarray, " m"]]]:
+) -> tuple[Failures, dict[str, Float[np.ndarray, "_ k"]], dict[str, Float[np.ndarray, " _"]]]:
     """Draw and measure in blocks: the draws that fail on some plant, the worst of each plant, and Ms of the first."""
     controller, plants, unknown = loops.value.controller, loops.value.plants, loops.value.unknown
     none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
@@ -120,7 +120,7 @@ def measure_draws(
 
 
 def _measure_block(
-    loops: Shared[Loops], values: Mapping[str, Float[np.ndarray, " n"]], size: int, executor: Executor | None,
+    loops: Shared[Loops], values: Mapping[str, Float[np.ndarray, " _"]], size: int, executor: Executor | None,
     progress: Progress,
 ) -> Iterator[tuple[str, BatchFigures]]:  # fmt: skip
     """Yield the figures of every plant at draws, which are cut where no executor has a say in it."""
@@ -147,7 +147,7 @@ def _measure_part(loops: Shared[Loops], part: tuple[str, Mapping[str, Float[np.n
 
 
 def search_worst(
-    loops: Shared[Loops], drawn: Mapping[str, Float[np.ndarray, "n k"]], executor: Executor | None, progress: Progress
+    loops: Shared[Loops], drawn: Mapping[str, Float[np.ndarray, "_ k"]], executor: Executor | None, progress: Progress
 ) -> tuple[dict[str, Worst], dict[str, Bracket]]:
     """Return the worst case found of every plant, from its worst draws, and the bounds where they are asked for."""
     worst: dict[str, Worst] = {}

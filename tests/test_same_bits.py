@@ -1,0 +1,161 @@
+"""Certificates, verifications, sweeps and bootstraps are the same, bit for bit, whatever does their parts."""
+
+from __future__ import annotations
+
+import pickle
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import sweep
+from seaopt.control.tuning import frontier
+from seaopt.estimation import bootstrap
+from seaopt.executors import Processes, Shared, _restore
+from seaopt.files import to_json
+from seaopt.progress import ignore
+from seaopt.robustness import Budget
+from seaopt.robustness.certificate import measured_draws
+from seaopt.robustness.certificate.measured_draws import Loops, measure_draws
+from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.uncertainty.draws import combine_uncertainty
+
+STAND, SWING, THOR = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
+
+
+class Apart(Executor):
+    """Works as another process does, on copies of what it is given, and in the opposite order."""
+
+    _max_workers = 3
+
+    def __init__(self):
+        self.waiting = []
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Late(self)
+        self.waiting.append((future, pickle.dumps((fn, args, kwargs))))
+        return future
+
+    def work(self):
+        while self.waiting:
+            future, packed = self.waiting.pop()
+            fn, args, kwargs = pickle.loads(packed)
+            future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
+
+
+class Late(Future):
+    """Is worked on when its result is asked for."""
+
+    def __init__(self, executor):
+        super().__init__()
+        self.executor = executor
+
+    def result(self, timeout=None):
+        self.executor.work()
+        return super().result(timeout)
+
+
+EXECUTORS = [
+    pytest.param(Apart, id="copies"),
+    pytest.param(lambda: ThreadPoolExecutor(3), id="threads", marks=pytest.mark.slow),
+    *(pytest.param(lambda n=n: Processes(n), id=f"{n} processes", marks=pytest.mark.slow) for n in (1, 2, 3)),
+]
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return so.tune(STAND, THOR, SPEC, robust_to={"swing": SWING})
+
+
+def drop_clock(content):
+    """Return what does not depend on the clock."""
+    if isinstance(content, dict):
+        return {name: drop_clock(value) for name, value in content.items() if name != "real_time_factor"}
+    return content
+
+
+def certify(controller, executor):
+    """Return all that a certificate says, but for what the clock said."""
+    ranges = {"I_p": (0.3, 0.5), "k": (0.95 * THOR["k"].value, 1.05 * THOR["k"].value)}
+    found = so.certify(
+        controller, {"swing": SWING}, THOR, ranges=ranges, samples=40, bounds=Budget(boxes=1),
+        sensors=so.Sensors(noise_std={"F1": 1.0}), executor=executor,
+    )  # fmt: skip
+    assert found.worst["swing"][0] is SWING  # a plant comes back as the caller's own
+    return to_json(drop_clock(found.to_dict())), {name: ms.tobytes() for name, ms in found.drawn_ms.items()}
+
+
+@pytest.fixture(scope="module")
+def certified(controller):
+    return certify(controller, None)
+
+
+@pytest.mark.parametrize("make", EXECUTORS)
+def test_a_certificate(controller, certified, make):
+    with make() as executor:
+        assert certify(controller, executor) == certified
+
+
+@pytest.fixture(scope="module")
+def swept():
+    return sweep_bandwidths(None)
+
+
+def sweep_bandwidths(executor):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frontier, "CHAIN", 2)
+        spec = so.ControllerSpec(structure="pd", max_sensitivity=1.6, max_noise_gain=25)
+        return to_json(sweep(STAND, THOR, spec, [20, 30, 60], executor=executor).to_dict())
+
+
+@pytest.mark.parametrize("make", EXECUTORS)
+def test_a_sweep(swept, make):
+    with make() as executor:
+        assert sweep_bandwidths(executor) == swept
+
+
+def draw_bootstrap(executor):
+    rng = np.random.default_rng(1)
+    drive = so.Log.from_arrays(time=np.arange(400) / 400, I=rng.normal(size=400))
+    force = so.simulate(STAND, THOR, drive)["F1"] + rng.normal(size=400)
+    log = so.Log.from_arrays(time=drive.time, I=drive["I"], F1=force)
+    fitted = so.fit([so.Experiment(plant=STAND, log=log, outputs=("F1",))], THOR.free("J", "b_r"))
+    return bootstrap(fitted, draws=20, seed=3, refit=True, executor=executor).draws.tobytes()
+
+
+@pytest.mark.parametrize("make", EXECUTORS)
+def test_a_bootstrap(make):
+    with make() as executor:
+        assert draw_bootstrap(executor) == draw_bootstrap(None)
+
+
+@pytest.mark.parametrize("make", [Apart, lambda: ThreadPoolExecutor(2)], ids=["copies", "threads"])
+def test_draws_in_several_blocks(controller, monkeypatch, make):
+    monkeypatch.setattr(measured_draws, "DRAWS_PER_BLOCK", 70)
+    monkeypatch.setattr(measured_draws, "DRAW_BLOCK", 30)
+    unknown = combine_uncertainty(THOR, so.ParameterSet(), {"I_p": (0.1, 2.0)}, {"swing": SWING})
+    loops = Shared(Loops(controller=controller, plants={"stand": STAND, "swing": SWING}, unknown=unknown, bounds=None))
+
+    def measure(executor):
+        return measure_draws(loops, 200, np.random.default_rng(1), executor, ignore)
+
+    alone = measure(None)
+    with make() as executor:
+        apart = measure(executor)
+    assert apart[0] == alone[0] and alone[0].count > 0
+    for one, other in zip(apart[1:], alone[1:], strict=True):
+        assert {name: values.tobytes() for name, values in one.items()} == {k: v.tobytes() for k, v in other.items()}
+    whole = batch_figures(
+        controller, SWING, unknown.nominal, unknown.values(unknown.draw(70, np.random.default_rng(1)))
+    )
+    assert whole.ms.tobytes() == alone[2]["swing"].tobytes()  # however the block is cut
+
+
+def test_what_is_shared_is_restored_once():
+    packed = pickle.dumps(Shared({"plant": STAND}))
+    one, other = pickle.loads(packed), pickle.loads(packed)
+    assert one is other and one.value["plant"] is not STAND
+    assert pickle.dumps(one) == packed
+    _restore.cache_clear()
