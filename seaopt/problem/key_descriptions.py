@@ -241,7 +241,8 @@ KEYS: dict[str, dict[str, str]] = {
     "ControllerTable": {
         "plant": 'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.',
         "measured": "The output that is regulated; or a list, it and what else is fed back, such as the motor's speed.",
-        "structure": "pid_dob adds a disturbance observer; mpc plans within limits, see [mpc].",
+        "structure": "pid_dob has a disturbance observer, cascade a loop on the motor's speed; mpc plans, see [mpc].",
+        "speed_loop": "Of a cascade; a PI rejects disturbances better, and hunts where dry friction sticks.",
         "notch": "Whether there is one, or which.",
         "prefilter": "A low-pass of the reference alone, of this order, or which; the bandwidth is placed with it.",
         "compensate": 'What is added because the plant is known, ["friction"]; or a table, to say how much of it.',

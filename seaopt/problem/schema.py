@@ -438,7 +438,8 @@ class ControllerTable(_Strict):
 
     plant: PlantOrResponse
     measured: str | tuple[str, ...] = "F1"
-    structure: Literal["pd", "pid", "pid_dob", "mpc"] = "pid"
+    structure: Literal["pd", "pid", "pid_dob", "cascade", "mpc"] = "pid"
+    speed_loop: Literal["P", "PI"] = "P"
     notch: Flag | NotchTable = False
     prefilter: Literal["first_order", "second_order"] | PrefilterTable | None = None
     compensate: Compensated = []
@@ -453,6 +454,7 @@ class ControllerTable(_Strict):
     max_reference_peak: Level = _limit("max_reference_peak")
     max_droop_db: Level = _limit("max_droop_db")
     max_noise_gain: Level = _limit("max_noise_gain")
+    max_other_noise_gain: Level = _limit("max_other_noise_gain")
     min_filter_samples: Level = _limit("min_filter_samples")
     min_friction_margin: Level = _limit("min_friction_margin")
     min_sensitivity_bandwidth_hz: Level = _limit("min_sensitivity_bandwidth_hz")

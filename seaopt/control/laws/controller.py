@@ -49,7 +49,7 @@ from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
 from seaopt.records import PlotAccessor, record
-from seaopt.units import divide_units, mechanics_of, unit_after
+from seaopt.units import Mechanics, divide_units, mechanics_of, unit_after
 
 if TYPE_CHECKING:
     import control
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 # Among what controller.json says is achieved:
 FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
 CONTROLLER_SCHEMA = "seaopt/controller/2"
-GAIN_UNITS = {"T_f": "s", "T_q": "s", PREFILTER: "Hz"}  # besides those of effort over what is measured
+GAIN_UNITS = {"T_f": "s", "T_q": "s", "T_v": "s", PREFILTER: "Hz"}  # besides those of effort over what is measured
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SAME_POLE = 1e-3  # to which poles that are equal are computed
 NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
@@ -169,8 +169,15 @@ class Controller:
             filter_samples, integral = count_filter_samples(law), find_integral_rate(law)
         return MeasuredLoop(
             name=name, figures=figures, port=port, filter_samples=filter_samples, integral_rad_s=integral,
-            gain_unit=self.command.gain_unit,
+            gain_unit=self.command.gain_unit, other_gain_unit=self._name_other_gain(),
         )  # fmt: skip
+
+    def _name_other_gain(self) -> str:
+        """Return the unit of effort over what the law reads besides; empty where it is not known, or not one."""
+        outputs = {} if self.design is None else self.design[0].outputs
+        units = {outputs.get(name, "") for name in self.signals[1:]}
+        unit = units.pop() if len(units) == 1 else ""
+        return divide_units(self.command.effort_unit, unit) if unit else ""
 
     def _add_friction(self, loop: MeasuredLoop) -> MeasuredLoop:
         """Return the design plant's loop with its friction margin, where it has friction."""
@@ -297,7 +304,7 @@ class Controller:
     @property
     def engineering(self) -> dict[str, tuple[float, str]]:
         """The gains as a drive is set, values and units: the command per force error, its integral and its rate."""
-        units = _name_rates(self.command.unit, self.command.reference_unit)
+        units = _name_rates(self.command.unit, self.command.reference_unit, self.command.mechanics)
         scale = self.command.per_effort
         return {name: (scale * value, units[name]) for name, value in self.gains.items() if name in units}
 
@@ -413,7 +420,7 @@ class Controller:
         stored = read_controller(content)
         if isinstance(plant, MeasuredResponse):
             return cls._on_measured(stored, content, plant, params)
-        measured = plant.outputs.get(stored["spec"].measured, "")
+        measured = plant.outputs.get(stored["spec"].regulated, "")
         stored["command"] = replace(
             stored["command"], largest=find_range(plant, params),
             measured_unit="" if measured == stored["command"].effort_unit else measured,
@@ -522,6 +529,8 @@ class Controller:
                 f"{name} = {value:.5g} {unit}" for name, (value, unit) in self.engineering.items()
             ),
         ]  # fmt: skip
+        if self.gains.get("k_v"):
+            lines.append(self._describe_cascade())
         if self.observer is not None:
             lines.append(f"  disturbance observer: Q is 3 dB down at {self.observer.bandwidth_hz:.4g} Hz")
         if "notch_depth" in self.gains:
@@ -537,6 +546,15 @@ class Controller:
                 f"the bandwidth is {bare} Hz"
             )
         return lines
+
+    def _describe_cascade(self) -> str:
+        """Return the gains as a drive with a speed loop is set: speed per force error, its integral and its rate."""
+        called = self.command.mechanics
+        units = _name_rates(f"{called.place}/s", self.command.reference_unit, called)
+        drive = ", ".join(f"{name} = {self.gains[name] / self.gains['k_v']:.5g} {units[name]}"
+                          for name in ("k_p", "k_i", "k_d", "k_r"))  # fmt: skip
+        inside = f"a PI of T_v = {self.gains['T_v']:.4g} s" if "T_v" in self.gains else "a P"
+        return f"  as speeds asked of the motor's speed loop, {inside} of k_v: {drive}"
 
     def _outer_lines(self) -> list[str]:
         """Say what the outer loop renders."""
@@ -601,17 +619,18 @@ class Controller:
 
 def name_gain_units(command: Command) -> dict[str, str]:
     """Return the units of the gains of a law that gives efforts, by name; what is not there has none."""
-    units = _name_rates(command.effort_unit, command.reference_unit)
+    units = _name_rates(command.effort_unit, command.reference_unit, command.mechanics)
     if command.effort_unit == command.reference_unit:
         units |= {"k_i": "1/s", "k_d": "s"}
     return GAIN_UNITS | units
 
 
-def _name_rates(unit: str, measured: str) -> dict[str, str]:
-    """Return the units of gains from a measured signal to what has a unit, to its rate, and from its rate."""
+def _name_rates(unit: str, measured: str, mechanics: Mechanics) -> dict[str, str]:
+    """Return the units of gains from a measured signal, its integral and rate, and a motor's speed, to some unit."""
     ratio, seconds = divide_units(unit, measured), f"{unit_after(unit).strip()} s".strip()
     return {
-        "k_p": ratio, "k_i": divide_units(unit, f"{measured} s"), "k_d": divide_units(seconds, measured), "k_r": ratio
+        "k_p": ratio, "k_i": divide_units(unit, f"{measured} s"), "k_d": divide_units(seconds, measured), "k_r": ratio,
+        "k_ff": ratio, "k_v": divide_units(seconds, mechanics.place),
     }  # fmt: skip
 
 

@@ -32,6 +32,8 @@ PASSIVE_ROUNDING = 1e-9  # Re Z/abs(Z) that is still called zero
 PLACED_BELOW = 0.97  # of the bandwidth: up to here abs(F/F_ref) must be above -3 dB, which it reaches at the bandwidth
 INTEGRAL_RAD_S = 2 * math.pi * 0.05  # k_i/(1 + k_p) at least, so that an integral does something
 
+OTHER_NOISE = "max_other_noise_gain"
+
 Sense = Literal["at most", "at least", "equal to"]
 Scope = Literal["every plant", "design plant"]
 
@@ -76,6 +78,8 @@ class MeasuredLoop:
         Its unit; empty without friction.
     gain_unit : str
         Of what the law gives over what it measures: N/N, N m/(N m), N m/rad.
+    other_gain_unit : str
+        The same of what it reads besides, where that is known.
 
     """
 
@@ -87,11 +91,14 @@ class MeasuredLoop:
     friction_slope: float = math.inf
     slope_unit: str = ""
     gain_unit: str = LINEAR.gain
+    other_gain_unit: str = ""
 
     def unit(self, limit: Limit) -> str:
         """Return the unit of a limit's figure: those of a friction's slope and of the noise gain are the plant's."""
         if limit.name == "max_noise_gain":
             return self.gain_unit
+        if limit.name == OTHER_NOISE:
+            return self.other_gain_unit or limit.unit
         return self.slope_unit if self.slope_unit and limit.name == "min_friction_margin" else limit.unit
 
 
@@ -348,6 +355,14 @@ LIMITS = (
         scope="design plant", unit="N/N", stuck_too=True, curve=LimitCurve(of="C_y"),
         meaning="peak of |F_m/noise on F|: motor force that the sensor's noise makes",
         remedy="lower the bandwidth, or filter the sensor",
+    ),
+    Limit(
+        name=OTHER_NOISE, label="other signals' noise gain",
+        figure=lambda loop: max(loop.figures.other_noise_gains, default=0.0), sense="at most", scope="design plant",
+        unit="effort per unit", stuck_too=True, curve=LimitCurve(of="C_v"),
+        meaning="peak of |F_m/noise on what the law reads besides|, the largest; of a cascade that of its encoder "
+        "(per rad or m), or of its speed",
+        remedy="lower the bandwidth, or allow more noise gain on the regulated signal",
     ),
     Limit(
         name="min_sensitivity_bandwidth_hz", label="sensitivity bandwidth",

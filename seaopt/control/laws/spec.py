@@ -19,6 +19,7 @@ from seaopt.control.laws.structures import (
     Prefilter,
     PrefilterOrder,
     ReferenceWeights,
+    SpeedLaw,
     SpeedLoop,
     Structure,
 )
@@ -53,6 +54,9 @@ class ControllerSpec:
         A pid_dob has a disturbance observer whose nominal plant is the design plant; a cascade closes a loop on the
         motor's speed, the second of `measured`, inside the force loop; custom is a law that is given
         (`seaopt.assess`), which may have more than bandwidth_hz.
+    speed_loop : {"P", "PI"}
+        Of a cascade: a PI is better at rejecting disturbances, and with the force loop's integral hunts where dry
+        friction sticks.
     notch : Notch, optional
         A notch in series; fields that are None are tuned.
     prefilter : {"first_order", "second_order"} or Prefilter, optional
@@ -76,6 +80,9 @@ class ControllerSpec:
         How far abs(F/F_ref) falls below its static value up to a third of the bandwidth, design plant.
     max_noise_gain : float, optional
         Peak of abs(F_m / noise on F), N/N, design plant.
+    max_other_noise_gain : float, optional
+        The same of what the law reads besides, effort per unit of it as it is read (of an encoder per rad or m), the
+        largest, design plant.
     min_filter_samples : float, optional
         T_f in samples.
     min_friction_margin : float, optional
@@ -109,6 +116,7 @@ class ControllerSpec:
     bandwidth_hz: float = 30.0
     bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
     structure: Structure = "pid"
+    speed_loop: SpeedLaw = "P"
     notch: Notch | None = None
     prefilter: PrefilterOrder | Prefilter | None = None
     reference_weights: ReferenceWeights = "tuned"
@@ -120,6 +128,7 @@ class ControllerSpec:
     max_reference_peak: Level = BY_NAME["max_reference_peak"].default
     max_droop_db: Level = BY_NAME["max_droop_db"].default
     max_noise_gain: Level = BY_NAME["max_noise_gain"].default
+    max_other_noise_gain: Level = BY_NAME["max_other_noise_gain"].default
     min_filter_samples: Level = BY_NAME["min_filter_samples"].default
     min_friction_margin: Level = BY_NAME["min_friction_margin"].default
     min_sensitivity_bandwidth_hz: Level = None
@@ -154,6 +163,8 @@ class ControllerSpec:
                 f'reference_weights = "{self.reference_weights}" is not known; '
                 f"{suggestion(str(self.reference_weights), REFERENCE_WEIGHTS)}"
             )
+        if self.speed_loop not in ("P", "PI"):
+            raise ControlError(f'speed_loop = {self.speed_loop!r} is not known; give speed_loop = "P", or "PI"')
         if self.objective not in ("disturbance", "noise"):
             raise ControlError(
                 f'objective = "{self.objective}" is not known; use "noise", or objective = "disturbance"'

@@ -84,6 +84,7 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
 Structure = Literal["pd", "pid", "pid_dob", "cascade", "custom"]
+SpeedLaw = Literal["P", "PI"]
 PrefilterOrder = Literal["first_order", "second_order"]
 PREFILTER_ORDERS: tuple[PrefilterOrder, ...] = ("first_order", "second_order")
 ReferenceWeights = Literal["tuned", "error", "measurement"]

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from seaopt.control.laws.limits import Limit, MeasuredLoop, Scope
+from seaopt.control.laws.limits import OTHER_NOISE, Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
@@ -234,13 +234,15 @@ class DesignFigure:
 
 
 def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[DesignFigure]:
-    """Return each limit of one loop's figures; a friction margin only where there is friction, or one is asked for."""
+    """Return each limit of one loop's figures; of friction and of further signals only where there are, or one asks."""
     rows: list[DesignFigure] = []
     for limit in spec.limits:
         if limit.has_field and limit.condition is None:  # a figure of the loop alone
             value, allowed, unit = limit.figure(design), spec.allowed(limit), design.unit(limit)
             margin = limit.name == "min_friction_margin"
             if margin and not design.slope_unit and allowed is None:
+                continue
+            if limit.name == OTHER_NOISE and not design.figures.other_noise_gains and allowed is None:
                 continue
             reached = limit.sense == "at most" or np.isfinite(value) or (margin and design.slope_unit)
             rows.append(DesignFigure(limit=limit, value=value if reached else None, allowed=allowed, unit=unit))

@@ -192,7 +192,8 @@ def sweep(
     Raises
     ------
     ControlError
-        As `tune`; or there is no bandwidth, too many, or one is outside the range.
+        As `tune`; or there is no bandwidth, too many, or one is outside the range; or a free law is asked for beside
+        one that reads several signals.
 
     Examples
     --------
@@ -208,6 +209,11 @@ def sweep(
     require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", ControlError)
     design = name_design(plant)
     require_type(bandwidths_hz, Collection, "bandwidths_hz", "give a sequence of frequencies in Hz", ControlError)
+    if free_law and not isinstance(spec.measured, str):
+        raise ControlError(
+            f"free_law = True with measured = {list(spec.measured)}: the best of all linear laws is computed of those "
+            "that read one signal; leave free_law out"
+        )
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
         raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
     spec = settle_delay(spec, design, params)

@@ -52,7 +52,7 @@ from seaopt.executors import IPOPT
 
 POINTS_PER_LIMIT = 24  # of each kind of limit
 SPREAD_POINTS = 10  # of them, at even distances
-LARGEST_FACTOR = 3.0  # factor by which a number may change in one solution
+LARGEST_FACTOR, SMALLEST_FACTOR = 3.0, 1.1  # by which a number may change in one solution
 WORST_PLANTS = 2  # plants whose objective is followed
 QUADRATURE_CHUNK = 64  # quadrature points come in multiples of this
 SLACK_PRICE = 1e3
@@ -124,26 +124,28 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNum
         Solutions at most; each adds the points where the one before broke a limit.
 
     """
-    x, chosen = start, _choose_points(task, grid, start)
+    x, chosen, factor = start, _choose_points(task, grid, start), LARGEST_FACTOR
     rank = task.rank(grid, start)
     for _ in range(rounds):
-        trial = _solve(task, grid, x, chosen)
+        trial = _solve(task, grid, x, chosen, factor)
         if trial is None:
             break
         again = _add_missed(task, grid, trial, chosen)
         trial_rank = task.rank(grid, trial)
         if trial_rank < rank and task.is_stable(trial):
-            again = again or _reached_end(trial, x)
-            x, rank = trial, trial_rank
+            again = again or _reached_end(trial, x, factor)
+            x, rank, factor = trial, trial_rank, min(factor**2, LARGEST_FACTOR)
+        elif task.speed_loop is not None:  # along its flat valleys other points matter at every step that is far
+            factor = max(np.sqrt(factor), SMALLEST_FACTOR)
         if not again:
             break
     return x
 
 
-def _reached_end(trial: LawNumbers, x: LawNumbers) -> bool:
+def _reached_end(trial: LawNumbers, x: LawNumbers, factor: float) -> bool:
     """Tell whether a number changed by as much as it may in one solution; the weights may as they like."""
     rest = np.delete(np.arange(x.size), [W_R, W_C])
-    return bool(np.any((trial > 0.99 * LARGEST_FACTOR * x)[rest] | (trial < 1.01 / LARGEST_FACTOR * x)[rest]))
+    return bool(np.any((trial > 0.99 * factor * x)[rest] | (trial < 1.01 / factor * x)[rest]))
 
 
 def _add_missed(task: Task, grid: Grid, x: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
@@ -293,8 +295,10 @@ def _bound_disc(curve: LimitCurve, p: _Complex, r: Any, c_y: _Complex, c_r: _Com
     return ca.log(top / room)
 
 
-def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> LawNumbers | None:
-    """Solve the program on the chosen points; None if its answer is not of numbers."""
+def _solve(
+    task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]], factor: float
+) -> LawNumbers | None:
+    """Solve the program on the chosen points, numbers within a factor; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
     m, kinds, passive, friction = grid.f.size, task.curve_names, task.port is not None, grid.friction_plant.size > 0
     flat = np.concatenate([chosen[kind] for kind in kinds])
@@ -334,8 +338,8 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     (linear, least, largest), gains = task.linear_limits(start), task.gains_tuned
     rows = np.max(np.abs(linear * scale[gains]), axis=1)  # each in units of its largest term
     near, far = (
-        np.maximum(low, start / LARGEST_FACTOR),
-        np.minimum(high, LARGEST_FACTOR * np.maximum(start, 0.3 * scale)),
+        np.maximum(low, start / factor),
+        np.minimum(high, factor * np.maximum(start, 0.3 * scale)),
     )
     near[[W_R, W_C]], far[[W_R, W_C]] = low[[W_R, W_C]], high[[W_R, W_C]]
     every = [p, grid.q[columns], grid.kept[columns], grid.inverse[columns]]

@@ -27,8 +27,9 @@ from seaopt.control.tuning.optimisation_problem import FRICTION, Grid, LawNumber
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, count_off, divide, ignore
 
-STARTS_TRIED = 3  # two more where an observer, a notch or a prefilter makes more valleys
-STARTS_REFINED = 2  # one more with an observer or a prefilter, all with a notch
+STARTS_TRIED = 3  # two more where an observer, a notch, a prefilter or a speed loop makes more valleys
+STARTS_REFINED = 2  # one more with an observer, a prefilter or a speed loop, all with a notch
+ROUNDS, LONG_ROUNDS = 5, 9  # of the interior point; integrals of a cascade move far
 RECHECKS = 3
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: less is not looked for
@@ -140,7 +141,8 @@ def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress:
     """Find the best numbers on a grid."""
     scanning, improving, refining = divide(progress, SCAN, IMPROVEMENT, REFINEMENT)
     scanning("scanning gains", 0.0)
-    more = task.nominal is not None or task.spec.notch is not None or task.spec.reference_filter is not None
+    parts = (task.nominal, task.spec.notch, task.spec.reference_filter, task.speed_loop)
+    more = any(part is not None for part in parts)
     warm = [task.tidy(x) for x in warm]
     first = [x for x in warm if task.is_stable(x)] + find_starts(task, grid, STARTS_TRIED + 2 * more - bool(warm))
     ranked = sorted((improve(task, grid, x) for x in count_off(first, "start", improving)), key=lambda pair: pair[0])
@@ -149,7 +151,8 @@ def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress:
     for _, x in ranked:
         if len(chosen) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
-    refined = (refine(task, grid, x) for x in count_off(chosen, "refining start", refining))
+    rounds = ROUNDS if task.speed_loop is None else LONG_ROUNDS
+    refined = (refine(task, grid, x, rounds) for x in count_off(chosen, "refining start", refining))
     return min(refined, key=lambda x: task.rank(grid, x))
 
 

@@ -68,8 +68,8 @@ WEIGHTS = (0.0, 0.5, 1.0)  # of w_c/k_d
 COARSE_FREQUENCIES = 90
 SCANNED_PLANTS = 4
 PASSIVE_FREQUENCIES = 20  # of the passive band
-SPEED_GAINS = (0.3, 1.0, 3.0, 10.0)  # of k_v, over the speed per command at the bandwidth
-SPEED_RATES = (0.0, 0.2)  # of 1/T_v, over the bandwidth's rad/s
+SPEED_GAINS = (0.3, 1.0, 3.0)  # of k_v, over the speed per command at the bandwidth
+SPEED_RATES = (0.0, 0.15, 0.6)  # of 1/T_v, over the bandwidth's rad/s
 PREFILTERS = (0.7, 1.2, 2.0)  # corners over the bandwidth; and the highest, which is next to none
 PREFILTER_START = 0.8  # damping
 # k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
@@ -122,7 +122,7 @@ def _are_alike(task: Task, x: LawNumbers, other: LawNumbers) -> bool:
     elif task.nominal is not None:
         apart = apart[[K_I, T_Q]]
     elif task.speed_loop is not None:
-        apart = apart[[K_I, K_V, SPEED_RATE]]
+        apart = apart[[K_I, SPEED_RATE, PREFILTER_W]] * [0.25, 1.0, 1.0]
     elif task.spec.reference_filter is not None:
         apart = apart[[K_I, PREFILTER_W]]
     elif task.spec.structure == "pid":
@@ -157,8 +157,8 @@ def _list_shapes(task: Task, grid: Grid) -> Iterator[Shape]:
     low, high = task.bounds(make_rest_start(task))
     spec, ts = task.spec, task.spec.sample_time_s
     unit = 1 / (2 * np.pi * spec.bandwidth_hz)
-    few = spec.notch is not None or task.speed_loop is not None
-    filters = np.geomspace(max(0.15 * ts, low[T_F]), min(0.7 * unit, high[T_F]), 3 if few else 5)
+    filters = np.geomspace(max(0.15 * ts, low[T_F]), min(0.7 * unit, high[T_F]), 5 if spec.notch is None else 3)
+    filters = filters if task.speed_loop is None else filters[:3:2]
     # An output that swings at a few tenths of a hertz bears only a slow observer.
     lags = [0.5 * unit, 2.0 * unit, 8.0 * unit, 0.5, 3.0] if task.nominal is not None else [1.0]
     notches = _list_notches(task) if spec.notch is not None else [tuple(low[NOTCH_W:PREFILTER_W])]
@@ -175,7 +175,8 @@ def _list_speed_loops(task: Task, grid: Grid) -> list[tuple[float, float]]:
         return [(0.0, 0.0)]
     at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
     gains = np.array(SPEED_GAINS) / max(float(np.abs(grid.speed[0, at])), 1e-12)
-    rates = [share * 2 * np.pi * task.spec.bandwidth_hz for share in SPEED_RATES]
+    shares = SPEED_RATES if task.spec.speed_loop == "PI" else SPEED_RATES[:1]
+    rates = [share * 2 * np.pi * task.spec.bandwidth_hz for share in shares]
     return [(0.0, 0.0), *itertools.product(map(float, gains), rates)]
 
 

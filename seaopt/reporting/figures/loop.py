@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from seaopt.control import Controller, Loop
 from seaopt.control.loops.loop import STABLE
+from seaopt.control.loops.peaks import TRACKING
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -77,9 +78,10 @@ def step_response(
     """Return what is measured, and the effort, at the samples after a step of the reference, linear."""
     system = loop.system()
     x, out = np.zeros(system.a.shape[0]), np.empty((samples, 2))
-    drive, through = size * system.b[:, 1], size * system.d[:, 1]
+    rows = [system.table[TRACKING].output, 1]  # what is measured, and the effort
+    drive, through, c = size * system.b[:, 1], size * system.d[rows, 1], system.c[rows]
     for k in range(samples):
-        out[k] = system.c @ x + through
+        out[k] = c @ x + through
         x = system.a @ x + drive
     return out[:, 0], out[:, 1]
 
