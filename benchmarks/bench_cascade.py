@@ -74,7 +74,8 @@ class Case:
         measured = ("tau_s", "thetad_m") if structure == "cascade" else "tau_s"
         limits = {name: level for name, level in self.limits.items() if structure == "cascade" or "other" not in name}
         return so.ControllerSpec(
-            structure=structure, measured=measured, speed_loop=self.speed_loop, delay_samples=self.delay, bandwidth_range_hz=(3.0, 60.0), **limits
+            structure=structure, measured=measured, speed_loop=self.speed_loop, delay_samples=self.delay,
+            bandwidth_range_hz=(3.0, 60.0), **limits,
         )  # fmt: skip
 
     def discretise(self, free: bool, slope: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -107,7 +108,7 @@ class Case:
         self.weights[np.flatnonzero(inside)[1:]] += step
 
     def respond(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return C_y, C_v and what is in series and rest of C_r for numbers (n, 7): k_p, k_i, k_d, T_f, k_v, 1/T_v, c."""
+        """Return C_y, C_v, the series part and the rest of C_r for numbers k_p, k_i, k_d, T_f, k_v, 1/T_v and c."""
         k_p, k_i, k_d, T_f, k_v, rate, c = (column[:, None] for column in x.T)
         integral, derivative = self.ts / 2 * (1 + self.q) / (1 - self.q), (1 - self.q) / (T_f + self.ts - T_f * self.q)
         series = 1.0 + rate * integral
@@ -261,7 +262,8 @@ def report(rows: list[dict[str, Any]]) -> None:
         gains = ", ".join(f"{name} {value:.3g}" for name, value in row["gains"].items())
         print(f"{row['seed']:4d} {'feasible' if row['feasible'] else 'not     '} {row['time']:6.2f} s  usage "
               f"{row['usage']:.4f}  integral {row['value']:.4f}  search {row['search_value']:.4f} "
-              f"({row['search_usage']:.4f}, {row['search_time']:.0f} s)  ratio {ratio:.3f}  {gains}; found {np.array2string(row['found'], precision=3)}")  # fmt: skip
+              f"({row['search_usage']:.4f}, {row['search_time']:.0f} s)  ratio {ratio:.3f}  {gains}; "
+              f"found {np.array2string(row['found'], precision=3)}")  # fmt: skip
         row["ratio"] = ratio
     ratios = np.array([row["ratio"] for row in rows])
     ratios = ratios[np.isfinite(ratios)]
@@ -269,8 +271,8 @@ def report(rows: list[dict[str, Any]]) -> None:
     kept = [row for row in rows if row["feasible"]]
     lost = [row["seed"] for row in rows if not row["feasible"] and row["search_usage"] <= 1.001]
     print(f"{len(rows)} cases, {len(kept)} feasible; feasible to the search alone: {lost}")
-    print(f"processor time of a tune: median {np.median(times):.2f} s, largest {np.max(times):.2f} s; of a feasible one "
-          f"{np.median([row['time'] for row in kept]):.2f} s")  # fmt: skip
+    print(f"processor time of a tune: median {np.median(times):.2f} s, largest {np.max(times):.2f} s; of a feasible "
+          f"one {np.median([row['time'] for row in kept]):.2f} s")  # fmt: skip
     print(f"objective over the search's: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f}, "
           f"within 3 %: {np.count_nonzero(ratios <= 1.03)} of {ratios.size}")  # fmt: skip
     print("refused by the judge:", [row["seed"] for row in kept if row["usage"] > 1.001] or "none")
