@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import seaopt as so
 from seaopt.control import Controller, cascade_pid, sweep
+from seaopt.control.laws.structures import Gains, InnerLoop, SpeedLoop
+from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.sampled_plant import sample
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
+from seaopt.reporting.figures.loop import step_response
 
 STAND, SWING = so.plants.rotary(link="locked"), so.plants.rotary(link="pendulum")
 VALUES = SWING.defaults.update(
@@ -29,11 +32,11 @@ def tuned() -> Controller:
     return so.tune(STAND, VALUES, SPEC, {"swing": SWING})
 
 
-def step_by_hand(controller: Controller, samples: int) -> np.ndarray:
+def step_by_hand(g: dict[str, float], samples: int) -> np.ndarray:
     """Return the torque after a step of the reference: drive and actuator, written down sample by sample."""
     from scipy.linalg import expm
 
-    g, ts, v = controller.gains, 1e-3, {name: VALUES[name].value for name in VALUES}
+    ts, v = 1e-3, {name: VALUES[name].value for name in VALUES}
     k, n, inertia = v["k_s"], v["N"], v["J_m"]
     a = np.array([[0.0, 1.0], [-k / n**2 / inertia, -v["b_r"] / inertia]])
     block = expm(ts * np.block([[a, np.array([[0.0], [1.0 / n / inertia]])], [np.zeros((1, 3))]]))
@@ -54,20 +57,15 @@ def step_by_hand(controller: Controller, samples: int) -> np.ndarray:
     return torques
 
 
-@pytest.mark.parametrize("speed_loop", ["P", "PI"])
-def test_the_law_is_the_drive_that_its_gains_describe(speed_loop: str, tuned: Controller) -> None:
+@pytest.mark.parametrize("T_v", [np.inf, 0.1])
+def test_the_law_is_the_drive_that_its_gains_describe(T_v: float) -> None:
     """A step, simulated by hand with integrals that are summed up, against the sampled loop."""
-    controller = (
-        tuned if speed_loop == "P" else so.tune(STAND, VALUES, replace(SPEC, speed_loop="PI"), {"swing": SWING})
-    )
-    assert controller.feasible and ("T_v" in controller.gains) == (speed_loop == "PI")
-    loop, samples = controller.close(STAND, VALUES), 400
-    system = loop.system()
-    x, torque = np.zeros(len(system.a)), np.zeros(samples)
-    for i in range(samples):
-        torque[i] = system.c[2] @ x + system.d[2, 1]
-        x = system.a @ x + system.b[:, 1]
-    np.testing.assert_allclose(torque, step_by_hand(controller, samples), atol=1e-9)
+    inner = InnerLoop(k_v=0.4, T_v=T_v, k_ff=1.0, speed=SpeedLoop(differenced=True))
+    gains = Gains(k_p=8.0, k_i=20.0, k_d=0.02, T_f=2e-3, k_r=7.0, c=0.5, inner=inner)
+    plant = sample(STAND, VALUES.update(f_c=0.0), ("tau_s", "theta_m"), 1.0 / (0.7 * 0.0369 * 100.0), 1e-3, 1)
+    torque, _ = step_response(Loop(plant=plant, law=gains.law("cascade", 1e-3).balanced()), 400)
+    assert abs(torque[-1] - 1.0) < 0.1
+    np.testing.assert_allclose(torque, step_by_hand(gains.by_name(), 400), atol=1e-9)
 
 
 def test_it_rejects_twice_as_much_as_a_pid_at_the_same_limits(tuned: Controller) -> None:
@@ -113,9 +111,13 @@ def test_it_is_read_again_and_refused_where_a_gain_is_another(tuned: Controller)
         )
 
 
-def test_a_sweep_of_cascades(tuned: Controller) -> None:
-    rows = sweep(STAND, VALUES, SPEC, [15.0]).rows
-    assert rows[0].feasible and rows[0].without_sticking is not None
+@pytest.mark.slow
+def test_a_sweep_of_cascades() -> None:
+    (row,) = sweep(STAND, VALUES, SPEC, [15.0]).rows
+    assert row.feasible and row.without_sticking is not None
+
+
+def test_a_free_law_reads_one_signal() -> None:
     with pytest.raises(ControlError, match="free_law"):
         sweep(STAND, VALUES, SPEC, [15.0], free_law=True)
 
@@ -135,11 +137,7 @@ def test_what_it_cannot_do_is_said(changed: dict[str, object], said: str) -> Non
         so.tune(STAND, VALUES, replace(SPEC, **changed))  # pyright: ignore[reportArgumentType]
 
 
-def test_its_certificate_and_its_step_are_drawn(tuned: Controller, tmp_path: Path) -> None:
-    from seaopt.reporting.figures.loop import step_response
-
-    torque, effort = step_response(tuned.close(STAND, VALUES), 2000)
-    assert torque[-1] == pytest.approx(1.0, abs=0.02) and effort[-1] == pytest.approx(1.0, abs=0.02)
+def test_it_is_certified_sliding_and_stuck(tuned: Controller) -> None:
     certificate = so.certify(tuned, {"swing": SWING}, VALUES, samples=20, simulations=False)
-    assert {"design plant sliding", "design plant stuck", "swing sliding", "swing stuck"} <= set(certificate.plants)
+    assert {"swing sliding", "swing stuck"} < set(certificate.plants) and len(certificate.plants) == 4
     assert all(one.stable for one in certificate.plants.values())
