@@ -135,6 +135,9 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
     again = () if fleet.met else ("mend what failed, then type the same command: only that is fitted again",)
     verdict = StageVerdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=again)
     show_verdicts(console, [verdict], verbose=verbose)
+    if drift.left_out:
+        total = format_count(len(fleet.rows), "log")
+        console.wrap(f"left out of drift, of {total}: {drift.describe_left_out()}", indent=9)
     if drift.missing:
         console.wrap(f"Drift: {drift.verdict}", indent=9)
         return

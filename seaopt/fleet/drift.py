@@ -152,6 +152,10 @@ class Drift:
         found = f"{count or 'none'} of {format_count(self.actuators, 'actuator')} with an alarm"
         return f"{found}; were all healthy, {format_number(self.expected, 2)} would be expected"
 
+    def describe_left_out(self) -> str:
+        """Return which logs no chart has, "2 not met and 1 without a time"; empty where all are in one."""
+        return join_words([f"{count} {reason}" for reason, count in self.left_out.items()])
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the part drift of fleet.json."""
         names = [name for name in Alarm.__dataclass_fields__ if name != "identity"]

@@ -279,8 +279,8 @@ def _explain(drift: Drift) -> tuple[str, ...]:
         f"Time: {drift.history.source}." + (f" Careful: {drift.history.warning}." if drift.history.warning else ""),
     ]
     if drift.left_out:
-        counts = join_words([f"{count} {reason}" for reason, count in drift.left_out.items()])
-        texts.append(f"Left out, of {format_count(len(drift.history.rows), 'log')}: {counts}.")
+        total = format_count(len(drift.history.rows), "log")
+        texts.append(f"Left out, of {total}: {drift.describe_left_out()}.")
     texts.append(
         "This holds where the runs of a healthy actuator scatter independently around a mean of its own, as widely as "
         "those of its siblings. A temperature that comes and goes over many runs raises alarms, too."

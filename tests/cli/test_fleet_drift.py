@@ -46,6 +46,10 @@ def test_an_alarm_is_told_and_stands_on_the_page(fleet: Run, folder: Path) -> No
     page = (folder / "out/fleet.html").read_text()
     assert "J rose" in page and "stand.toml" in page
     healthy = json.loads(fleet("-o", "out", *IDENTITY, "--since", "2026-01-04", "--json").stdout)
+    assert (
+        "left out of drift, of 25 logs: 15 before 2026-01-04"
+        in fleet("-o", "out", *IDENTITY, "--since", "2026-01-04").stdout
+    )
     assert healthy["drift"]["left_out"] == {"before 2026-01-04": 15} and not healthy["drift"]["alarms"]
 
 
