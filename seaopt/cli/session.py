@@ -104,7 +104,8 @@ MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 
 REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
-OF_THE_LAW = ("structure", "notch", "prefilter", "reference_weights", "sample_rate_hz", "delay_samples")
+FILTERS = ("notch", "prefilter", "link_feedforward")
+OF_THE_LAW = ("structure", *FILTERS, "reference_weights", "sample_rate_hz", "delay_samples")
 IN_PARTS = ("tune", "sweep", "certify")  # stages that several processes can work on
 SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",

@@ -676,8 +676,9 @@ def _stack(plant: Plant, what: str, equations: Mapping[str, Any], names: Mapping
 def _check_structure(plant: Plant) -> None:
     """Refuse what can only be a mistake: an output of nothing, a state that neither moves nor is driven."""
     moved_by = ca.vertcat(plant.t, plant.x, plant.u)
+    still = () if plant.sensing is None else plant.sensing.still
     for index, name in enumerate(plant.outputs):
-        if not ca.depends_on(plant.output[index], moved_by):
+        if name not in still and not ca.depends_on(plant.output[index], moved_by):
             raise PlantError(f'plant {plant.name}: output "{name}" depends on no state and no input; check h')
     held = plant.sampling.sets if plant.sampling is not None else {}
     for index, name in enumerate(plant.states):

@@ -72,6 +72,8 @@ class Sensing:
         Outputs that a device computes from these two positions: with their errors.
     weights : mapping of output to callable ``p -> {encoder: expression}``
         How much such an output moves with each encoder, where that is no longer its slope: behind a filter.
+    still : tuple of str
+        Outputs that stay at zero, as the motion of a link does that is held.
 
     """
 
@@ -83,6 +85,7 @@ class Sensing:
     weights: Mapping[str, Callable[[Any], Mapping[str, Any]]] = field(
         default_factory=dict[str, Callable[[Any], Mapping[str, Any]]], repr=False
     )
+    still: tuple[str, ...] = ()
 
 
 @record(eq=False)

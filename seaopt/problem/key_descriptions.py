@@ -225,6 +225,12 @@ KEYS: dict[str, dict[str, str]] = {
         "width": "Tuned where left out.",
         "depth": "Gain at its centre; tuned where left out.",
     },
+    "LinkFeedforwardTable": {
+        "measured": "The link's position or speed; where the plant says what that is, it may be left out.",
+        "fraction": "Of the effort that the model says; as much as Ms leaves where left out.",
+        "corner_hz": "Of the low-pass; the bandwidth where left out.",
+        "high_pass_hz": "Below which nothing is fed forward; a tenth of the bandwidth where left out, 0 for none.",
+    },
     "PrefilterTable": {
         "order": "With or without a damping.",
         "corner_hz": "Where its asymptotes meet; tuned where left out.",
@@ -244,6 +250,7 @@ KEYS: dict[str, dict[str, str]] = {
         "structure": "pid_dob has a disturbance observer, cascade a loop on the motor's speed; mpc plans, see [mpc].",
         "speed_loop": "Of a cascade; a PI rejects disturbances better, and hunts where dry friction sticks.",
         "notch": "Whether there is one, or which.",
+        "link_feedforward": "Whether the effort that the link's measured motion needs is added, or how.",
         "prefilter": "A low-pass of the reference alone, of this order, or which; the bandwidth is placed with it.",
         "compensate": 'What is added because the plant is known, ["friction"]; or a table, to say how much of it.',
         "reference_weights": '"tuned": of how the reference enters; "error", "measurement": fixed.',

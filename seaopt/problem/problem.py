@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
-from seaopt.control import ControllerSpec, MPCSpec, Notch, Prefilter
+from seaopt.control import ControllerSpec, LinkFeedforward, MPCSpec, Notch, Prefilter
 from seaopt.control import draw as draw_values
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.documents import check_table
@@ -667,17 +667,18 @@ def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
 def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    fields = table.controller.model_dump(
-        exclude={"plant", "robust_to", "frf_confidence", "draws", "notch", "prefilter", "compensate", "schedule"}
-    )
+    built = {"notch", "prefilter", "link_feedforward", "compensate", "schedule"}
+    fields = table.controller.model_dump(exclude={"plant", "robust_to", "frf_confidence", "draws", *built})
     low_pass = table.controller.prefilter
     prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass
+    fed = table.controller.link_feedforward
+    link = (LinkFeedforward() if fed else None) if isinstance(fed, bool) else LinkFeedforward(**fed.model_dump())
     notch = table.controller.notch
     tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
     if table.robustness is not None and table.robustness.min_friction_margin is not None:
         designed, certified = fields["min_friction_margin"], table.robustness.min_friction_margin
         fields["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
-    return ControllerSpec(**fields, notch=tuned, prefilter=prefilter)
+    return ControllerSpec(**fields, notch=tuned, prefilter=prefilter, link_feedforward=link)
 
 
 def _read_table(source: Path) -> ProblemTable:

@@ -390,6 +390,15 @@ class PrefilterTable(_Strict):
     damping: Number | None = None
 
 
+class LinkFeedforwardTable(_Strict):
+    """The effort that the link's measured motion needs."""
+
+    measured: str | None = None
+    fraction: Number | None = None
+    corner_hz: Number | None = None
+    high_pass_hz: Number | None = None
+
+
 def _limit(name: str) -> Any:
     """Return the field of a limit, with default and description of its row."""
     return Field(default=BY_NAME[name].default, description=BY_NAME[name].description)
@@ -441,6 +450,7 @@ class ControllerTable(_Strict):
     structure: Literal["pd", "pid", "pid_dob", "cascade", "mpc"] = "pid"
     speed_loop: Literal["P", "PI"] = "P"
     notch: Flag | NotchTable = False
+    link_feedforward: Flag | LinkFeedforwardTable = False
     prefilter: Literal["first_order", "second_order"] | PrefilterTable | None = None
     compensate: Compensated = []
     reference_weights: Literal["tuned", "error", "measurement"] = "tuned"

@@ -42,8 +42,8 @@ def assess(
         `seaopt.control.parallel_pid`, `ideal_pid`, or what `Law.from_control` takes. A law to the command itself (A) is
         divided by the command for one unit of effort: `law.scaled(1/command_of(plant, params, measured).per_effort)`.
     spec : ControllerSpec
-        Limits, and the bandwidth that the law should have at least; its structure, notch, prefilter and
-        reference_weights are those of no law, and its sample rate must be the law's.
+        Limits, and the bandwidth that the law should have at least; its structure, notch, prefilter,
+        link_feedforward and reference_weights are those of no law, and its sample rate must be the law's.
     robust_to, draws
         As in `tune`.
 
@@ -86,7 +86,12 @@ def assess(
         )
     given = replace(given, sample_time_s=spec.sample_time_s)
     spec = replace(
-        settle_delay(spec, plant, params), structure=CUSTOM, notch=None, prefilter=None, reference_weights="tuned"
+        settle_delay(spec, plant, params),
+        structure=CUSTOM,
+        notch=None,
+        prefilter=None,
+        link_feedforward=None,
+        reference_weights="tuned",
     )
     values = params.parameters if isinstance(params, Fit) else params
     task = make_task(plant, plant.complete(values), spec, robust_to or {}, draws)

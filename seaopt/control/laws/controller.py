@@ -21,6 +21,7 @@ from seaopt.control.laws.verdict import (
     shorten_blocked,
 )
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
@@ -109,6 +110,8 @@ class Controller:
         None, and `achieved` is the worst of the responses in its discs.
     outer : OuterLoop or None
         What makes the reference of a stiffness and a damping at the link (`seaopt.control.add_impedance`).
+    link : LinkPath or None
+        What is fed forward of the link's motion.
     reads : tuple of str
         The outputs that the law reads, one for each of its columns; those of the specification where it is empty.
     compensation : Compensation or None
@@ -137,6 +140,7 @@ class Controller:
     friction: FrictionMargin | None = None
     measured: tuple[MeasuredFigures, ...] = ()
     outer: OuterLoop | None = None
+    link: LinkPath | None = None
     reads: tuple[str, ...] = ()
     compensation: Compensation | None = None
 
@@ -160,8 +164,8 @@ class Controller:
 
         Filter and integral are those of the gains where they make the law; of another law they are read off the law.
         """
-        gains, law, ts = self.gains, self.law, self.sample_time_s
-        made = Gains.from_names(gains, self.observer, self.speed_loop) if set(LAW_GAINS) <= set(gains) else None
+        law, ts = self.law, self.sample_time_s
+        made = self._own_gains()
         if made is not None and made.makes(law, self.spec.structure):
             filter_samples = made.T_f / ts if made.k_d else np.inf
             integral = made.integral_rad_s if self.structure != "pd" and made.k_i else np.inf
@@ -188,7 +192,14 @@ class Controller:
     @property
     def prefilter(self) -> Prefilter | None:
         """The low-pass of the reference, with its numbers; None without one."""
-        return Gains.from_names(self.gains, self.observer, self.speed_loop).prefilter if self.gains else None
+        gains = self._own_gains()
+        return None if gains is None else gains.prefilter
+
+    def _own_gains(self) -> Gains | None:
+        """Return the gains with what else the law is made of; None of a custom law."""
+        if not set(LAW_GAINS) <= set(self.gains):
+            return None
+        return Gains.from_names(self.gains, self.observer, self.speed_loop, self.link)
 
     @property
     def bandwidth_without_prefilter_hz(self) -> float | None:
@@ -196,10 +207,11 @@ class Controller:
 
         None without a prefilter, of a loop that never falls to -3 dB, and of a measured design plant.
         """
-        if self.prefilter is None or self.design is None:
+        gains = self._own_gains()
+        if gains is None or gains.prefilter is None or self.design is None:
             return None
-        bare = replace(Gains.from_names(self.gains, self.observer, self.speed_loop), prefilter=None)
-        loop = replace(self.close(*self.design), law=bare.law(self.spec.structure, self.sample_time_s))
+        law = replace(gains, prefilter=None).law(self.spec.structure, self.sample_time_s)
+        loop = replace(self.close(*self.design), law=law)
         return loop.figures().bandwidth_hz
 
     @property
@@ -248,8 +260,17 @@ class Controller:
         return (
             *lifted, *vague, *self._friction_notes(), *actuation_notes(plant, self.command),
             *limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None),
-            *self._noise_notes(), *self._slow_notes(),
+            *self._link_notes(), *self._noise_notes(), *self._slow_notes(),
         )  # fmt: skip
+
+    def _link_notes(self) -> tuple[str, ...]:
+        """Say what is fed forward of the link's motion, and what noise on it makes."""
+        if self.link is None:
+            return ()
+        called, noise = self.command.mechanics, self.achieved.other_noise_gains[-1:]
+        made = "".join(f"; 1e-6 {self.link.unit} of noise on it makes up to {1e-6 * gain:.3g} {called.unit} of motor "
+                       f"{called.word}, less with a lower corner_hz" for gain in noise)  # fmt: skip
+        return (f"{self.link.describe()}{made}",)
 
     def _slow_notes(self) -> tuple[str, ...]:
         """Say that a step is long in arriving, which no limit forbids and friction makes longer."""
@@ -308,10 +329,14 @@ class Controller:
         scale = self.command.per_effort
         return {name: (scale * value, units[name]) for name, value in self.gains.items() if name in units}
 
+    def see(self, plant: Plant) -> Plant:
+        """Return a plant with every signal that the law reads: a link that is held does not move."""
+        return plant if self.link is None else self.link.see(plant)
+
     def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
         """Return a plant as this controller sees it: from effort, through its own command per effort."""
         return sample(
-            plant,
+            self.see(plant),
             params,
             self.signals,
             self.command.per_effort,
@@ -369,6 +394,7 @@ class Controller:
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
             "observer": self._observer_dict(),
             "heat": self._heat_dict(),
+            "link_feedforward": None if self.link is None else asdict(self.link),
             "impedance": None if self.outer is None else asdict(self.outer),
             "compensation": None if self.compensation is None else self.compensation.to_dict(),
             "blocked_by": list(self.blocked_by),
@@ -420,6 +446,8 @@ class Controller:
         stored = read_controller(content)
         if isinstance(plant, MeasuredResponse):
             return cls._on_measured(stored, content, plant, params)
+        link: LinkPath | None = stored["link"]
+        plant = plant if link is None else link.see(plant)
         measured = plant.outputs.get(stored["spec"].regulated, "")
         stored["command"] = replace(
             stored["command"], largest=find_range(plant, params),

@@ -23,6 +23,7 @@ from seaopt.control.laws.structures import (
     SpeedLoop,
     Structure,
 )
+from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward
 from seaopt.control.loops.measured.plant import MeasuredPlant, sample_measured
 from seaopt.control.loops.sampled_plant import Measured, list_names
 from seaopt.errors import ControlError, suggestion
@@ -59,6 +60,9 @@ class ControllerSpec:
         friction sticks.
     notch : Notch, optional
         A notch in series; fields that are None are tuned.
+    link_feedforward : LinkFeedforward, optional
+        The effort that the link's measured motion needs, added to that of the law, from the model of the first plant
+        whose link moves (`seaopt.control.loops.compensation.link_feedforward`).
     prefilter : {"first_order", "second_order"} or Prefilter, optional
         A low-pass of the reference alone, tuned with the gains; of a `Prefilter` fields that are None are. bandwidth_hz
         and all limits hold with it.
@@ -118,6 +122,7 @@ class ControllerSpec:
     structure: Structure = "pid"
     speed_loop: SpeedLaw = "P"
     notch: Notch | None = None
+    link_feedforward: LinkFeedforward | None = None
     prefilter: PrefilterOrder | Prefilter | None = None
     reference_weights: ReferenceWeights = "tuned"
     sample_rate_hz: float = 1000.0
@@ -211,6 +216,7 @@ class ControllerSpec:
             BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
         self._check_notch()
         self._check_prefilter()
+        self._check_link_feedforward()
         self._check_band()
         if self.step_N is not None and not self.step_N > 0.0:
             raise ControlError(
@@ -260,6 +266,23 @@ class ControllerSpec:
         numbers = {"corner_hz": chosen.corner_hz, "damping": chosen.damping}
         _check_numbers("prefilter", numbers, {"corner_hz": HIGHEST_CORNER * self.sample_rate_hz, "damping": 10.0})
 
+    def _check_link_feedforward(self) -> None:
+        asked = self.link_feedforward
+        if asked is None:
+            return
+        if not isinstance(asked, LinkFeedforward):
+            raise ControlError(
+                f"link_feedforward = {asked!r} is a {type(asked).__name__}; give a LinkFeedforward, in a file "
+                "link_feedforward = true"
+            )
+        numbers = {"fraction": asked.fraction, "corner_hz": asked.corner_hz, "high_pass_hz": asked.high_pass_hz or None}
+        highest = HIGHEST_CORNER * self.sample_rate_hz
+        _check_numbers("link_feedforward", numbers, {"fraction": 2.0, "corner_hz": highest, "high_pass_hz": highest})
+        if asked.measured is not None and asked.measured in list_names(self.measured):
+            raise ControlError(
+                f'link_feedforward.measured = "{asked.measured}" is fed back already; measure the link\'s motion'
+            )
+
     @property
     def reference_filter(self) -> Prefilter | None:
         """The prefilter with its fields; None without one."""
@@ -273,7 +296,8 @@ class ControllerSpec:
 
     def find_speed_loop(self, reads: tuple[str, ...]) -> SpeedLoop | None:
         """Return what the speed loop of a cascade reads, of the outputs that its law reads; None without one."""
-        return SpeedLoop(differenced=reads != list_names(self.measured)) if self.structure == CASCADE else None
+        names = list_names(self.measured)
+        return SpeedLoop(differenced=reads[: len(names)] != names) if self.structure == CASCADE else None
 
     @property
     def loop_delay_samples(self) -> int:
@@ -335,7 +359,9 @@ class ControllerSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        filters = {"notch": self.notch, "prefilter": self.reference_filter}
+        filters = {
+            "notch": self.notch, "prefilter": self.reference_filter, "link_feedforward": self.link_feedforward
+        }  # fmt: skip
         stated = {name: None if one is None else asdict(one) for name, one in filters.items()}
         return values | stated | {"delay_samples": self.loop_delay_samples}
 

@@ -26,6 +26,7 @@ from seaopt.control.laws.structures import (
 )
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
+from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward, LinkPath
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.figures import MeasuredFigures
@@ -233,6 +234,19 @@ class StoredCompensation(ResultTable):
         return Compensation(sample_time_s=sample_time_s, friction=friction)
 
 
+class StoredLinkPath(ResultTable):
+    """What is fed forward of the link's motion."""
+
+    measured: str
+    unit: str
+    inertia: Finite
+    damping: Finite
+    is_speed: Flag
+    fraction: Finite
+    corner_hz: Annotated[Finite, Field(gt=0.0)]
+    high_pass_hz: Annotated[Finite, Field(ge=0.0)]
+
+
 class StoredController(ResultTable):
     """A controller.json."""
 
@@ -255,6 +269,7 @@ class StoredController(ResultTable):
     measured_responses: list[StoredMeasured] = []
     impedance: StoredOuterLoop | None = None
     compensation: StoredCompensation | None = None
+    link_feedforward: StoredLinkPath | None = None
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -275,12 +290,15 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         stated = f"is {table.sample_time_s:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}"
         raise _contradict("sample_time_s", stated)
     law = table.law.build(spec.sample_time_s)
-    reads = _check_measured(table, spec, law)
+    link = None if table.link_feedforward is None else LinkPath(**table.link_feedforward.model_dump())
+    if (link is None) != (spec.link_feedforward is None):
+        raise _contradict("link_feedforward", "is not that of spec.link_feedforward")
+    reads = _check_measured(table, spec, law, link)
     observer = None if table.observer is None else table.observer.build(spec.sample_time_s)
     outer = None if table.impedance is None else OuterLoop(**table.impedance.model_dump())
     if outer is not None and not abs(outer.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
         raise _contradict("impedance.sample_time_s", f"is {outer.sample_time_s:g}, and the law has another")
-    _check_gains(table.gains, observer, spec, law, reads)
+    _check_gains(table.gains, observer, spec, law, reads, link)
     for name, stated in table.engineering.items():
         expected = table.command.per_effort * table.gains.get(name, np.nan)
         if not abs(stated.value - expected) <= AGREES * abs(expected):
@@ -291,7 +309,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "structure": spec.structure, "gains": table.gains, "sample_time_s": table.sample_time_s,
         "delay_samples": table.delay_samples, "command": _build_command(table.command), "spec": spec,
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
-        "observer": observer, "reads": reads, "blocked_by": tuple(table.blocked_by),
+        "observer": observer, "link": link, "reads": reads, "blocked_by": tuple(table.blocked_by),
         "measured": tuple(one.build() for one in table.measured_responses),
         "outer": outer,
         "compensation": None if table.compensation is None else table.compensation.build(spec.sample_time_s),
@@ -299,11 +317,14 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _check_measured(table: StoredController, spec: ControllerSpec, law: Law) -> tuple[str, ...]:
+def _check_measured(
+    table: StoredController, spec: ControllerSpec, law: Law, link: LinkPath | None
+) -> tuple[str, ...]:  # fmt: skip
     """Return the outputs that the law reads, where they are not those of the specification; refuse another number."""
     names = list_names(spec.measured)
     reads = names if table.measured is None else tuple(table.measured)
-    if len(reads) != len(names) or reads[0] != names[0]:
+    further = () if link is None else (link.measured,)
+    if len(reads) != len(names) + len(further) or reads[0] != names[0] or reads[len(names) :] != further:
         raise _contradict("measured", f"is {list(reads)}, and spec.measured {list(names)}")
     if law.d.size != 1 + len(reads):
         raise _contradict("law", f"has {law.d.size} inputs, and reference and measured are {1 + len(reads)}")
@@ -328,6 +349,8 @@ def _build_spec(stored: StoredSpec) -> tuple[ControllerSpec, tuple[str, ...]]:
             fields["notch"] = Notch(**fields["notch"])
         if isinstance(fields.get("prefilter"), Mapping):
             fields["prefilter"] = Prefilter(**fields["prefilter"])
+        if fields.get("link_feedforward") is not None:
+            fields["link_feedforward"] = LinkFeedforward(**fields["link_feedforward"])
         return ControllerSpec(**fields), tuple(stored.robust_to)
     except (ControlError, TypeError, ValueError) as error:
         raise FileError(f"controller.json: spec: {error}; {TUNE_AGAIN}") from error
@@ -339,6 +362,7 @@ def _check_gains(
     spec: ControllerSpec,
     law: Law,
     reads: tuple[str, ...],
+    link: LinkPath | None,
 ) -> None:
     """Refuse gains that do not give the law."""
     if spec.structure == CUSTOM:
@@ -361,7 +385,7 @@ def _check_gains(
         observer is not None and gains["T_q"] != observer.T_q
     ):
         raise _contradict("observer", "is not that of structure and gains")
-    if not Gains.from_names(gains, observer, speed).makes(law, spec.structure):
+    if not Gains.from_names(gains, observer, speed, link).makes(law, spec.structure):
         raise _contradict("law", "is not what gains, observer and spec give")
 
 

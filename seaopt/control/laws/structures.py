@@ -78,6 +78,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.laws.assembly import Assembly
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -357,6 +358,8 @@ class Gains:
         With a value in every field that they use.
     inner : InnerLoop, optional
         Of a cascade.
+    link : LinkPath, optional
+        What is fed forward of the link's motion, the last signal read.
 
     """
 
@@ -370,6 +373,7 @@ class Gains:
     notch: Notch | None = None
     inner: InnerLoop | None = None
     prefilter: Prefilter | None = None
+    link: LinkPath | None = None
 
     @property
     def integral_rad_s(self) -> float:
@@ -395,9 +399,10 @@ class Gains:
 
     @classmethod
     def from_names(
-        cls, numbers: Mapping[str, float], observer: DisturbanceObserver | None = None, speed: SpeedLoop | None = None
-    ) -> Gains:
-        """Return the gains of `by_name`; those of an observer are its own, and what a speed loop reads is given."""
+        cls, numbers: Mapping[str, float], observer: DisturbanceObserver | None = None, speed: SpeedLoop | None = None,
+        link: LinkPath | None = None,
+    ) -> Gains:  # fmt: skip
+        """Return the gains of `by_name`; observer, what a speed loop reads and link are given."""
         notch = inner = prefilter = None
         if PREFILTER in numbers:
             damping = numbers.get("prefilter_damping")
@@ -411,7 +416,7 @@ class Gains:
             notch = Notch(**{field.name: numbers[f"notch_{field.name}"] for field in fields(Notch)})
         return cls(
             **{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch, inner=inner,
-            prefilter=prefilter,
+            prefilter=prefilter, link=link,
         )  # fmt: skip
 
     def makes(self, law: Law, structure: Structure) -> bool:
@@ -444,7 +449,8 @@ class Gains:
             law = law.through(TransferFunction(num=over / under[0], den=under / under[0]))
         if self.prefilter is not None:
             law = law.with_reference_behind(*self.prefilter.filters(sample_time_s))
-        return law.law(sample_time_s)
+        made = law.law(sample_time_s)
+        return made if self.link is None else made.reading(self.link.feedback(sample_time_s))
 
 
 def _factors(roots: Complex[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:

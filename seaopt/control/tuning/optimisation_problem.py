@@ -65,6 +65,7 @@ from seaopt.control.loops.absolute_stability import (
     friction_margin,
     limit_feedback,
 )
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, Loop, LoopFigures
@@ -210,7 +211,8 @@ class Task:
     those that friction which falls with speed makes grow; `signals` are the outputs that the law reads.
 
     What it reads besides the regulated one has an entry each in `further`: the filter C that feeds it back, which is
-    given, or the `SpeedLoop` that is tuned.
+    given, or the `SpeedLoop` that is tuned. `link` is what the last of them is made of, where that feeds the motion of
+    the link forward.
     """
 
     spec: ControllerSpec
@@ -223,6 +225,7 @@ class Task:
     frictions: tuple[PlantWithFriction, ...] = ()
     signals: tuple[str, ...] = ()
     further: tuple[TransferFunction | SpeedLoop, ...] = ()
+    link: LinkPath | None = None
 
     @property
     def speed_loop(self) -> SpeedLoop | None:
@@ -347,7 +350,10 @@ class Task:
 
     def law_of(self, x: LawNumbers) -> Law:
         """Return the law of a vector, not balanced."""
-        law = self.gains(x).law(self.spec.structure, self.spec.sample_time_s)
+        return self._make_law(self.gains(x))
+
+    def _make_law(self, gains: Gains) -> Law:
+        law = gains.law(self.spec.structure, self.spec.sample_time_s)
         for one in self.further:
             law = law if isinstance(one, SpeedLoop) else law.reading(one)
         return law
@@ -358,8 +364,7 @@ class Task:
 
     def is_stable(self, x: LawNumbers) -> bool:
         """Tell whether every plant's loop is stable: by its eigenvalues, or by the turns of a measured one."""
-        loop_gains = replace(self.gains(x), prefilter=None)  # which is no part of the loop
-        law = loop_gains.law(self.spec.structure, self.spec.sample_time_s)
+        law = self._make_law(replace(self.gains(x), prefilter=None))  # which is no part of the loop
         return all(close_plant(plant, law).is_stable() for plant in self.plants)
 
     def grid(self, f: Float[np.ndarray, " m"], rows: Sequence[int] | None = None) -> Grid:

@@ -24,7 +24,7 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import CASCADE, CUSTOM, DisturbanceObserver, Nominal
+from seaopt.control.laws.structures import CASCADE, CUSTOM, DisturbanceObserver, Nominal, SpeedLoop
 from seaopt.control.laws.verdict import (
     PossibleBandwidths,
     explain_broken,
@@ -32,6 +32,12 @@ from seaopt.control.laws.verdict import (
     list_active,
     list_broken,
     list_broken_limits,
+)
+from seaopt.control.loops.compensation.link_feedforward import (
+    LinkPath,
+    limit_fraction,
+    model_link_path,
+    name_link_signal,
 )
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law, make_static_law
@@ -41,6 +47,7 @@ from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DigitalPlant, find_signals, list_names, sample
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.optimisation_problem import (
@@ -73,6 +80,10 @@ from seaopt.plants.motor.thermal import rate_motor
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
 
+FRACTION_FREQUENCIES = 1500
+NO_FORCE = 0.02  # of the design plant's static gain: where the force answers less, the feedback does next to nothing
+LOWER_FRACTIONS = 4  # by a fifth each
+USUAL_MS = 1.7  # that the fraction of a feedforward is chosen for where no Ms is asked
 SOLUTION, BANDWIDTHS = 1.0, 2.0  # of the time of a tune that is not possible as asked
 
 RobustTo = Mapping[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse]
@@ -152,6 +163,7 @@ def tune(
     check_current(spec, task.k_ff, command, {} if model is not plant else find_dry_friction(model, values))
     solving, seeking, again = divide(progress, SOLUTION * (8.0 if task.asks_margin else 1.0), BANDWIDTHS, SOLUTION)
     x, loops = solve(task, progress=solving)
+    task, x, loops = _lower_fraction(task, x, loops)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
     if broken - {FRICTION}:  # of a margin alone it is known what can be had
         possible, near = _find_possible(task, x, seeking, stable="stability" not in broken)
@@ -238,6 +250,10 @@ def make_task(
     else:
         named["design plant"] = (plant, values)
     named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in models_given.items()}
+    link = _find_link(spec, named, bool(first or seen), gain)
+    if link is not None:
+        named = {name: (link.see(model), given) for name, (model, given) in named.items()}
+        design, signals = link.see(design), (*signals, link.measured)
     varied = {parameter for draw in draws for parameter in draw}
     models: dict[str, tuple[Plant, CompletedParameters]] = {}
     design_states = 1 if first else len(split_friction({"": design}, values, varied))
@@ -267,13 +283,17 @@ def make_task(
         nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
         port = None if spec.passive_band_hz is None else port_of(pairs[0][1][0], values, signals, gain)
     speed_loop = spec.find_speed_loop(signals)
+    further: tuple[TransferFunction | SpeedLoop, ...] = () if speed_loop is None else (speed_loop,)
+    if link is not None:
+        link = _limit_fraction(link, spec, plants)
+        further = (*further, link.feedback(spec.sample_time_s))
     frictions = _find_friction(
         spec, signals, [pair for _, pair in pairs], plants[len(first) :], whole, gain, len(first)
     )  # fmt: skip
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
         design_states=design_states, signals=signals, frictions=frictions,
-        further=() if speed_loop is None else (speed_loop,),
+        further=further, link=link,
     )  # fmt: skip
 
 
@@ -293,11 +313,83 @@ def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
             f'measured = {[first, name]}: a cascade reads the motor\'s speed second, and "{name}" is not that of '
             f'{design.name}; give measured = ["{first}", "{speed}"]'
         )
+    _refuse_limits(spec, 'structure = "cascade"', 'give structure = "pid"')
+
+
+def _find_link(
+    spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], sees_responses: bool, per_effort: float
+) -> LinkPath | None:
+    """Return the path from the link's motion, of the first plant whose link moves; None where none is asked.
+
+    Raises
+    ------
+    ControlError
+        No plant has such a signal, or one is a measured response; or a limit is asked that such a law has not.
+
+    """
+    asked = spec.link_feedforward
+    if asked is None:
+        return None
+    _refuse_limits(spec, "link_feedforward", "leave link_feedforward out")
+    if sees_responses:
+        raise ControlError(
+            "link_feedforward reads the link's motion, which a measured response does not have; leave the measured "
+            "responses out, or link_feedforward"
+        )
+    for model, values in named.values():
+        if name_link_signal(asked, model) is not None:
+            return model_link_path(
+                asked, model, values, spec.regulated, per_effort, spec.bandwidth_hz
+            )  # fmt: skip
+    missing = "link motion" if asked.measured is None else f'output "{asked.measured}" that is its link\'s motion'
+    raise ControlError(
+        f"link_feedforward: none of {', '.join(named)} has a {missing}; name a plant whose link moves in robust_to, "
+        'as robust_to = ["swing"]'
+    )
+
+
+def _limit_fraction(link: LinkPath, spec: ControllerSpec, plants: Sequence[DigitalPlant | MeasuredPlant]) -> LinkPath:
+    """Return the path with the largest fraction that may be, where none is asked."""
+    if spec.link_feedforward is None or spec.link_feedforward.fraction is not None:
+        return link
+    models = [plant for plant in plants if isinstance(plant, DigitalPlant)]
+    f = np.geomspace(0.1 * OBJECTIVE_HZ, spec.bandwidth_hz, FRACTION_FREQUENCIES)
+    regulated, motions = (
+        np.array(part) for part in zip(*(plant.responses(f)[[0, -1]] for plant in models), strict=True)
+    )
+    beyond = np.abs(regulated) < NO_FORCE * abs(models[0].static_gain)
+    largest = (spec.level("max_sensitivity") or USUAL_MS) * (1.0 - spec.reserve)
+    return replace(link, fraction=limit_fraction(link, motions, beyond, f, spec.sample_time_s, largest))
+
+
+def _lower_fraction(
+    task: Task, x: LawNumbers, loops: list[MeasuredLoop]
+) -> tuple[Task, LawNumbers, list[MeasuredLoop]]:
+    """Return task, numbers and loops with as large a fraction of the link's feedforward as keeps the limits.
+
+    It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is zero, as
+    nothing shows then which one misses them least.
+    """
+    asked, link = task.spec.link_feedforward, task.link
+    if asked is None or asked.fraction is not None or link is None:
+        return task, x, loops
+    for power in range(LOWER_FRACTIONS + 1):
+        if not list_broken_limits(task.spec, loops, task.design_states):
+            break
+        share = 0.8 ** (power + 1) if power < LOWER_FRACTIONS else 0.0
+        lower = replace(link, fraction=round(share * link.fraction, 3))
+        task = replace(task, link=lower, further=(*task.further[:-1], lower.feedback(task.spec.sample_time_s)))
+        x, loops = solve(task)
+    return task, x, loops
+
+
+def _refuse_limits(spec: ControllerSpec, what: str, remedy: str) -> None:
+    """Refuse the limits that are not yet those of a law which reads further signals."""
     for limit in (PASSIVE, FRICTION):
         if getattr(spec, limit) not in (None, False):
             raise ControlError(
-                f'{limit} is not yet a limit of structure = "cascade"; leave it out and read what the certificate '
-                'says of it, or give structure = "pid"'
+                f"{limit} is not yet a limit of {what}; leave it out and read what the certificate says of it, or "
+                f"{remedy}"
             )
 
 
@@ -386,6 +478,8 @@ def describe_law(
 ) -> Controller:  # fmt: skip
     """Return the controller of a law whose loops are measured."""
     spec, (plant, params) = task.spec, design
+    if not isinstance(plant, MeasuredResponse) and task.link is not None:
+        plant = task.link.see(plant)
     verdicts = judge_all(spec, loops, task.design_states)
     broken = list_broken(verdicts)
     controller = Controller(
@@ -405,6 +499,7 @@ def describe_law(
         blocked_by=tuple(explain_broken(spec, verdicts, loops[0], close_plant(task.plants[0], law))),
         possible=None if not broken else possible,
         measured=measure_all_discs(task.plants, law, spec.bandwidth_hz),
+        link=task.link,
         reads=() if task.signals == list_names(spec.measured) else task.signals,
     )
     if isinstance(plant, MeasuredResponse):

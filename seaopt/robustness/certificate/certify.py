@@ -177,7 +177,8 @@ def certify(
         )
     asked = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
     min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
-    models, others = _with_design(controller, plants, others or ParameterSet())
+    seen = {name: controller.see(plant) for name, plant in plants.items()}
+    models, others = _with_design(controller, seen, others or ParameterSet())
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
     ranges = _add_warm_winding(ranges or {}, models, parameters, others)
     unknown = combine_uncertainty(parameters, others, ranges, models)

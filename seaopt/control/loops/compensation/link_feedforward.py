@@ -1,0 +1,246 @@
+r"""Feedforward of a link's measured motion: the effort that the motor needs to follow the link with its spring at rest.
+
+A link that moves drags the motor along through the spring, so that a force follows no slow reference where nothing
+holds the link. With the link's motion y as an input, the regulated force of the linear actuator is
+:math:`F = G_{11} u + G_{12} \dot y` (`seaopt.control.loops.port`), and stays as it is where
+
+.. math:: u = -\frac{G_{12}}{G_{11}}\, s\, y = (M s^2 + b s)\, y :
+
+of the actuators here the inertia and the damping of the drive, seen at the link; of others both are fitted from a
+tenth of the bandwidth up to it, and refused where that leaves too much. On what is measured, x, y is a number times x
+or times its integral, and the path is made causal by a low-pass and taken away at low frequencies by a high-pass,
+
+.. math::
+    u = \lambda\, (M s^2 + b s)\, \frac{\omega^2}{s^2 + \sqrt2\, \omega s + \omega^2}\, \frac{s}{s + \omega_h}\, x,
+
+by Tustin's rule, each corner prewarped.
+
+**Why a high-pass and a fraction.** With P_x from effort to x, the loop broken at the command has
+:math:`1 + L = B + P C_y`, :math:`B = 1 - \lambda (M s^2 + b s) P_x \cdots`. Where a link swings freely, at the zero of
+P, all effort moves the drive and none the spring: :math:`(M s^2 + b s) P_x = 1`, :math:`P C_y` is nothing, and
+:math:`S = 1/B = 1/(1 - \lambda)` without a high-pass: Ms of 1.6 leaves a fraction of 0.37. That zero is at a hertz or
+so, below what is followed, and there the high-pass takes the path away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from seaopt.control.loops.port import port_of
+from seaopt.control.loops.sampled_plant import linearise_sets
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
+from seaopt.plants.memo import memo
+from seaopt.plants.roles import Sensing
+from seaopt.records import record
+
+FIT_FREQUENCIES = 12
+LARGEST_MISFIT = 0.2  # of the effort, between a tenth of the bandwidth and it
+FRACTIONS = np.round(np.linspace(0.0, 1.0, 101), 2)
+ROOM = 0.95  # of Ms, that the path alone may use
+OTHER_STATES = 1e-9  # of a signal's slopes: less is rounding
+
+
+@record
+class LinkFeedforward:
+    """Which motion of the link is fed forward, and how; what is None has its default.
+
+    Parameters
+    ----------
+    measured : str, optional
+        The output that is the link's position or speed; the one that the plant states as its `link_position`.
+    fraction : float, optional
+        Of the effort that the model says; where it is left out, as much as the limits were found to leave.
+    corner_hz : float, optional
+        Of the low-pass; the bandwidth. Noise on the signal grows with its square and more.
+    high_pass_hz : float, optional
+        Of the high-pass; a tenth of the bandwidth. Zero for none.
+
+    """
+
+    measured: str | None = None
+    fraction: float | None = None
+    corner_hz: float | None = None
+    high_pass_hz: float | None = None
+
+
+@record
+class LinkPath:
+    """The path from the link's measured motion to the effort.
+
+    Parameters
+    ----------
+    measured, unit : str
+        The signal that is read, and its unit.
+    inertia, damping : float
+        Effort per acceleration and per speed of what is measured; where that is a speed, per its rate and per it.
+    is_speed : bool
+        Whether a speed is measured.
+    fraction : float
+        Of the effort that the model says.
+    corner_hz, high_pass_hz : float
+        Of the low-pass and of the high-pass; a high-pass of zero is none.
+
+    """
+
+    measured: str
+    unit: str
+    inertia: float
+    damping: float
+    is_speed: bool
+    fraction: float
+    corner_hz: float
+    high_pass_hz: float
+
+    def feedback(self, sample_time_s: float) -> TransferFunction:
+        """Return C of u = - C x, in q = 1/z."""
+        delta, double = np.array([1.0, -1.0]), np.array([1.0, 1.0])  # of s = (2/T_s) delta/double
+        rate, w = 2.0 / sample_time_s, math.tan(math.pi * self.corner_hz * sample_time_s)
+        pairs = ((delta, delta), (delta, double), (double, double))
+        squares = np.array([np.convolve(one, other) for one, other in pairs])
+        first = self.inertia * rate, self.damping
+        numbers = (0.0, *first) if self.is_speed else (first[0] * rate, first[1] * rate, 0.0)
+        num = w * w * (np.array(numbers) @ squares)
+        den = squares[0] + math.sqrt(2.0) * w * squares[1] + w * w * squares[2]
+        if self.high_pass_hz:
+            slow = math.tan(math.pi * self.high_pass_hz * sample_time_s)
+            num, den = np.convolve(num, delta), np.convolve(den, delta + slow * double)
+        return TransferFunction(num=-self.fraction * num / den[0], den=den / den[0])
+
+    def describe(self) -> str:
+        """Say in one line what is fed forward."""
+        per = ("its rate", "it") if self.is_speed else ("its acceleration", "its speed")
+        low = f"from {self.high_pass_hz:.3g} " if self.high_pass_hz else ""
+        return (
+            f"link feedforward of {self.measured} [{self.unit}], {low}to {self.corner_hz:.3g} Hz: "
+            f"{100 * self.fraction:.3g} % of {self.inertia:.4g} times {per[0]} and {self.damping:.4g} times {per[1]}"
+        )
+
+    def see(self, plant: Plant) -> Plant:
+        """Return a plant with the signal among its outputs: it is zero where the plant holds its link."""
+        return plant if self.measured in plant.outputs else _hold_output(plant, self.measured, self.unit)
+
+
+@memo
+def _hold_output(plant: Plant, name: str, unit: str) -> Plant:
+    """Return a plant with an output that stays at zero."""
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        return {**plant.h(t, x, u, p), name: 0.0}
+
+    sensing = plant.sensing or Sensing(regulated=())
+    still = (*sensing.still, name)
+    return replace(plant, h=h, outputs={**plant.outputs, name: unit}, sensing=replace(sensing, still=still))
+
+
+def name_link_signal(asked: LinkFeedforward, plant: Plant) -> str | None:
+    """Return the output of a plant that is its link's motion; None where it holds its link, or has another."""
+    sensing = plant.sensing
+    name = asked.measured or (None if sensing is None else sensing.link_position)
+    moves = plant.port is not None and plant.port.motion is not None
+    return name if moves and name in plant.outputs else None
+
+
+def model_link_path(
+    asked: LinkFeedforward, plant: Plant, params: ParameterSet, regulated: str, per_effort: float, bandwidth_hz: float
+) -> LinkPath:
+    """Return the path of a plant whose link moves, of a fraction of 1 where none is asked.
+
+    Raises
+    ------
+    ControlError
+        What is measured is not the link's position or speed, or the effort is not that of an inertia and a damper.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> swing, thor = so.plants.moving_output(), so.plants.thor()
+    >>> path = model_link_path(LinkFeedforward(), swing, thor, "F1", 1.0, 30.0)
+    >>> print(path.measured, f"{path.inertia:.1f} kg, {path.damping:.0f} N s/m")  # -J/r^2 and -b_r/r^2
+    x_2 -294.0 kg, -11636 N s/m
+
+    """
+    name = name_link_signal(asked, plant)
+    assert name is not None, "the plant has been asked"
+    sliding = take_sliding(plant, params)
+    values = sliding.complete(params)
+    per_signal, is_speed = _relate(sliding, values, name, per_effort)
+    f = np.geomspace(0.1 * bandwidth_hz, bandwidth_hz, FIT_FREQUENCIES)
+    response = port_of(sliding, values, regulated, per_effort).response(f)
+    inertia, damping = _fit(-response.motion_to_feedback / response.motor_to_feedback, f, plant.name)
+    return LinkPath(
+        measured=name, unit=plant.outputs[name], inertia=per_signal * inertia, damping=per_signal * damping,
+        is_speed=is_speed, fraction=1.0 if asked.fraction is None else asked.fraction,
+        corner_hz=asked.corner_hz or bandwidth_hz,
+        high_pass_hz=0.1 * bandwidth_hz if asked.high_pass_hz is None else asked.high_pass_hz,
+    )  # fmt: skip
+
+
+def _relate(plant: Plant, params: ParameterSet, name: str, per_effort: float) -> tuple[float, bool]:
+    """Return how far the port moves per unit of a signal, and whether the signal is a speed."""
+    port = plant.port
+    assert port is not None and port.motion is not None
+    (_, _, c, _), _ = linearise_sets(plant, [plant.complete(params)], (port.motion, name), per_effort)
+    states, (place, signal) = list(plant.states), c[0]
+    own = [states.index(state) for state in (port.coordinate, port.rate) if state is not None]
+    others = np.delete(signal, own)
+    speed = signal[own[1]] if len(own) > 1 else 0.0
+    position = signal[own[0]]
+    if np.any(np.abs(others) > OTHER_STATES * np.max(np.abs(signal))) or (position != 0.0) == (speed != 0.0):
+        raise ControlError(
+            f'link_feedforward: measured = "{name}" of {plant.name} is not its link\'s position or speed alone; '
+            f'measure the link: link_feedforward = {{ measured = "{port.motion}" }}'
+        )
+    return float(place[own[0]] / (position or speed)), bool(position == 0.0)
+
+
+def _fit(effort: Complex[np.ndarray, " m"], f: Float[np.ndarray, " m"], name: str) -> tuple[float, float]:
+    """Return inertia and damping of an effort per speed, by least squares."""
+    s = 2j * np.pi * f
+    terms = np.column_stack([s, np.ones_like(s)]) / np.abs(effort)[:, None]
+    seen = effort / np.abs(effort)
+    rows, wanted = np.vstack([terms.real, terms.imag]), np.concatenate([seen.real, seen.imag])
+    scale = np.linalg.norm(rows, axis=0)
+    inertia, damping = np.linalg.lstsq(rows / scale, wanted, rcond=None)[0] / scale
+    misfit = float(np.max(np.abs(terms @ np.array([inertia, damping]) - seen)))
+    if misfit > LARGEST_MISFIT:
+        raise ControlError(
+            f"link_feedforward: the effort that moves the drive of {name} is not that of an inertia and a damper, by "
+            f"{100 * misfit:.0f} %: leave link_feedforward out, or command a current"
+        )
+    return float(inertia), float(damping)
+
+
+def limit_fraction(
+    path: LinkPath, motions: Complex[np.ndarray, "n m"], beyond: Bool[np.ndarray, "n m"], f: Float[np.ndarray, " m"],
+    sample_time_s: float, max_sensitivity: float,
+) -> float:  # fmt: skip
+    """Return the largest fraction, in hundredths, that leaves Ms where the loop has next to nothing but the path.
+
+    Parameters
+    ----------
+    path : LinkPath
+        Of any fraction.
+    motions : array, shape (n, m)
+        Responses of what is measured, from the command, of every plant.
+    beyond : array, shape (n, m)
+        Where the regulated force does not answer to the command, so that S is 1/B.
+    f
+        Frequencies in Hz.
+    sample_time_s, max_sensitivity
+        Of the loop.
+
+    """
+    whole = replace(path, fraction=1.0).feedback(sample_time_s).response(f, sample_time_s) * motions
+    least = np.array([np.min(np.abs(1.0 + share * whole), where=beyond, initial=np.inf) for share in FRACTIONS])
+    broken = np.flatnonzero(least < 1.0 / (ROOM * max_sensitivity))
+    return float(FRACTIONS[broken[0] - 1] if broken.size else FRACTIONS[-1])

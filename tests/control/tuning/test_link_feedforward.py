@@ -1,0 +1,189 @@
+"""Feedforward of the link's motion, against THOR's swing from its equations of motion, with a loop closed by hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import seaopt as so
+from seaopt.control import LinkFeedforward, runnable
+from seaopt.control.loops.loop import Loop
+from seaopt.errors import ControlError, FileError
+from seaopt.files import to_json
+from seaopt.problem import read_problem
+from tests.c_code import CompiledLaw
+
+TS, DELAY = 1e-3, 1
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, min_sensitivity_bandwidth_hz=6)
+
+
+@pytest.fixture(scope="module")
+def fed():
+    """Return a controller with feedforward, of the fraction that the tuner finds."""
+    spec = replace(SPEC, link_feedforward=LinkFeedforward())
+    return so.tune(so.plants.high_impedance(), so.plants.thor(), spec, {"swing": so.plants.moving_output()})
+
+
+def sample_swing(**changes):
+    """Return A, B of the swing under a motor force at 1 kHz, states q, phi and rates; and the rows of F1 and x_2."""
+    thor = so.plants.thor().update(**changes)
+    k, m_l, I_p, m, L, L_a, J, b_r = (thor[name].value for name in ("k", "m_l", "I_p", "m", "L", "L_a", "J", "b_r"))
+    r = thor["l"].value / (2 * np.pi * thor["N_p"].value)
+    mass = np.array([[J / r**2 + m_l, m_l * L_a], [m_l * L_a, I_p + m_l * L_a**2]])
+    stiffness = k * np.outer([1.0, L_a], [1.0, L_a]) + np.diag([0.0, m * 9.81 * L])
+    a = np.zeros((5, 5))
+    a[:2, 2:4] = np.eye(2)
+    a[2:4, :2] = -np.linalg.solve(mass, stiffness)
+    a[2:4, 2:4] = -np.linalg.solve(mass, np.diag([b_r / r**2, 0.0]))
+    a[2:4, 4] = np.linalg.solve(mass, [1.0, 0.0])
+    held = expm(a * TS)
+    return held[:4, :4], held[:4, 4], np.array([[k, k * L_a, 0.0, 0.0], [0.0, L_a, 0.0, 0.0]])
+
+
+def close_by_hand(controller, f, inertia, damping, **changes):
+    """Return F1/F_ref and S of the swing from the gains and the numbers of the path alone."""
+    a, b, rows = sample_swing(**changes)
+    q = np.exp(-2j * np.pi * f * TS)
+    p, p_x = np.array([rows @ np.linalg.solve(z * np.eye(4) - a, b) for z in 1 / q]).T * q**DELAY
+    g, s = controller.gains, (1 - q) / (1 + q)
+    rate = (1 - q) / (g["T_f"] + TS - q * g["T_f"])
+    integral = g["k_i"] * TS / 2 * (1 + q) / (1 - q)
+    c_r, c_y = g["k_r"] + integral + g["c"] * g["k_d"] * rate, g["k_p"] + integral + g["k_d"] * rate
+    w, slow = (np.tan(np.pi * hz * TS) for hz in (controller.link.corner_hz, controller.link.high_pass_hz))
+    filters = w**2 / (s**2 + np.sqrt(2) * w * s + w**2) * s / (s + slow)
+    s = s * 2 / TS
+    path = controller.link.fraction * (inertia * s**2 + damping * s) * filters
+    one = 1 + p * c_y - p_x * path
+    return p * c_r / one, 1 / one
+
+
+def find_band(f, tracking):
+    """Return the widest band in which abs(F/F_ref) stays within 3 dB of 1."""
+    inside = (np.abs(tracking) > np.sqrt(0.5)) & (np.abs(tracking) < np.sqrt(2.0))
+    edges = np.flatnonzero(np.diff(np.r_[False, inside, False].astype(int)))
+    return max(((f[low], f[high - 1]) for low, high in edges.reshape(-1, 2)), key=lambda band: band[1] - band[0])
+
+
+def test_the_path_is_the_drives_inertia_and_damping(fed):
+    """The screw turns against the link's motion: J/r^2 and b_r/r^2 with r = l/(2 pi N_p)."""
+    r = 2e-3 / (2 * np.pi * 3)
+    assert (fed.link.measured, fed.link.unit, fed.link.is_speed) == ("x_2", "m", False)
+    assert -fed.link.inertia == pytest.approx(3.31e-6 / r**2, rel=1e-6)
+    assert -fed.link.damping == pytest.approx(1.31e-4 / r**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("changes", [{}, {"J": 3.6e-6, "b_r": 1.18e-4}, {"J": 3.0e-6, "I_p": 0.5}])
+def test_the_swing_follows_from_three_hertz(fed, changes):
+    """With the parameters of the model, and with others behind the same law: band and Ms by hand."""
+    r = 2e-3 / (2 * np.pi * 3)
+    f = np.unique(np.r_[np.geomspace(0.05, 499.0, 6000), np.linspace(0.5, 60.0, 12000)])
+    tracking, s = close_by_hand(fed, f, -3.31e-6 / r**2, -1.31e-4 / r**2, **changes)
+    figures = fed.close(so.plants.moving_output(), so.plants.thor().update(**changes)).figures()
+    assert figures.stable
+    assert figures.tracking_band_hz == pytest.approx(find_band(f, tracking), rel=2e-3)
+    assert figures.ms == pytest.approx(np.max(np.abs(s)), rel=1e-3)
+    assert 2.0 < figures.tracking_band_hz[0] < 4.0
+    if not changes:
+        assert fed.feasible and figures.ms <= 1.6
+        bare = so.tune(so.plants.high_impedance(), so.plants.thor(), SPEC, {"swing": so.plants.moving_output()})
+        assert bare.close(so.plants.moving_output(), so.plants.thor()).figures().tracking_band_hz[0] > 10.0
+
+
+def test_a_slow_reference_is_followed_sample_by_sample(fed):
+    """The stored law on the sampled swing, 5 Hz: within 3 dB, which no law without the path comes to."""
+    a, b, rows = sample_swing()
+    law, n = fed.law, 20_000
+    x, z, waiting = np.zeros(4), np.zeros(law.c.size), [0.0] * DELAY
+    reference, force = np.sin(2 * np.pi * 5.0 * TS * np.arange(n)), np.zeros(n)
+    for step in range(n):
+        seen = rows @ x
+        inputs, force[step] = np.r_[reference[step], seen], seen[0]
+        waiting.append(float(law.c @ z + law.d @ inputs))
+        z = law.a @ z + law.b @ inputs
+        x = a @ x + b * waiting.pop(0)
+    late = slice(n // 2, n)
+    size = np.abs(2 * np.mean(force[late] * np.exp(-2j * np.pi * 5.0 * TS * np.arange(n))[late]))
+    loop = fed.close(so.plants.moving_output(), so.plants.thor())
+    assert size == pytest.approx(abs(loop.tracking(np.array([5.0]))[0]), rel=5e-3)
+    assert np.sqrt(0.5) < size < np.sqrt(2.0)
+
+
+def test_nothing_happens_where_the_link_is_held(fed):
+    stand, thor = so.plants.high_impedance(), so.plants.thor()
+    loop = fed.close(stand, thor)
+    assert fed.signals == ("F1", "x_2") and "x_2" not in stand.outputs
+    alone = replace(fed.law, b=fed.law.b[:, :2], d=fed.law.d[:2])
+    bare = Loop(plant=replace(loop.plant, others=None), law=alone.balanced()).figures()
+    figures = loop.figures()
+    for name in ("ms", "mt", "bandwidth_hz", "noise_gain", "reference_peak"):
+        assert getattr(figures, name) == pytest.approx(getattr(bare, name), rel=1e-6)
+
+
+def test_the_certificate_plays_the_law_on_the_swing(fed):
+    swing, params = so.plants.moving_output(), so.plants.thor().prior(J=1e-10)
+    certificate = so.certify(fed, {"swing": swing}, params, ranges={"I_p": (0.359, 0.361)}, samples=40)
+    assert certificate.passed and certificate.simulated.passed
+    assert {row.plant for row in certificate.simulated.verification.rows} == {"design", "swing"}
+
+
+def test_the_exported_c_reads_the_link(fed, compiler, tmp_path):
+    rng = np.random.default_rng(3)
+    reference, signals = rng.normal(size=300), rng.normal(size=(300, 2)) * [1.0, 1e-6]
+    expected, _ = runnable(fed).run(reference, signals)
+    found = CompiledLaw(compiler, tmp_path, fed, "double").run(reference, signals)
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.max(np.abs(expected)))
+
+
+def test_it_is_stored_and_checked(fed):
+    content = json.loads(to_json(fed.to_dict()))
+    again = so.Controller.from_dict(content, so.plants.high_impedance(), so.plants.thor())
+    assert again.link == fed.link and again.feasible
+    content["link_feedforward"]["inertia"] *= 1.001
+    with pytest.raises(FileError, match="law is not what gains"):
+        so.Controller.from_dict(content, so.plants.high_impedance(), so.plants.thor())
+
+
+@pytest.mark.parametrize(
+    ("asked", "robust", "words"),
+    [
+        (LinkFeedforward(), False, r'robust_to = \["swing"\]'),
+        (LinkFeedforward(measured="q"), True, r'measured = "x_2"'),
+        (LinkFeedforward(measured="F2"), True, r'measured = "x_2"'),
+    ],
+)
+def test_what_is_no_motion_of_a_link_is_refused(stand, swing, thor, asked, robust, words):
+    with pytest.raises(ControlError, match=words):
+        so.tune(stand, thor, replace(SPEC, link_feedforward=asked), {"swing": swing} if robust else {})
+
+
+@pytest.mark.parametrize("changes", [{"fraction": -0.1}, {"corner_hz": 600.0}, {"high_pass_hz": -1.0}])
+def test_numbers_out_of_range_are_refused(changes):
+    with pytest.raises(ControlError, match=rf"link_feedforward\.{next(iter(changes))}"):
+        replace(SPEC, link_feedforward=LinkFeedforward(**changes))
+
+
+def test_the_angle_serves_as_the_position(stand, swing, thor, fed):
+    """The lever arm is in the numbers: 0.0725 m per radian."""
+    spec = replace(SPEC, link_feedforward=LinkFeedforward(measured="phi", fraction=fed.link.fraction))
+    controller = so.tune(stand, thor, spec, {"swing": swing})
+    assert controller.link.inertia == pytest.approx(0.0725 * fed.link.inertia, rel=1e-9)
+    band, other = (one.close(swing, thor).figures().tracking_band_hz for one in (controller, fed))
+    assert band == pytest.approx(other, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("link_feedforward = true", LinkFeedforward()),
+        ('link_feedforward = { measured = "x_2", fraction = 0.5, high_pass_hz = 0 }',
+         LinkFeedforward(measured="x_2", fraction=0.5, high_pass_hz=0.0)),
+    ],
+)  # fmt: skip
+def test_a_problem_file_asks_for_it(tmp_path, line, expected):
+    controller = f'[controller]\nplant = "stand"\nbandwidth_hz = 30\n{line}\n'
+    (tmp_path / "problem.toml").write_text(f'schema = 1\n[plant.stand]\nkind = "high_impedance"\n{controller}')
+    assert read_problem(tmp_path / "problem.toml").spec.link_feedforward == expected
