@@ -2,7 +2,8 @@
 
     python benchmarks/bench_mpc.py
 
-Times are of 10,000 steps over 2,000 random references with sensor noise, and are told over the sample time of 1 ms.
+Times are of 200,000 steps of the exported C in closed loop, references that jump every 50 samples, with noise; and the
+force error with references known ahead.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 import seaopt as so
-from seaopt.control import MPCSpec, close_loop, export_mpc, force_mpc
+from seaopt.control import MPCSpec, close_loop, export_mpc, force_mpc, sample
 from seaopt.control.laws.realisation import runnable
 
 STAND, SWING, THOR = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
-LIMIT_A, BANDWIDTH_HZ, STEPS, TS = 9.0, 30.0, 10_000, 1e-3
+LIMIT_A, BANDWIDTH_HZ, STEPS, TS = 9.0, 30.0, 200_000, 1e-3
 
 
 def laws(*, told=False):
@@ -48,53 +49,116 @@ def compare_steps():
             print(f"{size:8g} N  {name:<28} {run.overshoot:>9.1%} {times[0]:>8} {times[1]:>8} {peak:>10.2f} A")
 
 
-def over_sample(seconds):
-    found = np.array([np.median(seconds), np.percentile(seconds, 99.9), np.max(seconds)]) / TS
-    return "median {:.3f}, 99.9 % {:.3f}, worst {:.3f}".format(*found)
+CASES = {
+    "no slew limit": {"current_slew_A_per_s": None},
+    "2000 A/s": {},
+    "500 A/s": {"current_slew_A_per_s": 500.0},
+    "2000 A/s, speed": {"bounds": {"qd": (-0.05, 0.05)}},
+    "2000 A/s, speed, force": {"bounds": {"qd": (-0.05, 0.05), "F1": (-1800.0, 1800.0)}},
+    "the same, 200 iterations": {"bounds": {"qd": (-0.05, 0.05), "F1": (-1800.0, 1800.0)}, "max_iterations": 200},
+}
+
+# The loop around the exported step: the plant held over a sample, references that jump every 50 samples, noise.
+HARNESS = """
+#define _POSIX_C_SOURCE 199309L
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+#include "force_mpc.h"
+#define N {states}
+#define STEPS {steps}
+static const double A[N][N] = {{{a}}}, B[N] = {{{b}}}, C[N] = {{{c}}};
+static unsigned long long seed = 1;
+static double uniform(void) {{
+  seed = seed * 6364136223846793005ULL + 1442695040888963407ULL;
+  return (double)(seed >> 11) / 9007199254740992.0 * 2 - 1;
+}}
+static double now(void) {{
+  struct timespec t;
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+  return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}}
+static int order(const void *a, const void *b) {{
+  const double *one = a, *other = b;
+  return *one < *other ? -1 : *one > *other;
+}}
+int main(void) {{
+  static force_mpc law;
+  static double took[STEPS];
+  double x[N] = {{0}}, late = 0, reference = 0, sum = 0;
+  int most = 0, unsolved = 0, unfinished = 0;
+  force_mpc_reset(&law);
+  for (int k = 0; k < STEPS; k++) {{
+    if (k % 50 == 0) reference = 2000 * uniform();
+    double y = 0, next[N];
+    for (int i = 0; i < N; i++) y += C[i] * x[i];
+    y += 2 * (uniform() + uniform() + uniform());
+    double began = now();
+    double u = (double)force_mpc_step(&law, (OSQPFloat)reference, (OSQPFloat)y);
+    took[k] = now() - began;
+    sum += took[k];
+    if (law.iterations > most) most = law.iterations;
+    unsolved += !law.solved;
+    unfinished += law.iterations == FORCE_MPC_MAX_ITERATIONS;
+    for (int i = 0; i < N; i++) {{
+      next[i] = B[i] * late;
+      for (int j = 0; j < N; j++) next[i] += A[i][j] * x[j];
+    }}
+    for (int i = 0; i < N; i++) x[i] = next[i];
+    late = u;
+  }}
+  qsort(took, STEPS, sizeof *took, order);
+  printf("%.3f %.3f %.3f %d %g %g\\n", 1e6 * sum / STEPS, 1e6 * took[(int)(0.9999 * STEPS)], 1e6 * took[STEPS - 1],
+         most, (double)unfinished / STEPS, (double)unsolved / STEPS);
+  return 0;
+}}
+"""
 
 
 def time_steps():
-    rng = np.random.default_rng(0)
-    reference = np.repeat(rng.uniform(-2200.0, 2200.0, STEPS // 50), 50)
-    for slew in (None, 2000.0, 500.0):
-        mpc = force_mpc(STAND, THOR, MPCSpec(current_limit_A=LIMIT_A, current_slew_A_per_s=slew))
-        steps, pairs = [], []
-
-        def watched(state, r, y, mpc=mpc, steps=steps, pairs=pairs):
-            step = mpc.step(state, r, y)
-            steps.append(step)
-            pairs.append(f"{r!r} {y!r}")
-            return step.current_A, step.state
-
-        run = close_loop(watched, mpc.start, STAND, THOR, reference, sensor_std=2.0)
-        failed = sum(not step.solved for step in steps)
-        print(f"\nslew limit {slew} A/s: {len(steps)} steps, {failed} without a solution, at the limit of current in "
-              f"{np.mean(np.abs(run.current) > LIMIT_A - 1e-6):.0%}, iterations at most "
-              f"{max(step.iterations for step in steps)}")  # fmt: skip
-        print(f"  Python step / sample time:      {over_sample(np.array([step.step_time_s for step in steps]))}")
-        print(f"  OSQP alone in it / sample time: {over_sample(np.array([step.solve_time_s for step in steps]))}")
-        time_c(mpc, pairs, run.current)
-
-
-def time_c(mpc, pairs, currents):
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
-        print("  no C compiler: the exported code is not timed")
+        print("\nno C compiler: the exported code is not timed")
         return
-    with tempfile.TemporaryDirectory() as place:
-        folder = export_mpc(mpc, Path(place) / "code")
-        sources = sorted(str(path.relative_to(folder)) for path in [*folder.glob("*.c"), *folder.glob("src/*.c")])
-        paths = ["-std=c99", "-O2", "-Iinc/public", "-Iinc/private", "-I."]
-        subprocess.run([compiler, *paths, *sources, "-lm", "-o", "example"], cwd=folder, check=True)
-        runs = [
-            subprocess.run([str(folder / "example")], input="\n".join(pairs), capture_output=True, text=True).stdout
-            for _ in range(5)
-        ]
-        size = (folder / "example").stat().st_size
-    rows = np.array([[line.split() for line in said.splitlines()] for said in runs], dtype=float)
-    seconds, rows = rows[:, :, 3].min(axis=0), rows[0]  # the same step every time: the least is what it takes
-    print(f"  exported C, CPU / sample time:  {over_sample(seconds)}; {size // 1000} kB, currents as Python's "
-          f"within {np.max(np.abs(rows[:, 0] - currents)):.1e} A")  # fmt: skip
+    print(f"\nprocessor time of a step of the exported C (-O2, double), {STEPS} steps in closed loop, us")
+    print(f"{'limits':<26} {'mean':>7} {'99.99 %':>8} {'most':>8} {'iterations':>10} {'unfinished':>10} {'no plan':>8}")
+    digital = sample(STAND, THOR, "F1", 1.0, TS, 0)
+    for name, options in CASES.items():
+        spec = MPCSpec(**{"current_limit_A": LIMIT_A, "current_slew_A_per_s": 2000.0, **options})
+        with tempfile.TemporaryDirectory() as place:
+            folder = export_mpc(force_mpc(STAND, THOR, spec), Path(place) / "code")
+            (folder / "example.c").unlink()
+            plant = {key: ", ".join(map(repr, getattr(digital, key).ravel().tolist())) for key in "abc"}
+            code = HARNESS.format(states=digital.b.size, steps=STEPS, **plant)
+            (folder / "timing.c").write_text(code, encoding="utf-8")
+            sources = sorted(str(path.relative_to(folder)) for path in [*folder.glob("*.c"), *folder.glob("src/*.c")])
+            paths = ["-std=c99", "-O2", "-Wno-missing-braces", "-Iinc/public", "-Iinc/private", "-I."]
+            subprocess.run([compiler, *paths, *sources, "-lm", "-o", "timing"], cwd=folder, check=True)
+            said = subprocess.run([str(folder / "timing")], capture_output=True, text=True, check=True).stdout.split()
+        mean, rare, most = map(float, said[:3])
+        print(
+            f"{name:<26} {mean:7.1f} {rare:8.1f} {most:8.1f} {said[3]:>10} {float(said[4]):10.3%} {float(said[5]):8.3%}"
+        )
+
+
+def track_ahead():
+    print("\nforce error with references known ahead, rms N, bandwidth 20 Hz")
+    time = TS * np.arange(600)
+    references = {
+        "sine, 10 Hz, 300 N": 300 * np.sin(2 * np.pi * 10 * time),
+        "sine, 20 Hz, 150 N": 150 * np.sin(2 * np.pi * 20 * time),
+        "step of 500 N": np.where(time < 0.1, 0.0, 500.0), "ramp, 5000 N/s": np.clip(5000 * (time - 0.1), 0, 800),
+    }  # fmt: skip
+    for name, reference in references.items():
+        errors = []
+        for ahead in (0, 5, 10, 20, 40):
+            spec = MPCSpec(
+                current_limit_A=LIMIT_A, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, preview_samples=ahead
+            )  # fmt: skip
+            mpc = force_mpc(STAND, THOR, spec)
+            run = close_loop(mpc.command, mpc.start, STAND, THOR, reference, preview_samples=ahead)
+            errors.append(f"{ahead:2d}: {np.sqrt(np.mean((run.force - reference)[100:] ** 2)):6.1f}")
+        print(f"{name:<20} {'   '.join(errors)}")
 
 
 def margins():
@@ -110,4 +174,5 @@ def margins():
 if __name__ == "__main__":
     compare_steps()
     time_steps()
+    track_ahead()
     margins()

@@ -38,13 +38,20 @@ def planned(folder):
     return folder
 
 
-def test_the_whole_path(planned, seaopt):
-    out = seaopt("run", "plan.toml", "-o", "out")
-    assert out.returncode == 0
-    assert "Predictive control: F1, 20 Hz, every limit met" in out.stdout
+@pytest.mark.slow
+def test_the_report_has_plan_and_certificate(planned, seaopt):
+    assert seaopt("run", "plan.toml", "-o", "out").returncode == 0
+    page = (planned / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Predictive control" in page and "with limits active: 0 failures" in page
+    assert seaopt("report", "plan.toml", "-o", "out").returncode == 0
+
+
+def test_it_is_designed_certified_and_exported(planned, seaopt):
+    out = seaopt("tune", "plan.toml", "-o", "out")
+    assert out.returncode == 0 and "Predictive control: F1, 20 Hz, every limit met" in out.stdout
+    assert seaopt("certify", "plan.toml", "-o", "out").returncode == 0
     robustness = json.loads((planned / "out" / "robustness.json").read_text(encoding="utf-8"))
     assert robustness["passed"] and robustness["constrained"]["runs"] == 1
-    assert "with limits active: 0 failures" in (planned / "out" / "report.html").read_text(encoding="utf-8")
     assert seaopt("export", "out", "--c", "code").returncode == 0
     problem = so.read_problem(planned / "plan.toml")
     export_mpc(design_mpc(problem, problem.parameters), planned / "python")

@@ -77,7 +77,7 @@ def test_it_is_what_another_solver_finds_with_hard_bounds(stand, thor, bounds, a
     )  # fmt: skip
     rng = np.random.default_rng(11)
     solved = active = 0
-    for _ in range(15):
+    for _ in range(8):
         x0 = np.array([rng.uniform(-900, 900) / thor["k"].value, rng.uniform(-0.04, 0.04)])
         last, references = float(x0[0] * thor["k"].value / mpc.static_gain), rng.uniform(-950, 950, ahead + 1)
         best = exact(mpc, x0, last, references, bounds)
@@ -90,14 +90,14 @@ def test_it_is_what_another_solver_finds_with_hard_bounds(stand, thor, bounds, a
         assert step.current_A == pytest.approx(best, abs=2e-2)
         loose = exact(mpc, x0, last, references, {})
         solved, active = solved + 1, active + (abs(loose - best) > 0.05)
-    assert solved >= 6
+    assert solved >= 4
     assert active >= 2 or not bounds
 
 
 def test_a_motor_speed_is_kept_that_a_step_breaks_without(stand, thor):
     """On the nonlinear plant, simulated between samples too; with a current that is 10 % stronger than the model's."""
     params = thor.update(f_c=50.0, v_s=1e-3)
-    reference = np.repeat([0.0, 1000.0, -1000.0], [20, 150, 150])
+    reference = np.repeat([0.0, 1000.0, -1000.0], [10, 90, 100])
     bound = made(stand, params, bounds=SPEED_LIMIT)
     loose, _ = run_on(made(stand, params), stand, params, reference)
     tight, steps = run_on(bound, stand, params, reference)
@@ -135,10 +135,11 @@ def test_a_speed_that_is_there_already_is_broken_as_little_as_can_be(stand, thor
     assert step.current_A == pytest.approx(-2.0, abs=5e-3)  # brakes as hard as 2000 A/s let it
 
 
-def test_noise_and_spikes_leave_the_command_within_limits_and_the_speed_near_its_own(stand, thor):
+@pytest.mark.slow
+def test_noise_and_jumps_leave_the_command_within_limits_and_the_speed_near_its_own(stand, thor):
     mpc = made(stand, thor, bounds=SPEED_LIMIT)
     rng = np.random.default_rng(3)
-    run, steps = run_on(mpc, stand, thor, np.repeat(rng.uniform(-1500, 1500, 12), 50), sensor_std=2.0)
+    run, steps = run_on(mpc, stand, thor, np.repeat(rng.uniform(-1500, 1500, 5), 50), sensor_std=2.0)
     assert np.max(np.abs(run.state[:, 1])) < 1.25 * SPEED
     assert np.max(np.abs(run.current)) <= 9.0
     assert np.max(np.abs(np.diff(run.current, prepend=0.0))) <= 2.0 + 1e-9
@@ -146,14 +147,14 @@ def test_noise_and_spikes_leave_the_command_within_limits_and_the_speed_near_its
 
 
 def test_references_known_ahead_are_tracked_better(stand, thor):
-    time = TS * np.arange(400)
+    time = TS * np.arange(250)
     reference = 300.0 * np.sin(2 * np.pi * 10 * time)
     errors = []
-    for ahead in (0, 10, 20):
+    for ahead in (0, 20):
         mpc = made(stand, thor, preview_samples=ahead)
         run, _ = run_on(mpc, stand, thor, reference, preview_samples=ahead)
         errors.append(np.sqrt(np.mean((run.force - reference)[100:] ** 2)))
-    assert errors[0] > 2.5 * errors[1] > 10 * errors[2]
+    assert errors[0] > 10 * errors[1]
 
 
 @pytest.mark.parametrize("delay", [1, 3])
@@ -194,7 +195,7 @@ def test_the_c_code_does_the_same_with_bounds_and_preview_and_where_iterations_d
     ahead = 8
     spec = {"bounds": {**SPEED_LIMIT, "F2": (-1500.0, FORCE)}, "preview_samples": ahead, "max_iterations": 100}
     mpc = made(stand, thor, **spec)
-    reference = np.repeat(np.random.default_rng(5).uniform(-1500, 1500, 10), 40)
+    reference = np.repeat(np.random.default_rng(5).uniform(-1500, 1500, 4), 40)
     measurements, steps = [], []
 
     def law(state, r, y):
