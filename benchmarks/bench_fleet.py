@@ -3,12 +3,14 @@
     python benchmarks/bench_fleet.py overhead [--logs 200]
     python benchmarks/bench_fleet.py workers [--logs 400]
     python benchmarks/bench_fleet.py scale [--logs 10000] [--workers 2] [--seconds 1] [--rate 200]
+    python benchmarks/bench_fleet.py table [--logs 300000]
 
 `overhead`: the same logs are read and fitted in a plain loop, then by `fit_fleet` in this process, and again where
 nothing is left to do, in processor time. What the second takes more than the first is hashing, rows and table.
 `workers`: logs and samples per second on one and on two processes, started beforehand, against the clock.
 `scale`: one run over as many logs, each with noise of its own; every tenth of it what a log cost and what memory client
 and workers hold, then what the table took, and how often a C compiler was called.
+`table`: the table alone, of as many rows that nobody fitted: added, then replaced.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import resource
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +32,8 @@ import polars as pl
 import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.executors import Processes
+from seaopt.fleet.plan import list_columns, make_plan
+from seaopt.fleet.table import Table, make_schema
 
 PROBLEM = """
 schema = 1
@@ -60,7 +64,7 @@ class Here(Executor):
 
 
 @contextmanager
-def make_logs(count: int, seconds: float, rate_hz: float) -> Iterator[Path]:
+def make_logs(count: int, seconds: float, rate_hz: float) -> Generator[Path]:
     """Yield a folder with a problem file and so many logs, each of an actuator and with noise of its own."""
     with tempfile.TemporaryDirectory(prefix="bench-fleet-") as place:
         folder, plant, truth = Path(place), so.plants.high_impedance(), so.plants.thor()
@@ -150,6 +154,26 @@ def measure_scale(count: int, workers: int, seconds: float, rate_hz: float) -> N
         )
 
 
+def measure_table(count: int) -> None:
+    """Print what a row costs along a table that grows, and one that is replaced, and what memory that takes."""
+    with make_logs(1, 1.0, 200.0) as folder:
+        plan = make_plan(so.read_problem(folder / "stand.toml"), None, None, "bench")
+        table = Table(folder / "out", make_schema(list_columns(plan.make_problem()), ()), plan)
+        row = {"status": "met", "J": 1e-6, "J_std": 1e-9, "log_sha256": "0" * 64, "findings": []}
+        for what in ("added", "replaced"):
+            for tenth in range(TENTHS):
+                begun = time.process_time()
+                for start in range(tenth * count // TENTHS, (tenth + 1) * count // TENTHS, 100):
+                    table.add([row | {"log": f"/logs/{k:09d}.csv"} for k in range(start, start + 100)])
+                spent = 1e6 * (time.process_time() - begun) * TENTHS / count
+                memory = read_memory(os.getpid())
+                print(f"{what} {(tenth + 1) * count // TENTHS}: {spent:.0f} us per row, {memory:.0f} MB", flush=True)
+            begun = time.process_time()
+            table.finish()
+            print(f"finished in {time.process_time() - begun:.1f} s, {len(table.parts())} files")
+        table.close()
+
+
 class Tell:
     """Prints a line every tenth of a run."""
 
@@ -158,8 +182,8 @@ class Tell:
         self.begun, self.client, self.printed = time.perf_counter(), time.process_time(), 0
         self.last = (0, 0.0)
 
-    def __call__(self, text: str, share: float) -> None:
-        if share * TENTHS >= self.printed + 1:
+    def __call__(self, text: str, share: float | None = None, /) -> None:
+        if share is not None and share * TENTHS >= self.printed + 1:
             self.show(int(text.split()[0]))
             self.printed = int(share * TENTHS)
 
@@ -193,7 +217,7 @@ def read_memory(pid: int) -> float:
 
 
 @contextmanager
-def count_compilers(folder: Path) -> Iterator[Callable[[], list[str]]]:
+def count_compilers(folder: Path) -> Generator[Callable[[], list[str]]]:
     """Yield what lists the calls of a C compiler from here on, with a cache of kernels that is empty."""
     compiler, calls = shutil.which("cc"), folder / "calls"
     (folder / "cache").mkdir(parents=True)
@@ -213,7 +237,7 @@ def count_compilers(folder: Path) -> Iterator[Callable[[], list[str]]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["overhead", "workers", "scale"])
+    parser.add_argument("what", choices=["overhead", "workers", "scale", "table"])
     parser.add_argument("--logs", type=int)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=1.0)
@@ -225,6 +249,8 @@ def main() -> None:
         measure_overhead(given.logs or 200)
     elif given.what == "workers":
         measure_workers(given.logs or 400)
+    elif given.what == "table":
+        measure_table(given.logs or 300_000)
     else:
         measure_scale(given.logs or 10_000, given.workers, given.seconds, given.rate)
 
