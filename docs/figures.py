@@ -32,6 +32,7 @@ from seaopt.control import (
     run_loop,
     sample,
     sweep,
+    tune_schedule,
 )
 from seaopt.control.laws.realisation import realise, runnable
 from seaopt.control.loops.port import hold_response, port_of
@@ -330,6 +331,36 @@ def compensation() -> None:
     save(figure, "compensation")
 
 
+def scheduling() -> None:
+    """Bandwidth and Ms over the knee's angle, of a schedule and of the fastest law for all angles."""
+    problem = so.read_problem(FOLDER.parents[1] / "problems" / "lever_knee.toml")
+    stand, swing, asked = problem.plants["stand"], problem.plants["swing"], problem.schedule
+    places = [
+        problem.parameters.with_parameters(so.Parameter(name=asked.over, value=value, unit="rad"))
+        for value in asked.points
+    ]
+    others = {f"{plant.name} {i}": (plant, here) for i, here in enumerate(places) for plant in (stand, swing)}
+    schedule = tune_schedule(stand, problem.parameters, problem.spec, asked.over, asked.points, {"swing": swing})
+    one = so.tune(stand, places[-1], replace(problem.spec, bandwidth_hz=22), others)
+    figure, axes = new(["bandwidth on the stand", "largest Ms"], "", "joint angle [rad]")
+    angles = np.linspace(asked.points[0], asked.points[-1], 24)
+    for name, choose, colour in (
+        ("schedule, 30 Hz", schedule.at, "#0072b2"), ("one law, 22 Hz with the leg bent", lambda _: one, "#d55e00")
+    ):  # fmt: skip
+        loops = []
+        for angle in angles:
+            here = problem.parameters.with_parameters(so.Parameter(name=asked.over, value=float(angle), unit="rad"))
+            loops.append([choose(float(angle)).close(plant, here).figures() for plant in (stand, swing)])
+        axes[0].plot(angles, [held.bandwidth_hz for held, _ in loops], color=colour, label=name)
+        axes[1].plot(angles, [max(held.ms, free.ms) for held, free in loops], color=colour)
+    axes[0].set_ylim(0.0, None)
+    axes[0].set_ylabel("bandwidth [Hz]")
+    axes[1].set_ylabel("Ms [-]")
+    axes[1].axhline(1.6, color="#777777", linewidth=0.8, linestyle="--")
+    axes[0].legend(frameon=False, fontsize="x-small")
+    save(figure, "scheduling")
+
+
 def thor_frontiers() -> dict[str, Frontier]:
     """Sweep THOR's bandwidth at Ms 1.6, the swinging output in robust_to, as it is and with the screw's mode."""
     limits = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
@@ -386,6 +417,7 @@ if __name__ == "__main__":
     passivity()
     impedance()
     compensation()
+    scheduling()
     experiment_design()
     state_estimator()
     predictive_control()
