@@ -206,3 +206,20 @@ class TestTuneSchedule:
         ):
             with pytest.raises(ControlError, match=what):
                 tune_schedule(stand, values, replace(spec, **changed), over, [0.0, 0.4])
+
+
+@pytest.mark.slow
+def test_a_schedule_keeps_limits_that_one_law_cannot():
+    """The table of docs/howto/scheduling.md: 24 Hz with the leg bent is too much for one law, 30 Hz is none for seven."""
+    problem = so.read_problem("problems/lever_knee.toml")
+    stand, swing, values = read_knee()
+    points = problem.schedule.points
+    others = {
+        f"{plant.name} at {value:g}": (plant, values.with_parameters(replace(values["phi"], value=value)))
+        for plant in (stand, swing) for value in points
+    }  # fmt: skip
+    bent = values.update(phi=points[-1])
+    for hz, feasible in ((22.0, True), (24.0, False)):
+        assert so.tune(stand, bent, replace(problem.spec, bandwidth_hz=hz), others).feasible is feasible
+    schedule = tune_schedule(stand, values, problem.spec, "phi", points, {"swing": swing})
+    assert schedule.feasible and {one.spec.bandwidth_hz for one in schedule.controllers} == {30.0}
