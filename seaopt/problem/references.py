@@ -107,6 +107,7 @@ def _check_beside_schedule(table: ProblemTable, over: str) -> None:
     for key, there in (
         ('controller.structure = "mpc"', law is not None and law.structure == "mpc"),
         ("controller.prefilter", law is not None and law.prefilter is not None),
+        ("controller.link_feedforward", law is not None and law.link_feedforward is not False),
         ("controller.compensate", law is not None and bool(law.compensate)),
         ("impedance", table.impedance is not None),
         ("robustness.retune", robustness is not None and robustness.retune),

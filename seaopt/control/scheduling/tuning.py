@@ -142,7 +142,7 @@ def tune_schedule(
 
 
 def _check_structure(spec: ControllerSpec) -> None:
-    parts = {"a notch": spec.notch, "a prefilter": spec.prefilter}
+    parts = {"a notch": spec.notch, "a prefilter": spec.prefilter, "link_feedforward": spec.link_feedforward}
     if spec.structure not in STRUCTURES or any(part is not None for part in parts.values()):
         what = next((name for name, part in parts.items() if part is not None), f'structure = "{spec.structure}"')
         raise ControlError(

@@ -210,7 +210,7 @@ class TestTuneSchedule:
 
 @pytest.mark.slow
 def test_a_schedule_keeps_limits_that_one_law_cannot():
-    """The table of docs/howto/scheduling.md: 24 Hz with the leg bent is too much for one law, 30 Hz is none for seven."""
+    """The table of docs/howto/scheduling.md: 24 Hz with the leg bent are too much for one law."""
     problem = so.read_problem("problems/lever_knee.toml")
     stand, swing, values = read_knee()
     points = problem.schedule.points
