@@ -12,6 +12,7 @@ of the numbers that the step computes.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -48,8 +49,13 @@ def count_stable_steps(model: Model, theta: Float[np.ndarray, " np"], period: fl
 
     Its slope there is f_c/v_s, and the rate that follows, f_c/(m v_s), grows without limit as v_s falls.
     """
+    return _count_stable_steps(model, np.asarray(theta, dtype=float).tobytes(), period)
+
+
+@lru_cache(maxsize=32)  # a solver asks several times at one point
+def _count_stable_steps(model: Model, theta: bytes, period: float) -> float:
     nx = model.nx
-    a = linearise(model).matrices(theta)[0][:nx, :nx]
+    a = linearise(model).matrices(np.frombuffer(theta))[0][:nx, :nx]
     if not np.all(np.isfinite(a)):
         return 1.0
     return float(np.ceil(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) * period / STABLE))
