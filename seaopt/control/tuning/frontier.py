@@ -14,11 +14,21 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.free_law import FreeLaw, bound_free_law
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
-from seaopt.control.tuning.tuner import RobustTo, disturbance, make_controller, make_task, name_design
+from seaopt.control.tuning.tuner import (
+    RobustTo,
+    aim_task,
+    disturbance,
+    feed_link,
+    lower_fraction,
+    make_controller,
+    make_task,
+    name_design,
+)
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, map_ordered
@@ -229,7 +239,7 @@ def sweep(
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
     for one, solved in zip(specs, _solve_chains(swept, specs, executor, progress), strict=True):
-        task = replace(swept.task, spec=one)
+        task = feed_link(replace(swept.task, spec=one), solved.link)
         controller = make_controller(task, solved.x, solved.loops, swept.design)
         row = _row(task, solved.x, solved.loops, controller)
         rows.append(replace(row, without_sticking=solved.without_sticking, free_law=solved.free_law))
@@ -255,10 +265,11 @@ class _Sweep:
 
 @record(eq=False)
 class _Solved:
-    """The numbers of one bandwidth's law, its loops, and what it is compared with."""
+    """The numbers of one bandwidth's law, its loops, its link's path, and what it is compared with."""
 
     x: LawNumbers
     loops: list[MeasuredLoop]
+    link: LinkPath | None
     without_sticking: SlidingAlone | None
     free_law: FreeLaw | None
 
@@ -288,13 +299,14 @@ def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progr
     warm: tuple[LawNumbers, ...] = ()
     for one, part in zip(chain, divide(progress, *(1.0 for _ in chain)), strict=True):
         whole, sliding_alone = divide(prefix(part, f"{one.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
-        task = replace(swept.task, spec=one)
-        x, loops = solve(task, warm, whole)
-        alone = _tune_sliding(replace(swept.sliding, spec=one), x, sliding_alone) if swept.sticks else None
+        task = aim_task(swept.task, one)
+        task, x, loops = lower_fraction(task, *solve(task, warm, whole))
+        sliding = feed_link(replace(swept.sliding, spec=one), task.link)
+        alone = _tune_sliding(sliding, x, sliding_alone) if swept.sticks else None
         free = None
         if swept.free_law and isinstance(task.plants[0], DigitalPlant):
             free = bound_free_law(task.plants[0], one, [task.law_of(x).balanced()])
-        yield _Solved(x=x, loops=loops, without_sticking=alone, free_law=free)
+        yield _Solved(x=x, loops=loops, link=task.link, without_sticking=alone, free_law=free)
         warm = (x,)
 
 

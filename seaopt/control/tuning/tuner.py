@@ -163,7 +163,7 @@ def tune(
     check_current(spec, task.k_ff, command, {} if model is not plant else find_dry_friction(model, values))
     solving, seeking, again = divide(progress, SOLUTION * (8.0 if task.asks_margin else 1.0), BANDWIDTHS, SOLUTION)
     x, loops = solve(task, progress=solving)
-    task, x, loops = _lower_fraction(task, x, loops)
+    task, x, loops = lower_fraction(task, x, loops)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
     if broken - {FRICTION}:  # of a margin alone it is known what can be had
         possible, near = _find_possible(task, x, seeking, stable="stability" not in broken)
@@ -362,9 +362,22 @@ def _limit_fraction(link: LinkPath, spec: ControllerSpec, plants: Sequence[Digit
     return replace(link, fraction=limit_fraction(link, motions, beyond, f, spec.sample_time_s, largest))
 
 
-def _lower_fraction(
-    task: Task, x: LawNumbers, loops: list[MeasuredLoop]
-) -> tuple[Task, LawNumbers, list[MeasuredLoop]]:
+def feed_link(task: Task, link: LinkPath | None) -> Task:
+    """Return a task whose link is fed forward by another path; the same where it is not fed forward."""
+    if link is None:
+        return task
+    return replace(task, link=link, further=(*task.further[:-1], link.feedback(task.spec.sample_time_s)))
+
+
+def aim_task(task: Task, spec: ControllerSpec) -> Task:
+    """Return a task at another bandwidth, with the corners and the largest fraction of the link's path there."""
+    task, asked = replace(task, spec=spec), spec.link_feedforward
+    if asked is None or task.link is None:
+        return task
+    return feed_link(task, _limit_fraction(asked.place(task.link, spec.bandwidth_hz), spec, task.plants))
+
+
+def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tuple[Task, LawNumbers, list[MeasuredLoop]]:
     """Return task, numbers and loops with as large a fraction of the link's feedforward as keeps the limits.
 
     It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is zero, as
@@ -377,8 +390,7 @@ def _lower_fraction(
         if not list_broken_limits(task.spec, loops, task.design_states):
             break
         share = 0.8 ** (power + 1) if power < LOWER_FRACTIONS else 0.0
-        lower = replace(link, fraction=round(share * link.fraction, 3))
-        task = replace(task, link=lower, further=(*task.further[:-1], lower.feedback(task.spec.sample_time_s)))
+        task = feed_link(task, replace(link, fraction=round(share * link.fraction, 3)))
         x, loops = solve(task)
     return task, x, loops
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control import LinkFeedforward, runnable
+from seaopt.control import LinkFeedforward, runnable, sweep
 from seaopt.control.loops.loop import Loop
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
@@ -136,6 +136,15 @@ def test_the_exported_c_reads_the_link(fed, compiler, tmp_path):
     expected, _ = runnable(fed).run(reference, signals)
     found = CompiledLaw(compiler, tmp_path, fed, "double").run(reference, signals)
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.max(np.abs(expected)))
+
+
+def test_a_sweep_places_the_path_at_every_bandwidth(stand, swing, thor):
+    spec = replace(SPEC, link_feedforward=LinkFeedforward())
+    frontier = sweep(stand, thor, spec, [20.0, 30.0], {"swing": swing})
+    assert [row.feasible for row in frontier.rows] == [True, True]
+    assert [one.link.high_pass_hz for one in frontier.controllers] == [2.0, 3.0]
+    for one in frontier.controllers:
+        assert one.close(swing, thor).figures().ms <= 1.6 * (1 + 1e-6)
 
 
 def test_it_is_stored_and_checked(fed):

@@ -72,6 +72,13 @@ class LinkFeedforward:
     corner_hz: float | None = None
     high_pass_hz: float | None = None
 
+    def place(self, path: LinkPath, bandwidth_hz: float) -> LinkPath:
+        """Return a path with the corners asked, or their defaults at a bandwidth."""
+        return replace(
+            path, corner_hz=self.corner_hz or bandwidth_hz,
+            high_pass_hz=0.1 * bandwidth_hz if self.high_pass_hz is None else self.high_pass_hz,
+        )  # fmt: skip
+
 
 @record
 class LinkPath:
@@ -177,12 +184,12 @@ def model_link_path(
     f = np.geomspace(0.1 * bandwidth_hz, bandwidth_hz, FIT_FREQUENCIES)
     response = port_of(sliding, values, regulated, per_effort).response(f)
     inertia, damping = _fit(-response.motion_to_feedback / response.motor_to_feedback, f, plant.name)
-    return LinkPath(
+    path = LinkPath(
         measured=name, unit=plant.outputs[name], inertia=per_signal * inertia, damping=per_signal * damping,
-        is_speed=is_speed, fraction=1.0 if asked.fraction is None else asked.fraction,
-        corner_hz=asked.corner_hz or bandwidth_hz,
-        high_pass_hz=0.1 * bandwidth_hz if asked.high_pass_hz is None else asked.high_pass_hz,
+        is_speed=is_speed, fraction=1.0 if asked.fraction is None else asked.fraction, corner_hz=bandwidth_hz,
+        high_pass_hz=0.0,
     )  # fmt: skip
+    return asked.place(path, bandwidth_hz)
 
 
 def _relate(plant: Plant, params: ParameterSet, name: str, per_effort: float) -> tuple[float, bool]:
