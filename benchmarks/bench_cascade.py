@@ -28,7 +28,7 @@ KNEE = {"J_m": 2.4e-5, "b_r": 1e-4, "K_tau": 0.0369, "N": 100.0, "eta": 0.7, "k_
         "J_l": 0.25, "d_l": 0.3, "m": 4.0, "L": 0.2}  # fmt: skip
 KNEE_LIMITS = {"bandwidth_hz": 15.0, "max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3,
                "max_noise_gain": 45.0}  # fmt: skip
-INTEGRAL, DROOP = 2 * np.pi * 0.05, 10 ** (-1 / 20)
+INTEGRAL = 2 * np.pi * 0.05
 SEARCHED, GENERATIONS = 160, 300
 OFFSET = 0.05  # of the rate 1/T_v in the search: below it there is no integral inside
 
@@ -156,11 +156,11 @@ class Case:
             most(np.abs(c_y * s) / (keep * lim["max_noise_gain"]))
             most(np.abs(c_v * s) / (keep * lim.get("max_other_noise_gain", np.inf)))
             if number == 0:  # the stand, sliding
-                most(np.abs(s) * np.sqrt(2.0), f <= f_b / 5 * (1 + 1e-9))
-                most(DROOP / tracking, f <= f_b / 3 * (1 + 1e-9))
+                most(np.abs(s) * np.sqrt(2.0) / keep, f <= f_b / 5 * (1 + 1e-9))
+                most(10 ** (-keep / 20) / tracking, f <= f_b / 3 * (1 + 1e-9))
                 most(np.sqrt(0.5) / tracking, f < 0.97 * f_b * (1 - 1e-9))
                 later = (f >= 1.03 * f_b * (1 - 1e-9)) & (f <= 3.0 * f_b * (1 + 1e-9))
-                most(tracking * np.sqrt(2.0) * (f / f_b) ** 0.25, later)
+                most(tracking * np.sqrt(2.0) * (f / f_b) ** 0.25 / keep, later)
         return np.nan_to_num(used, nan=1e3), objective
 
     def search(self, seed: int) -> tuple[float, float, np.ndarray]:
@@ -168,7 +168,7 @@ class Case:
         f_b = self.limits["bandwidth_hz"]
         low = np.log([0.1, 0.3, 1e-6, self.ts, 1e-3, OFFSET, 1e-3])
         high = np.log([100.0, 3e3, 1.0, 4 / (2 * np.pi * f_b), 3.0, 300.0, 1.0])
-        keep = 0.995  # the tuner's reserve
+        keep = 0.995  # the tuner's reserve, on the same curves
 
         def unpack(z: np.ndarray) -> np.ndarray:
             x = np.exp(z.T)

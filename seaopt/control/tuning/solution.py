@@ -23,13 +23,14 @@ from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.absolute_stability import SIMPLEST
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import FRICTION, Grid, LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.optimisation_problem import FRICTION, K_I, Grid, LawNumbers, Task, place_frequencies
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, count_off, divide, ignore
 
 STARTS_TRIED = 3  # two more where an observer, a notch, a prefilter or a speed loop makes more valleys
 STARTS_REFINED = 2  # one more with an observer, a prefilter or a speed loop, all with a notch
 ROUNDS, LONG_ROUNDS = 5, 9  # of the interior point; integrals of a cascade move far
+QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: less is not looked for
@@ -153,7 +154,18 @@ def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress:
             chosen.append(x)
     rounds = ROUNDS if task.speed_loop is None else LONG_ROUNDS
     refined = (refine(task, grid, x, rounds) for x in count_off(chosen, "refining start", refining))
-    return min(refined, key=lambda x: task.rank(grid, x))
+    best = min(refined, key=lambda x: task.rank(grid, x))
+    return best if task.speed_loop is None else _quicken_integral(task, grid, best)
+
+
+def _quicken_integral(task: Task, grid: Grid, x: LawNumbers) -> LawNumbers:
+    """Return the better of numbers and what comes of them with a much faster integral, a valley of its own."""
+    faster = x.copy()
+    faster[K_I] *= QUICKER_INTEGRAL
+    faster = task.tidy(faster)
+    if not task.is_stable(faster):
+        return x
+    return min(x, refine(task, grid, improve(task, grid, faster)[1], LONG_ROUNDS), key=lambda one: task.rank(grid, one))
 
 
 def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
