@@ -243,6 +243,11 @@ KEYS: dict[str, dict[str, str]] = {
     },
     "CompensationTable": {
         "friction": "Coulomb friction at the motor.",
+        "gravity": "The weight of a link that hangs, by its position.",
+    },
+    "GravityCompensationTable": {
+        "fraction": "Of what the spring carries at rest.",
+        "plant": "Whose link it is; the design plant where left out.",
     },
     "ControllerTable": {
         "plant": 'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.',
@@ -252,7 +257,7 @@ KEYS: dict[str, dict[str, str]] = {
         "notch": "Whether there is one, or which.",
         "link_feedforward": "Whether the effort that the link's measured motion needs is added, or how.",
         "prefilter": "A low-pass of the reference alone, of this order, or which; the bandwidth is placed with it.",
-        "compensate": 'What is added because the plant is known, ["friction"]; or a table, to say how much of it.',
+        "compensate": 'What is added because the plant is known, ["friction", "gravity"]; or a table: how much.',
         "reference_weights": '"tuned": of how the reference enters; "error", "measurement": fixed.',
         "bandwidth_range_hz": "Within which bandwidths are sensible; 15 to 60 where left out.",
         "sample_rate_hz": "At which it runs.",

@@ -40,6 +40,9 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
         named = [("controller.plant", table.controller.plant)]
         named += [("controller.robust_to", name) for name in table.controller.robust_to]
         places += [(place, name) for place, name in named if not name.startswith(RESPONSE)]
+        gravity = table.controller.compensation.gravity
+        if gravity is not None and gravity.plant is not None:
+            places.append(("controller.compensate.gravity.plant", gravity.plant))
     if table.impedance:
         if table.controller is None:
             raise ProblemError("[impedance] is there, and no [controller] is; add one, or leave it out")

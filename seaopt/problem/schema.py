@@ -416,10 +416,18 @@ class FrictionCompensationTable(_Strict):
     speed: Annotated[Number, Field(gt=0.0)] | None = None
 
 
+class GravityCompensationTable(_Strict):
+    """Compensation of gravity."""
+
+    fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = 1.0
+    plant: Name | None = None
+
+
 class CompensationTable(_Strict):
     """What is compensated, and how much of it."""
 
     friction: FrictionCompensationTable | None = None
+    gravity: GravityCompensationTable | None = None
 
 
 def _tell_list(value: Any) -> str:
@@ -428,7 +436,7 @@ def _tell_list(value: Any) -> str:
 
 
 Compensated = Annotated[
-    Annotated[list[Literal["friction"]], Tag("names")] | Annotated[CompensationTable, Tag("table")],
+    Annotated[list[Literal["friction", "gravity"]], Tag("names")] | Annotated[CompensationTable, Tag("table")],
     Discriminator(_tell_list),
 ]
 
@@ -484,7 +492,10 @@ class ControllerTable(_Strict):
         """What is compensated; of a list of names, each with its defaults."""
         if isinstance(self.compensate, CompensationTable):
             return self.compensate
-        return CompensationTable(friction=FrictionCompensationTable() if "friction" in self.compensate else None)
+        return CompensationTable(
+            friction=FrictionCompensationTable() if "friction" in self.compensate else None,
+            gravity=GravityCompensationTable() if "gravity" in self.compensate else None,
+        )
 
 
 class NoiseModelTable(_Strict):

@@ -11,6 +11,7 @@ import numpy as np
 
 from seaopt.control import (
     CompensateFriction,
+    CompensateGravity,
     Controller,
     ForceMPC,
     GivenLaw,
@@ -178,10 +179,18 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     """
     controller = add_outer_loop(problem, controller, source)
     assert problem.table.controller is not None
-    friction = problem.table.controller.compensation.friction
-    if friction is None:
+    asked = problem.table.controller.compensation
+    if asked.friction is None and asked.gravity is None:
         return controller
-    return add_compensation(controller, friction=CompensateFriction(**friction.model_dump()))
+    link = None
+    if asked.gravity is not None and asked.gravity.plant is not None:
+        link = problem.plants[asked.gravity.plant], problem.values(source)
+    return add_compensation(
+        controller,
+        friction=None if asked.friction is None else CompensateFriction(**asked.friction.model_dump()),
+        gravity=None if asked.gravity is None else CompensateGravity(fraction=asked.gravity.fraction),
+        link=link,
+    )
 
 
 def _refuse_schedule(problem: Problem, done: str) -> None:

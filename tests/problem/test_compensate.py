@@ -71,3 +71,19 @@ def test_without_friction_there_is_nothing_to_compensate(tmp_path):
     problem = so.read_problem(path)
     with pytest.raises(so.SeaoptError, match="no Coulomb friction at the motor"):
         tune_problem(problem, problem.parameters)
+
+
+def test_gravity_of_another_plant_is_compensated(tmp_path):
+    path = tmp_path / "problem.toml"
+    text = TEXT.replace("[controller]", '[plant.swing]\nkind = "moving_output"\n[controller]')
+    path.write_text(text % '{ gravity = { fraction = 0.9, plant = "swing" } }', encoding="utf-8")
+    problem = so.read_problem(path)
+    term = tune_problem(problem, problem.parameters).compensation.gravity
+    assert (term.reads, term.fraction) == ("x_2", 0.9)
+    path.write_text(text % '{ gravity = { plant = "swnig" } }', encoding="utf-8")
+    with pytest.raises(so.SeaoptError, match="swing"):
+        so.read_problem(path)
+    path.write_text(text % '["gravity"]', encoding="utf-8")
+    problem = so.read_problem(path)
+    with pytest.raises(so.SeaoptError, match=r"holds its link; name the plant"):
+        tune_problem(problem, problem.parameters)

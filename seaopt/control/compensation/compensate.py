@@ -6,10 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from seaopt.control.compensation.friction import find_motor_friction, find_reading, make_friction_term
+from seaopt.control.compensation.gravity import make_gravity_term
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction_margin import take_friction_out
 from seaopt.control.loops.compensation.stability import CompensationMargin, SpeedReading, compensation_margin
-from seaopt.control.loops.compensation.terms import CompensateFriction, Compensation, FrictionTerm
+from seaopt.control.loops.compensation.terms import (
+    CompensateFriction,
+    CompensateGravity,
+    Compensation,
+    FrictionTerm,
+    GravityTerm,
+)
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
@@ -18,8 +25,11 @@ from seaopt.plants import Plant
 ENOUGH = 1.5  # times the slope asked for: at the nominal parameters no better multiplier is looked for
 
 
-def add_compensation(controller: Controller, *, friction: CompensateFriction | None = None) -> Controller:
-    """Return a controller that also compensates its design plant's friction, at its parameters.
+def add_compensation(
+    controller: Controller, *, friction: CompensateFriction | None = None, gravity: CompensateGravity | None = None,
+    link: tuple[Plant, ParameterSet] | None = None,
+) -> Controller:  # fmt: skip
+    """Return a controller that also compensates its design plant's friction, and the weight of a link.
 
     The law, its figures and its friction margin stay what they are; what is added acts between the law and the limit
     of the command, in every simulation and in exported code.
@@ -30,6 +40,10 @@ def add_compensation(controller: Controller, *, friction: CompensateFriction | N
         As tuned or read; it knows its design plant.
     friction : CompensateFriction, optional
         What is asked for friction; left out, none of it is compensated.
+    gravity : CompensateGravity, optional
+        What is asked for gravity.
+    link : (Plant, ParameterSet), optional
+        The plant whose link it is; the design plant if left out.
 
     Raises
     ------
@@ -52,19 +66,39 @@ def add_compensation(controller: Controller, *, friction: CompensateFriction | N
             "compensate: the controller does not know its design plant, whose friction it would compensate; tune it on "
             "a model, or read it with Controller.from_dict"
         )
-    if friction is None:
+    if friction is None and gravity is None:
         return replace(controller, compensation=None)
+    added = Compensation(
+        sample_time_s=controller.sample_time_s,
+        friction=None if friction is None else _meet_friction(controller, *controller.design, friction),
+        gravity=None if gravity is None else _meet_gravity(controller, *(link or controller.design), gravity),
+    )
+    return replace(controller, compensation=added)
+
+
+def _meet_gravity(
+    controller: Controller, plant: Plant, params: ParameterSet, gravity: CompensateGravity
+) -> GravityTerm:
+    if controller.outer is not None and not controller.outer.stiffness:
+        raise ControlError(
+            "compensate.gravity with an [impedance] without stiffness is not computed; give a stiffness, or leave "
+            "[impedance] out"
+        )
+    return make_gravity_term(plant, params, controller.spec.regulated, gravity)
+
+
+def _meet_friction(
+    controller: Controller, plant: Plant, params: ParameterSet, friction: CompensateFriction
+) -> FrictionTerm:
     if friction.source == "reference" and controller.outer is not None:
         raise ControlError(
             'compensate.friction: from = "reference" with [impedance] would be a feedback of the link, for which '
             'stability is not shown; take from = "speed"'
         )
-    plant, params = controller.design
     loop = None
     if friction.source == "speed" and friction.speed is None:
         (loop,) = take_friction_out(controller, plant, [params])
-    term = make_friction_term(plant, params, controller.spec.regulated, friction, loop)
-    return replace(controller, compensation=Compensation(sample_time_s=controller.sample_time_s, friction=term))
+    return make_friction_term(plant, params, controller.spec.regulated, friction, loop)
 
 
 def find_compensation_margins(

@@ -340,6 +340,7 @@ def _numbers(
         ],
         "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
         "friction": _write_friction(law.compensation, number),
+        "gravity": _write_gravity(law.compensation, number),
         "further": _list_further(law.compensation, others),
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
@@ -380,6 +381,19 @@ def _write_friction(compensation: Compensation | None, number: Callable[[float],
         "whence": f"the speed of {strip_markup(term.reads)}" if term.reads else "the rate of the reference",
         "percent": f"{100.0 * term.fraction:.3g}",
     }
+
+
+def _write_gravity(compensation: Compensation | None, number: Callable[[float], str]) -> dict[str, Any]:
+    """Return the compensation of gravity as text; empty where there is none."""
+    if compensation is None or compensation.gravity is None:
+        return {}
+    term = compensation.gravity
+    middle, scale, *coefficients = term.numbers
+    return {
+        "middle": number(middle), "scale": number(scale), "terms": len(coefficients),
+        "coefficients": ", ".join(map(number, coefficients)), "read": f"read_{identifier(term.reads)}",
+        "output": strip_markup(term.reads), "unit": term.unit, "percent": f"{100.0 * term.fraction:.3g}",
+    }  # fmt: skip
 
 
 def _list_further(compensation: Compensation | None, others: Sequence[str]) -> list[dict[str, str]]:

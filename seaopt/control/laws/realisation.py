@@ -167,13 +167,14 @@ class RunnableLaw:
 
     def reset(
         self, reference: float = 0.0, measurement: Reading | None = None, current_A: float = 0.0,
-        heat: tuple[float, float] = COLD,
+        heat: tuple[float, float] = COLD, readings: Sequence[float] = (),
     ) -> LawState:  # fmt: skip
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
 
         A law without an integrator cannot be set: its next command follows from the inputs alone. A measurement that
         is left out is zero, and a gate judges the first reading by its range; one that is given, by its jump from it.
-        `heat` is what is known of winding and case above the ambient (K); cold if left out.
+        `heat` is what is known of winding and case above the ambient (K); cold if left out. `readings` are of what the
+        compensation reads; zero if left out.
 
         Raises
         ------
@@ -193,6 +194,9 @@ class RunnableLaw:
         if not abs(current_A) <= self.current_limit_A:
             limit = show_command(self.current_limit_A, *self.command)
             raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
+        if self.compensation is not None:
+            reads = tuple(readings) or (0.0,) * len(self.compensation.reads)
+            reference, _, _ = self.compensation.step(FORGOTTEN, reference, reads)
         per_reference, per_measurement = self.rest()
         x = per_reference * reference - np.dot(per_measurement, measurement)
         if self.integrators:
@@ -250,7 +254,7 @@ class RunnableLaw:
             applied = min(max(force, -most), most)
             x = self.a @ state.x + self.b_reference * reference - np.dot(self.b_measurement, measurement)
             x += self.anti_windup * (applied - force)
-        if not (math.isfinite(force) and math.isfinite(memory[1]) and np.all(np.isfinite(x))):
+        if not (math.isfinite(force + memory[1]) and all(map(math.isfinite, readings)) and np.all(np.isfinite(x))):
             return state.current_A, replace(state, held=state.held + 1, gate=seen)
         current = applied * self.per_effort
         current = min(max(current, -limit_A), limit_A)  # a limit to the last bit

@@ -27,7 +27,7 @@ from seaopt.control.laws.structures import (
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward, LinkPath
-from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm
+from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.outer_loop import OuterLoop
@@ -223,15 +223,34 @@ class StoredFrictionTerm(ResultTable):
         return self
 
 
+class StoredGravityTerm(ResultTable):
+    """Compensation of gravity."""
+
+    coefficients: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=100)]
+    low: Finite
+    high: Finite
+    reads: Annotated[str, Field(min_length=1)]
+    unit: str
+    fraction: Annotated[Finite, Field(gt=0.0)]
+
+    @model_validator(mode="after")
+    def _require_range(self) -> StoredGravityTerm:
+        if not self.low < self.high:
+            raise ValueError("should have low below high")
+        return self
+
+
 class StoredCompensation(ResultTable):
     """What is added to reference and effort."""
 
     friction: StoredFrictionTerm | None = None
+    gravity: StoredGravityTerm | None = None
 
     def build(self, sample_time_s: float) -> Compensation:
         """Return the compensation."""
         friction = None if self.friction is None else FrictionTerm(**self.friction.model_dump())
-        return Compensation(sample_time_s=sample_time_s, friction=friction)
+        gravity = None if self.gravity is None else GravityTerm(**self.gravity.model_dump())
+        return Compensation(sample_time_s=sample_time_s, friction=friction, gravity=gravity)
 
 
 class StoredLinkPath(ResultTable):

@@ -127,6 +127,7 @@ def run_loop(
     seed: int = 0,
     start_s: float = 0.0,
     rtol: float | None = None,
+    standing: float | Float[np.ndarray, " runs"] = 0.0,
 ) -> LoopRun:
     """Run a loop, once for each set of parameters.
 
@@ -148,6 +149,8 @@ def run_loop(
         Time of the first sample.
     rtol : float, optional
         Of the integration, see the module's docstring.
+    standing : float or array, shape (runs,)
+        Where the link stands of a plant that holds it, as the law's compensation of gravity reads it.
 
     Returns
     -------
@@ -182,7 +185,7 @@ def run_loop(
     n = wanted.shape[1]
     job = Job(
         reference=np.ascontiguousarray(np.broadcast_to(wanted, (runs, n))),
-        noise=_noise(loop, values, n, seed),
+        noise=_noise(loop, values, n, seed, standing),
         external=_external(loop.plant, external or {}, n),
         p=np.array([each.vector for each in values]).reshape(runs, -1),
         **_lags(loop, values),
@@ -276,16 +279,25 @@ def _result(loop: SampledLoop, job: Job, arrays: LoopArrays, error: float, subst
 
 
 def _noise(
-    loop: SampledLoop, params: Sequence[CompletedParameters], n: int, seed: int
+    loop: SampledLoop,
+    params: Sequence[CompletedParameters],
+    n: int,
+    seed: int,
+    standing: float | Float[np.ndarray, " runs"],
 ) -> Float[np.ndarray, "runs n y"]:
-    """Return the noise of every measured output; that of further ones is drawn after the first."""
-    std = np.array([
-        [loop.sensors.combine_errors(loop.plant, values, name)[0] for name in loop.signals] for values in params
-    ])  # fmt: skip
+    """Return the noise of every reading, that of further ones drawn after the first; where a held link stands too."""
+
+    def find_std(values: CompletedParameters, name: str) -> float:
+        return 0.0 if name in loop.standing else loop.sensors.combine_errors(loop.plant, values, name)[0]
+
+    std = np.array([[find_std(values, name) for name in loop.signals] for values in params])
+    noise = np.zeros((len(params), n, len(loop.signals)))
+    for name in loop.standing:
+        noise[:, :, loop.signals.index(name)] = np.broadcast_to(standing, len(params))[:, None]
     if not np.any(std):
-        return np.zeros((len(params), n, len(loop.signals)))
+        return noise
     rng = np.random.default_rng(seed)
-    return std[:, None, :] * np.column_stack([rng.normal(size=n) for _ in loop.signals])
+    return noise + std[:, None, :] * np.column_stack([rng.normal(size=n) for _ in loop.signals])
 
 
 def _external(plant: Plant, signals: Mapping[str, Float[np.ndarray, " n"]], n: int) -> Float[np.ndarray, "n ne"]:

@@ -96,6 +96,9 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
         read = y[[names.index(name) for name in loop.fed_back]]
         force = float(read[0])
         inner, reference = _law_at_rest(law, read if law.measured > 1 else force, float(u[0]), plant, loop.regulated)
+        if law.compensation is not None and law.compensation.gravity is not None:
+            gravity = law.compensation.gravity
+            reference -= gravity.effort(float(y[names.index(gravity.reads)])) if gravity.reads in names else 0.0
         forgotten = np.zeros(loop.law_states - inner.size)
         z[run] = np.concatenate([inner, forgotten, np.full(loop.waiting, u[0])])
         figures[run] = reference, force, u[0], y[-1]

@@ -143,7 +143,9 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     )
     readings: list[Any] = []
     for column, (signal, device) in enumerate(zip(structure.measured, structure.devices, strict=True)):
-        reading, weights = outputs[signal] + w[column], weigh_encoders(plant, signal)
+        reading, weights = outputs.get(signal, 0.0) + w[column], {}
+        if signal in outputs:
+            weights = weigh_encoders(plant, signal)
         for number, (name, encoder) in enumerate(structure.encoders, measured):
             if name in weights:
                 reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])

@@ -47,9 +47,12 @@ def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
     measured[:n, 0], measured[:n, 1] = law.b_measurement, law.b_reference * by_position
     measured[n, 1] = (1.0 - outer.pole) * outer.rate
     by_reference = outer.direction * outer.stiffness
+    added = law.compensation
+    if added is not None and added.gravity is not None:  # of the force law's reference: here it moves x_0
+        added = replace(added, gravity=added.gravity.scaled(1.0 / by_reference))
     return replace(
         law, a=a, b_measurement=measured, c=np.append(law.c, law.d_reference * by_speed),
         b_reference=np.append(law.b_reference * by_reference, 0.0), d_reference=law.d_reference * by_reference,
         d_measurement=np.array([float(law.d_measurement), law.d_reference * by_position]),
-        anti_windup=np.append(law.anti_windup, 0.0),
+        anti_windup=np.append(law.anti_windup, 0.0), compensation=added,
     )  # fmt: skip

@@ -66,7 +66,7 @@ class SampledLoop:
     def __post_init__(self) -> None:
         plant = self.plant
         for name in self.signals:
-            if name not in plant.outputs:
+            if name not in plant.outputs and name not in self.standing:
                 raise SimulationError(
                     f'measured = "{name}" is not an output of {plant.name}; ' + suggestion(name, plant.outputs)
                 )
@@ -97,7 +97,7 @@ class SampledLoop:
                 "zero is; give the amplifier's step"
             )
         for name in self.signals if self.delay_samples == 0 else ():
-            if ca.depends_on(plant.output[list(plant.outputs).index(name)], plant.u[0]):
+            if name not in self.standing and ca.depends_on(plant.output[list(plant.outputs).index(name)], plant.u[0]):
                 raise SimulationError(
                     f"{name} of {plant.name} contains the present command, which a law without delay sets from "
                     "it; give delay_samples = 1 or more, or measure another output"
@@ -115,6 +115,14 @@ class SampledLoop:
         return tuple(dict.fromkeys((*self.fed_back, *further)))
 
     @property
+    def standing(self) -> tuple[str, ...]:
+        """The link's position, where gravity is compensated by it and the plant holds its link."""
+        gravity = None if self.law.compensation is None else self.law.compensation.gravity
+        if gravity is None or gravity.reads in self.plant.outputs or self.plant.moves:
+            return ()
+        return (gravity.reads,)
+
+    @property
     def law_states(self) -> int:
         """How many numbers the law keeps: its states, and what its compensation remembers."""
         remembered = 0 if self.law.compensation is None else self.law.compensation.shape.remembered
@@ -130,7 +138,8 @@ class SampledLoop:
         """The encoders that the measured outputs are computed from and that have an offset, a range or a step."""
         sensors = self.sensors
         erring = {*sensors.offset, *sensors.saturation, *sensors.quantisation} & self.plant.outputs.keys()
-        used = [name for signal in self.signals for name in weigh_encoders(self.plant, signal) if name in erring]
+        signals = [name for name in self.signals if name not in self.standing]
+        used = [name for signal in signals for name in weigh_encoders(self.plant, signal) if name in erring]
         return tuple(dict.fromkeys(used))
 
     @property

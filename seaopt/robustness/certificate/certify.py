@@ -43,6 +43,7 @@ from seaopt.robustness.certificate.certificate import (
 )
 from seaopt.robustness.certificate.compensation import find_compensation_at_draws, find_nominal_compensation
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
+from seaopt.robustness.certificate.gravity import require_gravity
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
 from seaopt.robustness.certificate.measured_draws import Loops, measure_draws, search_worst
 from seaopt.robustness.certificate.requirements import (
@@ -211,12 +212,14 @@ def certify(
         impedance = replace(impedance, draws=draw_impedance(controller, models, unknown, samples, rng, rendering))
     compensation = find_nominal_compensation(controller, models, nominal)
     compensation_draws = find_compensation_at_draws(controller, models, unknown, compensation, samples, rng)
+    gravity = require_gravity(controller, models, unknown, samples, rng)
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin),
         *compensation_requirements(controller, compensation, compensation_draws),
+        *gravity,
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
         *impedance_requirements(impedance),
     )

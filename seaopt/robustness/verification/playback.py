@@ -20,7 +20,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
 from seaopt.plants.friction import can_stick
 from seaopt.plants.impacts import catch, offset, release, strike
-from seaopt.plants.plant import fill_vector
+from seaopt.plants.plant import fill_vector, output_function
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
 from seaopt.robustness.verification.scenarios import Phase, Scenario
@@ -219,7 +219,10 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             now = LoopState(x=np.stack(blows), z=now.z)
         loop = stage.loop(phase.held, longest, sticks=scenario.friction == "sticking")
         reference = offset + _build_reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
-        run = run_loop(loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s)
+        run = run_loop(
+            loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s,
+            standing=0.0 if grip is None else _read_standing(stage, values, grip, loop.standing),
+        )  # fmt: skip
         now, begin_s = run.end, begin_s + reference.shape[1] * loop.law.sample_time_s
         runs.append(run)
     return _join_phases(stage, runs, rest, tuple(contacts))
@@ -269,6 +272,20 @@ def _catch(
     impulse, loss = (np.array([figures[k] for figures in catches]) for k in (1, 2))
     contact = Contact(time_s=time_s, impulse=impulse, loss_J=loss)
     return after, [{name: float(row[place])} for row in now.x], contact
+
+
+def _read_standing(
+    stage: Stage, values: Sequence[CompletedParameters], grip: Sequence[Mapping[str, float]], names: tuple[str, ...]
+) -> Float[np.ndarray, " runs"]:
+    """Return where held links stand, as their position is read."""
+    if not names:
+        return np.zeros(len(values))
+    plant = stage.plant
+    observe, row, still = output_function(plant), list(plant.outputs).index(names[0]), np.zeros(len(plant.inputs))
+    places = [fill_vector("state", plant.states, at) for at in grip]
+    return np.array([
+        float(observe(0.0, x, still, each.vector)[row]) for x, each in zip(places, values, strict=True)
+    ])  # fmt: skip
 
 
 def _let_go(

@@ -9,13 +9,23 @@ where :math:`v_k` is the velocity at the friction: the one that the reference as
 :math:`v_k = g (\theta_k - \theta_{k-1})/T_s` of an encoder at the motor, which is a feedback
 (`seaopt.control.loops.compensation.stability`). The saturation has the slope of a hyperbolic tangent at rest, needs no
 library on a target, and is monotone and odd, which is all that the test of stability asks.
+
+Gravity is met through the reference: what the spring has to carry so that the link stands still where it is,
+
+.. math:: r_k' = r_k + \gamma G(x_k), \qquad G(x) = \sum_n g_n T_n(\xi), \qquad
+          \xi = \mathrm{sat}\left(\frac{2 x - x_\mathrm{lo} - x_\mathrm{hi}}{x_\mathrm{hi} - x_\mathrm{lo}}\right),
+
+of the link's measured position x, as a series of Chebyshev polynomials summed by Clenshaw's recurrence, constant
+beyond its range.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Literal
+
+from numpy.polynomial.chebyshev import chebder, chebval
 
 from seaopt.errors import ControlError, require_number
 from seaopt.records import record
@@ -71,6 +81,92 @@ class CompensateFriction:
             self.speed, "compensate.friction.speed", ControlError
         ) < float("inf"):
             raise ControlError(f"compensate.friction.speed = {self.speed:g} is not positive; leave it out, or give one")
+
+
+@record
+class CompensateGravity:
+    """What is asked of a compensation of gravity.
+
+    Parameters
+    ----------
+    fraction : float
+        Of what the spring carries at rest, above 0 and up to 1.5; above 1 a link falls upwards.
+
+    Raises
+    ------
+    ControlError
+        The fraction is out of range.
+
+    """
+
+    fraction: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < require_number(self.fraction, "compensate.gravity.fraction", ControlError) <= 1.5:
+            raise ControlError(
+                f"compensate.gravity.fraction = {self.fraction:g} is not above 0 and up to 1.5; give fraction = 1.0"
+            )
+
+
+@record
+class GravityTerm:
+    """Compensation of gravity as it runs.
+
+    Parameters
+    ----------
+    coefficients : tuple of float
+        Of Chebyshev's polynomials, the fraction in them, in the unit of the reference.
+    low, high : float
+        The range of the link's position in which they hold, in its unit.
+    reads : str
+        The output that is the link's position.
+    unit : str
+        Of it.
+    fraction : float
+        Of what the spring carries at rest.
+
+    Examples
+    --------
+    >>> term = GravityTerm(coefficients=(0.0, 3.0), low=-0.5, high=0.5, reads="theta_l", unit="rad", fraction=1.0)
+    >>> term.effort(0.25), term.effort(2.0), term.slope(0.25)
+    (1.5, 3.0, 6.0)
+
+    """
+
+    coefficients: tuple[float, ...]
+    low: float
+    high: float
+    reads: str
+    unit: str
+    fraction: float
+
+    @property
+    def numbers(self) -> list[float]:
+        """Middle of the range, 2 over its width, and the coefficients."""
+        return [0.5 * (self.low + self.high), 2.0 / (self.high - self.low), *self.coefficients]
+
+    def effort(self, position: float) -> float:
+        """Return what is added to the reference at a position."""
+        return _sum_series(self.numbers, position, _Floats)
+
+    def slope(self, position: float) -> float:
+        """Return its slope there; zero beyond the range."""
+        if not self.low <= position <= self.high:
+            return 0.0
+        middle, scale, *coefficients = self.numbers
+        return float(scale * chebval(scale * (position - middle), chebder(coefficients)))
+
+    def scaled(self, factor: float) -> GravityTerm:
+        """Return the term times a factor."""
+        return replace(self, coefficients=tuple(factor * one for one in self.coefficients))
+
+    def describe(self, effort_unit: str) -> str:
+        """Return what it does in words."""
+        largest = max(abs(self.effort(self.low)), abs(self.effort(self.high)), abs(self.effort(0.5 * self.high)))
+        return (
+            f"{100.0 * self.fraction:.3g} % of the link's weight, by {self.reads} from {self.low:.3g} to "
+            f"{self.high:.3g} {self.unit}, of the order of {largest:.3g} {effort_unit}"
+        )
 
 
 @record
@@ -131,6 +227,7 @@ class Compensation:
     sample_time_s : float
         Seconds.
     friction : FrictionTerm, optional
+    gravity : GravityTerm, optional
 
     Examples
     --------
@@ -146,24 +243,27 @@ class Compensation:
 
     sample_time_s: float
     friction: FrictionTerm | None = None
+    gravity: GravityTerm | None = None
 
     @property
     def reads(self) -> tuple[str, ...]:
         """The outputs that it reads, besides what the law does."""
-        return (self.friction.reads,) if self.friction is not None and self.friction.reads else ()
+        named = [term.reads for term in (self.friction, self.gravity) if term is not None]
+        return tuple(name for name in named if name)
 
     @property
     def numbers(self) -> list[float]:
         """Its numbers, in the order in which `compensate` takes them."""
-        if self.friction is None:
-            return []
-        return [self.friction.effort, self.friction.share_per_step(self.sample_time_s)]
+        friction = self.friction
+        rubs = [] if friction is None else [friction.effort, friction.share_per_step(self.sample_time_s)]
+        return rubs + ([] if self.gravity is None else self.gravity.numbers)
 
     @property
     def shape(self) -> CompensationShape:
         """What of it is no number."""
         return CompensationShape(
             friction=None if self.friction is None else self.friction.source, reads=self.reads,
+            gravity=0 if self.gravity is None else len(self.gravity.numbers),
         )  # fmt: skip
 
     def step(self, memory: Memory, reference: float, readings: Sequence[float]) -> tuple[float, float, Memory]:
@@ -190,15 +290,17 @@ class Compensation:
                 "one reading for each"
             )
         asked, effort, kept = compensate(self.shape, self.numbers, memory, reference, readings, _Floats)
-        return asked, effort, (kept[0], kept[1])
+        return asked, effort, (kept[0], kept[1]) if kept else FORGOTTEN
 
     def to_dict(self) -> dict[str, Any]:
         """Return its terms, for controller.json."""
-        return {"friction": None if self.friction is None else asdict(self.friction)}
+        terms = {"friction": self.friction, "gravity": self.gravity}
+        return {name: None if term is None else asdict(term) for name, term in terms.items()}
 
     def describe(self, effort_unit: str) -> list[str]:
         """Return what it does, one line for each term."""
-        return [] if self.friction is None else [f"friction: {self.friction.describe(effort_unit)}"]
+        terms = {"friction": self.friction, "gravity": self.gravity}
+        return [f"{name}: {term.describe(effort_unit)}" for name, term in terms.items() if term is not None]
 
 
 @record
@@ -207,6 +309,7 @@ class CompensationShape:
 
     friction: FrictionSource | None = None
     reads: tuple[str, ...] = ()
+    gravity: int = 0
 
     @property
     def remembered(self) -> int:
@@ -216,7 +319,7 @@ class CompensationShape:
     @property
     def size(self) -> int:
         """How many numbers it takes."""
-        return 0 if self.friction is None else 2
+        return (0 if self.friction is None else 2) + self.gravity
 
 
 class _Floats:
@@ -249,9 +352,26 @@ def compensate(
         What has fmin and fmax for them: the module casadi for expressions.
 
     """
+    asked = reference
+    if shape.gravity:
+        asked = reference + _sum_series(numbers[-shape.gravity :], readings[-1], operations)
     if shape.friction is None:
-        return reference, 0.0, []
+        return asked, 0.0, []
     effort, share_per_step = numbers[:2]
     now = reference if shape.friction == "reference" else readings[0]
     share = memory[0] * share_per_step * (now - memory[1])
-    return reference, effort * operations.fmax(operations.fmin(share, 1.0), -1.0), [1.0, now]
+    return asked, effort * _limit(share, operations), [1.0, now]
+
+
+def _limit(value: Any, operations: Any) -> Any:
+    return operations.fmax(operations.fmin(value, 1.0), -1.0)
+
+
+def _sum_series(numbers: Sequence[Any], position: Any, operations: Any) -> Any:
+    """Return a series of Chebyshev's polynomials, by Clenshaw's recurrence; constant beyond its range."""
+    middle, scale, *coefficients = numbers
+    place = _limit(scale * (position - middle), operations)
+    one, two = 0.0 * place, 0.0 * place
+    for coefficient in coefficients[:0:-1]:
+        one, two = 2.0 * place * one - two + coefficient, one
+    return place * one - two + coefficients[0]

@@ -1,0 +1,68 @@
+"""The requirement on a controller that compensates gravity: no link that hangs may rise, whatever it weighs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import (
+    CompensateGravity,
+    Impedance,
+    SampledLoop,
+    add_compensation,
+    add_impedance,
+    run_loop,
+    runnable,
+)
+from seaopt.robustness.certificate.gravity import NEUTRAL, find_worst_gravity
+
+KNEE, HELD = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
+VALUES = KNEE.defaults.update(N=50.0, k_s=300.0, J_l=0.3, d_l=0.5, m=4.0, L=0.2, f_c=0.0)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return so.tune(HELD, VALUES, so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6))
+
+
+def compensate(controller, fraction):
+    return add_compensation(controller, gravity=CompensateGravity(fraction=fraction), link=(KNEE, VALUES))
+
+
+def test_eigenvalue_is_that_of_the_link_under_what_is_left_of_its_weight(plain):
+    found = find_worst_gravity(compensate(plain, 1.2), KNEE, VALUES, [{}])
+    left = 4.0 * 9.81 * 0.2 * (1.0 - 1.2)  # J s^2 + d s + left = 0, and the torque follows its reference at once
+    rate = (-0.5 + np.sqrt(0.25 - 4.0 * 0.3 * left)) / 0.6
+    assert found.angle == pytest.approx(0.0, abs=1e-9)
+    assert (found.radius - 1.0) / 1e-3 == pytest.approx(rate, rel=0.05)
+
+
+def test_a_link_that_weighs_less_than_is_compensated_is_found(plain):
+    lighter = [{}, {"m": 3.5}, {"m": 4.5}]
+    neutral = find_worst_gravity(compensate(plain, 1.0), KNEE, VALUES, [{}])
+    assert neutral.radius <= 1.0 + NEUTRAL
+    assert find_worst_gravity(compensate(plain, 0.8), KNEE, VALUES, lighter).radius < 1.0
+    worst = find_worst_gravity(compensate(plain, 1.0), KNEE, VALUES, lighter)
+    assert (worst.radius > 1.0 + NEUTRAL, worst.parameters) == (True, {"m": 3.5})
+    held = compensate(add_impedance(plain, KNEE, VALUES, Impedance(stiffness=20.0, damping=1.0)), 1.0)
+    assert find_worst_gravity(held, KNEE, VALUES, lighter).radius < 1.0
+
+
+def test_certificate_requires_it(plain):
+    certificate = so.certify(
+        compensate(plain, 1.0), {"knee": KNEE}, VALUES, ranges={"m": (3.7, 4.3)}, samples=5, simulations=False
+    )
+    (row,) = [row for row in certificate.requirements if row.name == "gravity_compensation"]
+    assert not row.met
+    assert row.where.startswith("knee at 0 rad and m = 3")
+
+
+def test_an_impedance_stands_where_it_is_asked_to(plain):
+    from seaopt.control.running.outer_run import enclose_law
+
+    stiff = compensate(add_impedance(plain, KNEE, VALUES, Impedance(stiffness=20.0, damping=1.0)), 1.0)
+    law = enclose_law(runnable(stiff), stiff.outer)
+    loop = SampledLoop(plant=KNEE, law=law, measured=("tau_s", "theta_l"), delay_samples=1)
+    ends = run_loop(loop, [VALUES], np.full(4000, 0.6)).outputs["theta_l"][0]
+    assert ends[-1] == pytest.approx(0.6, abs=2e-3)  # 20 N m/rad against 4.4 N m: without it 0.45
