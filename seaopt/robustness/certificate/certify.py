@@ -41,9 +41,12 @@ from seaopt.robustness.certificate.certificate import (
     Requirement,
     plant_margins,
 )
-from seaopt.robustness.certificate.compensation import find_compensation_at_draws, find_nominal_compensation
+from seaopt.robustness.certificate.compensation import (
+    find_compensation_at_draws,
+    find_gravity_cases,
+    find_nominal_compensation,
+)
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
-from seaopt.robustness.certificate.gravity import require_gravity
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
 from seaopt.robustness.certificate.measured_draws import Loops, measure_draws, search_worst
 from seaopt.robustness.certificate.requirements import (
@@ -51,6 +54,7 @@ from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
     friction_requirements,
+    gravity_requirements,
     impedance_requirements,
     measured_design_requirements,
     measured_requirements,
@@ -212,14 +216,14 @@ def certify(
         impedance = replace(impedance, draws=draw_impedance(controller, models, unknown, samples, rng, rendering))
     compensation = find_nominal_compensation(controller, models, nominal)
     compensation_draws = find_compensation_at_draws(controller, models, unknown, compensation, samples, rng)
-    gravity = require_gravity(controller, models, unknown, samples, rng)
+    gravity = find_gravity_cases(controller, models, unknown, samples, rng)
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin),
         *compensation_requirements(controller, compensation, compensation_draws),
-        *gravity,
+        *gravity_requirements(controller, models, gravity),
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
         *impedance_requirements(impedance),
     )

@@ -20,7 +20,13 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, MonteCarlo, Requirement
-from seaopt.robustness.certificate.compensation import FRICTION_COMPENSATION, CompensationDraws
+from seaopt.robustness.certificate.compensation import (
+    FRICTION_COMPENSATION,
+    GRAVITY_COMPENSATION,
+    NEUTRAL,
+    CompensationDraws,
+    GravityCase,
+)
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.uncertainty.severity import UNSTABLE
@@ -164,6 +170,25 @@ def compensation_requirements(
                 f"; shown up to {value / margin.asked * controller.compensation.friction.fraction:.3g} of the friction"
             )
         rows.append(Requirement(name=FRICTION_COMPENSATION, limit=margin.asked, value=value, met=met, where=where))
+    return rows
+
+
+def gravity_requirements(
+    controller: Controller, models: Mapping[str, Plant], cases: Mapping[str, GravityCase]
+) -> list[Requirement]:
+    """Return that no link that hangs rises with its weight compensated, at nominal values and over draws."""
+    if controller.compensation is None or controller.compensation.gravity is None:
+        return []
+    percent = f"{100.0 * controller.compensation.gravity.fraction:.3g} % of the weight compensated"
+    rows: list[Requirement] = []
+    for name, case in cases.items():
+        port = models[name].port
+        unit = "" if port is None else models[name].states[str(port.coordinate)]
+        known = f" and {format_values(case.parameters)}" if case.parameters else ""
+        rows.append(Requirement(
+            name=GRAVITY_COMPENSATION, limit=1.0 + NEUTRAL, value=case.radius, met=case.radius <= 1.0 + NEUTRAL,
+            where=f"{name} at {case.angle:.3g} {unit}{known}: the largest eigenvalue with {percent}",
+        ))  # fmt: skip
     return rows
 
 

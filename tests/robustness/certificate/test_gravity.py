@@ -15,7 +15,7 @@ from seaopt.control import (
     run_loop,
     runnable,
 )
-from seaopt.robustness.certificate.gravity import NEUTRAL, find_worst_gravity
+from seaopt.robustness.certificate.compensation import NEUTRAL, find_worst_gravity
 
 KNEE, HELD = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
 VALUES = KNEE.defaults.update(N=50.0, k_s=300.0, J_l=0.3, d_l=0.5, m=4.0, L=0.2, f_c=0.0)
