@@ -28,6 +28,7 @@ from seaopt.units import unit_after
 SCHEDULE_SCHEMA = "seaopt/schedule/1"
 PARTS = 4  # of every stretch between two points, at whose ends the limits are judged
 LEAST_BANDWIDTH = 0.9  # of the one asked, that the law has between the points
+SAME_GAIN = 0.01  # of its largest, by which a gain that is called the same may change
 LARGE_STEP = 1.0  # of a gain between neighbours, over the smaller of the two, from which it is remarked on
 Plants = Mapping[str, tuple[Plant, ParameterSet]]
 
@@ -160,7 +161,14 @@ class ScheduledController:
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
         shared = [note for note in self.controllers[0].notes if all(note in one.notes for one in self.controllers)]
-        return (*shared, *self._step_notes())
+        return (*shared, *self._same_notes(), *self._step_notes())
+
+    def _same_notes(self) -> tuple[str, ...]:
+        """Say that one law would do, where no gain changes."""
+        rows = self.table.gains.values()
+        if any(np.ptp(row) > SAME_GAIN * np.max(np.abs(row)) for row in rows):
+            return ()
+        return (f"no gain changes over {self.over}: one law for all points does, without a schedule",)
 
     def _step_notes(self) -> tuple[str, ...]:
         """Name gains that more than double from a point to the next: another valley of the tuner, or too few points."""

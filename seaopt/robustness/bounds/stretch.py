@@ -87,7 +87,9 @@ def bound_stretch(
     """
     frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s
     change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
-    nominal = combine_uncertainty(params, ParameterSet(), {table.over: (low, high)}, {name: plant})
+    moves = table.over in plant.parameters or table.over in plant.states
+    ranges = {table.over: (low, high)} if moves else {}  # of a plant without the variable the law alone changes
+    nominal = combine_uncertainty(params, ParameterSet(), ranges, {name: plant})
     alone = Uncertainty(
         nominal=nominal.nominal, names=(), covariance=np.zeros((0, 0)), ranges=nominal.ranges, absent=nominal.absent
     )

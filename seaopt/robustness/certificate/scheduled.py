@@ -143,6 +143,10 @@ class ScheduleCertificate:
     def assumption(self) -> str:
         """What is assumed of the variable's motion, with the number that the simulations give it."""
         over, rate = self.schedule.over, f"{self.fastest:.3g} {self.rate_unit}"
+        if not self.sweeps:
+            return (
+                f"{over} is assumed to move slowly: the limits hold with it standing still, and no sweep was simulated"
+            )
         if not self.fastest:
             return f"{over} is assumed to stand still: the slowest sweep that was simulated does not keep its judgement"
         return (

@@ -195,6 +195,11 @@ class TestTuneSchedule:
         made = tune_schedule(plants[0], plants[2], spec, "phi", [0.0, 0.4], bandwidths_hz=[30, 25])
         assert [round(one.achieved.bandwidth_hz, 1) for one in made.controllers] == [30.0, 25.0]
 
+    def test_gains_that_do_not_change_are_noted(self, schedule):
+        same = replace(schedule, controllers=(schedule.controllers[0],) * len(schedule.points))
+        assert any("one law" in note for note in same.notes)
+        assert not any("one law" in note for note in schedule.notes)
+
     def test_what_cannot_be_scheduled_is_refused(self, plants):
         stand, _, values = plants
         spec = so.ControllerSpec(measured="tau", bandwidth_hz=30)

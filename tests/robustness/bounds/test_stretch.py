@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import seaopt as so
 from seaopt.robustness.bounds.stretch import bound_stretch
 from tests.schedules import read_knee, tune_knee
 
@@ -20,6 +21,19 @@ def test_no_frozen_loop_of_a_stretch_has_more_than_its_bound(which, low, high):
     ]  # fmt: skip
     assert bound.shown and all(one.stable for one in found)
     assert max(one.ms for one in found) <= bound.ms <= 1.15 * max(one.ms for one in found)
+
+
+def test_of_a_plant_without_the_variable_the_law_alone_changes():
+    schedule, (stand, _, values) = tune_knee(), read_knee()
+    straight = so.Plant(
+        name="leg straight", states=stand.states, inputs=stand.inputs, outputs=stand.outputs,
+        parameters={name: unit for name, unit in stand.parameters.items() if name != "phi"},
+        f=lambda t, x, u, p: {"q": x.v, "v": (p.K_f * u.I - p.b * x.v - p.k * x.q) / p.M},
+        h=lambda t, x, u, p: {"tau": p.L_a * p.k * x.q}, actuation=stand.actuation,
+    )  # fmt: skip
+    bound = bound_stretch("it", schedule.at(0.05), schedule.table, straight, values, 0.0, 0.1)
+    found = [schedule.at(s).close(straight, values).figures().ms for s in np.linspace(0.0, 0.1, 5)]
+    assert bound.shown and max(found) <= bound.ms <= 1.15 * max(found)
 
 
 def test_a_law_that_changes_too_much_on_a_stretch_is_not_said_to_be_stable():
