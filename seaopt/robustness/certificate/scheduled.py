@@ -29,7 +29,7 @@ from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.formatting import format_count, html_text
+from seaopt.formatting import format_count, html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
@@ -165,12 +165,10 @@ class ScheduleCertificate:
                 f"for every {over} from {first:g} to {last:g}, standing still, at the nominal parameters: stable, Ms "
                 f"below {_round_up(max(shown))}, proved"
             )
-        spans = ", ".join(f"{one.low:.4g} to {one.high:.4g} ({one.plant})" for one in missing[:3])
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        return (
-            f"between the values that were looked at nothing is proved of {format_count(len(missing), 'stretch')[:-1]}"
-            f"{'es' if len(missing) > 1 else 'h'}: {over} = {spans}{more}, {missing[0].reason}"
-        )
+        spans = [f"{over} = {one.low:.4g} to {one.high:.4g} on {one.plant}" for one in missing[:3]]
+        more = [f"{len(missing) - 3} more"] if len(missing) > 3 else []
+        where = join_words([*spans, *more])
+        return f"nothing is proved between the values that were looked at for {where}: {missing[0].reason}"
 
     @property
     def notes(self) -> tuple[str, ...]:

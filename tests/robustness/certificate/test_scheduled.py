@@ -46,6 +46,8 @@ def test_every_stretch_is_proved_and_above_what_was_found(certificate):
     assert all(one.shown for one in certificate.stretches) and len(certificate.stretches) == 16
     assert max(one.ms for one in certificate.stretches) >= max(place.ms for place in certificate.places)
     assert "proved" in certificate.proof
+    lost = replace(certificate.stretches[0], reason="no bound in 400 boxes")
+    assert replace(certificate, stretches=(lost,)).proof.startswith("nothing is proved")
 
 
 @pytest.mark.slow
