@@ -16,7 +16,7 @@ from seaopt.control.loops.compensation import stability
 from seaopt.control.loops.compensation.stability import SpeedReading, compensation_margin
 
 STAND, PARAMETERS = so.plants.high_impedance(), so.plants.thor().update(f_c=100.0)
-SUBSTEPS = 200
+SUBSTEPS = 120
 
 
 @pytest.fixture(scope="module")

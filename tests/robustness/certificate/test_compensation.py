@@ -9,7 +9,11 @@ import pytest
 import seaopt as so
 from seaopt.control import CompensateFriction, add_compensation
 from seaopt.files import to_json
-from seaopt.robustness.certificate.compensation import FROM_REFERENCE
+from seaopt.robustness.certificate.compensation import (
+    FROM_REFERENCE,
+    describe_compensation,
+    find_nominal_compensation,
+)
 
 STAND, PARAMETERS = so.plants.high_impedance(), so.plants.thor().update(f_c=100.0)
 RANGES = {"f_c": (20.0, 120.0), "K_tau": (0.024, 0.027)}
@@ -22,7 +26,7 @@ def controller():
 
 def certify(controller, **options):
     return so.certify(
-        controller, {"stand": STAND}, PARAMETERS, ranges=RANGES, samples=10, simulations=False, **options
+        controller, {"stand": STAND}, PARAMETERS, ranges=RANGES, samples=5, simulations=False, **options
     )  # fmt: skip
 
 
@@ -36,7 +40,7 @@ def test_stability_is_required_with_less_friction_than_is_compensated(controller
     (row,) = find(certificate)
     assert row.met
     assert row.limit == pytest.approx(chosen.compensation.friction.slope)
-    assert certificate.compensation_draws["stand"].shown == 10
+    assert certificate.compensation_draws["stand"].shown == 5
     shown = float(row.where.split("shown up to ")[1].split(" ")[0])
     assert shown == pytest.approx(row.value * chosen.compensation.friction.speed / 100.0, rel=1e-2)
     assert row.value == certificate.compensation_draws["stand"].least_slope < certificate.compensation["stand"].slope
@@ -46,6 +50,7 @@ def test_stability_is_required_with_less_friction_than_is_compensated(controller
     assert again.compensation["stand"].slope == pytest.approx(stored["compensation"]["stand"]["slope"])
 
 
+@pytest.mark.slow
 def test_what_is_too_steep_is_not_met(controller):
     steep = add_compensation(controller, friction=CompensateFriction(fraction=0.9, source="speed", speed=5e-4))
     certificate = certify(steep)
@@ -58,6 +63,7 @@ def test_what_is_too_steep_is_not_met(controller):
 
 
 def test_reference_changes_no_stability(controller):
-    certificate = certify(add_compensation(controller, friction=CompensateFriction()))
-    assert not find(certificate)
-    assert FROM_REFERENCE in certificate.notes
+    added = add_compensation(controller, friction=CompensateFriction())
+    assert not find_nominal_compensation(added, {"stand": STAND}, PARAMETERS)
+    assert describe_compensation(added, {}, {}) == (FROM_REFERENCE,)
+    assert describe_compensation(controller, {}, {}) == ()

@@ -49,6 +49,7 @@ def test_a_link_that_weighs_less_than_is_compensated_is_found(plain):
     assert find_worst_gravity(held, KNEE, VALUES, lighter).radius < 1.0
 
 
+@pytest.mark.slow
 def test_certificate_requires_it(plain):
     certificate = so.certify(
         compensate(plain, 1.0), {"knee": KNEE}, VALUES, ranges={"m": (3.7, 4.3)}, samples=5, simulations=False
