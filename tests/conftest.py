@@ -37,7 +37,9 @@ CHOICES = (
     ("zero", "first"),
     ("split", "error"),
     ("auto", "declared", "none"),
-    ("pd", "pid", "pid_dob", "custom"),
+    ("pd", "pid", "pid_dob", "cascade", "custom"),
+    ("P", "PI"),
+    ("first_order", "second_order"),
     ("error", "measurement"),
     ("disturbance", "noise"),
 )

@@ -248,7 +248,7 @@ class Limit:
         """Tell whether a loop could keep what is asked."""
         return (self.above is None or asked > self.above) and (self.below is None or asked < self.below)
 
-    def allow(self, level: float | Literal[False] | None, bandwidth_hz: float) -> float | None:
+    def allow(self, level: Any, bandwidth_hz: float) -> float | None:
         """Return what a specification's level allows, None being its default; None where nothing is imposed.
 
         `bandwidth_hz` is the one that is asked for. A limit without a field has no level.

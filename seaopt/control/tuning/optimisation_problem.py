@@ -84,7 +84,8 @@ SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
 MORE_FREQUENCIES = 300  # about lightly damped modes
 LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
 NO_LIMIT = 1e9
-NO_FLOOR = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
+NO_FLOOR = 1e-9
+NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
 LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 NEARLY_KEPT = 1.001
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
@@ -279,7 +280,8 @@ class Task:
     def level(self, name: str, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return a curve's level, with the reserve taken off; one that is never reached where none is imposed."""
         curve, limit, keep = CURVES[name], BY_NAME[name], 1.0 - self.spec.reserve
-        allowed, never = self.spec.allowed(limit), NO_FLOOR if curve.floor else NO_LIMIT
+        allowed, floor = self.spec.allowed(limit), NO_FLOOR if self.spec.reference_filter is None else NO_FLOOR_FILTERED
+        never = floor if curve.floor else NO_LIMIT
         if allowed is None:
             return np.full(f.size, never)
         if limit.reserve == "figure":

@@ -68,7 +68,7 @@ def test_it_is_as_good_as_a_long_global_search(stand, thor):
     task = make_task(stand, thor, spec, {})
 
     def cost(v):
-        x = np.array([np.exp(v[0]), 0.0, np.exp(v[1]), 0.0, 0.0, 0.0, np.exp(v[2]), 1, 0, 1, 1, 1])
+        x = np.array([np.exp(v[0]), 0.0, np.exp(v[1]), 0.0, 0.0, 0.0, np.exp(v[2]), 1, 0, 1, 1, 1, 1, 1])
         loop = task.loop(x)
         f = np.geomspace(0.1, 499, 200)
         open_loop, tracking, noise = independent(loop, np.r_[f, 30.0])
