@@ -1,7 +1,8 @@
 """Compile, load and call native code: the kernels of log passes and of closed loops, where there is a C compiler.
 
 A kernel is one C function ``int f(const jobs *, long count)`` that does independent jobs one after the other.
-`load_kernel` compiles it once per user and source; `Kernel.run` shares the jobs among threads.
+`load_kernel` compiles it once per user and source, in however many processes; `Kernel.run` shares the jobs among
+threads.
 
 The shared libraries live in a folder of the user's own (mode 0700, refused if anyone else can write to it, or if it is
 a link) under the hash of their source, flags and compiler. A file with the hash of the library itself stands beside
@@ -30,9 +31,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -121,7 +122,7 @@ def load_library(source: str) -> ctypes.CDLL | None:
         return None
     key = hashlib.sha256("\0".join((source, *FLAGS, *compiler, sys.platform, _processor())).encode()).hexdigest()
     library = folder / f"{key}.so"
-    for ready in (_is_whole, partial(_compile, compiler, source)):
+    for ready in (_is_whole, partial(_compile_once, compiler, source)):
         if ready(library) and _is_private(library):
             try:
                 return ctypes.CDLL(str(library))
@@ -150,6 +151,26 @@ def _processor() -> str:
     except OSError:
         return platform.processor()
     return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
+
+
+def _compile_once(compiler: list[str], source: str, library: Path) -> bool:
+    """Compile as `_compile` does; of several processes that want one library at a time, one does, and others wait."""
+    with _lock(library.with_suffix(".lock")):
+        return _is_whole(library) or _compile(compiler, source, library)
+
+
+@contextmanager
+def _lock(path: Path) -> Generator[None]:
+    """Hold a file's lock, which ends with the process; on a disk that has none everybody goes on at once."""
+    import fcntl  # not on Windows, where nothing is compiled
+
+    with ExitStack() as stack:
+        with suppress(OSError):
+            handle = stack.enter_context(path.open("w"))
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+        with suppress(OSError):  # whoever waits has it open still, and finds the library made
+            path.unlink()
 
 
 def _compile(compiler: list[str], source: str, library: Path) -> bool:

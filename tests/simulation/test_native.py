@@ -269,6 +269,16 @@ def test_a_compiler_that_hangs_is_asked_once(kernels, make_compiler, monkeypatch
     assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == 2
 
 
+@needs_compiler
+def test_processes_that_want_one_kernel_compile_it_once(kernels, make_compiler, tmp_path):
+    make_compiler(f'echo asked >> "{tmp_path}/asked"; sleep 0.3; exec {native.shutil.which("cc")} "$@"')
+    program = [sys.executable, "-c", LOAD.format(source=ANSWER % "at once")]
+    processes = [subprocess.Popen(program, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    assert [process.communicate(timeout=60)[0] for process in processes] == ["42\n"] * 3
+    assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == 1
+    assert {file.suffix for file in kernels.iterdir()} == {".so", ".sha256"}
+
+
 def test_a_compiler_that_fails_leaves_nothing(kernels, make_compiler):
     make_compiler("exit 1")
     assert native.load_library(ANSWER % "fails") is None
