@@ -132,8 +132,7 @@ def _write(fleet: Fleet, drift: Drift, population: Population | None, folder: Pa
 def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> None:
     """Print the verdict on the logs, and which actuators have an alarm."""
     reasons = tuple(Reason(what=f"{text} ({log})", where="", count=count) for text, count, log in fleet.reasons)
-    again = () if fleet.met else ("mend what failed, then type the same command: only that is fitted again",)
-    verdict = StageVerdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=again)
+    verdict = StageVerdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=_advise(fleet))
     show_verdicts(console, [verdict], verbose=verbose)
     if drift.left_out:
         total = format_count(len(fleet.rows), "log")
@@ -150,6 +149,18 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
         console.wrap(f"and {len(drift.alarms) - len(shown)} more: --verbose prints them", indent=9)
     if drift.history.warning:
         console.wrap(f"warning: {drift.history.warning}", indent=9)
+
+
+def _advise(fleet: Fleet) -> tuple[str, ...]:
+    """Return what to do about logs that failed or are not met: the latter stay as they are until something changes."""
+    from seaopt.fleet.worker import FAILED, NOT_MET
+
+    counts = fleet.counts
+    failed = ("mend what failed, then type the same command: only that is fitted again",) if counts[FAILED] else ()
+    not_met = (
+        "what is not met is fitted again when its log or the problem changes; a changed problem fits every log anew",
+    )
+    return failed + (not_met if counts[NOT_MET] else ())
 
 
 def _show_tables(console: Terminal, fleet: Fleet, population: Population | None, missing: str) -> None:

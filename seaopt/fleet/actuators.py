@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from seaopt.files import write_bytes
-from seaopt.fleet.drift import Drift
+from seaopt.fleet.drift import Between, Drift
 from seaopt.fleet.history import LABEL, TIME, format_time
 from seaopt.fleet.population import Population
 from seaopt.fleet.result import Fleet
@@ -36,8 +36,8 @@ def tabulate_actuators(fleet: Fleet, drift: Drift, population: Population | None
     polars.DataFrame
         Columns label (the identity in one text), those of the identity, logs, met, not_met, failed, last (time),
         alarm, alarms (in words), level (the largest chart over its threshold), off; of each parameter NAME and NAME_std
-        (weighted means of the logs that are met, where there is no population), then NAME_slope, NAME_change and
-        NAME_level with their stds.
+        (weighted means of the logs that are met, where there is no population; the std is of the fits and, where drift
+        tells it, of what differs from run to run), then NAME_slope, NAME_change and NAME_level with their stds.
 
     Examples
     --------
@@ -58,7 +58,7 @@ def tabulate_actuators(fleet: Fleet, drift: Drift, population: Population | None
         pl.len().alias("logs"),
         *((pl.col("status") == status).sum().alias(name) for name, status in statuses.items()),
         pl.col(TIME).max(),
-        *(column for name in names for column in _average(name)),
+        *(column for name in names for column in _average(name, drift.between.get(name))),
     )
     table = counted.rename({LABEL: "label"}).with_columns(
         pl.col(TIME).map_elements(lambda time: format_time(time, history.unit), return_dtype=pl.String).alias("last")
@@ -97,11 +97,11 @@ def write_actuators(table: pl.DataFrame, path: Path | str) -> Path:
     return write_bytes(path, content.getvalue())
 
 
-def _average(name: str) -> tuple[pl.Expr, pl.Expr]:
-    """Return the mean of a parameter over logs that are met, weighted by their fits, and its std."""
+def _average(name: str, between: Between | None) -> tuple[pl.Expr, pl.Expr]:
+    """Return the mean of a parameter over logs that are met, weighted by fits and spread between runs, and its std."""
     value, std = (pl.col(column).cast(pl.Float64) for column in (name, f"{name}_std"))
     known = (pl.col("status") == MET) & value.is_finite() & (std > 0.0)
-    weights = 1.0 / std.filter(known) ** 2
+    weights = 1.0 / (std.filter(known) ** 2 + (between.std**2 if between else 0.0))
     total = weights.sum()
     some = total > 0.0
     mean = (value.filter(known) * weights).sum() / total

@@ -159,9 +159,10 @@ def _read_times(rows: pl.DataFrame, when: Sequence[str]) -> tuple[list[float | N
             return [None if one is None else one / DAY_S for one in numbers], DAY, source
         return numbers, when[0], source
     if when[0].lower() in DATES:
-        bad = next(text for text in texts if text)
+        first, odd = _find_odd_date(texts)
+        others = "" if odd == first else f', but "{first}" elsewhere'
         raise SeaoptError(
-            f'{source} has "{bad}" and others, which are no dates of one form; write all as 2026-01-31 or '
+            f'{source} has "{odd}"{others}, which are no dates of one form; write all as 2026-01-31 or '
             "2026-01-31T12:00:00, or name another column with --time"
         )
     ranks = _rank(texts)
@@ -176,6 +177,22 @@ def _read_dates(texts: Sequence[str]) -> list[float | None] | None:
         except ValueError:
             continue
     return None
+
+
+def _find_odd_date(texts: Sequence[str]) -> tuple[str, str]:
+    """Return the first text, and the first that is no date of its form; twice the first where that is no date."""
+    first = next(text for text in texts if text)
+    form = next((form for form in FORMATS if _has_form(first, form)), None)
+    odd = (text for text in texts if text and form and not _has_form(text, form))
+    return first, next(odd, first)
+
+
+def _has_form(text: str, form: str) -> bool:
+    try:
+        _read_date(text, form)
+    except ValueError:
+        return False
+    return True
 
 
 def _read_date(text: str, form: str) -> float:

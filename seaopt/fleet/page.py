@@ -226,7 +226,10 @@ def _note_table(table: pl.DataFrame, timed: bool, population: Population | None)
             "from that mean, in stds of the actuators."
         )
     else:
-        notes.append("Values are means over all logs of the actuator that are met, weighted by their fits.")
+        notes.append(
+            "Values are means over all logs of the actuator that are met, weighted by their fits"
+            + (" and by what differs from run to run, which their stds allow for." if timed else ".")
+        )
     if timed and len(table) > MOST_DRAWN:
         notes.append(f"The {MOST_DRAWN} worst of {len(table)} actuators have drawings.")
     if len(table) > MOST_ROWS:

@@ -65,6 +65,12 @@ def test_what_is_refused(options: dict[str, list[str]], words: str) -> None:
         order_runs(make_fleet(joint=["a", "b"], date=["yesterday", "2026-01-01"]), **options)
 
 
+def test_the_one_date_that_is_none_is_named() -> None:
+    dates = ["2026-01-01", "", "2026-01-02", "2026-13-03"]
+    with pytest.raises(SeaoptError, match='"2026-13-03"'):
+        order_runs(make_fleet(joint=["a"] * 4, date=dates))
+
+
 def test_numbers_of_other_length_are_no_dates() -> None:
     history = order_runs(make_fleet(run=["123456", "234567"]))
     assert history.unit == "run" and history.rows[TIME].to_list() == [123456.0, 234567.0]

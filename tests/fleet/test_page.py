@@ -70,8 +70,22 @@ def test_the_table_of_actuators_has_values_trends_and_alarms(fleet: Fleet) -> No
     assert table.filter(pl.col("label") == "3").select("met", "failed").row(0) == (RUNS - 1, 1)
     plain = tabulate_actuators(fleet, drift).filter(pl.col("label") == "7").row(0, named=True)
     own = fleet.rows.filter(pl.col("unit") == "7")
-    mean = np.average(own["J"], weights=own["J_std"].to_numpy() ** -2)
-    assert plain["J"] == pytest.approx(mean, rel=1e-9)
+    weights = 1.0 / (own["J_std"].to_numpy() ** 2 + drift.between["J"].std ** 2)
+    assert plain["J"] == pytest.approx(np.average(own["J"], weights=weights), rel=1e-9)
+
+
+def test_stds_of_means_allow_for_what_differs_from_run_to_run() -> None:
+    rng, (units, runs) = np.random.default_rng(5), (300, 6)
+    truth = rng.normal(50.0, 5.0, units)
+    stds = rng.uniform(0.05, 0.2, units * runs)  # of fits; runs differ by 1
+    values = np.repeat(truth, runs) + rng.normal(size=units * runs) * np.hypot(1.0, stds)
+    unit, run = np.divmod(np.arange(units * runs), runs)
+    columns = {"log": [f"{u}_{r}" for u, r in zip(unit, run, strict=True)], "status": "met"}
+    columns |= {"unit": unit.astype(str), "run": run.astype(str), "J": values, "J_std": stds}
+    fleet = Fleet(rows=pl.DataFrame(columns), units={"J": "kg m^2"}, identity=("unit", "run"), fitted=("J",))
+    table = tabulate_actuators(fleet, find_drift(fleet))
+    off = (table["J"].to_numpy() - truth[table["label"].cast(pl.Int64).to_numpy()]) / table["J_std"].to_numpy()
+    assert 0.9 < np.std(off) < 1.1
 
 
 def test_of_many_actuators_only_the_worst_have_drawings(
