@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
-from seaopt.errors import SeaoptError
+from seaopt.errors import SeaoptError, require_type
 
 __all__ = ["Processes", "Shared", "connect_dask", "count_cores", "count_workers", "map_ordered"]
 
@@ -180,6 +180,11 @@ def map_ordered(
     executor : Executor, optional
         Where it is called; here, if left out.
 
+    Raises
+    ------
+    SeaoptError
+        `executor` is none of `concurrent.futures`.
+
     Examples
     --------
     >>> list(map_ordered(abs, [-3, 2, -1]))
@@ -193,6 +198,7 @@ def map_ordered(
     if executor is None:
         yield from map(function, items)
         return
+    require_type(executor, Executor, "executor", "give a concurrent.futures.Executor")
     most, flying = QUEUED * count_workers(executor), deque[Future[Result]]()
     try:
         for item in items:

@@ -69,7 +69,8 @@ def order_runs(fleet: Fleet, actuator: Sequence[str] | None = None, time: Sequen
     fleet : Fleet
         With an identity.
     actuator : sequence of str, optional
-        The columns of its identity that name the actuator: all that are not of time, if left out.
+        The columns of its identity that name the actuator: all that are not of time, if left out. A log in which these
+        are all empty is an actuator of its own, called by its path.
     time : sequence of str, optional
         The columns that say when: dates, clocks, numbers, or names with a number (run12); several are read together, as
         a date and a clock. Columns that are called date, time, run or the like, if left out.
@@ -140,7 +141,11 @@ def _label(rows: pl.DataFrame, whose: Sequence[str]) -> pl.Series:
     if not whose:
         return pl.Series(LABEL, ["the actuator"] * len(rows), dtype=pl.String)
     columns = [rows[name].cast(pl.String).fill_null("").to_list() for name in whose]
-    return pl.Series(LABEL, [" / ".join(parts) for parts in zip(*columns, strict=True)], dtype=pl.String)
+    # Logs of which nobody says whose they are need not be of one actuator: each is its own.
+    labels = [
+        " / ".join(parts) if any(parts) else log for log, *parts in zip(rows["log"].to_list(), *columns, strict=True)
+    ]
+    return pl.Series(LABEL, labels, dtype=pl.String)
 
 
 def _read_times(rows: pl.DataFrame, when: Sequence[str]) -> tuple[list[float | None], str, str]:

@@ -65,6 +65,12 @@ def test_what_is_refused(options: dict[str, list[str]], words: str) -> None:
         order_runs(make_fleet(joint=["a", "b"], date=["yesterday", "2026-01-01"]), **options)
 
 
+def test_logs_that_name_no_actuator_are_not_taken_for_one() -> None:
+    fleet = make_fleet(robot=["", "", "r1"], joint=["", "", ""], run=["1", "2", "3"])
+    history = order_runs(fleet)
+    assert sorted(history.rows[LABEL].to_list()) == sorted([*fleet.rows["log"].to_list()[:2], "r1 / "])
+
+
 def test_the_one_date_that_is_none_is_named() -> None:
     dates = ["2026-01-01", "", "2026-01-02", "2026-13-03"]
     with pytest.raises(SeaoptError, match='"2026-13-03"'):
