@@ -36,7 +36,7 @@ ALLOWANCE = 0.5  # k: best for a change of one standard deviation
 CLIP = 4.0
 STATES = 200  # of the Markov chain: average run lengths are right within 0.1 %
 LARGEST = 40.0  # threshold that is looked for
-LEAST = 1e-10  # probability of one side of a chart, for which rounding leaves digits
+LEAST = 1e-6  # false_alarms: of each side of some thousand charts rounding then leaves digits
 LEARNT_DOF = 1e6  # from where on a variance is known
 
 
@@ -111,7 +111,7 @@ def choose_threshold(probability: float, runs: int, charts: int, allowance: floa
     Raises
     ------
     SeaoptError
-        The probability is not between 0 and 1, or too small for any threshold.
+        The probability is not between 0 and 1, or smaller than 1e-6.
 
     Examples
     --------
@@ -121,9 +121,9 @@ def choose_threshold(probability: float, runs: int, charts: int, allowance: floa
     """
     if not 0.0 < probability < 1.0:
         raise SeaoptError(f"false_alarms = {probability:g} is no probability above 0 and below 1; give 0.01")
+    if probability < LEAST:
+        raise SeaoptError(f"false_alarms = {probability:g} is too small; give {LEAST:g} or more")
     share = probability / (2 * charts)
-    if share < LEAST:
-        raise SeaoptError(f"false_alarms = {probability:g} is too small for {charts} charts; give 1e-6 or more")
 
     def exceed(threshold: float) -> float:
         return float(np.log(max(alarm_probabilities(threshold, runs, allowance)[-1], 1e-15) / share))

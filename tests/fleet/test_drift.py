@@ -126,3 +126,11 @@ def test_what_has_come_back_further_than_it_was_is_told_as_it_was_at_the_alarm()
     alarm = find_drift(make_fleet(20, 4, 20.0 * (run >= 50) - 60.0 * (run >= 60))).alarms[0]
     assert (alarm.actuator, alarm.since_time) == ("0", "run 51") and "rose" in alarm.describe()
     assert alarm.after - alarm.before == pytest.approx(20.0, abs=4.0) and alarm.runs < 6
+
+
+def test_what_is_too_rare_is_refused_whatever_the_number_of_charts() -> None:
+    for charts in (1, 50):
+        with pytest.raises(SeaoptError, match="1e-06 or more"):
+            choose_threshold(1e-9, 100, charts)
+    threshold = choose_threshold(1e-6, 100, 50)
+    assert 2 * 50 * alarm_probabilities(threshold, 100)[-1] == pytest.approx(1e-6, rel=1e-2)
