@@ -16,6 +16,8 @@ on `ANGLES` frequencies, with a thousandth added.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from seaopt.control import Controller, GainTable
@@ -89,7 +91,8 @@ def bound_stretch(
     change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
     moves = table.over in plant.parameters or table.over in plant.states
     ranges = {table.over: (low, high)} if moves else {}  # of a plant without the variable the law alone changes
-    nominal = combine_uncertainty(params, ParameterSet(), ranges, {name: plant})
+    values = ParameterSet(replace(one, std=None) for one in params.values())  # of a fit its values alone count here
+    nominal = combine_uncertainty(values, ParameterSet(), ranges, {name: plant})
     alone = Uncertainty(
         nominal=nominal.nominal, names=(), covariance=np.zeros((0, 0)), ranges=nominal.ranges, absent=nominal.absent
     )

@@ -23,6 +23,16 @@ def test_no_frozen_loop_of_a_stretch_has_more_than_its_bound(which, low, high):
     assert max(one.ms for one in found) <= bound.ms <= 1.15 * max(one.ms for one in found)
 
 
+def test_values_of_a_fit_are_bounded_as_the_same_values_without_their_stds():
+    schedule, (stand, _, values) = tune_knee(), read_knee()
+    fitted = values.with_parameters(replace(values.update(k=655e3)["k"], std=10.0, identified=True))
+    known, found = (
+        bound_stretch("it", schedule.at(0.05), schedule.table, stand, one.update(phi=0.05), 0.0, 0.1)
+        for one in (values.update(k=655e3), fitted)
+    )
+    assert found.shown and found.ms == known.ms
+
+
 def test_of_a_plant_without_the_variable_the_law_alone_changes():
     schedule, (stand, _, values) = tune_knee(), read_knee()
     straight = so.Plant(
