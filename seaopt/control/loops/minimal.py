@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.linalg import block_diag, schur, solve_sylvester
+from scipy.linalg import block_diag, matrix_balance, schur, solve_sylvester
 
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
@@ -156,17 +156,20 @@ def split_integrators(
     apart: with N = A_1 - I the first is :math:`\sum_j c_1 N^{j-1} b_1 w^j`.
     """
     distance = np.sort(np.abs(np.linalg.eigvals(a) - 1.0))
+    # States of very different units would leave the Schur form's poles less exact than these, which are of scaled ones.
+    scaled, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    b_scaled, c_scaled = b / scale[:, None], c * scale
     for m in range(min(c.size, MOST_INTEGRATORS), 0, -1):
         reach = (ROUNDED_POLES * EPS) ** (1.0 / m)
         if np.count_nonzero(distance < reach) != m:
             continue
-        parts: tuple[Any, ...] = schur(a, sort=lambda re, im, reach=reach: np.hypot(re - 1.0, im) < reach)
+        parts: tuple[Any, ...] = schur(scaled, sort=lambda re, im, reach=reach: np.hypot(re - 1.0, im) < reach)
         triangle, basis, first = parts
         if first != m:
             continue
         one, rest = triangle[:m, :m], triangle[m:, m:]
         link = np.asarray(solve_sylvester(one, -rest, -triangle[:m, m:])) if rest.size else np.zeros((m, 0))
-        into, out = basis.T @ b, c @ basis
+        into, out = basis.T @ b_scaled, c_scaled @ basis
         drive, read = into[:m] - link @ into[m:], out[:m]
         chain, power = np.zeros((m, b.shape[1])), np.eye(m)
         for j in range(m):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control import Controller, ControllerSpec, ForceMPC, MPCSpec, assess
+from seaopt.control import Controller, ControllerSpec, ForceMPC, Law, MPCSpec, assess
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
 from seaopt.errors import ControlError, require_number, require_type
@@ -45,7 +45,9 @@ def linear_controller(mpc: ForceMPC) -> Controller:
     ('custom', True)
 
     """
-    return assess(*mpc.design, mpc.law, linear_spec(mpc.spec))
+    law = mpc.law  # its integrator apart: rounding leaves that pole on either side of the unit circle
+    split = Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
+    return assess(*mpc.design, split, linear_spec(mpc.spec))
 
 
 def linear_spec(spec: MPCSpec) -> ControllerSpec:

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import MPCSpec, close_loop, force_mpc
+from seaopt.control import MPCSpec, close_loop, force_mpc, runnable
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.robustness import certify_mpc, linear_controller
@@ -51,6 +51,17 @@ def test_the_linear_region_is_certified_as_a_law(certificate, mpc, thor):
     assert certificate.monte_carlo.samples == 200 and certificate.monte_carlo.failures == 0
     assert linear_controller(mpc).feasible == mpc.feasible
     assert any("linear region" in note for note in certificate.notes)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+@pytest.mark.parametrize("inertia", [2.8e-6, 3.3e-6, 3.9e-6])
+def test_the_law_integrates_and_runs_whichever_side_of_the_unit_circle_rounding_leaves_its_pole(
+    stand, thor, inertia, delay
+):
+    mpc = force_mpc(stand, thor.update(J=inertia), MPCSpec(current_limit_A=9.0, bandwidth_hz=20, delay_samples=delay))
+    controller, f = linear_controller(mpc), np.geomspace(0.1, 499.0, 50)
+    assert controller.law.integrators == 1 and runnable(controller).integrators == 1
+    assert np.allclose(controller.law.responses(f), mpc.law.responses(f), rtol=1e-7)
 
 
 def test_runs_that_keep_everything_pass_with_the_bound_of_clopper_and_pearson(certificate):
