@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -400,12 +401,38 @@ def _check_gains(
         needed |= PREFILTER_GAINS if spec.reference_filter.is_second_order else {PREFILTER}
     if set(gains) != needed:
         raise _contradict("gains", f"has {', '.join(sorted(gains))} where the law has {', '.join(sorted(needed))}")
+    _check_asked(gains, spec, link)
     if (observer is not None) != (spec.structure == "pid_dob") or (
         observer is not None and gains["T_q"] != observer.T_q
     ):
         raise _contradict("observer", "is not that of structure and gains")
     if not Gains.from_names(gains, observer, speed, link).makes(law, spec.structure):
         raise _contradict("law", "is not what gains, observer and spec give")
+
+
+def _check_asked(gains: Mapping[str, float], spec: ControllerSpec, link: LinkPath | None) -> None:
+    """Refuse numbers that the specification gives and the law has otherwise."""
+    if "T_v" in gains and spec.speed_loop != "PI":
+        raise _contradict("gains.T_v", f'is given, and spec.speed_loop is "{spec.speed_loop}"')
+    if not gains.get("T_v", 1.0) > 0.0:
+        raise _contradict("gains.T_v", f"is {gains['T_v']:g}, which is no integral time")
+    parts: tuple[tuple[str, Any, Mapping[str, Any]], ...] = (
+        ("notch", spec.notch, _take(gains, "notch_")),
+        ("prefilter", spec.reference_filter, _take(gains, "prefilter_")),
+        ("link_feedforward", spec.link_feedforward, {} if link is None else asdict(link)),
+    )
+    for part, asked, has in parts:
+        for name, value in ({} if asked is None else asdict(asked)).items():
+            if value is None or name not in has:
+                continue
+            same = has[name] == value if isinstance(value, str) else math.isclose(has[name], value, rel_tol=AGREES)
+            if not same:
+                raise _contradict(f"spec.{part}.{name}", f"is {value!r}, and the law has {has[name]!r}")
+
+
+def _take(gains: Mapping[str, float], prefix: str) -> dict[str, float]:
+    """Return the gains of one part of the law, by the part's own names."""
+    return {name.removeprefix(prefix): value for name, value in gains.items() if name.startswith(prefix)}
 
 
 def _check_reading(table: StoredController, law: Law) -> None:

@@ -129,6 +129,15 @@ def test_it_is_read_again_and_refused_where_a_gain_is_another(tuned: Controller)
         )
 
 
+@pytest.mark.parametrize(("speed_loop", "T_v"), [("P", 0.1), ("P", 0.0), ("PI", 0.0), ("PI", -1.0)])
+def test_an_integral_time_that_cannot_be_is_refused(tuned: Controller, speed_loop: str, T_v: float) -> None:
+    content = json.loads(to_json(tuned.to_dict()))
+    content["spec"]["speed_loop"] = speed_loop
+    content["gains"]["T_v"] = T_v
+    with pytest.raises(FileError, match=r"gains\.T_v"):
+        Controller.from_dict(content, STAND, VALUES)
+
+
 @pytest.mark.slow
 def test_a_sweep_of_cascades() -> None:
     (row,) = sweep(STAND, VALUES, SPEC, [15.0]).rows

@@ -157,6 +157,16 @@ def test_it_is_stored_and_checked(fed):
 
 
 @pytest.mark.parametrize(
+    ("name", "value"), [("fraction", 0.5), ("corner_hz", 100.0), ("high_pass_hz", 1.0), ("measured", "phi")]
+)
+def test_a_specification_that_asks_for_another_path_is_refused(fed, name, value):
+    content = json.loads(to_json(fed.to_dict()))
+    content["spec"]["link_feedforward"][name] = value
+    with pytest.raises(FileError, match=rf"spec\.link_feedforward\.{name}"):
+        so.Controller.from_dict(content, so.plants.high_impedance(), so.plants.thor())
+
+
+@pytest.mark.parametrize(
     ("asked", "robust", "words"),
     [
         (LinkFeedforward(), False, r'robust_to = \["swing"\]'),

@@ -118,6 +118,14 @@ def test_given_numbers_are_kept_and_stored(filtered):
         so.Controller.from_dict(content, *filtered.design)
 
 
+@pytest.mark.parametrize(("name", "value"), [("corner_hz", 50.0), ("damping", 0.9)])
+def test_a_specification_that_gives_other_numbers_is_refused(filtered, name, value):
+    content = json.loads(to_json(filtered.to_dict()))
+    content["spec"]["prefilter"][name] = value
+    with pytest.raises(FileError, match=rf"spec\.prefilter\.{name}"):
+        so.Controller.from_dict(content, *filtered.design)
+
+
 @pytest.mark.parametrize(
     ("prefilter", "words"),
     [
