@@ -52,7 +52,7 @@ def test_what_the_file_asks_is_what_runs(tmp_path, asked, fraction, source):
 @pytest.mark.parametrize(
     ("asked", "named"),
     [
-        ('["frictoin"]', "friction"),
+        ('["frictoin"]', "'frictoin': should be 'friction' or 'gravity'; correct that entry"),
         ("{ friction = { fraction = 2.0 } }", "fraction"),
         ('{ friction = { from = "encoder" } }', "speed"),
         ("{ friction = { speed = 0.0 } }", "speed"),
