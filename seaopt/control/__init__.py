@@ -1,6 +1,7 @@
 """Loop algebra, controller structures, the tuner, laws that run, the state estimator and predictive control."""
 
 from seaopt.control.compensation.compensate import add_compensation
+from seaopt.control.compensation.ripple_fit import RippleFit, identify_ripple
 from seaopt.control.deploy.export import export
 from seaopt.control.given.assessment import assess
 from seaopt.control.given.law_file import GivenLaw, read_law
@@ -17,6 +18,7 @@ from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runn
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch, Prefilter
 from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward, LinkPath
+from seaopt.control.loops.compensation.ripple_term import CompensateRipple
 from seaopt.control.loops.compensation.terms import CompensateFriction, CompensateGravity, Compensation
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
@@ -44,15 +46,15 @@ from seaopt.control.tuning.frontier import Frontier, sweep
 from seaopt.control.tuning.tuner import tune
 
 __all__ = [
-    "Command", "CompensateFriction", "CompensateGravity", "Compensation", "Controller", "ControllerSpec",
-    "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator", "EstimatorRun", "EstimatorState", "ForceMPC",
-    "ForceRun", "FreeLaw", "Frontier", "GainTable", "Gains", "GateState", "GivenLaw", "Impedance",
-    "ImpedanceRegion", "Law", "LawState", "LinkFeedforward", "LinkPath", "Loop", "LoopFigures", "MPCSpec",
-    "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate",
-    "Prefilter", "Rendering", "RunnableLaw", "RunnableSchedule", "SampledLoop", "ScheduleState",
+    "Command", "CompensateFriction", "CompensateGravity", "CompensateRipple", "Compensation", "Controller",
+    "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator", "EstimatorRun",
+    "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "GainTable", "Gains", "GateState", "GivenLaw",
+    "Impedance", "ImpedanceRegion", "Law", "LawState", "LinkFeedforward", "LinkPath", "Loop", "LoopFigures",
+    "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate",
+    "Prefilter", "Rendering", "RippleFit", "RunnableLaw", "RunnableSchedule", "SampledLoop", "ScheduleState",
     "ScheduledController", "Score", "Scorecard", "TransferFunction", "add_compensation", "add_impedance", "assess",
-    "bound_free_law", "cascade_pid", "close_loop", "command_of", "corners", "critical_impedance", "draw",
-    "drive_pid", "estimate_noise", "estimator", "export", "export_mpc", "force_mpc", "ideal_pid", "margins",
+    "bound_free_law", "cascade_pid", "close_loop", "command_of", "corners", "critical_impedance", "draw", "drive_pid",
+    "estimate_noise", "estimator", "export", "export_mpc", "force_mpc", "ideal_pid", "identify_ripple", "margins",
     "nu_gap", "parallel_pid", "passive_region", "passivity", "passivity_rows", "read_law", "realise", "render",
     "run_loop", "runnable", "sample", "scorecard", "sweep", "tune", "tune_schedule",
 ]  # fmt: skip

@@ -244,10 +244,18 @@ KEYS: dict[str, dict[str, str]] = {
     "CompensationTable": {
         "friction": "Coulomb friction at the motor.",
         "gravity": "The weight of a link that hangs, by its position.",
+        "ripple": "Torque ripple and cogging, by the motor's position.",
     },
     "GravityCompensationTable": {
         "fraction": "Of what the spring carries at rest.",
         "plant": "Whose link it is; the design plant where left out.",
+    },
+    "RippleCompensationTable": {
+        "cycles": "Harmonics, in cycles per revolution.",
+        "cos": "Of each, the command that meets it, in the command's unit.",
+        "sin": "Of each, likewise.",
+        "fraction": "Of the series.",
+        "period": "What the motor's position moves in one revolution; 2 pi where it is in rad and this left out.",
     },
     "ControllerTable": {
         "plant": 'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.',

@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from seaopt.control.laws.limits import BY_NAME
+from seaopt.control.loops.compensation.ripple_term import MOST_CYCLES, RIPPLE_FRACTION
 from seaopt.control.loops.compensation.terms import DEFAULT_FRACTION, FrictionSource
 from seaopt.documents import Flag, Number, Whole
 from seaopt.problem.key_descriptions import KEYS
@@ -423,11 +424,30 @@ class GravityCompensationTable(_Strict):
     plant: Name | None = None
 
 
+class RippleCompensationTable(_Strict):
+    """Compensation of torque ripple and cogging."""
+
+    cycles: Annotated[
+        tuple[Annotated[Whole, Field(ge=1, le=MOST_CYCLES)], ...], Field(min_length=1, max_length=MOST_CYCLES)
+    ]
+    cos: tuple[Number, ...]
+    sin: tuple[Number, ...]
+    fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = RIPPLE_FRACTION
+    period: Annotated[Number, Field(gt=0.0)] | None = None
+
+    @model_validator(mode="after")
+    def _require_series(self) -> RippleCompensationTable:
+        if not len(set(self.cycles)) == len(self.cycles) == len(self.cos) == len(self.sin):
+            raise ValueError("should have each of cycles once, and one cos and one sin for each")
+        return self
+
+
 class CompensationTable(_Strict):
     """What is compensated, and how much of it."""
 
     friction: FrictionCompensationTable | None = None
     gravity: GravityCompensationTable | None = None
+    ripple: RippleCompensationTable | None = None
 
 
 def _tell_list(value: Any) -> str:

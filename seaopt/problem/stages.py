@@ -12,6 +12,7 @@ import numpy as np
 from seaopt.control import (
     CompensateFriction,
     CompensateGravity,
+    CompensateRipple,
     Controller,
     ForceMPC,
     GivenLaw,
@@ -180,7 +181,7 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     controller = add_outer_loop(problem, controller, source)
     assert problem.table.controller is not None
     asked = problem.table.controller.compensation
-    if asked.friction is None and asked.gravity is None:
+    if asked.friction is None and asked.gravity is None and asked.ripple is None:
         return controller
     link = None
     if asked.gravity is not None and asked.gravity.plant is not None:
@@ -189,6 +190,7 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
         controller,
         friction=None if asked.friction is None else CompensateFriction(**asked.friction.model_dump()),
         gravity=None if asked.gravity is None else CompensateGravity(fraction=asked.gravity.fraction),
+        ripple=None if asked.ripple is None else CompensateRipple(**asked.ripple.model_dump()),
         link=link,
     )
 

@@ -35,6 +35,7 @@ REMEDIES = {
     "impedance_draws": "less stiffness, or more damping, in [impedance]",
     "impedance_damper": "other stiffness, damping or velocity_filter_s in [impedance], inside the region of the report",
     "gravity_compensation": "a smaller fraction of gravity in compensate of [controller], or an [impedance]",
+    "ripple_compensation": "a smaller fraction of ripple, or fewer of its cycles, in compensate of [controller]",
     "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
     "constrained_failures": "a larger max_iterations or wider bounds in [mpc], or bound_tolerance in [robustness]",
     "constrained_failure_probability": "more constrained_runs in [robustness]",

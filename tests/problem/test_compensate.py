@@ -87,3 +87,21 @@ def test_gravity_of_another_plant_is_compensated(tmp_path):
     problem = so.read_problem(path)
     with pytest.raises(so.SeaoptError, match=r"holds its link; name the plant"):
         tune_problem(problem, problem.parameters)
+
+
+def test_ripple_of_the_file_is_added(tmp_path):
+    path = tmp_path / "problem.toml"
+    asked = "{ ripple = { cycles = [6, 12], cos = [0.1, 0.0], sin = [0.0, 0.02], fraction = 0.8, period = 0.002 } }"
+    path.write_text(TEXT % asked, encoding="utf-8")
+    problem = so.read_problem(path)
+    controller = tune_problem(problem, problem.parameters)
+    term = controller.compensation.ripple
+    assert (term.reads, term.cycles, term.period) == ("q", (6, 12), 0.002)
+    assert controller.command.per_effort * term.effort(0.0) == pytest.approx(0.08)
+    content = json.loads(to_json(controller.to_dict()))
+    content["compensation"]["ripple"]["cos"] = [0.1]
+    with pytest.raises(so.SeaoptError, match="one cos and one sin"):
+        Controller.from_dict(content, problem.design_plant, problem.parameters)
+    path.write_text(TEXT % asked.replace("[0.1, 0.0]", "[0.1]"), encoding="utf-8")
+    with pytest.raises(so.SeaoptError, match="one cos and one sin"):
+        so.read_problem(path)

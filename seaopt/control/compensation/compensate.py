@@ -7,8 +7,10 @@ from dataclasses import replace
 
 from seaopt.control.compensation.friction import find_motor_friction, find_reading, make_friction_term
 from seaopt.control.compensation.gravity import make_gravity_term
+from seaopt.control.compensation.ripple import make_ripple_term
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction_margin import take_friction_out
+from seaopt.control.loops.compensation.ripple_term import CompensateRipple
 from seaopt.control.loops.compensation.stability import CompensationMargin, SpeedReading, compensation_margin
 from seaopt.control.loops.compensation.terms import (
     CompensateFriction,
@@ -27,9 +29,9 @@ ENOUGH = 1.5  # times the slope asked for: at the nominal parameters no better m
 
 def add_compensation(
     controller: Controller, *, friction: CompensateFriction | None = None, gravity: CompensateGravity | None = None,
-    link: tuple[Plant, ParameterSet] | None = None,
+    ripple: CompensateRipple | None = None, link: tuple[Plant, ParameterSet] | None = None,
 ) -> Controller:  # fmt: skip
-    """Return a controller that also compensates its design plant's friction, and the weight of a link.
+    """Return a controller that also compensates its design plant's friction, its ripple, and the weight of a link.
 
     The law, its figures and its friction margin stay what they are; what is added acts between the law and the limit
     of the command, in every simulation and in exported code.
@@ -42,6 +44,8 @@ def add_compensation(
         What is asked for friction; left out, none of it is compensated.
     gravity : CompensateGravity, optional
         What is asked for gravity.
+    ripple : CompensateRipple, optional
+        What is asked for torque ripple and cogging.
     link : (Plant, ParameterSet), optional
         The plant whose link it is; the design plant if left out.
 
@@ -49,7 +53,8 @@ def add_compensation(
     ------
     ControlError
         The controller does not know its design plant; no friction is where the motor acts; the reference is that of an
-        outer loop, and friction would be compensated from it; or nothing is shown to be stable for the measured speed.
+        outer loop, and friction would be compensated from it; nothing is shown to be stable for the measured speed; or
+        the motor's position has no revolution.
 
     Examples
     --------
@@ -66,12 +71,15 @@ def add_compensation(
             "compensate: the controller does not know its design plant, whose friction it would compensate; tune it on "
             "a model, or read it with Controller.from_dict"
         )
-    if friction is None and gravity is None:
+    if friction is None and gravity is None and ripple is None:
         return replace(controller, compensation=None)
     added = Compensation(
         sample_time_s=controller.sample_time_s,
         friction=None if friction is None else _meet_friction(controller, *controller.design, friction),
         gravity=None if gravity is None else _meet_gravity(controller, *(link or controller.design), gravity),
+        ripple=None
+        if ripple is None
+        else make_ripple_term(controller.design[0], controller.command.per_effort, ripple),
     )
     return replace(controller, compensation=added)
 

@@ -132,10 +132,11 @@ def make_friction_term(
     """
     found = find_motor_friction(plant, params)
     effort = asked.fraction * found.level
-    reads = "" if asked.source == "reference" else find_motor_position(plant)
+    reads = ""
     if asked.source == "reference":
         velocity, speed = find_velocity_per_rate(plant, params, regulated, found.name), asked.speed or found.smoothing
     else:
+        reads = find_motor_position(plant, "friction", 'take from = "reference", or ')
         velocity = find_reading(plant, params, reads, found)
         speed = asked.speed or _choose_speed(found, effort, loop)
     if speed is None:
@@ -164,8 +165,17 @@ def _choose_speed(found: MotorFriction, effort: float, loop: FrictionLoop | None
     return max(own, SAFETY * effort / margin.slope)
 
 
-def find_motor_position(plant: Plant) -> str:
+def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
     """Return the output that is the motor's position.
+
+    Parameters
+    ----------
+    plant : Plant
+        Any.
+    wanted : str
+        What would be compensated by it, for the message.
+    otherwise : str
+        What else there is to do, for the message.
 
     Raises
     ------
@@ -176,8 +186,8 @@ def find_motor_position(plant: Plant) -> str:
     position = plant.sensing.motor_position if plant.sensing is not None else None
     if position is None or position not in plant.outputs:
         raise ControlError(
-            f"compensate.friction: {plant.name} has no output that is the motor's position; take "
-            'from = "reference", or give the plant one: sensing = Sensing(regulated, motor_position=...)'
+            f"compensate.{wanted}: {plant.name} has no output that is the motor's position; {otherwise}"
+            "give the plant one: sensing = Sensing(regulated, motor_position=...)"
         )
     return position
 

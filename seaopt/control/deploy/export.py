@@ -33,6 +33,7 @@ from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
+from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
@@ -341,7 +342,9 @@ def _numbers(
         "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
         "friction": _write_friction(law.compensation, number),
         "gravity": _write_gravity(law.compensation, number),
+        "ripple": _write_ripple(law.compensation, number),
         "further": _list_further(law.compensation, others),
+        "resets": _list_resets(law.compensation, others),
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
             for key, tf in zip(
@@ -394,6 +397,31 @@ def _write_gravity(compensation: Compensation | None, number: Callable[[float], 
         "coefficients": ", ".join(map(number, coefficients)), "read": f"read_{identifier(term.reads)}",
         "output": strip_markup(term.reads), "unit": term.unit, "percent": f"{100.0 * term.fraction:.3g}",
     }  # fmt: skip
+
+
+def _write_ripple(compensation: Compensation | None, number: Callable[[float], str]) -> dict[str, Any]:
+    """Return the compensation of torque ripple as text, every harmonic up to the last; empty where there is none."""
+    if compensation is None or compensation.ripple is None:
+        return {}
+    term = compensation.ripple
+    series = {n: (cos, sin) for n, cos, sin in zip(term.cycles, term.cos, term.sin, strict=True)}
+    rows = [series.get(n, (0.0, 0.0)) for n in range(1, max(term.cycles) + 1)]
+    return {
+        "terms": len(rows), "cos": ", ".join(number(one) for one, _ in rows),
+        "sin": ", ".join(number(one) for _, one in rows), "per_unit": number(1.0 / term.period),
+        "quarter": number(0.5 * math.pi), "most": number(MOST_TURNS), "sine": ", ".join(map(number, SINE)),
+        "cosine": ", ".join(map(number, COSINE)), "sine_terms": len(SINE), "cosine_terms": len(COSINE),
+        "cycles": ", ".join(map(str, term.cycles)), "read": f"read_{identifier(term.reads)}",
+        "output": strip_markup(term.reads), "unit": term.unit, "period": f"{term.period:.6g}",
+        "percent": f"{100.0 * term.fraction:.3g}",
+    }  # fmt: skip
+
+
+def _list_resets(compensation: Compensation | None, others: Sequence[str]) -> list[str]:
+    """Return the arguments of a reset that the compensation reads and the law does not."""
+    terms = () if compensation is None else (compensation.gravity, compensation.ripple)
+    names = dict.fromkeys(term.reads for term in terms if term is not None)
+    return [f"read_{identifier(name)}" for name in names if name not in others]
 
 
 def _list_further(compensation: Compensation | None, others: Sequence[str]) -> list[dict[str, str]]:

@@ -194,13 +194,14 @@ class RunnableLaw:
         if not abs(current_A) <= self.current_limit_A:
             limit = show_command(self.current_limit_A, *self.command)
             raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
+        added = 0.0
         if self.compensation is not None:
             reads = tuple(readings) or (0.0,) * len(self.compensation.reads)
-            reference, _, _ = self.compensation.step(FORGOTTEN, reference, reads)
+            reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads)
         per_reference, per_measurement = self.rest()
         x = per_reference * reference - np.dot(per_measurement, measurement)
         if self.integrators:
-            x[0] = current_A / self.per_effort - self._find_force(x, reference, measurement)
+            x[0] = current_A / self.per_effort - added - self._find_force(x, reference, measurement)
         return LawState(x=x, current_A=current_A, gate=seen, heat=heat)
 
     def _check_measurement(self, measurement: Reading | None) -> Reading:

@@ -28,6 +28,7 @@ from seaopt.control.laws.structures import (
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward, LinkPath
+from seaopt.control.loops.compensation.ripple_term import MOST_CYCLES, RippleTerm
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.figures import MeasuredFigures
@@ -241,17 +242,39 @@ class StoredGravityTerm(ResultTable):
         return self
 
 
+class StoredRippleTerm(ResultTable):
+    """Compensation of torque ripple."""
+
+    cycles: Annotated[
+        tuple[Annotated[Whole, Field(ge=1, le=MOST_CYCLES)], ...], Field(min_length=1, max_length=MOST_CYCLES)
+    ]
+    cos: tuple[Finite, ...]
+    sin: tuple[Finite, ...]
+    period: Annotated[Finite, Field(gt=0.0)]
+    reads: Annotated[str, Field(min_length=1)]
+    unit: str
+    fraction: Annotated[Finite, Field(gt=0.0)]
+
+    @model_validator(mode="after")
+    def _require_series(self) -> StoredRippleTerm:
+        if not len(set(self.cycles)) == len(self.cycles) == len(self.cos) == len(self.sin):
+            raise ValueError("should have each of cycles once, and one cos and one sin for each")
+        return self
+
+
 class StoredCompensation(ResultTable):
     """What is added to reference and effort."""
 
     friction: StoredFrictionTerm | None = None
     gravity: StoredGravityTerm | None = None
+    ripple: StoredRippleTerm | None = None
 
     def build(self, sample_time_s: float) -> Compensation:
         """Return the compensation."""
         friction = None if self.friction is None else FrictionTerm(**self.friction.model_dump())
         gravity = None if self.gravity is None else GravityTerm(**self.gravity.model_dump())
-        return Compensation(sample_time_s=sample_time_s, friction=friction, gravity=gravity)
+        ripple = None if self.ripple is None else RippleTerm(**self.ripple.model_dump())
+        return Compensation(sample_time_s=sample_time_s, friction=friction, gravity=gravity, ripple=ripple)
 
 
 class StoredLinkPath(ResultTable):

@@ -90,12 +90,16 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
     figures = np.zeros((len(params), 4))
     z = np.zeros((len(params), loop.law_states + loop.waiting))
     for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):
-        if not (np.any(x) or np.any(u)):
+        ripple = None if law.compensation is None else law.compensation.ripple
+        if not (np.any(x) or np.any(u)) and ripple is None:
             continue
         y = np.array(observe(x, u, values.vector)).ravel()
         read = y[[names.index(name) for name in loop.fed_back]]
         force = float(read[0])
-        inner, reference = _law_at_rest(law, read if law.measured > 1 else force, float(u[0]), plant, loop.regulated)
+        added = 0.0 if ripple is None else law.per_effort * ripple.effort(float(y[names.index(ripple.reads)]))
+        inner, reference = _law_at_rest(
+            law, read if law.measured > 1 else force, float(u[0]) - added, plant, loop.regulated
+        )
         if law.compensation is not None and law.compensation.gravity is not None:
             gravity = law.compensation.gravity
             reference -= gravity.effort(float(y[names.index(gravity.reads)])) if gravity.reads in names else 0.0

@@ -45,6 +45,7 @@ from seaopt.robustness.certificate.compensation import (
     find_compensation_at_draws,
     find_gravity_cases,
     find_nominal_compensation,
+    find_ripple_cases,
 )
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
@@ -59,6 +60,7 @@ from seaopt.robustness.certificate.requirements import (
     measured_design_requirements,
     measured_requirements,
     plant_requirements,
+    ripple_requirements,
 )
 from seaopt.robustness.uncertainty.draws import check_ranges, combine_uncertainty
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
@@ -217,6 +219,7 @@ def certify(
     compensation = find_nominal_compensation(controller, models, nominal)
     compensation_draws = find_compensation_at_draws(controller, models, unknown, compensation, samples, rng)
     gravity = find_gravity_cases(controller, models, unknown, samples, rng)
+    ripple = find_ripple_cases(controller, models, unknown, samples, rng)
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
@@ -224,6 +227,7 @@ def certify(
         *friction_requirements(friction, friction_draws, min_friction_margin),
         *compensation_requirements(controller, compensation, compensation_draws),
         *gravity_requirements(controller, models, gravity),
+        *ripple_requirements(controller, ripple),
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
         *impedance_requirements(impedance),
     )

@@ -9,6 +9,12 @@ loop is linearised, sliding, with the slope that the compensation has there, and
 there is one. All of a link's weight compensated leaves it neutral, an eigenvalue at 1; more than it weighs lets it
 rise, so that fractions near 1 want an impedance, or a load that is known well. Angles at which the link falls without
 compensation, as it does on its head, are left out.
+
+Compensation of ripple is a feedback of the motor's position whose slope changes sign over a revolution. The sampled
+loop, sliding and with gravity's slope where that is compensated, is linearised with slopes from its steepest negative
+to its steepest positive. That says that no place at which the motor rests is unstable, on a plant whose ripple is none;
+one that moves through the slopes has a loop that varies, of which eigenvalues prove nothing, and ripple that is
+elsewhere than compensated may double the slope.
 """
 
 from __future__ import annotations
@@ -25,6 +31,7 @@ from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.compensation.terms import GravityTerm
 from seaopt.control.loops.sampled_plant import find_rest, sample
 from seaopt.control.running.outer_run import enclose_law
+from seaopt.errors import ControlError
 from seaopt.formatting import format_values
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -37,7 +44,9 @@ from seaopt.robustness.uncertainty.worst import place_values
 
 FRICTION_COMPENSATION = "friction_compensation"
 GRAVITY_COMPENSATION = "gravity_compensation"
+RIPPLE_COMPENSATION = "ripple_compensation"
 GRAVITY_DRAWS = 20
+RIPPLE_DRAWS, SLOPES = 20, 9  # draws, and slopes from the steepest negative to the steepest positive
 PLACES, INSIDE = 9, 0.95  # over so much of the range
 NEUTRAL = 1e-6  # beyond 1, of an eigenvalue that neither grows nor decays, by rounding and the series' last digits
 FROM_REFERENCE = "friction is compensated from the reference, outside the loop: its stability is the law's without it"
@@ -93,8 +102,7 @@ def find_compensation_at_draws(
     enough, count = {name: margin for name, margin in nominal.items() if margin.shown}, min(samples, MARGIN_DRAWS)
     if not enough or not count:
         return {}
-    values = unknown.values(unknown.draw(count, rng))
-    draws = [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
+    draws = _draw(unknown, count, rng)
     found: dict[str, CompensationDraws] = {}
     for name, margin in enough.items():
         placed = [place_values(models[name], unknown.nominal, draw) for draw in draws]
@@ -161,9 +169,7 @@ def find_gravity_cases(
     term = None if controller.compensation is None else controller.compensation.gravity
     if term is None:
         return {}
-    count = min(samples, GRAVITY_DRAWS)
-    values = unknown.values(unknown.draw(count, rng)) if count else {}
-    draws = [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
+    draws = _draw(unknown, min(samples, GRAVITY_DRAWS), rng)
     return {
         name: find_worst_gravity(controller, model, unknown.nominal, [{}, *draws])
         for name, model in models.items()
@@ -210,22 +216,37 @@ def _find_radius(
     controller: Controller, term: GravityTerm, plant: Plant, params: ParameterSet, share: float = 1.0
 ) -> float:
     """Return the largest eigenvalue of the loop at one angle, with a share of the compensation."""
-    law, signals = runnable(controller), list(controller.signals)
-    if controller.outer is not None:
+    slope = share * term.slope(_read_position(plant, params, term.reads))
+    return _find_largest_eigenvalue(controller, plant, params, _Slopes(weight=(term.reads, slope)))
+
+
+@record
+class _Slopes:
+    """What is fed back besides the law: the reference by the link's position, the effort by the motor's."""
+
+    weight: tuple[str, float] | None = None
+    ripple: tuple[str, float] | None = None
+
+
+def _find_largest_eigenvalue(controller: Controller, plant: Plant, params: ParameterSet, slopes: _Slopes) -> float:
+    """Return the largest eigenvalue of the sampled loop, sliding, with further feedback."""
+    law, signals, per_reference = runnable(controller), list(controller.signals), 1.0
+    if controller.outer is not None and plant.port is not None and plant.port.motion in plant.outputs:
         law = enclose_law(law, controller.outer)
-        signals.append(str(plant.port.motion) if plant.port is not None else term.reads)
-        assert law.compensation is not None and law.compensation.gravity is not None
-        term = law.compensation.gravity
+        signals.append(str(plant.port.motion))
+        per_reference = controller.outer.direction * controller.outer.stiffness
     n = law.c.size
-    b, d = np.reshape(law.b_measurement, (n, -1)), np.ravel(law.d_measurement)
-    if term.reads not in signals:
-        signals.append(term.reads)
-        b, d = np.hstack([b, np.zeros((n, 1))]), np.append(d, 0.0)
-    position = _read_position(plant, params, term.reads)
-    slope, column = share * term.slope(position), signals.index(term.reads)
-    b, d = b.copy(), d.copy()
-    b[:, column] -= law.b_reference * slope
-    d[column] -= law.d_reference * slope
+    b, d = np.reshape(law.b_measurement, (n, -1)).copy(), np.ravel(law.d_measurement).copy()
+    for reads in (one[0] for one in (slopes.weight, slopes.ripple) if one is not None):
+        if reads not in signals:
+            signals.append(reads)
+            b, d = np.hstack([b, np.zeros((n, 1))]), np.append(d, 0.0)
+    if slopes.weight is not None:
+        column, slope = signals.index(slopes.weight[0]), slopes.weight[1] / per_reference
+        b[:, column] -= law.b_reference * slope
+        d[column] -= law.d_reference * slope
+    if slopes.ripple is not None:
+        d[signals.index(slopes.ripple[0])] -= slopes.ripple[1]
     whole = Law(
         a=law.a, b=np.column_stack([law.b_reference, -b]), c=law.c, d=np.append(law.d_reference, -d),
         sample_time_s=law.sample_time_s,
@@ -241,3 +262,93 @@ def _read_position(plant: Plant, params: ParameterSet, output: str) -> float:
     values = plant.complete(params)
     x, u = find_rest(plant, values)
     return float(output_function(plant)(0.0, x, u, values.vector)[list(plant.outputs).index(output)])
+
+
+def _draw(unknown: Uncertainty, count: int, rng: np.random.Generator) -> list[dict[str, float]]:
+    """Return draws, values by name."""
+    values = unknown.values(unknown.draw(count, rng)) if count else {}
+    return [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
+
+
+@record
+class RippleCase:
+    """The largest eigenvalue of a loop with ripple compensated, and at which slope over the motor's position."""
+
+    radius: float
+    slope: float
+    parameters: dict[str, float]
+
+
+def find_ripple_cases(
+    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator
+) -> dict[str, RippleCase]:
+    """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without.
+
+    Parameters
+    ----------
+    controller : Controller
+        Any.
+    models : mapping of name to Plant
+        All on which it runs.
+    unknown : Uncertainty
+        Of the parameters.
+    samples : int
+        Draws; at most `RIPPLE_DRAWS` are looked at.
+    rng : numpy.random.Generator
+        Of the draws.
+
+    Raises
+    ------
+    ControlError
+        A plant has no output that is read.
+
+    """
+    if controller.compensation is None or controller.compensation.ripple is None:
+        return {}
+    draws = [{}, *_draw(unknown, min(samples, RIPPLE_DRAWS), rng)]
+    return {name: find_worst_ripple(controller, model, unknown.nominal, draws) for name, model in models.items()}
+
+
+def find_worst_ripple(
+    controller: Controller, plant: Plant, nominal: ParameterSet, draws: Sequence[Mapping[str, float]]
+) -> RippleCase:
+    """Return the largest eigenvalue over slopes and draws.
+
+    Parameters
+    ----------
+    controller : Controller
+        With a compensation of ripple.
+    plant : Plant
+        With its output.
+    nominal : ParameterSet
+        What is not drawn.
+    draws : sequence of mapping
+        Values by name.
+
+    Raises
+    ------
+    ControlError
+        The plant has no output that is read.
+
+    """
+    compensation = controller.compensation
+    assert compensation is not None and compensation.ripple is not None
+    ripple, gravity = compensation.ripple, compensation.gravity
+    if ripple.reads not in plant.outputs:
+        raise ControlError(
+            f"compensate.ripple: {plant.name} has no output {ripple.reads}, by which ripple is compensated; give it "
+            "one, or leave the plant out of [robustness]"
+        )
+    worst = RippleCase(radius=0.0, slope=0.0, parameters={})
+    for draw in draws:
+        placed = place_values(plant, nominal, draw)
+        weight = None
+        if gravity is not None and gravity.reads in plant.outputs:
+            weight = gravity.reads, gravity.slope(_read_position(plant, placed, gravity.reads))
+        for slope in map(float, np.linspace(*ripple.steepest, SLOPES)):
+            slopes = _Slopes(weight=weight, ripple=(ripple.reads, slope))
+            radius = _find_largest_eigenvalue(controller, plant, placed, slopes)
+            if radius > worst.radius:
+                used = {name: value for name, value in draw.items() if name in placed}
+                worst = RippleCase(radius=radius, slope=slope, parameters=used)
+    return worst

@@ -24,8 +24,10 @@ from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
     GRAVITY_COMPENSATION,
     NEUTRAL,
+    RIPPLE_COMPENSATION,
     CompensationDraws,
     GravityCase,
+    RippleCase,
 )
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
@@ -188,6 +190,21 @@ def gravity_requirements(
         rows.append(Requirement(
             name=GRAVITY_COMPENSATION, limit=1.0 + NEUTRAL, value=case.radius, met=case.radius <= 1.0 + NEUTRAL,
             where=f"{name} at {case.angle:.3g} {unit}{known}: the largest eigenvalue with {percent}",
+        ))  # fmt: skip
+    return rows
+
+
+def ripple_requirements(controller: Controller, cases: Mapping[str, RippleCase]) -> list[Requirement]:
+    """Return that no slope of a ripple's compensation makes a loop unstable, at nominal values and over draws."""
+    if controller.compensation is None or controller.compensation.ripple is None:
+        return []
+    effort, unit = controller.command.effort_unit, controller.compensation.ripple.unit
+    rows: list[Requirement] = []
+    for name, case in cases.items():
+        known = f" and {format_values(case.parameters)}" if case.parameters else ""
+        rows.append(Requirement(
+            name=RIPPLE_COMPENSATION, limit=1.0 + NEUTRAL, value=case.radius, met=case.radius <= 1.0 + NEUTRAL,
+            where=f"{name} at {case.slope:.3g} {effort}/{unit}{known}: the largest eigenvalue over the slopes",
         ))  # fmt: skip
     return rows
 

@@ -16,17 +16,20 @@ Gravity is met through the reference: what the spring has to carry so that the l
           \xi = \mathrm{sat}\left(\frac{2 x - x_\mathrm{lo} - x_\mathrm{hi}}{x_\mathrm{hi} - x_\mathrm{lo}}\right),
 
 of the link's measured position x, as a series of Chebyshev polynomials summed by Clenshaw's recurrence, constant
-beyond its range.
+beyond its range. Torque ripple is met with a Fourier series of the motor's angle
+(`seaopt.control.loops.compensation.ripple_term`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any, Literal
 
 from numpy.polynomial.chebyshev import chebder, chebval
 
+from seaopt.control.loops.compensation.ripple_term import RippleTerm, sum_ripple
 from seaopt.errors import ControlError, require_number
 from seaopt.records import record
 
@@ -228,6 +231,7 @@ class Compensation:
         Seconds.
     friction : FrictionTerm, optional
     gravity : GravityTerm, optional
+    ripple : RippleTerm, optional
 
     Examples
     --------
@@ -244,19 +248,21 @@ class Compensation:
     sample_time_s: float
     friction: FrictionTerm | None = None
     gravity: GravityTerm | None = None
+    ripple: RippleTerm | None = None
 
     @property
     def reads(self) -> tuple[str, ...]:
         """The outputs that it reads, besides what the law does."""
-        named = [term.reads for term in (self.friction, self.gravity) if term is not None]
-        return tuple(name for name in named if name)
+        named = [term.reads for term in (self.friction, self.gravity, self.ripple) if term is not None]
+        return tuple(dict.fromkeys(name for name in named if name))
 
     @property
     def numbers(self) -> list[float]:
         """Its numbers, in the order in which `compensate` takes them."""
         friction = self.friction
         rubs = [] if friction is None else [friction.effort, friction.share_per_step(self.sample_time_s)]
-        return rubs + ([] if self.gravity is None else self.gravity.numbers)
+        weighs = [] if self.gravity is None else self.gravity.numbers
+        return rubs + weighs + ([] if self.ripple is None else self.ripple.numbers)
 
     @property
     def shape(self) -> CompensationShape:
@@ -264,6 +270,9 @@ class Compensation:
         return CompensationShape(
             friction=None if self.friction is None else self.friction.source, reads=self.reads,
             gravity=0 if self.gravity is None else len(self.gravity.numbers),
+            link=0 if self.gravity is None else self.reads.index(self.gravity.reads),
+            ripple=() if self.ripple is None else self.ripple.cycles,
+            motor=0 if self.ripple is None else self.reads.index(self.ripple.reads),
         )  # fmt: skip
 
     def step(self, memory: Memory, reference: float, readings: Sequence[float]) -> tuple[float, float, Memory]:
@@ -294,22 +303,25 @@ class Compensation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return its terms, for controller.json."""
-        terms = {"friction": self.friction, "gravity": self.gravity}
+        terms = {"friction": self.friction, "gravity": self.gravity, "ripple": self.ripple}
         return {name: None if term is None else asdict(term) for name, term in terms.items()}
 
     def describe(self, effort_unit: str) -> list[str]:
         """Return what it does, one line for each term."""
-        terms = {"friction": self.friction, "gravity": self.gravity}
+        terms = {"friction": self.friction, "gravity": self.gravity, "ripple": self.ripple}
         return [f"{name}: {term.describe(effort_unit)}" for name, term in terms.items() if term is not None]
 
 
 @record
 class CompensationShape:
-    """Which terms a compensation has, and what they read; all else is numbers."""
+    """Which terms a compensation has, and which readings are the link's and the motor's; all else is numbers."""
 
     friction: FrictionSource | None = None
     reads: tuple[str, ...] = ()
     gravity: int = 0
+    link: int = 0
+    ripple: tuple[int, ...] = ()
+    motor: int = 0
 
     @property
     def remembered(self) -> int:
@@ -319,7 +331,7 @@ class CompensationShape:
     @property
     def size(self) -> int:
         """How many numbers it takes."""
-        return (0 if self.friction is None else 2) + self.gravity
+        return (0 if self.friction is None else 2) + self.gravity + (1 + 2 * len(self.ripple) if self.ripple else 0)
 
 
 class _Floats:
@@ -332,6 +344,10 @@ class _Floats:
     @staticmethod
     def fmax(a: float, b: float) -> float:
         return b if b > a else a
+
+    @staticmethod
+    def floor(a: float) -> float:
+        return float(math.floor(a)) if math.isfinite(a) else a
 
 
 def compensate(
@@ -349,18 +365,20 @@ def compensate(
     reference, readings
         Of this sample.
     operations
-        What has fmin and fmax for them: the module casadi for expressions.
+        What has fmin, fmax and floor for them: the module casadi for expressions.
 
     """
-    asked = reference
+    asked, added, rubs = reference, 0.0, 0 if shape.friction is None else 2
     if shape.gravity:
-        asked = reference + _sum_series(numbers[-shape.gravity :], readings[-1], operations)
+        asked = reference + _sum_series(numbers[rubs : rubs + shape.gravity], readings[shape.link], operations)
+    if shape.ripple:
+        added = sum_ripple(shape.ripple, numbers[rubs + shape.gravity :], readings[shape.motor], operations)
     if shape.friction is None:
-        return asked, 0.0, []
+        return asked, added, []
     effort, share_per_step = numbers[:2]
     now = reference if shape.friction == "reference" else readings[0]
     share = memory[0] * share_per_step * (now - memory[1])
-    return asked, effort * _limit(share, operations), [1.0, now]
+    return asked, added + effort * _limit(share, operations), [1.0, now]
 
 
 def _limit(value: Any, operations: Any) -> Any:

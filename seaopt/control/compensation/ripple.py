@@ -1,0 +1,49 @@
+"""Compensation of torque ripple from a plant: which output is the motor's position, and in which unit its effort is."""
+
+from __future__ import annotations
+
+import math
+
+from seaopt.control.compensation.friction import find_motor_position
+from seaopt.control.loops.compensation.ripple_term import CompensateRipple, RippleTerm
+from seaopt.errors import ControlError
+from seaopt.plants import Plant
+
+
+def make_ripple_term(plant: Plant, per_effort: float, asked: CompensateRipple) -> RippleTerm:
+    """Return the compensation of ripple over a plant's motor position.
+
+    Parameters
+    ----------
+    plant : Plant
+        Any whose motor position is an output.
+    per_effort : float
+        The command for one unit of effort.
+    asked : CompensateRipple
+        Coefficients in the command's unit.
+
+    Raises
+    ------
+    ControlError
+        No output is the motor's position, or it is not in rad and no period is given.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> asked = CompensateRipple(cycles=(6,), cos=(0.2,), sin=(0.0,), fraction=0.5)
+    >>> make_ripple_term(so.plants.rotary(), 0.01, asked).effort(0.0)
+    10.0
+
+    """
+    reads = find_motor_position(plant, "ripple")
+    unit = plant.outputs[reads]
+    period = asked.period if asked.period is not None or unit != "rad" else 2.0 * math.pi
+    if period is None:
+        raise ControlError(
+            f"compensate.ripple: {reads} of {plant.name} is in {unit}, of which no revolution is known; give what it "
+            "moves in one: ripple = { period = 0.002, ... }"
+        )
+    cos, sin = (tuple(asked.fraction * one / per_effort for one in values) for values in (asked.cos, asked.sin))
+    return RippleTerm(
+        cycles=asked.cycles, cos=cos, sin=sin, period=period, reads=reads, unit=unit, fraction=asked.fraction
+    )

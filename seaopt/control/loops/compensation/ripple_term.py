@@ -1,0 +1,218 @@
+r"""Compensation of torque ripple and cogging: a Fourier series of the measured motor angle, added to the effort.
+
+.. math:: c_k = \sum_n a_n \cos n\varphi_k + b_n \sin n\varphi_k, \qquad \varphi_k = 2\pi\, \theta_k / \Theta,
+
+with the fraction in the coefficients, :math:`\theta_k` the motor's position as read and :math:`\Theta` what it moves in
+one revolution. A target needs no library for it: the turn is reduced to :math:`|x| \le 1/2`, sine and cosine of a
+quarter of its angle (at most :math:`\pi/4`) are Taylor's polynomials, below rounding in double, two doublings of the
+angle lead to :math:`e^{i\varphi}`, and its powers follow by the recurrence
+:math:`e^{i n\varphi} = e^{i (n - 1)\varphi} e^{i\varphi}`, whose error grows in proportion to n.
+
+Its slope is a stiffness at the motor, of either sign, which is feedback.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from seaopt.errors import ControlError, require_number
+from seaopt.records import record
+
+MOST_CYCLES = 200  # per revolution
+RIPPLE_FRACTION = 0.9
+MOST_TURNS = 1e9  # which a C long holds
+# Of y^2, highest power first: sin y = y p(y^2), cos y = q(y^2).
+SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(7, -1, -1))
+COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(8, -1, -1))
+POINTS_PER_CYCLE = 64
+
+
+@record
+class CompensateRipple:
+    """What is asked of a compensation of torque ripple.
+
+    Parameters
+    ----------
+    cycles : tuple of int
+        Harmonics, in cycles per revolution.
+    cos, sin : tuple of float
+        Of each, the command that meets the ripple, in the command's unit (`identify_ripple` has them).
+    fraction : float
+        Of them, above 0 and up to 1.5.
+    period : float, optional
+        What the motor's position moves in one revolution; 2 pi of a position in rad where it is left out.
+
+    Raises
+    ------
+    ControlError
+        The lists differ in length, a harmonic is no whole number from 1 to 200 or is there twice, or a number is out
+        of range.
+
+    Examples
+    --------
+    >>> CompensateRipple(cycles=(6, 12), cos=(0.1, 0.0), sin=(0.0, 0.02)).fraction
+    0.9
+
+    """
+
+    cycles: tuple[int, ...]
+    cos: tuple[float, ...]
+    sin: tuple[float, ...]
+    fraction: float = RIPPLE_FRACTION
+    period: float | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.cycles)
+        if not count or len(self.cos) != count or len(self.sin) != count:
+            raise ControlError(
+                f"compensate.ripple: {count} cycles, {len(self.cos)} cos and {len(self.sin)} sin; give one of each per "
+                "harmonic: ripple = { cycles = [6], cos = [0.1], sin = [0.0] }"
+            )
+        check_cycles(self.cycles, "compensate.ripple.cycles")
+        for name, values in (("cos", self.cos), ("sin", self.sin)):
+            for value in values:
+                if not math.isfinite(require_number(value, f"compensate.ripple.{name}", ControlError)):
+                    raise ControlError(f"compensate.ripple.{name} has {value:g}; give finite numbers")
+        if not any((*self.cos, *self.sin)):
+            raise ControlError("compensate.ripple: cos and sin are all zero; leave ripple out of compensate")
+        if not 0.0 < require_number(self.fraction, "compensate.ripple.fraction", ControlError) <= 1.5:
+            raise ControlError(
+                f"compensate.ripple.fraction = {self.fraction:g} is not above 0 and up to 1.5; give "
+                f"fraction = {RIPPLE_FRACTION}"
+            )
+        if self.period is not None and not 0.0 < require_number(
+            self.period, "compensate.ripple.period", ControlError
+        ) < float("inf"):
+            raise ControlError(f"compensate.ripple.period = {self.period:g} is not positive; leave it out, or give one")
+
+
+def check_cycles(cycles: Sequence[int], name: str) -> None:
+    """Refuse harmonics that are not whole numbers from 1 to 200, each once.
+
+    Raises
+    ------
+    ControlError
+        They are not.
+
+    """
+    for value in cycles:
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_CYCLES:
+            raise ControlError(
+                f"{name} has {value!r}, which is not a whole number from 1 to {MOST_CYCLES}; give cycles per "
+                "revolution, or a longer period"
+            )
+    if len(set(cycles)) != len(cycles):
+        raise ControlError(f"{name} = {list(cycles)} has a harmonic twice; give each once")
+
+
+@record
+class RippleTerm:
+    """Compensation of torque ripple as it runs.
+
+    Parameters
+    ----------
+    cycles : tuple of int
+        Harmonics, in cycles per revolution.
+    cos, sin : tuple of float
+        Of each, the fraction in them, in the command's unit of effort.
+    period : float
+        What the reading moves in one revolution, in its unit.
+    reads : str
+        The output that is the motor's position.
+    unit : str
+        Of it.
+    fraction : float
+        Of the ripple.
+
+    Examples
+    --------
+    >>> term = RippleTerm(cycles=(2,), cos=(0.0,), sin=(3.0,), period=4.0, reads="q", unit="m", fraction=1.0)
+    >>> round(term.effort(0.5), 12), round(term.slope(0.0) / math.pi, 12)  # 3 sin(2 * 2 pi * 0.5 / 4)
+    (3.0, 3.0)
+
+    """
+
+    cycles: tuple[int, ...]
+    cos: tuple[float, ...]
+    sin: tuple[float, ...]
+    period: float
+    reads: str
+    unit: str
+    fraction: float
+
+    @property
+    def numbers(self) -> list[float]:
+        """Revolutions per unit of the reading, and the coefficients."""
+        return [1.0 / self.period, *self.cos, *self.sin]
+
+    def effort(self, position: float) -> float:
+        """Return what is added to the effort at a position."""
+        return float(sum_ripple(self.cycles, self.numbers, position, np))
+
+    def slope(self, position: float) -> float:
+        """Return its slope there, effort per unit of the reading."""
+        rates = 2.0 * np.pi / self.period * np.array(self.cycles)
+        return float(rates @ (np.array(self.sin) * np.cos(rates * position) - self.cos * np.sin(rates * position)))
+
+    @property
+    def steepest(self) -> tuple[float, float]:
+        """Bounds of its slope over a revolution: below the least and above the largest, by 0.1 % or so."""
+        rates = 2.0 * np.pi / self.period * np.array(self.cycles)
+        count = POINTS_PER_CYCLE * max(self.cycles)
+        angles = np.outer(np.arange(count) * (self.period / count), rates)
+        slopes = np.cos(angles) @ (rates * self.sin) - np.sin(angles) @ (rates * self.cos)
+        # Between points an extreme is at most half a step away, where the slope is flat.
+        between = 0.5 * (0.5 * self.period / count) ** 2 * float(rates**3 @ np.hypot(self.cos, self.sin))
+        return float(np.min(slopes)) - between, float(np.max(slopes)) + between
+
+    def describe(self, effort_unit: str) -> str:
+        """Return what it does in words."""
+        sizes = ", ".join(
+            f"{size:.3g} at {cycles}" for cycles, size in zip(self.cycles, np.hypot(self.cos, self.sin), strict=True)
+        )
+        return (
+            f"{100.0 * self.fraction:.3g} % of the ripple over {self.reads}, {sizes} cycles per revolution "
+            f"({self.period:.6g} {self.unit}), {effort_unit}"
+        )
+
+
+def sum_ripple(cycles: Sequence[int], numbers: Sequence[Any], position: Any, operations: Any) -> Any:
+    """Return the series at a position, of floats or expressions.
+
+    Parameters
+    ----------
+    cycles : sequence of int
+        Harmonics.
+    numbers : sequence
+        Of a `RippleTerm`.
+    position
+        The reading.
+    operations
+        What has fmin, fmax and floor for them: the modules numpy or casadi.
+
+    """
+    count = len(cycles)
+    turns = operations.fmax(operations.fmin(numbers[0] * position, MOST_TURNS), -MOST_TURNS)
+    quarter = 0.5 * math.pi * (turns - operations.floor(turns + 0.5))
+    squared = quarter * quarter
+    sine, cosine = quarter * _horner(SINE, squared), _horner(COSINE, squared)
+    for _ in range(2):
+        sine, cosine = 2.0 * sine * cosine, 1.0 - 2.0 * sine * sine
+    weights = {n: (numbers[1 + i], numbers[1 + count + i]) for i, n in enumerate(cycles)}
+    total, real, imaginary = 0.0 * position, 1.0, 0.0
+    for n in range(1, max(cycles) + 1):
+        real, imaginary = real * cosine - imaginary * sine, real * sine + imaginary * cosine
+        if n in weights:
+            total += weights[n][0] * real + weights[n][1] * imaginary
+    return total
+
+
+def _horner(coefficients: Sequence[float], value: Any) -> Any:
+    total: Any = 0.0
+    for coefficient in coefficients:
+        total = total * value + coefficient
+    return total
