@@ -100,6 +100,7 @@ LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
 INNER_GAINS = ("k_v", "k_ff")  # of a cascade besides; and T_v where its speed loop integrates
 SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms
 AGREES = 1e-6  # numbers for reading give the law's response to this share
+MADE_ROUNDING = 1e-10  # of a response's largest: left where a prefilter takes away next to all of it
 COMPARED = np.geomspace(1e-4, 0.49, 60)  # frequencies at which it is compared, of the sample rate
 HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal lags are 3 dB down
 
@@ -420,10 +421,11 @@ class Gains:
         )  # fmt: skip
 
     def makes(self, law: Law, structure: Structure) -> bool:
-        """Tell whether these gains make a law: its responses, to a millionth, and its integrators."""
+        """Tell whether these gains make a law: its responses, to a millionth or to rounding, and its integrators."""
         made, f = self.law(structure, law.sample_time_s), COMPARED / law.sample_time_s
         expected = made.responses(f)
-        near = np.abs(law.responses(f) - expected) <= AGREES * np.abs(expected)
+        rounding = MADE_ROUNDING * np.max(np.abs(expected), axis=-1, keepdims=True)
+        near = np.abs(law.responses(f) - expected) <= AGREES * np.abs(expected) + rounding
         return made.integrators == law.integrators and bool(np.all(near))
 
     def law(self, structure: Structure, sample_time_s: float) -> Law:

@@ -73,6 +73,21 @@ def test_the_law_is_the_drive_that_its_gains_describe(T_v: float) -> None:
     np.testing.assert_allclose(torque, step_by_hand(gains.by_name(), 400), atol=1e-9)
 
 
+def test_gains_make_their_law_where_a_prefilter_leaves_nothing() -> None:
+    """Just below half the sample rate, where the reference's path is 2e-5 of its largest."""
+    numbers = {
+        "k_p": 9.8606, "k_i": 3.4122, "k_d": 6.2005e-5, "T_f": 0.015676, "k_r": 9.86058, "c": 0.99466, "k_v": 55049.87,
+        "k_ff": 1.0, "notch_frequency_hz": 430.553388617703, "notch_width": 0.067349, "notch_depth": 0.99992278,
+        "prefilter_corner_hz": 48.38671335551759, "prefilter_damping": 0.40000087807522877,
+    }  # fmt: skip
+    gains = Gains.from_names(numbers, speed=SpeedLoop(differenced=True))
+    law = gains.law("cascade", 1e-3).balanced()
+    assert gains.makes(law, "cascade")
+    for name in ("k_p", "k_v", "prefilter_corner_hz"):
+        other = Gains.from_names(numbers | {name: 1.0001 * numbers[name]}, speed=SpeedLoop(differenced=True))
+        assert not other.makes(law, "cascade")
+
+
 def test_it_rejects_twice_as_much_as_a_pid_at_the_same_limits(tuned: Controller) -> None:
     from seaopt.control.tuning.tuner import disturbance
 
