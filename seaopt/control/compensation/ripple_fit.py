@@ -165,7 +165,7 @@ def identify_ripple(
 
     """
     period = _choose_period(log, angle, period)
-    wanted = list(range(1, highest + 1)) if cycles is None else list(cycles)
+    wanted = list(range(1, highest + 1)) if cycles is None else np.asarray(cycles).tolist()  # not of NumPy
     if not wanted:
         raise ControlError("cycles: is empty; give harmonics, or leave it out to find them")
     check_cycles(wanted, "highest" if cycles is None else "cycles")
