@@ -84,3 +84,12 @@ def test_labels_stand_beyond_the_numbers(draw):
         for figure in figures
     )
     np.testing.assert_allclose(ours, theirs, atol=1.5)  # pixels
+
+
+def test_a_logarithmic_side_on_which_nothing_is_drawn_has_no_ticks():
+    figure = new_figure(5.0, 4.0)
+    (axis,) = add_axes(figure, (1.0,), 0.8)
+    axis.plot([1.0, 10.0], [np.inf, np.inf])
+    scale_log([axis], "y")
+    simplify_ticks([axis])
+    paint(figure)

@@ -157,6 +157,8 @@ def saturation_panel(sweep: LargeSignal) -> Panel:
         from seaopt.reporting.figures.canvas import BLUE, scale_log
 
         (axis,) = axes
+        if not np.any(np.isfinite(sweep.onset_N)):
+            axis.text(0.5, 0.5, "the command has no limit", transform=axis.transAxes, ha="center")
         axis.plot(sweep.frequency_hz, sweep.onset_N, color=BLUE, linewidth=1.4, label="the command saturates above")
         scale_log(axes)
         scale_log(axes, "y")

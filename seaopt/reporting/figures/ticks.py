@@ -84,7 +84,10 @@ def simplify_ticks(axes: Iterable[Axes]) -> None:
 def find_ticks(axes: Axes, name: str) -> Side:
     """Return a side of axes with the ticks that are in view."""
     axis: Any = axes.xaxis if name == "x" else axes.yaxis
-    major, minor = (np.asarray(each, dtype=float) for each in (axis.get_majorticklocs(), axis.get_minorticklocs()))
+    try:
+        major, minor = (np.asarray(each, dtype=float) for each in (axis.get_majorticklocs(), axis.get_minorticklocs()))
+    except ValueError:  # a logarithmic side on which nothing is drawn
+        return Side(axes=axes, name=name, major=np.empty(0), labels=(), minor=np.empty(0))
     labels, seen = axis.get_major_formatter().format_ticks(major), _in_view(axis, major)
     return Side(
         axes=axes, name=name, major=major[seen], minor=minor[_in_view(axis, minor)],

@@ -20,7 +20,7 @@ elsewhere than compensated may double the slope.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -209,7 +209,7 @@ def find_worst_gravity(
             if radius > worst.radius:
                 used = {name: value for name, value in draw.items() if name in placed}
                 worst = GravityCase(radius=radius, angle=float(angle), parameters=used)
-    return worst
+    return worst if worst.radius else replace(worst, radius=np.inf)  # the link falls wherever it is: nothing is shown
 
 
 def _find_radius(

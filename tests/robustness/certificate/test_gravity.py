@@ -15,6 +15,7 @@ from seaopt.control import (
     run_loop,
     runnable,
 )
+from seaopt.robustness.certificate import compensation
 from seaopt.robustness.certificate.compensation import NEUTRAL, find_worst_gravity
 
 KNEE, HELD = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
@@ -47,6 +48,11 @@ def test_a_link_that_weighs_less_than_is_compensated_is_found(plain):
     assert (worst.radius > 1.0 + NEUTRAL, worst.parameters) == (True, {"m": 3.5})
     held = compensate(add_impedance(plain, KNEE, VALUES, Impedance(stiffness=20.0, damping=1.0)), 1.0)
     assert find_worst_gravity(held, KNEE, VALUES, lighter).radius < 1.0
+
+
+def test_nothing_is_shown_of_a_link_that_falls_by_itself_wherever_it_is(plain, monkeypatch):
+    monkeypatch.setattr(compensation, "_find_radius", lambda *_, **__: 1.1)
+    assert np.isinf(find_worst_gravity(compensate(plain, 0.8), KNEE, VALUES, [{}]).radius)
 
 
 @pytest.mark.slow

@@ -171,7 +171,8 @@ def model_link_path(
     --------
     >>> import seaopt as so
     >>> swing, thor = so.plants.moving_output(), so.plants.thor()
-    >>> path = model_link_path(LinkFeedforward(), swing, thor, "F1", 1.0, 30.0)
+    >>> per_newton = 0.002 / (2 * np.pi * 3.0 * 0.0255)  # A: F_m = N_p K_tau 2 pi/l I
+    >>> path = model_link_path(LinkFeedforward(), swing, thor, "F1", per_newton, 30.0)
     >>> print(path.measured, f"{path.inertia:.1f} kg, {path.damping:.0f} N s/m")  # -J/r^2 and -b_r/r^2
     x_2 -294.0 kg, -11636 N s/m
 
