@@ -115,7 +115,7 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     if first["type"] == "missing":
         return f"key {place} is missing; {remedy or f'add it: {own} = ...'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    if isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
+    if first["loc"] and isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
         return f"{place} = {_shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
     correct = f"correct it: {own} = {EXAMPLES.get(first['type'].partition('_')[0], '...')}"
     return f"{place} = {_shorten(first['input'])}: {words}; {remedy or correct}"

@@ -139,6 +139,8 @@ class LawFile(_Strict):
     observer: Any = None
     heat: Any = None
     impedance: Any = None
+    link_feedforward: Any = None
+    compensation: Any = None
     blocked_by: Any = None
     largest_bandwidth_hz: Any = None
     possible: Any = None
@@ -157,6 +159,8 @@ class LawFile(_Strict):
             raise ValueError("should have both of reference and measurement, each with num and den")
         if (self.pid is not None) == (self.law is not None or self.reference is not None):
             raise ValueError("should have law (A, B, C, D), or reference and measurement (num, den), or pid (gains)")
+        if self.compensation is not None:
+            raise ValueError("should have no compensation, which no linear law has; ask for it in [controller]")
         if isinstance(self.measured, list) and not self.measured:
             raise ValueError("should name what is measured")
         return self
