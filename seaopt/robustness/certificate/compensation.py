@@ -102,7 +102,7 @@ def find_compensation_at_draws(
     enough, count = {name: margin for name, margin in nominal.items() if margin.shown}, min(samples, MARGIN_DRAWS)
     if not enough or not count:
         return {}
-    draws = _draw(unknown, count, rng)
+    draws = unknown.list_draws(count, rng)
     found: dict[str, CompensationDraws] = {}
     for name, margin in enough.items():
         placed = [place_values(models[name], unknown.nominal, draw) for draw in draws]
@@ -169,7 +169,7 @@ def find_gravity_cases(
     term = None if controller.compensation is None else controller.compensation.gravity
     if term is None:
         return {}
-    draws = _draw(unknown, min(samples, GRAVITY_DRAWS), rng)
+    draws = unknown.list_draws(min(samples, GRAVITY_DRAWS), rng)
     return {
         name: find_worst_gravity(controller, model, unknown.nominal, [{}, *draws])
         for name, model in models.items()
@@ -264,12 +264,6 @@ def _read_position(plant: Plant, params: ParameterSet, output: str) -> float:
     return float(output_function(plant)(0.0, x, u, values.vector)[list(plant.outputs).index(output)])
 
 
-def _draw(unknown: Uncertainty, count: int, rng: np.random.Generator) -> list[dict[str, float]]:
-    """Return draws, values by name."""
-    values = unknown.values(unknown.draw(count, rng)) if count else {}
-    return [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
-
-
 @record
 class RippleCase:
     """The largest eigenvalue of a loop with ripple compensated, and at which slope over the motor's position."""
@@ -305,7 +299,7 @@ def find_ripple_cases(
     """
     if controller.compensation is None or controller.compensation.ripple is None:
         return {}
-    draws = [{}, *_draw(unknown, min(samples, RIPPLE_DRAWS), rng)]
+    draws = [{}, *unknown.list_draws(min(samples, RIPPLE_DRAWS), rng)]
     return {name: find_worst_ripple(controller, model, unknown.nominal, draws) for name, model in models.items()}
 
 

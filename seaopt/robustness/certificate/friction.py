@@ -83,8 +83,7 @@ def find_margins_at_draws(
     }  # fmt: skip
     if not count or not enough:
         return {}
-    values = unknown.values(unknown.draw(count, rng))
-    draws = [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
+    draws = unknown.list_draws(count, rng)
     return {
         name: _count_shown(controller, models[name], unknown.nominal, draws, margin) for name, margin in enough.items()
     }

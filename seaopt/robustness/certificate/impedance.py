@@ -158,12 +158,10 @@ def draw_impedance(
     if controller.outer is None or not count:
         return None
     name = _find_plant(controller, models)
-    values = unknown.values(unknown.draw(count, rng))
     states = split_friction({name: models[name]}, unknown.nominal, [row.name for row in unknown.varied()]).values()
     stable = passive = 0
     least, worst = np.inf, dict[str, float]()
-    for k in count_off(range(count), "impedance, draw", progress):
-        draw = {key: float(column[k]) for key, column in values.items()}
+    for draw in count_off(unknown.list_draws(count, rng), "impedance, draw", progress):
         judged = [
             _judge(controller, state, place_values(state, unknown.nominal, draw), controller.outer.impedance)
             for state in states

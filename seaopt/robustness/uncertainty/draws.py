@@ -171,6 +171,11 @@ class Uncertainty:
             out[name if mode is None else mode.parameter] = value if mode is None else mode.values_at(value)
         return out
 
+    def list_draws(self, count: int, rng: np.random.Generator) -> list[dict[str, float]]:
+        """Return `count` draws, each as values of the parameters and conditions by name."""
+        values = self.values(self.draw(count, rng))
+        return [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
+
     def slopes(self, coordinates: Float[np.ndarray, "n k"]) -> dict[str, Float[np.ndarray, "n k"]]:
         """Return the derivatives of `values` with respect to the coordinates, by name."""
         count, width = coordinates.shape
