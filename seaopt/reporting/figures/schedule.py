@@ -15,8 +15,6 @@ from seaopt.units import unit_after
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DENSE = 100  # values on which lines are drawn
-
 
 def schedule_panels(schedule: ScheduledController, certificate: ScheduleCertificate | None = None) -> list[Panel]:
     """Return the figures of a schedule: gains, bandwidth, and Ms with what is proved of it."""
