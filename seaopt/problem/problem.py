@@ -37,6 +37,7 @@ from seaopt.frequency import MeasuredResponse, measure_response
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Difference, Plant, known_parameters, plant_of_kind
+from seaopt.plants.motor.thermal import list_guessed_heat
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.equations import list_partners, list_unused, make_plant, order_plants
 from seaopt.problem.predictive import make_mpc_spec
@@ -524,6 +525,7 @@ def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
         plants = _make_plants(table.plant)
         parameters = _make_parameters(table, plants)
         check_references(table, plants, parameters)
+        table = _name_guesses(table, plants)
         mpc = make_mpc_spec(table)
         spec = _make_spec(table) if mpc is None else linear_spec(mpc)
     except SeaoptError as error:
@@ -606,6 +608,16 @@ def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Parame
         except UnitError as error:
             raise UnitError(f"parameters.{name}: {error}") from error
     return ParameterSet(parameters.values())
+
+
+def _name_guesses(table: ProblemTable, plants: Mapping[str, Plant]) -> ProblemTable:
+    """Return the file with what it leaves out of a motor's heat among its guesses: no default is right for a motor."""
+    names = list(table.guessed)
+    for key, plant in plants.items():
+        own = [set(experiment.parameters) for experiment in table.experiment if experiment.plant == key]
+        stated = set(table.parameters).union(set[str].intersection(*own) if own else ())
+        names += list_guessed_heat(plant, stated)
+    return table.model_copy(update={"guessed": list(dict.fromkeys(names))})
 
 
 def _ask_for(key: str, plant: Plant, missing: Sequence[str], known: Mapping[str, Parameter]) -> str:

@@ -209,12 +209,29 @@ def test_what_cannot_be_is_one_line():
         so.plants.wrapped(so.plants.rotary(parts=["voltage_input"]), ["thermal"])
 
 
+def test_no_motor_is_rated_by_defaults_that_nobody_gave():
+    with pytest.raises(PlantError, match="R, R_wc, R_ca, C_w, C_c and T_max of the winding are not given"):
+        rate_motor(PLANT, so.plants.rotary(link="locked").defaults)
+    with pytest.raises(PlantError, match="C_c of the winding is not given"):
+        rate_motor(PLANT, so.ParameterSet(one for name, one in VALUES.items() if name != "C_c"))
+
+
+def test_a_fit_names_what_of_the_motors_heat_is_a_guess():
+    cold = so.plants.rotary(link="locked").defaults.free("k_s")
+    time = np.arange(400) * 1e-3
+    log = so.simulate(PLANT, VALUES, so.Log.from_arrays(time=time, I=np.sin(40.0 * time)))
+    experiment = so.Experiment(plant=PLANT, log=log, outputs={"tau_s": 0.01})
+    guess = [one for one in so.fit([experiment], cold).findings if one.kind == "guess"]
+    assert [one.where for one in guess] == ["on 6 guesses: R, R_wc, R_ca, C_w, C_c, T_max"]
+    assert not [one for one in so.fit([experiment], VALUES.free("k_s")).findings if one.kind == "guess"]
+
+
 def test_a_plant_with_heat_pickles_and_its_held_partner_has_heat():
     plant = so.plants.moving_output(parts=["thermal", "duty_input"])
     again = pickle.loads(pickle.dumps(plant))
     assert again.winding.rises == plant.winding.rises
     values = plant.complete(so.plants.thor())
-    assert rate_motor(again, so.plants.thor()).continuous_A == rate_motor(plant, so.plants.thor()).continuous_A
+    assert rate_motor(again, again.defaults).continuous_A == rate_motor(plant, plant.defaults).continuous_A
     held = plant.port.held()
     assert [name for name in plant.states if name not in ("phi", "phid")] == list(held.states)
     assert values["T_max"].unit == "degC"

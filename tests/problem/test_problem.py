@@ -47,6 +47,14 @@ virtual = {{ seed = 1, duration_s = 2, rate_hz = 400, excitation = {{ {lines} }}
     assert current[100] == pytest.approx(0.0, abs=1e-9)  # a quarter of a second is two periods
 
 
+def test_what_a_file_leaves_out_of_a_motors_heat_is_among_its_guesses(write):
+    plant = '[plant.joint]\nkind = "rotary"\nparts = ["thermal"]\n'
+    problem = so.read_problem(write('schema = 1\nguessed = ["N"]\n' + plant + "[parameters]\nR = 0.6\nR_wc = 1.2\n"))
+    assert problem.table.guessed == ["N", "R_ca", "C_w", "C_c", "T_max"]
+    stated = "R = 0.6\nR_wc = 1.2\nR_ca = 3.0\nC_w = 15\nC_c = 160\nT_max = 110\n"
+    assert so.read_problem(write("schema = 1\n" + plant + "[parameters]\n" + stated)).table.guessed == []
+
+
 @pytest.mark.parametrize("order", [("plain", "bristled"), ("bristled", "plain")])
 def test_a_default_that_differs_among_plants_is_asked_for(write, order):
     """In whatever order they stand; a value in the file is that of both."""

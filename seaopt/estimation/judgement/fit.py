@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from seaopt.estimation.problem.experiment import Experiment, check_shots, is_con
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS
 from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
+from seaopt.estimation.result.findings import find_guesses, order_findings
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.delay_cells import search_delays
@@ -24,6 +26,7 @@ from seaopt.estimation.solver.step_size import hold_bristles
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, list_smoothing
+from seaopt.plants.motor.thermal import list_guessed_heat
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
 from seaopt.simulation.simulate import input_samples
@@ -117,9 +120,17 @@ def fit(
     callback = _count_iterations(searching)
     solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
     result = summarise(solved, chosen, diagnostics, started)
-    result = judge(result, alternatives, judging) if diagnostics else result
+    if diagnostics:
+        result = _name_guesses(judge(result, alternatives, judging), named, params)
     progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)
     return result
+
+
+def _name_guesses(result: Fit, experiments: tuple[Experiment, ...], params: ParameterSet) -> Fit:
+    """Return a fit that names what of a motor's heat nobody gave."""
+    names = [name for e in experiments for name in list_guessed_heat(e.plant, {*params, *e.parameters})]
+    guesses = find_guesses(list(dict.fromkeys(names)))
+    return replace(result, findings=order_findings((*result.findings, *guesses))) if guesses else result
 
 
 def _count_iterations(progress: Progress) -> Callback:

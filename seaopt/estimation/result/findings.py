@@ -67,8 +67,8 @@ def find_guesses(guessed: Sequence[str]) -> tuple[FitFinding, ...]:
     if not guessed:
         return ()
     text = (
-        "no interval covers them, and what is fitted is only as right as they are; measure them, and take each name "
-        "out of guessed = [...] once its value is known"
+        "no interval covers them, and what is fitted is only as right as they are; measure each, give its value, and "
+        "take its name out of guessed = [...]"
     )
     return (FitFinding(severity="warning", kind=GUESS, where=state_guesses(guessed), text=text),)
 

@@ -23,7 +23,7 @@ two time constants. Where the feedback of the resistance makes one positive the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, fields, replace
 from types import SimpleNamespace
 from typing import Any
@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import PlantError, require_number
-from seaopt.formatting import html_text
+from seaopt.formatting import html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import Plant, find_range
@@ -60,6 +60,16 @@ PARAMETERS = (
     Parameter(name=AMBIENT, value=25.0, unit="degC", min=-273.15, description="of the air", plausible=(-60, 80)),
     Parameter(name="T_max", value=125.0, unit="degC", min=-273.15, description="largest of the winding"),
 )
+
+NETWORK = ("R", "R_wc", "R_ca", "C_w", "C_c")  # these and T_max differ from motor to motor
+
+
+def list_guessed_heat(plant: Plant, given: Collection[str]) -> list[str]:
+    """Return what of a motor's winding is not among the given names, so that its default is a guess."""
+    if not set(RISES) <= set(plant.states):
+        return []
+    network_alone = plant.winding is None  # the kind "winding", which has no largest temperature to keep
+    return [name for name in (*NETWORK, *(() if network_alone else ("T_max",))) if name not in given]
 
 
 def find_resistance(winding: Winding | None, x: Any, p: Any) -> Any:
@@ -390,7 +400,8 @@ def rate_motor(plant: Plant, params: ParameterSet, largest: float | None = None)
     Raises
     ------
     PlantError
-        The plant has no such part, or its largest temperature is not above the ambient's.
+        The plant has no such part, a parameter of it that differs from motor to motor is not given, or its largest
+        temperature is not above the ambient's.
 
     Examples
     --------
@@ -405,6 +416,12 @@ def rate_motor(plant: Plant, params: ParameterSet, largest: float | None = None)
     if winding is None:
         raise PlantError(f'plant {plant.name} has no winding that warms up; give it parts = ["thermal"]')
     values = plant.complete(params)
+    guessed = list_guessed_heat(plant, values.given)
+    if guessed:
+        raise PlantError(
+            f"{join_words(guessed)} of the winding {'is' if len(guessed) == 1 else 'are'} not given, and what a motor "
+            "can do is only known with them; give them from its data sheet"
+        )
     p = values.by_attribute
     if not p.T_max > p.T_ambient:
         raise PlantError(f"T_max = {p.T_max:g} degC is not above T_ambient = {p.T_ambient:g} degC; raise the one")
