@@ -220,7 +220,7 @@ def test_a_fit_names_what_of_the_motors_heat_is_a_guess():
     cold = so.plants.rotary(link="locked").defaults.free("k_s")
     time = np.arange(400) * 1e-3
     log = so.simulate(PLANT, VALUES, so.Log.from_arrays(time=time, I=np.sin(40.0 * time)))
-    experiment = so.Experiment(plant=PLANT, log=log, outputs={"tau_s": 0.01})
+    experiment = so.Experiment(plant=PLANT, log=log, outputs=("tau_s",))
     guess = [one for one in so.fit([experiment], cold).findings if one.kind == "guess"]
     assert [one.where for one in guess] == ["on 6 guesses: R, R_wc, R_ca, C_w, C_c, T_max"]
     assert not [one for one in so.fit([experiment], VALUES.free("k_s")).findings if one.kind == "guess"]
