@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -160,13 +161,12 @@ def tune_problem(
             f"{problem.source}: retune = {table.retune} in [robustness] tunes again on models, and "
             f"{problem.response_names[0]} is a measured response; leave retune out"
         )
-    joint = tune_certified(
+    return tune_certified(
         problem.design_plant, source, spec, problem.certified_plants(), ranges=problem.ranges,
         robust_to=problem.robust_to(problem.values(source)), draws=draws, others=problem.parameters,
-        samples=table.samples, seed=table.seed + 1, rounds=table.retune, executor=executor,
-        progress=progress,
+        samples=table.samples, seed=table.seed + 1, rounds=table.retune,
+        complete=partial(complete_controller, problem, source=source), executor=executor, progress=progress,
     )  # fmt: skip
-    return replace(joint, controller=complete_controller(problem, joint.controller, source))
 
 
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:

@@ -49,6 +49,18 @@ def test_what_the_file_asks_is_what_runs(tmp_path, asked, fraction, source):
         Controller.from_dict(content, problem.design_plant, problem.parameters)
 
 
+def test_retune_certifies_what_is_compensated(tmp_path):
+    path = tmp_path / "problem.toml"
+    asked = '{ friction = { from = "speed", speed = 0.05 } }\n[robustness]\nplants = []\nsamples = 10\nretune = 1'
+    path.write_text(TEXT % asked, encoding="utf-8")
+    problem = so.read_problem(path)
+    joint = tune_problem(problem, problem.parameters)
+    (one,) = joint.rounds
+    assert one.certificate.controller.compensation is not None
+    assert "friction_compensation" in [row.name for row in joint.certificate.requirements]
+    assert joint.controller is joint.certificate.controller
+
+
 @pytest.mark.parametrize(
     ("asked", "named"),
     [

@@ -12,7 +12,7 @@ that the one which passes holds at `confidence`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from types import NoneType
 from typing import Literal
@@ -131,6 +131,7 @@ def tune_certified(
     seed: int = 1,
     confidence: float = CONFIDENCE,
     rounds: int = MOST_ROUNDS,
+    complete: Callable[[Controller], Controller] | None = None,
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> JointTuning:
@@ -158,6 +159,8 @@ def tune_certified(
         Of the certificate that passes, over all rounds.
     rounds : int
         Largest number of rounds.
+    complete : callable, optional
+        Makes what runs of each tuned controller, and what is certified: adds compensation or an outer loop to it.
     executor : concurrent.futures.Executor, optional
         Of the certificates, as in `certify`.
     progress : callable, optional
@@ -196,6 +199,7 @@ def tune_certified(
     for number, part in enumerate(divide(progress, *(1.0 for _ in range(rounds))), start=1):
         tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
         controller = tune(plant, values, spec, witnesses, draws=draws, progress=tuning)
+        controller = controller if complete is None else complete(controller)
         certificate = None
         if controller.feasible:
             certificate = certify(
