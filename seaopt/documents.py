@@ -17,7 +17,14 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationE
 
 from seaopt.errors import FileError, SeaoptError, suggestion
 
-EXAMPLES = {"float": "1.0", "int": "1", "bool": "true", "string": '"..."'}  # of a kind of value
+EXAMPLES = {
+    "float": "1.0",
+    "int": "1",
+    "bool": "true",
+    "string": '"..."',
+    "list": "[...]",
+    "model": "{ ... }",
+}  # of a kind of value
 MAX_SHOWN = 60  # characters of a wrong value that a message repeats
 # In a place of pydantic's these name what a value was tried as, and are no keys of the file.
 UNION_BRANCH = re.compile(
@@ -115,6 +122,7 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     if first["type"] == "missing":
         return f"key {place} is missing; {remedy or f'add it: {own} = ...'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    words = "should be a table" if first["type"] == "model_type" else words
     if first["loc"] and isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
         return f"{place} = {_shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
     correct = f"correct it: {own} = {EXAMPLES.get(first['type'].partition('_')[0], '...')}"

@@ -450,13 +450,17 @@ class CompensationTable(_Strict):
     ripple: RippleCompensationTable | None = None
 
 
+_NAMES = "list[names]"  # as pydantic names branches of unions, which messages leave out
+
+
 def _tell_list(value: Any) -> str:
-    """Tell a list of names from a table, so that what is wrong in one is not reported of the other."""
-    return "names" if isinstance(value, list) else "table"
+    """Tell a table from a list of names, so that what is wrong in one is not reported of the other."""
+    return CompensationTable.__name__ if isinstance(value, Mapping | CompensationTable) else _NAMES
 
 
 Compensated = Annotated[
-    Annotated[list[Literal["friction", "gravity"]], Tag("names")] | Annotated[CompensationTable, Tag("table")],
+    Annotated[list[Literal["friction", "gravity"]], Tag(_NAMES)]
+    | Annotated[CompensationTable, Tag(CompensationTable.__name__)],
     Discriminator(_tell_list),
 ]
 

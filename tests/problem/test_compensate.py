@@ -64,7 +64,13 @@ def test_retune_certifies_what_is_compensated(tmp_path):
 @pytest.mark.parametrize(
     ("asked", "named"),
     [
-        ('["frictoin"]', "'frictoin': should be 'friction' or 'gravity'; correct that entry"),
+        (
+            '["frictoin"]',
+            r"controller\.compensate\.1 = 'frictoin': should be 'friction' or 'gravity'; correct",
+        ),
+        ('"friction"', r"controller\.compensate = 'friction': should be a valid list; correct it: compensate = \["),
+        ("{ friction = 3 }", r"controller\.compensate\.friction = 3: should be a table; correct it: friction = \{"),
+        ("{ frictoin = {} }", r"unknown key controller\.compensate\.frictoin; did you mean"),
         ("{ friction = { fraction = 2.0 } }", "fraction"),
         ('{ friction = { from = "encoder" } }', "speed"),
         ("{ friction = { speed = 0.0 } }", "speed"),
