@@ -54,13 +54,12 @@ from seaopt.robustness.certificate.requirements import (
     compensation_requirements,
     design_requirements,
     draw_requirements,
+    eigenvalue_requirements,
     friction_requirements,
-    gravity_requirements,
     impedance_requirements,
     measured_design_requirements,
     measured_requirements,
     plant_requirements,
-    ripple_requirements,
 )
 from seaopt.robustness.uncertainty.draws import check_ranges, combine_uncertainty
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
@@ -226,8 +225,7 @@ def certify(
         *draw_requirements(monte_carlo, worst, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin),
         *compensation_requirements(controller, compensation, compensation_draws),
-        *gravity_requirements(controller, models, gravity),
-        *ripple_requirements(controller, ripple),
+        *eigenvalue_requirements(controller, models, gravity, ripple),
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
         *impedance_requirements(impedance),
     )

@@ -175,38 +175,32 @@ def compensation_requirements(
     return rows
 
 
-def gravity_requirements(
-    controller: Controller, models: Mapping[str, Plant], cases: Mapping[str, GravityCase]
-) -> list[Requirement]:
-    """Return that no link that hangs rises with its weight compensated, at nominal values and over draws."""
-    if controller.compensation is None or controller.compensation.gravity is None:
-        return []
-    percent = f"{100.0 * controller.compensation.gravity.fraction:.3g} % of the weight compensated"
-    rows: list[Requirement] = []
-    for name, case in cases.items():
-        port = models[name].port
-        unit = "" if port is None else models[name].states[str(port.coordinate)]
-        known = f" and {format_values(case.parameters)}" if case.parameters else ""
-        rows.append(Requirement(
-            name=GRAVITY_COMPENSATION, limit=1.0 + NEUTRAL, value=case.radius, met=case.radius <= 1.0 + NEUTRAL,
-            where=f"{name} at {case.angle:.3g} {unit}{known}: the largest eigenvalue with {percent}",
-        ))  # fmt: skip
-    return rows
-
-
-def ripple_requirements(controller: Controller, cases: Mapping[str, RippleCase]) -> list[Requirement]:
-    """Return that no slope of a ripple's compensation makes a loop unstable, at nominal values and over draws."""
-    if controller.compensation is None or controller.compensation.ripple is None:
-        return []
-    effort, unit = controller.command.effort_unit, controller.compensation.ripple.unit
-    rows: list[Requirement] = []
-    for name, case in cases.items():
-        known = f" and {format_values(case.parameters)}" if case.parameters else ""
-        rows.append(Requirement(
-            name=RIPPLE_COMPENSATION, limit=1.0 + NEUTRAL, value=case.radius, met=case.radius <= 1.0 + NEUTRAL,
-            where=f"{name} at {case.slope:.3g} {effort}/{unit}{known}: the largest eigenvalue over the slopes",
-        ))  # fmt: skip
-    return rows
+def eigenvalue_requirements(
+    controller: Controller, models: Mapping[str, Plant], gravity: Mapping[str, GravityCase],
+    ripple: Mapping[str, RippleCase],
+) -> list[Requirement]:  # fmt: skip
+    """Return that neither a weight nor a ripple compensated makes a loop grow, at nominal values and over draws."""
+    terms = controller.compensation
+    found: list[tuple[str, str, GravityCase | RippleCase, str, str]] = []
+    if terms is not None and terms.gravity is not None:
+        looked = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
+        for name, case in gravity.items():
+            port = models[name].port
+            unit = "" if port is None else models[name].states[str(port.coordinate)]
+            found.append((GRAVITY_COMPENSATION, name, case, f"{case.angle:.3g} {unit}", looked))
+    if terms is not None and terms.ripple is not None:
+        unit = f"{controller.command.effort_unit}/{terms.ripple.unit}"
+        for name, case in ripple.items():
+            found.append((RIPPLE_COMPENSATION, name, case, f"{case.slope:.3g} {unit}", "over the slopes"))
+    limit = 1.0 + NEUTRAL
+    return [
+        Requirement(
+            name=requirement, limit=limit, value=case.radius, met=case.radius <= limit,
+            where=f"{name} at {at}{f' and {format_values(case.parameters)}' if case.parameters else ''}: the largest "
+            f"eigenvalue {looked}",
+        )
+        for requirement, name, case, at, looked in found
+    ]  # fmt: skip
 
 
 def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
