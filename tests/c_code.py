@@ -12,7 +12,6 @@ from seaopt.control import export_mpc
 from seaopt.control.deploy.export import export
 
 STRICT = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
-MPC_FLAGS = ["-std=c99", "-Iinc/public", "-Iinc/private", "-I."]
 
 
 class CompiledLaw:
@@ -56,15 +55,12 @@ class CompiledLaw:
 
 
 class CompiledMPC:
-    """An exported `ForceMPC`: its own files without a warning, and its example as a program."""
+    """An exported `ForceMPC`: its files without a warning, as the program of its example."""
 
-    def __init__(self, compiler, folder, mpc):
-        self.folder = export_mpc(mpc, folder)
-        own = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", "force_mpc.c", "example.c"]
-        sources = [*self.folder.glob("*.c"), *self.folder.glob("src/*.c")]
-        files = sorted(str(path.relative_to(self.folder)) for path in sources)
-        for rest in (own, ["-O1", *files, "-lm", "-o", "example"]):
-            subprocess.run([*compiler, *MPC_FLAGS, *rest], cwd=self.folder, check=True)
+    def __init__(self, compiler, folder, mpc, **options):
+        self.folder = export_mpc(mpc, folder, **options)
+        files = sorted(path.name for path in self.folder.glob("*.c"))
+        subprocess.run([*compiler, *STRICT, "-O1", *files, "-lm", "-o", "example"], cwd=self.folder, check=True)
 
     def run(self, references, measurements):
         """Return a row per sample: the current, whether it was solved, iterations, ..., what the gate says.

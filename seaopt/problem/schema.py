@@ -541,7 +541,7 @@ class MPCTable(_Strict):
     largest_force_N: Number | None = None
     bounds: dict[str, tuple[Number, Number]] = {}
     preview_samples: Whole = 0
-    max_iterations: Whole = 500
+    max_iterations: Whole = 100
     noise: NoiseModelTable | None = None
 
 

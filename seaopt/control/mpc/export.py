@@ -1,4 +1,4 @@
-"""The C code of a `ForceMPC`: OSQP's own, generated for its program, and one step function around it."""
+"""The C code of a `ForceMPC`: the numbers of one controller, and what runs it, which is the same for all."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
-from seaopt.control.mpc.quadratic_program import PENALTY, RHO, WIDE, make_solver, stack_hessian
+from seaopt.control.mpc.quadratic_program import PENALTY, WIDE, factor_program, stack_hessian
 from seaopt.errors import FileError
 from seaopt.files import write_text
 from seaopt.records import record
 
-SOURCES = ("force_mpc.h", "force_mpc.c", "example.c")
-LEFT_OUT = ("emosqp.c", "Makefile")  # OSQP's demonstration, which has a main of its own
+SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "example.c")
 
 
 @record(eq=False)
@@ -30,8 +30,7 @@ class MPCCode:
     sizes, numbers, arrays, units : mapping of name to value
         Of ``force_mpc_data.h``.
     hessian, rows : arrays, shapes (nv, nv) and (r, nv)
-        Of the program, which OSQP is generated for.
-    max_iterations : int
+        Of the program.
 
     """
 
@@ -41,14 +40,13 @@ class MPCCode:
     units: Mapping[str, str]
     hessian: Float[np.ndarray, "nv nv"]
     rows: Float[np.ndarray, "r nv"]
-    max_iterations: int
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as they stand in controller.json."""
         return {
             "sizes": dict(self.sizes), "numbers": dict(self.numbers), "units": dict(self.units),
             "arrays": {name: value.tolist() for name, value in self.arrays.items()},
-            "hessian": self.hessian.tolist(), "rows": self.rows.tolist(), "max_iterations": self.max_iterations,
+            "hessian": self.hessian.tolist(), "rows": self.rows.tolist(),
         }  # fmt: skip
 
 
@@ -81,17 +79,11 @@ def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = Fa
     target = Path(folder)
     try:
         target.mkdir(parents=True, exist_ok=True)
-        make_solver(code.hessian, code.rows, code.max_iterations).codegen(
-            str(target), parameters="matrices", extension_name=None, force_rewrite=True, use_float=single_precision,
-            prefix="force_mpc_",
-        )  # fmt: skip
-        for name in LEFT_OUT:
-            (target / name).unlink(missing_ok=True)
     except OSError as error:
         raise FileError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
     for name in SOURCES:
         write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
-    write_text(target / "force_mpc_data.h", _format_data(code))
+    write_text(target / "force_mpc_data.h", _format_data(code, single_precision))
     return target
 
 
@@ -107,7 +99,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
     }  # fmt: skip
     numbers = {
         "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
-        "offset": float(kalman.offset[0]), "violation": VIOLATION, "rho": RHO, "penalty": PENALTY, "wide": WIDE,
+        "offset": float(kalman.offset[0]), "violation": VIOLATION, "penalty": PENALTY, "wide": WIDE,
         "slack_unit": SLACK_UNIT, "lag": spec.lag_s / spec.sample_time_s,
     }  # fmt: skip
     if mpc.gate is not None:
@@ -126,23 +118,28 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
     return MPCCode(
         sizes=sizes, numbers={name: value for name, value in numbers.items() if np.isfinite(value)}, units=units,
         arrays={name: value for name, value in arrays.items() if value.size}, hessian=stack_hessian(prediction),
-        rows=prediction.rows, max_iterations=spec.max_iterations,
+        rows=prediction.rows,
     )  # fmt: skip
 
 
-def _format_data(code: MPCCode) -> str:
-    lines = [f"#define FORCE_MPC_{name} {value}" for name, value in code.sizes.items()]
+def _format_data(code: MPCCode, single_precision: bool) -> str:
+    program = factor_program(code.hessian, code.rows)
+    tolerance, dependent = (TOLERANCE_SINGLE, DEPENDENT_SINGLE) if single_precision else (TOLERANCE, DEPENDENT)
+    numbers = {**code.numbers, "tolerance": tolerance, "dependent": dependent}
+    arrays = {**code.arrays, "inverse": program.inverse, "normals": program.normals, "scale": program.scale}
+    lines = [f"typedef {'float' if single_precision else 'double'} force_mpc_real;"]
+    lines += [f"#define FORCE_MPC_{name} {value}" for name, value in code.sizes.items()]
     lines += [f'#define FORCE_MPC_{name} "{text}"' for name, text in code.units.items()]
-    lines += [f"static const OSQPFloat mpc_{name} = {_format_number(value)};" for name, value in code.numbers.items()]
-    lines += [_format_array(name, value) for name, value in code.arrays.items()]
+    lines += [f"static const force_mpc_real mpc_{name} = {_format_number(value)};" for name, value in numbers.items()]
+    lines += [_format_array(name, value) for name, value in arrays.items()]
     return "\n".join(
         ["/* Sizes and numbers of one controller. */", "#ifndef FORCE_MPC_DATA_H", "#define FORCE_MPC_DATA_H",
-         '#include "osqp_api_types.h"', *lines, "#endif", ""]
+         *lines, "#endif", ""]
     )  # fmt: skip
 
 
 def _format_number(value: float) -> str:
-    return f"(OSQPFloat){value:.17g}"
+    return f"(force_mpc_real){value:.17g}"
 
 
 def _format_array(name: str, value: Float[np.ndarray, "..."]) -> str:
@@ -151,4 +148,4 @@ def _format_array(name: str, value: Float[np.ndarray, "..."]) -> str:
         body = ", ".join(map(_format_number, value))
     else:
         body = ",\n ".join("{" + ", ".join(map(_format_number, line)) + "}" for line in value)
-    return f"static const OSQPFloat mpc_{name}{shape} = {{{body}}};"
+    return f"static const force_mpc_real mpc_{name}{shape} = {{{body}}};"

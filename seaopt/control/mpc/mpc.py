@@ -8,7 +8,7 @@ disturbance,
           x_s = (I - A)^{-1} b\,(u_s + \hat d),
 
 make the force free of offset wherever a current within limits can (Pannocchia and Rawlings, AIChE J. 49, 2003); and
-the program of `prediction`, which always has a solution, is solved from the last one shifted by a sample.
+the program of `prediction`, which always has a solution, is solved exactly (`active_set`), from what the last plan held.
 
 While no limit is active the controller is a linear law (`ForceMPC.law`), whose loop is judged by the table of limits as
 a tuned controller's is: on the sliding design plant, which it is designed for, and on the stuck one where there is
@@ -41,12 +41,20 @@ from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
+from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.knots import interpolate_knots, spread_knots
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.output_bounds import SLACK_UNIT, bound_outputs
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, tune_regulator
-from seaopt.control.mpc.quadratic_program import PENALTY, SOLVED, WIDE, make_solver, solve_program, stack_hessian
+from seaopt.control.mpc.quadratic_program import (
+    PENALTY,
+    WIDE,
+    QuadraticProgram,
+    Solution,
+    factor_program,
+    stack_hessian,
+)
 from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.mpc.step import MPCState, MPCStep
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
@@ -79,13 +87,15 @@ class ForceMPC:
     regulator : Regulator
         The controller without limits.
     prediction : HorizonProgram
-        The quadratic program.
+        What the quadratic program minimises, and its limits.
     static_gain : float
         N/A.
     rest : array, shape (nx,)
         The plant's state at rest per ampere.
     shift : array, shape (n, n)
         Shifts the plan at the knots by one sample.
+    solver : QuadraticProgram
+        The program's matrices, factored.
     gate : PlausibilityGate, optional
         Which measurements are believed, the first if it is in range; the others are predicted, and at a fault the
         current goes to zero.
@@ -102,7 +112,7 @@ class ForceMPC:
     static_gain: float
     rest: Float[np.ndarray, " nx"]
     shift: Float[np.ndarray, "n n"]
-    solver: Any
+    solver: QuadraticProgram
     gate: PlausibilityGate | None = None
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
@@ -221,8 +231,9 @@ class ForceMPC:
         """At rest at zero."""
         n, m = self.prediction.knots.size, len(self.prediction.rows)
         return MPCState(
-            kalman=self.kalman.start, current_A=0.0, plan=np.zeros(n), dual=np.zeros(m), age=self.spec.samples
-        )
+            kalman=self.kalman.start, current_A=0.0, plan=np.zeros(n), sides=np.zeros(m, dtype=int),
+            age=self.spec.samples,
+        )  # fmt: skip
 
     def step(
         self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float
@@ -257,24 +268,22 @@ class ForceMPC:
         xi = ahead[: self.rest.size] - self.rest * (u_s + drift)
         q, low, high = self.program(xi, u_s, last, drift, targets)
         shifted = self.shift @ state.plan
-        first = np.concatenate([(shifted - u_s) / limit, np.zeros(q.size - shifted.size)])
-        theta, dual, status, info = solve_program(self.solver, q, low, high, first, state.dual)
-        if not status and (fault := self._fault(theta, low, high)):
-            status = fault if info.status == SOLVED else f"{info.status}, {fault}"
-        planned, age = limit * theta[: shifted.size] + u_s, 0
+        solution = self.solver.solve(q, low, high, state.sides, self.spec.max_iterations)
+        theta, status = solution.x, self._fault(solution, low, high)
+        planned, age, sides = limit * theta[: shifted.size] + u_s, 0, solution.sides
         if status:  # the last plan goes on for as long as its horizon
             old = state.age >= self.spec.samples
             planned, age = (np.full(shifted.size, u_s) if old else shifted), min(state.age + 1, self.spec.samples)
         if self.gate is not None and seen.fault:
-            status, age, dual = "sensor fault", self.spec.samples, np.zeros_like(dual)
+            status, age, sides = "sensor fault", self.spec.samples, np.zeros_like(sides)
             planned = np.full(shifted.size, self.gate.ramp(last, self.spec.sample_time_s))
         current = self.admissible(float(planned[0]), last)
         kalman = self._advance(state.kalman, corrected, innovation, current)
         return MPCStep(
-            current_A=current, solved=not status, status=status or str(info.status), target_N=float(targets[-1]),
+            current_A=current, solved=not status, status=status or solution.status, target_N=float(targets[-1]),
             slack=0.0 if status else SLACK_UNIT * float(np.max(theta[shifted.size :], initial=0.0)),
-            state=MPCState(kalman=kalman, current_A=current, plan=planned, dual=dual, age=age, gate=seen),
-            force_N=float(self.kalman.C[0] @ corrected), iterations=int(info.iter), solve_time_s=float(info.run_time),
+            state=MPCState(kalman=kalman, current_A=current, plan=planned, sides=sides, age=age, gate=seen),
+            force_N=float(self.kalman.C[0] @ corrected), iterations=solution.iterations,
             step_time_s=time.perf_counter() - began,
         )  # fmt: skip
 
@@ -351,12 +360,16 @@ class ForceMPC:
         first = min(self.delay_samples, references.size - 1)
         return float(currents[-1]), self.static_gain * (currents[first:] + drift)
 
-    def _fault(
-        self, theta: Float[np.ndarray, " nv"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]
-    ) -> str:
-        rows = self.prediction.rows @ theta
+    def _fault(self, solution: Solution, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> str:
+        """Return why a solution is not used; an unfinished one is if it keeps the limits."""
+        if solution.status not in (SOLVED, UNFINISHED):
+            return solution.status
+        if not np.all(np.isfinite(solution.x)):
+            return "solution is not finite"
+        rows = self.prediction.rows @ solution.x
         outside = float(np.max(np.maximum(low - rows, rows - high)))
-        return "" if outside <= VIOLATION else f"solution breaks a limit by {outside:.1%} of it"
+        broken = "" if outside <= VIOLATION else f"solution breaks a limit by {outside:.1%} of it"
+        return f"{UNFINISHED}, {broken}" if broken and solution.status == UNFINISHED else broken
 
     def _advance(
         self, kalman: EstimatorState, corrected: Float[np.ndarray, " n"], innovation: Float[np.ndarray, " 1"],
@@ -541,7 +554,7 @@ def _design(
     return ForceMPC(
         spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift,
-        solver=make_solver(stack_hessian(prediction), prediction.rows, spec.max_iterations),
+        solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate, warnings=warnings,
     )  # fmt: skip
 

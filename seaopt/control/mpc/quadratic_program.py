@@ -1,29 +1,24 @@
-"""The quadratic program of a `HorizonProgram` in OSQP (Stellato et al., Math. Prog. Comp. 12, 2020), set up once.
+r"""The quadratic program of a `HorizonProgram`, of which only vectors change from sample to sample.
 
-Only its vectors change from sample to sample. Each solution starts from a given point with the same penalty rho, so
-that it is a function of what it is given, here and in the C code, whatever was solved before.
+.. math:: \text{minimise } \tfrac12 x^T H x + q^T x \quad\text{with}\quad l \le A x \le h, \qquad H = L L^T.
+
+In :math:`y = L^T x` it asks for the point nearest to :math:`-L^{-1} q` within bounds of the rows :math:`A L^{-T}`,
+which `active_set` finds. Those rows are divided by their lengths, so that the row that is broken most is the one
+furthest away.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from seaopt.control.mpc.active_set import Ending, find_nearest
 from seaopt.control.mpc.prediction import HorizonProgram
-from seaopt.control.mpc.spec import ITERATIONS_PER_CHECK
+from seaopt.records import record
 
-RHO = 0.3  # of ADMM at the start of each program; with slew limits on many knots it has to grow on the way
 PENALTY = 3.0  # of a unit of slack, a tenth of half the width of its bounds; the Hessian's diagonal is 1 on the mean
-CURVATURE = 1.0  # of half its square: ADMM converges slowly along a direction with little
-SOLVED, UNFINISHED = "solved", "maximum iterations reached"  # the solver's status, where it has a plan
+CURVATURE = 1.0  # of half its square
 WIDE = 1e6  # stands for no limit: of a row in units of its limit
-SETTINGS: dict[str, Any] = {
-    "eps_abs": 1e-4, "eps_rel": 1e-4, "check_termination": ITERATIONS_PER_CHECK, "rho": RHO, "adaptive_rho": True,
-    "adaptive_rho_interval": 50, "adaptive_rho_tolerance": 2.0, "polishing": False, "warm_starting": True,
-    "scaling": 10, "verbose": False,
-}  # fmt: skip
 
 
 def stack_hessian(prediction: HorizonProgram) -> Float[np.ndarray, "nv nv"]:
@@ -32,34 +27,51 @@ def stack_hessian(prediction: HorizonProgram) -> Float[np.ndarray, "nv nv"]:
     return np.block([[prediction.H, np.zeros((n, k))], [np.zeros((k, n)), CURVATURE * np.eye(k)]])
 
 
-def make_solver(hessian: Float[np.ndarray, "nv nv"], rows: Float[np.ndarray, "r nv"], max_iterations: int) -> Any:
-    """Return OSQP set up with a program's matrices, and bounds that have no effect yet."""
-    import osqp  # deferred: scipy.sparse and jinja2 are slow to load
-    from scipy.sparse import csc_matrix
+@record(eq=False)
+class Solution:
+    """Of a program: x, where its rows are held (as in `active_set.Nearest`), how the search ended, and its changes."""
 
-    solver = osqp.OSQP(algebra="builtin")
-    P, wide = csc_matrix(np.triu(hessian)), np.full(len(rows), 10.0)
-    solver.setup(
-        P=P, q=np.zeros(len(hessian)), A=csc_matrix(rows), l=-wide, u=wide, max_iter=max_iterations, **SETTINGS
-    )  # fmt: skip
-    return solver
+    x: Float[np.ndarray, " n"]
+    sides: Int[np.ndarray, " m"]
+    status: Ending
+    iterations: int
 
 
-def solve_program(
-    solver: Any, q: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
-    first: Float[np.ndarray, " n"], dual: Float[np.ndarray, " m"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], str, Any]:  # fmt: skip
-    """Return the solution, the dual to go on from, what went wrong ("" if nothing), and the solver's report.
+@record(eq=False)
+class QuadraticProgram:
+    """A program's matrices; `factor_program` makes one.
 
-    A program that the iterations did not suffice for is not wrong: its plan may keep the limits all the same.
+    Parameters
+    ----------
+    inverse : array, shape (n, n)
+        Of L.
+    normals : array, shape (m, n)
+        The rows of y, of length 1.
+    scale : array, shape (m,)
+        One over the lengths that they had: of their bounds too.
+
     """
-    solver.update(q=q, l=low, u=high)
-    solver.warm_start(x=first, y=dual)
-    result = solver.solve(raise_error=False)
-    if result.info.rho_updates:
-        solver.update_settings(rho=RHO)  # the next step starts as this one did
-    x, y = np.array(result.x), np.array(result.y)
-    wrong = "" if result.info.status in (SOLVED, UNFINISHED) else str(result.info.status)
-    if not wrong and not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
-        wrong = "solution is not finite"
-    return x, np.zeros_like(y) if wrong else y, wrong, result.info
+
+    inverse: Float[np.ndarray, "n n"]
+    normals: Float[np.ndarray, "m n"]
+    scale: Float[np.ndarray, " m"]
+
+    def solve(
+        self, q: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
+        sides: Int[np.ndarray, " m"], max_iterations: int,
+    ) -> Solution:  # fmt: skip
+        """Return the solution for a gradient and bounds, from rows that are held to begin with."""
+        nearest = find_nearest(
+            -self.inverse @ q, self.normals, low * self.scale, high * self.scale, sides, max_iterations
+        )
+        return Solution(
+            x=self.inverse.T @ nearest.point, sides=nearest.sides, status=nearest.status, iterations=nearest.iterations
+        )
+
+
+def factor_program(hessian: Float[np.ndarray, "n n"], rows: Float[np.ndarray, "m n"]) -> QuadraticProgram:
+    """Return a program by its Hessian and its rows, none of which is zero."""
+    inverse = np.linalg.inv(np.linalg.cholesky(hessian))
+    normals = rows @ inverse.T
+    scale = 1.0 / np.linalg.norm(normals, axis=1)
+    return QuadraticProgram(inverse=inverse, normals=normals * scale[:, None], scale=scale)

@@ -18,7 +18,6 @@ from seaopt.records import record
 MAX_HORIZON_SAMPLES = 500  # of a horizon
 MAX_MPC_DELAY_SAMPLES = 100
 MAX_MPC_ITERATIONS = 10_000
-ITERATIONS_PER_CHECK = 5  # of the solver, after which it looks whether it is done
 MPC_BANDWIDTH_TOLERANCE = 0.02  # the weight makes the bandwidth of a plan with every current free; few cost accuracy
 MPC_LIMITS = (  # of the table of limits, those of a loop without gains
     *(BY_NAME[name] for name in (
@@ -69,8 +68,8 @@ class MPCSpec:
     preview_samples : int
         How many references beyond the present one the controller may be given; the horizon and the delay at most.
     max_iterations : int
-        Of the solver in one step. Where they do not suffice, its plan is used if it keeps the limits; otherwise the
-        last plan goes on.
+        Of the solver in one step, each of which takes in or lets go a limit of the plan. Where they do not suffice, its
+        plan is used if it keeps the limits; otherwise the last plan goes on.
     noise : NoiseModel, optional
         Of the Kalman filter, with a drift of the current. If left out, one that makes the filter quick: its sensor
         noise is 1/120 of the static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).
@@ -99,7 +98,7 @@ class MPCSpec:
     largest_force_N: float | None = None
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
     preview_samples: int = 0
-    max_iterations: int = 500
+    max_iterations: int = 100
     noise: NoiseModel | None = None
     max_sensitivity: Level = BY_NAME["max_sensitivity"].default
     max_complementary: Level = BY_NAME["max_complementary"].default
@@ -124,7 +123,7 @@ class MPCSpec:
             raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
         ranges = {
             "delay_samples": (0, MAX_MPC_DELAY_SAMPLES), "moves": (2, MAX_HORIZON_SAMPLES),
-            "max_iterations": (ITERATIONS_PER_CHECK, MAX_MPC_ITERATIONS), "preview_samples": (0, MAX_HORIZON_SAMPLES),
+            "max_iterations": (1, MAX_MPC_ITERATIONS), "preview_samples": (0, MAX_HORIZON_SAMPLES),
         }  # fmt: skip
         for name, (least, most) in ranges.items():
             value = getattr(self, name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from seaopt.control.laws.plausibility import GateState
 from seaopt.control.mpc.estimator import EstimatorState
@@ -21,8 +21,8 @@ class MPCState:
         The last command.
     plan : array, shape (n,)
         The currents planned at the knots, A.
-    dual : array, shape (m,)
-        Of the last program, where the next starts.
+    sides : array of int, shape (m,)
+        Where the last program held its rows, as in `active_set.Nearest`; the next starts there.
     age : int
         Samples since a program was solved: so old is the plan. Of one that never was: the horizon.
     gate : GateState
@@ -33,7 +33,7 @@ class MPCState:
     kalman: EstimatorState
     current_A: float
     plan: Float[np.ndarray, " n"]
-    dual: Float[np.ndarray, " m"]
+    sides: Int[np.ndarray, " m"]
     age: int
     gate: GateState = GateState()
 
@@ -60,9 +60,7 @@ class MPCStep:
     slack : float
         By how much the plan breaks the bounds of outputs, in units of half their width; the largest.
     iterations : int
-        Of the solver.
-    solve_time_s : float
-        The solver's own, in C.
+        Rows that the solver took in or let go.
     step_time_s : float
         The whole step's, in Python.
 
@@ -76,5 +74,4 @@ class MPCStep:
     target_N: float
     slack: float
     iterations: int
-    solve_time_s: float
     step_time_s: float

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, StringConstraints
+from pydantic import StringConstraints
 
 from seaopt.control.mpc.export import MPCCode
-from seaopt.control.mpc.spec import MAX_MPC_ITERATIONS
 from seaopt.documents import Number, ResultTable, Whole, check_table
 from seaopt.files import plain
 
@@ -26,7 +25,6 @@ class StoredCode(ResultTable):
     units: dict[CName, CText]
     hessian: list[list[Number]]
     rows: list[list[Number]]
-    max_iterations: Annotated[Whole, Field(ge=1, le=MAX_MPC_ITERATIONS)]
 
 
 def read_code(content: Any) -> MPCCode:
@@ -40,7 +38,7 @@ def read_code(content: Any) -> MPCCode:
     """
     stored = check_table(StoredCode, plain(content), "controller.json: mpc.code", remedy=TUNE_AGAIN)
     return MPCCode(
-        sizes=stored.sizes, numbers=stored.numbers, units=stored.units, max_iterations=stored.max_iterations,
+        sizes=stored.sizes, numbers=stored.numbers, units=stored.units,
         arrays={name: np.array(value, dtype=float) for name, value in stored.arrays.items()},
         hessian=np.array(stored.hessian, dtype=float), rows=np.array(stored.rows, dtype=float),
     )  # fmt: skip

@@ -184,7 +184,7 @@ def test_predictive_control_names_what_is_commanded_and_keeps_to_its_range(tmp_p
     data = (folder / "force_mpc_data.h").read_text()
     for line in ('COMMAND "duty"', 'COMMAND_UNIT "-"', 'UNIT "N m"'):
         assert f"#define FORCE_MPC_{line}" in data
-    assert "mpc_limit = (OSQPFloat)1;" in data
+    assert "mpc_limit = (force_mpc_real)1;" in data
     for name in ("force_mpc.h", "force_mpc.c", "example.c"):
         assert not re.search(r"current|\(A\)|\(N\)", (folder / name).read_text()), name
 

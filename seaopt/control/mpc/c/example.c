@@ -5,18 +5,18 @@
 
 #include "force_mpc.h"
 
-static int read_line(OSQPFloat *values, int count) {
+static int read_line(force_mpc_real *values, int count) {
   for (int i = 0; i < count; i++) {
     double value;
     if (scanf("%lf", &value) != 1) return 0;
-    values[i] = (OSQPFloat)value;
+    values[i] = (force_mpc_real)value;
   }
   return 1;
 }
 
 int main(void) {
   static force_mpc controller;
-  OSQPFloat line[FORCE_MPC_PREVIEW + 2];
+  force_mpc_real line[FORCE_MPC_PREVIEW + 2];
   force_mpc_reset(&controller);
   while (read_line(line, FORCE_MPC_PREVIEW + 2)) {
     clock_t began = clock();

@@ -2,9 +2,6 @@
 
 #include <string.h>
 
-#include "force_mpc_workspace.h"
-#include "osqp.h"
-
 #define STATES FORCE_MPC_STATES
 #define PLANT (FORCE_MPC_PLANT_STATES)
 #define KNOTS FORCE_MPC_KNOTS
@@ -12,30 +9,32 @@
 #define SIGNALS FORCE_MPC_SIGNALS /* with bounds, each held at SAMPLES of the horizon */
 #define SAMPLES FORCE_MPC_SAMPLES
 #define LIMITS (ROWS - 2 * SIGNALS * SAMPLES - SIGNALS) /* rows of the command, before those of the signals */
-#define VARIABLES (KNOTS + SIGNALS)
+#define VARIABLES FORCE_MPC_VARIABLES
 #define DELAY FORCE_MPC_DELAY
 #define PREVIEW FORCE_MPC_PREVIEW
 #define KNOWN (PREVIEW > DELAY ? PREVIEW - DELAY : 0) /* samples of the horizon whose references differ */
 
-static int finite_number(OSQPFloat x) { return x - x == 0; }
+typedef force_mpc_real real;
 
-static OSQPFloat clip(OSQPFloat x, OSQPFloat low, OSQPFloat high) { return x < low ? low : x > high ? high : x; }
+static int finite_number(real x) { return x - x == 0; }
 
-static OSQPFloat dot(const OSQPFloat *a, const OSQPFloat *b, int n) {
-  OSQPFloat sum = 0;
+static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
+
+static real dot(const real *a, const real *b, int n) {
+  real sum = 0;
   for (int i = 0; i < n; i++) sum += a[i] * b[i];
   return sum;
 }
 
 /* z := A z + B u */
-static void advance(OSQPFloat *z, OSQPFloat u) {
-  OSQPFloat next[STATES];
+static void advance(real *z, real u) {
+  real next[STATES];
   for (int i = 0; i < STATES; i++) next[i] = dot(mpc_A[i], z, STATES) + mpc_B[i] * u;
   memcpy(z, next, sizeof next);
 }
 
 /* Row i of the program's constraints, times its variables. */
-static OSQPFloat row(const OSQPFloat *theta, int i) {
+static real row(const real *theta, int i) {
   if (i < KNOTS) return theta[i];
 #if FORCE_MPC_SLEWS
   if (i < LIMITS) return dot(mpc_M[i - KNOTS], theta, KNOTS);
@@ -44,7 +43,7 @@ static OSQPFloat row(const OSQPFloat *theta, int i) {
   i -= LIMITS;
   if (i < 2 * SIGNALS * SAMPLES) {
     int upper = i < SIGNALS * SAMPLES, k = upper ? i : i - SIGNALS * SAMPLES;
-    OSQPFloat slack = mpc_slack_unit * theta[KNOTS + k / SAMPLES];
+    real slack = mpc_slack_unit * theta[KNOTS + k / SAMPLES];
     return dot(mpc_forced[k], theta, KNOTS) + (upper ? -slack : slack);
   }
   return theta[KNOTS + i - 2 * SIGNALS * SAMPLES];
@@ -54,14 +53,14 @@ static OSQPFloat row(const OSQPFloat *theta, int i) {
 }
 
 /* Ends of the commands at rest that keep the bounds of signals: the least and the largest. */
-static void admissible_rest(OSQPFloat drift, OSQPFloat *low, OSQPFloat *high) {
+static void admissible_rest(real drift, real *low, real *high) {
   *low = -mpc_limit;
   *high = mpc_limit;
 #if SIGNALS
   for (int i = 0; i < SIGNALS; i++) {
     if (mpc_static[i] == 0) continue;
-    OSQPFloat one = (mpc_centre[i] - 1) / mpc_static[i] - drift, other = (mpc_centre[i] + 1) / mpc_static[i] - drift;
-    OSQPFloat least = one < other ? one : other, most = one < other ? other : one;
+    real one = (mpc_centre[i] - 1) / mpc_static[i] - drift, other = (mpc_centre[i] + 1) / mpc_static[i] - drift;
+    real least = one < other ? one : other, most = one < other ? other : one;
     if (least > *low) *low = least;
     if (most < *high) *high = most;
   }
@@ -73,22 +72,22 @@ static void admissible_rest(OSQPFloat drift, OSQPFloat *low, OSQPFloat *high) {
 }
 
 /* Limits of all rows. */
-static void limit_rows(const force_mpc *s, const OSQPFloat *error, OSQPFloat rest, OSQPFloat drift, OSQPFloat *low,
-                       OSQPFloat *high) {
+static void limit_rows(const force_mpc *s, const real *error, real rest, real drift, real *low,
+                       real *high) {
   for (int i = 0; i < KNOTS; i++) {
     low[i] = -1 - rest / mpc_limit;
     high[i] = 1 - rest / mpc_limit;
   }
 #if FORCE_MPC_SLEWS
   for (int i = KNOTS; i < LIMITS; i++) {
-    OSQPFloat start = i == KNOTS ? (s->command - rest) / mpc_slew : 0;
+    real start = i == KNOTS ? (s->command - rest) / mpc_slew : 0;
     low[i] = start - 1;
     high[i] = start + 1;
   }
 #endif
 #if SIGNALS
   for (int k = 0; k < SIGNALS * SAMPLES; k++) {
-    OSQPFloat base = mpc_static[k / SAMPLES] * (rest + drift) - mpc_centre[k / SAMPLES] + dot(mpc_free[k], error, PLANT);
+    real base = mpc_static[k / SAMPLES] * (rest + drift) - mpc_centre[k / SAMPLES] + dot(mpc_free[k], error, PLANT);
     low[LIMITS + k] = -mpc_wide;
     high[LIMITS + k] = 1 - base;
     low[LIMITS + SIGNALS * SAMPLES + k] = -1 - base;
@@ -102,31 +101,21 @@ static void limit_rows(const force_mpc *s, const OSQPFloat *error, OSQPFloat res
   (void)s, (void)error, (void)drift;
 }
 
-/* Solve from the last plan, shifted, which is in `plan`; return whether there is a solution that can be used. */
-static int solve(force_mpc *s, OSQPFloat *plan, OSQPFloat *start, const OSQPFloat *error, const OSQPFloat *delta,
-                 OSQPFloat rest, OSQPFloat drift) {
-  OSQPFloat q[VARIABLES], low[ROWS], high[ROWS], first[VARIABLES];
-  for (int i = 0; i < VARIABLES; i++) {
-    q[i] = i < KNOTS ? dot(mpc_F[i], error, PLANT + 1) : mpc_penalty;
-    first[i] = i < KNOTS ? (plan[i] - rest) / mpc_limit : 0;
-  }
+/* Put the solution into `plan` if it can be used; return whether it can. */
+static int solve(force_mpc *s, real *plan, const real *error, const real *delta, real rest, real drift) {
+  real q[VARIABLES], low[ROWS], high[ROWS], theta[VARIABLES];
+  for (int i = 0; i < VARIABLES; i++) q[i] = i < KNOTS ? dot(mpc_F[i], error, PLANT + 1) : mpc_penalty;
 #if KNOWN
   for (int i = 0; i < KNOTS; i++) q[i] += dot(mpc_R[i], delta, KNOWN);
 #endif
   (void)delta;
   limit_rows(s, error, rest, drift, low, high);
-  if (osqp_update_data_vec(&force_mpc_solver, q, low, high) || osqp_warm_start(&force_mpc_solver, first, start) ||
-      osqp_solve(&force_mpc_solver)) return 0;
-  s->iterations = (int)force_mpc_solver.info->iter;
-  if (force_mpc_solver.info->rho_updates) osqp_update_rho(&force_mpc_solver, mpc_rho);
-  OSQPInt status = force_mpc_solver.info->status_val;
-  if (status != OSQP_SOLVED && status != OSQP_MAX_ITER_REACHED) return 0;
-  const OSQPFloat *theta = force_mpc_solver.solution->x, *dual = force_mpc_solver.solution->y;
+  force_mpc_ending ending = force_mpc_minimise(&s->program, q, low, high, theta);
+  s->iterations = s->program.iterations;
+  if (ending == FORCE_MPC_INFEASIBLE) return 0;
   for (int i = 0; i < VARIABLES; i++) if (!finite_number(theta[i])) return 0;
-  for (int i = 0; i < ROWS; i++) if (!finite_number(dual[i])) return 0;
-  memcpy(s->dual, dual, sizeof s->dual); /* the next step goes on from here, whether or not this plan is used */
   for (int i = 0; i < ROWS; i++) {
-    OSQPFloat value = row(theta, i);
+    real value = row(theta, i);
     if (value < low[i] - mpc_violation || value > high[i] + mpc_violation) return 0;
   }
   for (int i = 0; i < KNOTS; i++) plan[i] = mpc_limit * theta[i] + rest;
@@ -135,11 +124,11 @@ static int solve(force_mpc *s, OSQPFloat *plan, OSQPFloat *start, const OSQPFloa
 
 #if FORCE_MPC_GATE
 /* Whether a measurement is believed: in range, and no further from the last than the plant moves since. */
-static int believed(force_mpc *s, OSQPFloat measurement) {
-  OSQPFloat moved = measurement > s->measurement ? measurement - s->measurement : s->measurement - measurement;
+static int believed(force_mpc *s, real measurement) {
+  real moved = measurement > s->measurement ? measurement - s->measurement : s->measurement - measurement;
   if (s->refused > FORCE_MPC_MAX_HELD) return 0;
   if (!(measurement >= mpc_low && measurement <= mpc_high) ||
-      (s->known && !(moved <= mpc_step * (OSQPFloat)(s->refused + 1)))) {
+      (s->known && !(moved <= mpc_step * (real)(s->refused + 1)))) {
     s->refused++;
     return 0;
   }
@@ -155,14 +144,14 @@ void force_mpc_reset(force_mpc *s) {
   s->age = FORCE_MPC_HORIZON;
 }
 
-OSQPFloat force_mpc_step(force_mpc *s, OSQPFloat reference, OSQPFloat measurement) {
+real force_mpc_step(force_mpc *s, real reference, real measurement) {
   return force_mpc_step_ahead(s, &reference, 1, measurement);
 }
 
-OSQPFloat force_mpc_step_ahead(force_mpc *s, const OSQPFloat *references, int count, OSQPFloat measurement) {
-  OSQPFloat ahead[STATES], error[PLANT + 1], target[PREVIEW + 1], delta[KNOWN + 1], plan[KNOTS], dual[ROWS];
-  OSQPFloat least, most;
-  OSQPFloat innovation = measurement - mpc_offset - dot(mpc_C, s->z, STATES);
+real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real measurement) {
+  real ahead[STATES], error[PLANT + 1], target[PREVIEW + 1], delta[KNOWN + 1], plan[KNOTS];
+  real least, most;
+  real innovation = measurement - mpc_offset - dot(mpc_C, s->z, STATES);
   int used = finite_number(innovation);
 #if FORCE_MPC_GATE
   used = believed(s, measurement);
@@ -174,9 +163,9 @@ OSQPFloat force_mpc_step_ahead(force_mpc *s, const OSQPFloat *references, int co
 
   memcpy(ahead, s->z, sizeof ahead);
   for (int i = 0; i < DELAY; i++) advance(ahead, s->past[i]);
-  OSQPFloat drift = ahead[STATES - 1];
+  real drift = ahead[STATES - 1];
   admissible_rest(drift, &least, &most);
-  OSQPFloat last = s->reference, rest = 0;
+  real last = s->reference, rest = 0;
   for (int i = 0; i <= PREVIEW; i++) {
     if (i < count && finite_number(references[i])) last = references[i];
     if (i == 0) s->reference = last;
@@ -185,16 +174,14 @@ OSQPFloat force_mpc_step_ahead(force_mpc *s, const OSQPFloat *references, int co
   }
   delta[KNOWN] = 0;
   for (int j = 0; j < KNOWN; j++) {
-    const OSQPFloat *at = target + DELAY + j;
+    const real *at = target + DELAY + j;
     delta[j] = at[0] - target[PREVIEW] + mpc_lag * (at[1] - at[0]);
   }
   for (int i = 0; i < PLANT; i++) error[i] = ahead[i] - mpc_rest[i] * (rest + drift);
   error[PLANT] = s->command - rest;
 
   for (int i = 0; i < KNOTS; i++) plan[i] = dot(mpc_shift[i], s->plan, KNOTS);
-  memcpy(dual, s->dual, sizeof dual);
-  memset(s->dual, 0, sizeof s->dual); /* of a program that fails */
-  s->solved = solve(s, plan, dual, error, delta, rest, drift);
+  s->solved = solve(s, plan, error, delta, rest, drift);
   if (!s->solved && s->age >= FORCE_MPC_HORIZON)
     for (int i = 0; i < KNOTS; i++) plan[i] = rest; /* else the last plan goes on */
   s->age = s->solved ? 0 : s->age < FORCE_MPC_HORIZON ? s->age + 1 : FORCE_MPC_HORIZON;
@@ -203,13 +190,13 @@ OSQPFloat force_mpc_step_ahead(force_mpc *s, const OSQPFloat *references, int co
     s->status = FORCE_MPC_FAULT;
     s->solved = 0;
     s->age = FORCE_MPC_HORIZON;
-    memset(s->dual, 0, sizeof s->dual);
+    memset(s->program.side, 0, sizeof s->program.side);
     rest = s->command > mpc_ramp ? s->command - mpc_ramp : s->command < -mpc_ramp ? s->command + mpc_ramp : 0;
     for (int i = 0; i < KNOTS; i++) plan[i] = rest;
   }
 #endif
   memcpy(s->plan, plan, sizeof s->plan);
-  OSQPFloat command = plan[0];
+  real command = plan[0];
 #if FORCE_MPC_SLEWS
   command = clip(command, s->command - mpc_slew, s->command + mpc_slew);
 #endif

@@ -1,0 +1,164 @@
+r"""The point nearest to another within bounds, by the dual active-set method.
+
+For :math:`y_0` and rows :math:`n_i` of length 1,
+
+.. math:: \text{minimise } \tfrac12 |y - y_0|^2 \quad\text{with}\quad l_i \le n_i y \le h_i.
+
+Rows are held at one of their ends, those of the last program to begin with. On them y is the nearest point, with
+multipliers :math:`\lambda`; with N the held rows, signed to point inwards, and b their ends,
+
+.. math:: y = y_0 + N^T \lambda, \qquad N N^T \lambda = b - N y_0, \qquad N^T = Q R.
+
+Rows with negative multipliers are let go, so that the distance to :math:`y_0` is the least that the held rows allow.
+Then the row that is broken most is taken in. On the way there the multipliers change by :math:`-t r`, with r the row's
+share in the held ones; one that would become negative is let go first. Each full step increases the distance, so that
+no set comes back, and the method ends: at the solution, or with a row that no step brings closer, which proves that the
+bounds contradict each other. In most samples of a controller nothing changes, and the answer is one product.
+
+`c/active_set.c` takes the same steps, and updates Q and R where this module makes them anew.
+
+Source: D. Goldfarb and A. Idnani, Math. Programming 27, 1983.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.records import record
+
+TOLERANCE, TOLERANCE_SINGLE = 1e-10, 1e-5  # by how much a bound may be broken, per 1 + the largest value of a row
+DEPENDENT, DEPENDENT_SINGLE = 1e-12, 1e-6  # square of what is left of a row besides the held ones: it depends on them
+SOLVED, UNFINISHED, INFEASIBLE = "solved", "maximum iterations reached", "the bounds contradict each other"
+Ending = Literal["solved", "maximum iterations reached", "the bounds contradict each other"]
+
+
+@record(eq=False)
+class Nearest:
+    """What the search ends with.
+
+    Parameters
+    ----------
+    point : array, shape (n,)
+    sides : array of int, shape (m,)
+        1: the row is held at its high end, -1: at its low one, 0: at none. The next search starts here.
+    status : Ending
+    iterations : int
+        Rows taken in or let go after the start.
+
+    """
+
+    point: Float[np.ndarray, " n"]
+    sides: Int[np.ndarray, " m"]
+    status: Ending
+    iterations: int
+
+
+@record(eq=False)
+class _Held:
+    """The nearest point on held rows, its multipliers, and Q with the upper triangle R of the rows' normals."""
+
+    rows: tuple[int, ...]
+    signs: tuple[int, ...]
+    point: Float[np.ndarray, " n"]
+    dual: Float[np.ndarray, " k"]
+    Q: Float[np.ndarray, "n n"]
+    R: Float[np.ndarray, "k k"]
+
+
+@record(eq=False)
+class _Bounds:
+    start: Float[np.ndarray, " n"]
+    normals: Float[np.ndarray, "m n"]
+    low: Float[np.ndarray, " m"]
+    high: Float[np.ndarray, " m"]
+
+    def hold(self, rows: tuple[int, ...], signs: tuple[int, ...]) -> _Held:
+        """Return the point nearest to the start on which each row has its end: the high one where its sign is 1."""
+        k, at, inward = len(rows), list(rows), -np.array(signs, dtype=float)
+        normals = inward[:, None] * self.normals[at]
+        ends = inward * np.where(inward < 0.0, self.high[at], self.low[at])
+        Q, tall = np.linalg.qr(normals.T, mode="complete")
+        R = tall[:k]
+        w = np.linalg.solve(R.T, ends - normals @ self.start)
+        return _Held(
+            rows=rows, signs=signs, point=self.start + Q[:, :k] @ w, dual=np.linalg.solve(R, w), Q=Q, R=R
+        )  # fmt: skip
+
+    def let_go(self, held: _Held, j: int) -> _Held:
+        """Return what holds without the j-th of the held rows."""
+        return self.hold(held.rows[:j] + held.rows[j + 1 :], held.signs[:j] + held.signs[j + 1 :])
+
+    def find_broken(self, held: _Held) -> tuple[int, int, float]:
+        """Return the row that is broken most, its side, and by how much."""
+        values = self.normals @ held.point
+        broken = np.maximum(values - self.high, self.low - values)
+        broken[list(held.rows)] = 0.0
+        row = int(np.argmax(broken))
+        return row, 1 if values[row] > self.high[row] else -1, float(broken[row])
+
+    def take_in(self, held: _Held, row: int, sign: int, broken: float, most: int) -> tuple[_Held, Ending, int]:
+        """Return what holds with a broken row, once the rows that are in its way are let go; in `most` changes."""
+        dual = held.dual
+        for used in range(1, most + 1):
+            k = len(held.rows)
+            d = held.Q.T @ (-sign * self.normals[row])
+            share, rest = np.linalg.solve(held.R, d[:k]), float(d[k:] @ d[k:])
+            ratios = np.where(share > 0.0, dual / np.where(share > 0.0, share, 1.0), np.inf)
+            partial, full = float(np.min(ratios, initial=np.inf)), broken / rest if rest > DEPENDENT else np.inf
+            step = min(partial, full)
+            if step == np.inf:
+                return held, INFEASIBLE, used
+            if full <= partial:
+                return self.hold((*held.rows, row), (*held.signs, sign)), SOLVED, used
+            j = int(np.argmin(ratios))
+            dual, broken = np.delete(dual - step * share, j), broken - (step * rest if full < np.inf else 0.0)
+            held = self.let_go(held, j)
+        return held, UNFINISHED, most
+
+
+def find_nearest(
+    start: Float[np.ndarray, " n"], normals: Float[np.ndarray, "m n"], low: Float[np.ndarray, " m"],
+    high: Float[np.ndarray, " m"], sides: Int[np.ndarray, " m"], max_iterations: int,
+) -> Nearest:  # fmt: skip
+    """Return the point nearest to `start` within bounds.
+
+    Parameters
+    ----------
+    start : array, shape (n,)
+        The other point.
+    normals : array, shape (m, n)
+        Rows of length 1.
+    low, high : arrays, shape (m,)
+        Their bounds.
+    sides : array of int, shape (m,)
+        Where rows are held to begin with, as `Nearest.sides`; the held ones are linearly independent.
+    max_iterations : int
+        Changes of the held rows at most, besides the rows that are let go at the start.
+
+    Examples
+    --------
+    >>> high = np.array([2.0, 2.0])
+    >>> found = find_nearest(np.array([3.0, 1.0]), np.eye(2), -high, high, np.zeros(2, int), max_iterations=10)
+    >>> found.point.tolist(), found.sides.tolist(), found.status
+    ([2.0, 1.0], [1, 0], 'solved')
+
+    """
+    bounds = _Bounds(start=start, normals=normals, low=low, high=high)
+    at = np.flatnonzero(sides)
+    held = bounds.hold(tuple(at.tolist()), tuple(sides[at].tolist()))
+    while np.min(held.dual, initial=0.0) < 0.0:
+        held = bounds.let_go(held, int(np.argmin(held.dual)))
+    status: Ending = SOLVED
+    iterations, tolerance = 0, TOLERANCE * (1.0 + float(np.max(np.abs(normals @ start))))
+    while status == SOLVED:
+        row, sign, broken = bounds.find_broken(held)
+        if not broken > tolerance:
+            break
+        held, status, used = bounds.take_in(held, row, sign, broken, max_iterations - iterations)
+        iterations += used
+    ended = np.zeros_like(sides)
+    ended[list(held.rows)] = held.signs
+    return Nearest(point=held.point, sides=ended, status=status, iterations=iterations)
