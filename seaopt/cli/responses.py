@@ -19,12 +19,12 @@ from seaopt.progress import Progress, count_off
 from seaopt.records import record
 from seaopt.reporting import experiment_survey, write_frequency_figure
 
-TITLES = ("response", "coherent", "peak", "gain", "f_n", "zeta", "(16)", "file")
+TITLES = ("response", "coherent", "peak", "gain", "f_n", "zeta", "form", "file")
 
 RESPONSES_NOTE = (
     "coherent: band of coherence above 0.8; peak and natural frequency f_n in Hz; gain, f_n and damping ratio zeta: "
-    "of the second-order fit (16); (16), file, fit: how far that and the model with the file's and the fitted values "
-    "lie from H1, in its standard deviations"
+    "of the second-order form K/(s² + a s + b), fitted; form, file, fit: how far that form and the model with the "
+    "file's and the fitted values lie from H1, in its standard deviations"
 )
 
 
@@ -64,7 +64,7 @@ class Responses:
         return [pair.second_order for pair in pairs if pair.second_order is not None]
 
     def show(self, console: Terminal) -> None:
-        """Print a row per response of each experiment, and what those of the form (16) say of the actuator."""
+        """Print a row per response of each experiment, and what those of second order say of the actuator."""
         titles = (*TITLES, "fit") if self.fitted else TITLES
         for name, survey in self.surveys.items():
             console.say(f"\n{name}", style="bold")
@@ -131,8 +131,8 @@ def _describe_drive(survey: Survey, pair: Pair, drive: DriveEstimate) -> tuple[s
     assert form is not None and spring is not None
     m_k, b_m = spring.mass, spring.damping
     return (
-        f"{pair.name} as (16), per unit of what the motor gives: {drive.K.value:.5g}/(s² + {form.a.value:.4g} s + "
-        f"{form.b.value:.5g})",
+        f"{pair.name} in second order, per unit of what the motor gives: "
+        f"{drive.K.value:.5g}/(s² + {form.a.value:.4g} s + {form.b.value:.5g})",
         f"with k known: {m_k} = {drive.m_k}, {b_m} = {drive.b_m}, efficiency {drive.efficiency}",
         f"K and b averaged, as the paper does: {m_k} = {drive.m_k_averaged}, {b_m} = {drive.b_m_averaged}",
     )

@@ -41,7 +41,7 @@ from seaopt.plants.motor.thermal import list_guessed_heat
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.equations import list_partners, list_unused, make_plant, order_plants
 from seaopt.problem.predictive import make_mpc_spec
-from seaopt.problem.references import RESPONSE, check_references, range_remarks
+from seaopt.problem.references import RESPONSE, check_references, guess_remarks, range_remarks
 from seaopt.problem.schema import (
     AnyPlant,
     ColumnTable,
@@ -229,7 +229,11 @@ class Problem:
 
     def remarks(self, parameters: ParameterSet) -> list[str]:
         """Return remarks on ranges that are valid but may not be meant, at nominal parameters."""
-        return range_remarks(self.ranges, self.certified_plants(), parameters)
+        plants = self.certified_plants()
+        return [
+            *range_remarks(self.ranges, plants, parameters),
+            *guess_remarks(self.table.guessed, self.ranges, plants, parameters),
+        ]
 
     def values(self, source: Fit | ParameterSet) -> ParameterSet:
         """Return the values to design with: a fit's, the file's for what it does not have."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 
 import numpy as np
@@ -12,8 +12,10 @@ from seaopt.control.loops.sampled_plant import DELAY, find_signals, list_names
 from seaopt.control.scheduling.gain_table import check_points
 from seaopt.control.scheduling.scheduled_controller import find_unit
 from seaopt.errors import ControlError, ProblemError, SeaoptError, UnitError, suggestion
+from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.motor.thermal import PARAMETERS as HEAT
 from seaopt.problem.columns import check_inside
 from seaopt.problem.proposal.vocabulary import read_header
 from seaopt.problem.schema import ControllerTable, ExpectTable, ExperimentTable, ProblemTable, RangeTable, SensorsTable
@@ -334,6 +336,34 @@ def range_remarks(
             ends = f"{math.degrees(low):.4g} to {math.degrees(high):.4g}"
             remarks.append(f"{place} is in rad: {ends} degrees, beyond a right angle; keep it if that is meant")
     return remarks
+
+
+def guess_remarks(
+    guessed: Sequence[str], ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant],
+    nominal: ParameterSet,
+) -> list[str]:  # fmt: skip
+    """Return a sentence that names the guesses of which nothing is drawn, with ranges to draw them from.
+
+    Parameters
+    ----------
+    guessed : sequence of str
+        Names of parameters, among words for other entries.
+    ranges, plants, nominal
+        As in `range_remarks`; what has a std, of a fit or as a prior, is drawn.
+
+    """
+    used = {name for plant in plants.values() for name in plant.parameters} - {one.name for one in HEAT}
+    unknown = [nominal[name] for name in guessed if name in used and name not in ranges]
+    fixed = [one for one in unknown if one.std is None and one.prior_std is None]
+    if not fixed:
+        return []
+    wide = ", ".join(
+        f"{one.name} = [{max(0.5 * one.value, one.min):.3g}, {min(2.0 * one.value, one.max):.3g}]" for one in fixed
+    )
+    return [
+        f"nothing is drawn of {join_words([one.name for one in fixed])}, which {'is a guess' if len(fixed) == 1 else 'are guesses'}: give each "
+        f"a range that holds the truth, in [robustness]: parameters = {{ {wide} }}"
+    ]
 
 
 def _mode_outside(name: str, ends_hz: tuple[float, float], plants: Mapping[str, Plant], nominal: ParameterSet) -> bool:

@@ -270,7 +270,7 @@ def test_the_report_stands_alone(done):
 def test_frf_shows_and_writes_what_the_logs_say_in_frequency(copied, seaopt):
     out = seaopt("frf", "short.toml", "-o", "all")
     assert out.returncode == 0, out.stderr
-    assert "as (16)" in out.stdout and "efficiency" in out.stdout
+    assert "in second order" in out.stdout and "efficiency" in out.stdout
     for name in ("frf.json", "frf.svg", "frf.png"):
         assert (copied / "all" / name).stat().st_size > 500
     content = json.loads((copied / "all" / "frf.json").read_text(encoding="utf-8"))

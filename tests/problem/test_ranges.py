@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import seaopt as so
-from seaopt.problem.references import range_remarks
+from seaopt.problem.references import guess_remarks, range_remarks
 
 
 @pytest.mark.parametrize(
@@ -26,3 +26,15 @@ def test_an_angle_that_may_be_in_degrees_is_told(swing, thor, ranges, words):
 def test_the_nominal_screw_mode_is_at_80_hz(thor, low, high, outside):
     plant = so.plants.high_impedance(parts=["screw_mode"])
     assert bool(range_remarks({"screw_mode_hz": (low, high)}, {"stand": plant}, thor)) == outside
+
+
+def test_guesses_of_which_nothing_is_drawn_are_named_with_ranges(stand, thor):
+    known = thor.prior(J=1e-7)  # which is drawn
+    (text,) = guess_remarks(["N_p", "unit of F1", "J", "k", "eta"], {"k": (6e5, 7e5)}, {"stand": stand}, known)
+    n_p = thor["N_p"].value
+    assert "nothing is drawn of N_p and eta, which are guesses" in text
+    assert (
+        f"parameters = {{ N_p = [{0.5 * n_p:.3g}, {2 * n_p:.3g}], eta = [0.5, {min(2.0, thor['eta'].max):.3g}] }}"
+        in text
+    )
+    assert not guess_remarks(["unit of F1", "J"], {}, {"stand": stand}, known)

@@ -15,6 +15,7 @@ from seaopt.errors import EstimationError, require_number, require_type, suggest
 from seaopt.formatting import format_count
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
+from seaopt.logs.quality.channel import BEYOND
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.sensors.difference import Difference, add_difference, find_state
@@ -25,7 +26,6 @@ from seaopt.units import factor, same_dimension
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
-LARGEST = 1e100  # of a sample
 SHORTEST_SHOT = 4  # samples
 Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
@@ -144,6 +144,7 @@ class Experiment:
         object.__setattr__(self, "stretches", tuple(self.log.segments))
         self._check_settings()
         self._mask()
+        self._check_sizes()
 
     def list_own(self) -> dict[str, Parameter]:
         """Return the parameters of this log alone that are free, by their names in the plant."""
@@ -225,6 +226,17 @@ class Experiment:
                 )
         object.__setattr__(self, "log", log)
 
+    def _check_sizes(self) -> None:
+        """Refuse samples that no sensor gives and no declared range masks: one of them is all that a fit would see."""
+        for name in {*self.outputs, *self.plant.inputs} & set(self.log.signals):
+            rows = np.flatnonzero(np.abs(self.log[name]) > BEYOND)
+            if rows.size:
+                raise EstimationError(
+                    f"experiment {self.name}: {format_count(rows.size, 'sample')} of channel {name} beyond any sensor "
+                    f"({self.log[name][rows[0]]:.3g} at {self.log.time[rows[0]]:.6g} s); set such samples to NaN, or "
+                    "correct unit or scale"
+                )
+
     def _check_units(self) -> None:
         for kind, names in (("input", self.plant.inputs), ("output", self.plant.outputs)):
             for name, unit in names.items():
@@ -288,12 +300,6 @@ class Experiment:
         delay = self.delay_s.value if isinstance(self.delay_s, Parameter) else self.delay_s
         if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
             raise EstimationError(f"experiment {self.name}: delay_s = {delay!r} is not a time; give seconds, 0 or more")
-        for name in {*self.outputs, *self.plant.inputs} & set(self.log.signals):
-            if (largest := float(np.fmax.reduce(np.abs(self.log[name])))) > LARGEST:
-                raise EstimationError(
-                    f"experiment {self.name}: channel {name} reaches {largest:.3g}, whose square no number holds; "
-                    "correct its unit, scale or samples"
-                )
         if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
             raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
         if self.gaps not in ("split", "error"):

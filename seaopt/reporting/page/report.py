@@ -64,7 +64,6 @@ FILED = (
     "contact",
 )
 FIGURES_SCHEMA = "seaopt/figures/1"
-DESIGN_PLANT = "design plant"
 LAW_NAME = "force_law"  # of the C header that can be copied
 
 
@@ -464,7 +463,7 @@ def group_requirements(certificate: Certificate) -> list[RequirementRow]:
     return [
         RequirementRow(
             label=certificates.label_requirement(row), value=row.value, limit=row.limit, sense=row.sense,
-            unit=units.get(row.name, ""), met=row.met, where=DESIGN_PLANT if row.where == "design" else row.where,
+            unit=units.get(row.name, ""), met=row.met, where=row.where,
             count=count,
         )
         for row, count in groups

@@ -66,7 +66,8 @@ MIN_FRICTION_MARGIN = "min_friction_margin"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 LIMIT_CYCLE = "limit_cycle"
 NO_MODEL = "nothing drawn or simulated: measured points alone, without a model"
-DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
+DESIGN_PLANT = "design plant"  # where its own limits are judged
+DESIGN_NAMES = ("design", DESIGN_PLANT)  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
     "disk_margin", "noise_gain", "spectral_radius",

@@ -34,6 +34,7 @@ from seaopt.progress import Progress, divide, ignore
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.certificate.certificate import (
     DESIGN_NAMES,
+    DESIGN_PLANT,
     MIN_FRICTION_MARGIN,
     NO_MODEL,
     Certificate,
@@ -400,4 +401,4 @@ def _design_requirements(controller: Controller, nominal: ParameterSet, varied: 
     assert controller.design is not None
     plant, values = controller.design
     named = values.with_parameters(*(nominal[name] for name in nominal if name in plant.parameters))
-    return design_requirements(controller, split_friction({"design": plant}, named, varied), named)
+    return design_requirements(controller, split_friction({DESIGN_PLANT: plant}, named, varied), named)

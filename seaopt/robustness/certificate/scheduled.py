@@ -36,7 +36,7 @@ from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
-from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, Requirement
+from seaopt.robustness.certificate.certificate import DESIGN_PLANT, Certificate, MonteCarlo, Requirement
 from seaopt.robustness.certificate.certify import CONFIDENCE, certify, failure_bound
 from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
 from seaopt.robustness.uncertainty.batch import batch_figures
@@ -404,7 +404,9 @@ def _certify_place(
     rows = [row for name in plants for row in plant_requirements(controller, name, figures[name])]
     if point:
         design, _ = schedule.design
-        rows += design_requirements(controller, split_friction({DESIGN: design}, unknown.nominal), unknown.nominal)
+        rows += design_requirements(
+            controller, split_friction({DESIGN_PLANT: design}, unknown.nominal), unknown.nominal
+        )
     return PlaceCertificate(
         value=value, point=point, plants=figures,
         worst={name: find_worst(controller, plant, unknown, points) for name, plant in plants.items()} if point else {},

@@ -128,3 +128,18 @@ def test_the_problem_file_declares_it(tmp_path, stand, clipped, limit):
 def test_what_makes_no_sense_is_refused(stand, short_log, options, words):
     with pytest.raises(EstimationError, match=words):
         so.Experiment(plant=stand, log=short_log, outputs=("F1",), **options)
+
+
+@pytest.mark.parametrize(("channel", "size"), [("F1", 1e31), ("I", 3.4e38), ("F1", -1e200)])
+def test_a_sample_that_no_sensor_gives_is_refused_where_no_range_masks_it(stand, channel, size):
+    t = np.arange(200) / 400
+    samples = {"I": np.sin(40 * t), "F1": 50 * np.sin(40 * t)}
+    samples[channel][70] = size
+    log = so.Log.from_arrays(time=t, **samples, units={"I": "A", "F1": "N"})
+    with pytest.raises(
+        so.errors.EstimationError, match=f"1 sample of channel {channel} beyond any sensor .* at 0.175 s"
+    ):
+        so.Experiment(plant=stand, log=log)
+    if channel == "F1":
+        masked = so.Experiment(plant=stand, log=log, saturation={"F1": (-1e4, 1e4)})
+        assert np.flatnonzero(np.isnan(masked.log["F1"])).tolist() == [70]

@@ -65,7 +65,7 @@ def test_a_passive_band_that_is_broken_names_figure_limit_and_frequency(loud, st
     assert not row.met and not certificate.passed
     assert (row.limit, row.value) == (0.0, pytest.approx(least, rel=1e-6))
     assert f"Re Z/|Z| at {at_hz:.3g}" in row.where
-    assert f"NOT MET: passive_band_hz = {row.value:.6g}, limit 0 (design, Re Z/|Z| at " in repr(certificate)
+    assert f"NOT MET: passive_band_hz = {row.value:.6g}, limit 0 (design plant, Re Z/|Z| at " in repr(certificate)
     again = next(item for item in certificate.to_dict()["requirements"] if item["name"] == "passive_band_hz")
     assert (again["met"], again["value"]) == (False, row.value)
 
