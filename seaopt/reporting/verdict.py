@@ -24,8 +24,10 @@ RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be 
 DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
 MOST_PLACES = 3  # that a reason names
 SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
+RETUNE = "retune = 4 in [robustness] tunes for the worst cases, too"
+REPLAN = "a lower bandwidth_hz in [controller], or narrower ranges in [robustness]"  # what plans is not tuned again
 REMEDIES = {
-    **dict.fromkeys(FROM_DRAWS, "retune = 4 in [robustness] tunes for the worst cases, too"),
+    **dict.fromkeys(FROM_DRAWS, RETUNE),
     "step_overshoot": "lower max_reference_peak in [controller]",
     "step_settling_s": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
     "steady_error": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
@@ -37,7 +39,6 @@ REMEDIES = {
     "gravity_compensation": "a smaller fraction of gravity in compensate of [controller], or an [impedance]",
     "ripple_compensation": "a smaller fraction of ripple, or fewer of its cycles, in compensate of [controller]",
     "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
-    "constrained_failures": "a larger max_iterations or wider bounds in [mpc], or bound_tolerance in [robustness]",
     "constrained_failure_probability": "more constrained_runs in [robustness]",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }
@@ -286,6 +287,8 @@ def judge_certificate(certificate: Certificate, again: str = "", sweep: str = ""
     broken = [row for row in certificate.requirements if not row.met]
     reasons = [explain_failure(one) for one in group_failures(broken)]
     remedies = [_advise(row.name) for row in broken]
+    if certificate.constrained is not None:
+        remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
     first = next((text for text in remedies if text), "")
     command = f"type {again}" if not first else f"{first}; then type {again}"
     near, swept = _range_about(certificate.controller.spec.bandwidth_hz), certificate.constrained is None

@@ -8,7 +8,7 @@ disturbance,
           x_s = (I - A)^{-1} b\,(u_s + \hat d),
 
 make the force free of offset wherever a current within limits can (Pannocchia and Rawlings, AIChE J. 49, 2003); and
-the program of `prediction`, which always has a solution, is solved exactly (`active_set`), from what the last plan held.
+the program of `prediction`, which always has a solution, is solved exactly, from what the last one held (`active_set`).
 
 While no limit is active the controller is a linear law (`ForceMPC.law`), whose loop is judged by the table of limits as
 a tuned controller's is: on the sliding design plant, which it is designed for, and on the stuck one where there is

@@ -12,8 +12,9 @@ Pearson's bound; nothing is claimed beyond that distribution.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -22,6 +23,7 @@ from jaxtyping import Float
 
 from seaopt.control import ForceMPC, ForceRun, MPCStep, close_loop
 from seaopt.control.loops.sampled_plant import DELAY, conditions
+from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.errors import SeaoptError
 from seaopt.formatting import format_count, format_values
 from seaopt.parameters import ParameterSet
@@ -63,7 +65,9 @@ class ConstrainedRuns:
     sensor_std : float
         Noise of the measurement.
     where : str
-        The worst run, with its parameters; "" where none failed.
+        The first run that failed, with its parameters; "" where none did.
+    remedy : str
+        What stands in its way, found by playing it again at other parameters, and what to do about it.
     left_out : tuple of str
         Bounded signals that a plant does not have, and conditions that are not drawn.
 
@@ -84,6 +88,7 @@ class ConstrainedRuns:
     iterations: int
     sensor_std: float
     where: str = ""
+    remedy: str = ""
     left_out: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
@@ -117,6 +122,7 @@ class _Outcome:
     kind: str
     text: str
     violation: float
+    signal: str
     steps: tuple[MPCStep, ...]
     at_limit: int
 
@@ -143,19 +149,26 @@ def run_constrained(
     drawn = unknown.values(unknown.draw(runs, rng))
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name != DELAY}
     kinds: list[str] = []
-    worst, outcomes = "", list[_Outcome]()
+    worst, remedy, outcomes = "", "", list[_Outcome]()
     for k in count_off(range(runs), "limits active, run", progress):
         draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
         reference, disturbance = _draw_references(mpc, rng)
+        play = partial(
+            _play, mpc, reference=reference, disturbance=disturbance, tolerance=tolerance, sensor_std=sensor_std,
+            seed=seed + k,
+        )  # fmt: skip
         first = ""
         for name, plant in plants.items():
             values = place_values(plant, unknown.nominal, draw)
-            outcome = _play(mpc, plant, values, reference, disturbance, tolerance, sensor_std, seed + k)
+            outcome = play(plant, values)
             outcomes.append(outcome)
             if outcome.kind and not first:
                 first = outcome.kind
-                at = format_values({key: value for key, value in draw.items() if key in values})
-                worst = worst or f"{name}, run {k}, seed {seed}: {outcome.text}{f'; {at}' if at else ''}"
+                if not worst:
+                    drawn_here = {key: value for key, value in draw.items() if key in values}
+                    at = f"; {format_values(drawn_here)}" if drawn_here else ""
+                    worst = f"{name}, run {k}, seed {seed}: {outcome.text}{at}"
+                    remedy = _find_remedy(mpc, name, plant, unknown.nominal, drawn_here, outcome, play)
         kinds.append(first)
     failures, steps = sum(map(bool, kinds)), [step for one in outcomes for step in one.steps]
     missing = (
@@ -173,7 +186,7 @@ def run_constrained(
         at_limit=sum(one.at_limit for one in outcomes) / max(len(steps), 1),
         fallback=float(np.mean([not step.solved for step in steps])) if steps else 0.0,
         iterations=max((step.iterations for step in steps), default=0), sensor_std=sensor_std, where=worst,
-        left_out=(*missing, *kept),
+        remedy=remedy, left_out=(*missing, *kept),
     )  # fmt: skip
 
 
@@ -210,14 +223,44 @@ def _play(
             disturbance_A=disturbance, seed=seed,
         )  # fmt: skip
     except SeaoptError as error:
-        return _Outcome(kind=DIVERGED, text=str(error), violation=0.0, steps=tuple(steps), at_limit=0)
+        return _Outcome(kind=DIVERGED, text=str(error), violation=0.0, signal="", steps=tuple(steps), at_limit=0)
     violation, signal = _find_violation(mpc, plant, values, run, disturbance)
     kind, text = _judge(mpc, plant, run, np.array([step.target_N for step in steps]))
     if not kind and violation > tolerance:
         kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
     slews = np.abs(np.diff(run.current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
     at_limit = int(np.count_nonzero(slews | (np.abs(run.current) > mpc.command_limit * (1.0 - 1e-6))))
-    return _Outcome(kind=kind, text=text, violation=violation, steps=tuple(steps), at_limit=at_limit)
+    return _Outcome(
+        kind=kind, text=text, violation=violation, signal=signal, steps=tuple(steps), at_limit=at_limit
+    )  # fmt: skip
+
+
+def _find_remedy(
+    mpc: ForceMPC, name: str, plant: Plant, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome,
+    play: Callable[[Plant, ParameterSet], _Outcome],
+) -> str:  # fmt: skip
+    """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
+    late = sum(step.status.startswith(UNFINISHED) and not step.solved for step in failed.steps)
+    if late:
+        return f"a larger max_iterations in [mpc]: {format_count(late, 'sample')} of that run had no plan"
+    if (own := play(*mpc.design)).kind:
+        return f"{_name_obstacle(mpc, own)}: the run fails on the design plant with its own parameters too"
+    room = f", or leave {failed.signal} more room by bound_tolerance" if failed.kind == OVER_BOUND else ""
+    if play(plant, place_values(plant, nominal, {})).kind:
+        return f"design on {name}, which is not what the model says at its nominal parameters either{room}"
+    alone = [key for key in draw if play(plant, place_values(plant, nominal, {key: draw[key]})).kind]
+    wrong = ", ".join(alone or draw)
+    together = "" if alone else " together"
+    return f"fit {wrong} or narrow their ranges in [robustness]: the model is too wrong in them{together}{room}"
+
+
+def _name_obstacle(mpc: ForceMPC, failed: _Outcome) -> str:
+    """Return what of the specification is in the way of a run on the plant that it was made for."""
+    if failed.kind != OVER_BOUND:
+        return "a lower bandwidth_hz, or a longer horizon_s in [mpc]"
+    low, high = mpc.spec.bounds[failed.signal]
+    more = 0.5 * (high - low) * failed.violation
+    return f"bounds of {failed.signal} wider than [{low - more:.3g}, {high + more:.3g}] in [mpc], or bound_tolerance"
 
 
 def _judge(mpc: ForceMPC, plant: Plant, run: ForceRun, target: Float[np.ndarray, " n"]) -> tuple[str, str]:

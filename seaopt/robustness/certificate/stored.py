@@ -168,6 +168,7 @@ class StoredConstrained(ResultTable):
     iterations: Whole
     sensor_std: Number
     where: str
+    remedy: str = ""
     left_out: tuple[str, ...]
 
 

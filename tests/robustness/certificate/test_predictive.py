@@ -13,6 +13,7 @@ import seaopt as so
 from seaopt.control import MPCSpec, close_loop, force_mpc, runnable
 from seaopt.errors import ControlError
 from seaopt.files import to_json
+from seaopt.reporting.verdict import judge_certificate
 from seaopt.robustness import certify_mpc, linear_controller
 
 TS = 1e-3
@@ -69,7 +70,7 @@ def test_runs_that_keep_everything_pass_with_the_bound_of_clopper_and_pearson(ce
     assert certificate.passed and (runs.runs, runs.failures) == (2, 0)
     assert runs.failure_probability_bound == pytest.approx(1.0 - 1e-6 ** (1 / 2), rel=1e-9)  # no failure: (1 - p)^n
     assert 0.0 < runs.at_limit < 1.0  # the limits were active
-    assert 0.0 < runs.iterations <= 500 and runs.largest_violation <= runs.bound_tolerance
+    assert 0.0 < runs.iterations <= 100 and runs.largest_violation <= runs.bound_tolerance
     rows = {row.name: row for row in certificate.requirements}
     assert rows["constrained_failures"].met
 
@@ -82,6 +83,8 @@ def test_a_motor_much_stronger_than_its_model_fails_and_its_run_can_be_played_ag
     broken = {row.name for row in failed.requirements if not row.met}
     assert {"constrained_failures", "constrained_failure_probability"} <= broken
     assert runs.over_bound + runs.not_settled + runs.diverged == 1
+    assert "fit K_tau or narrow" in runs.remedy and "qd" in runs.remedy and "max_iterations" not in runs.remedy
+    assert judge_certificate(failed, "seaopt certify", "seaopt tune").next[0].startswith(runs.remedy)
     torque = float(runs.where.split("K_tau = ")[1])
     run = close_loop(mpc.command, mpc.start, stand, thor.update(K_tau=torque), np.full(100, 2000.0))
     assert np.max(np.abs(run.state[:, 1])) > 1.05 * SPEED_LIMIT["qd"][1]
@@ -91,6 +94,25 @@ def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, 
     late = certify_mpc(mpc, {"stand": stand}, thor, ranges={"delay_s": (9e-3, 10e-3)}, samples=1, runs=1)
     assert late.constrained.failures == 1 and not late.passed
     assert late.constrained.diverged + late.constrained.not_settled == 1
+    assert "fit delay_s or narrow" in late.constrained.remedy
+
+
+def test_a_bound_that_noise_breaks_on_the_design_plant_itself_is_named_with_the_room_it_needs(stand, thor):
+    spec = MPCSpec(current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, bounds={"qd": (-0.05, 0.05)})
+    tight = force_mpc(stand, thor, spec)
+    runs = certify_mpc(tight, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, sensor_std=3.0).constrained
+    assert runs.over_bound == 1 and "on the design plant with its own parameters too" in runs.remedy
+    low, high = (float(end) for end in runs.remedy.split("[")[1].split("]")[0].split(","))
+    assert -high == pytest.approx(low) and high == pytest.approx(0.05 * (1 + runs.largest_violation), rel=0.2)
+
+
+def test_iterations_are_named_where_a_run_has_no_plan(stand, thor):
+    spec = MPCSpec(
+        current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, bounds={"qd": (-0.05, 0.05)},
+        max_iterations=1,
+    )  # fmt: skip
+    runs = certify_mpc(force_mpc(stand, thor, spec), {"stand": stand}, thor, ranges=HERE, samples=1, runs=2).constrained
+    assert runs.failures and runs.remedy.startswith("a larger max_iterations in [mpc]: ")
 
 
 def test_it_comes_back_from_its_file(certificate, mpc, stand, thor):
