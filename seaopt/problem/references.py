@@ -360,9 +360,10 @@ def guess_remarks(
     wide = ", ".join(
         f"{one.name} = [{max(0.5 * one.value, one.min):.3g}, {min(2.0 * one.value, one.max):.3g}]" for one in fixed
     )
+    names, are = join_words([one.name for one in fixed]), "is a guess" if len(fixed) == 1 else "are guesses"
     return [
-        f"nothing is drawn of {join_words([one.name for one in fixed])}, which {'is a guess' if len(fixed) == 1 else 'are guesses'}: give each "
-        f"a range that holds the truth, in [robustness]: parameters = {{ {wide} }}"
+        f"nothing is drawn of {names}, which {are}: give each a range that holds the truth, in [robustness]: "
+        f"parameters = {{ {wide} }}"
     ]
 
 

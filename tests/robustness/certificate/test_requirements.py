@@ -75,7 +75,7 @@ def test_the_port_is_the_design_plants_at_the_parameters_certified(quiet, stand,
     other = thor.update(J=1.5e-6, k=3e5)
     row, _ = row_of(quiet, {"swing": so.plants.moving_output()}, other, "passive_band_hz")
     assert row.value == pytest.approx(by_hand(quiet, other)[0], rel=1e-6)
-    assert row.where.startswith("design, ")
+    assert row.where.startswith("design plant, ")
 
 
 def test_what_no_band_is_asked_of_has_no_row(loud, stand, thor):
