@@ -39,6 +39,7 @@ def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force
         sys.stdout.write(to_json({
             "schema": "seaopt/new/1", "file": str(target), "columns": rows,
             "guesses": {one.key: one.guess for one in proposal.guesses}, "guessed": list(proposal.guessed),
+            "notes": list(proposal.notes),
         }))  # fmt: skip
         return target
     if yes:
@@ -148,5 +149,7 @@ def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
         console.tabulate(guesses)
     if proposal.guessed:
         console.wrap('Verdicts name those that they rest on, until they are out of "guessed" in the file.')
+    for note in proposal.notes:
+        console.wrap(f"note: {note}")
     out = shlex.quote(str(target.with_suffix("")))
     console.say(f"next: seaopt run {shlex.quote(str(target))} -o {out}", soft_wrap=True)

@@ -461,3 +461,60 @@ def test_a_log_in_which_nothing_moves_is_refused(tmp_path, text):
     path.write_text(text, encoding="utf-8")
     with pytest.raises(so.SeaoptError, match=r"no column"):
         propose([path], {}, tmp_path)
+
+
+def knee_log(path, *, rate=1000.0, late=0, change=lambda signals: signals):
+    """Write the log of a held knee whose command takes effect some samples late, and return what is proposed for it."""
+    t, command = drive(10.0, rate, 2.0)
+    of = knee(np.concatenate([np.zeros(late), command[: command.size - late]]), rate, locked=True)
+    signals = {"cmd_current": command, "theta_m": of["theta_m"], "tau_s": of["tau_s"]}
+    units = ("time [s]", "cmd_current [A]", "theta_m [rad]", "tau_s [N m]")
+    write_csv(path, dict(zip(units, (t, *change(signals).values()), strict=True)))
+    return propose([path], {}, path.parent)
+
+
+def test_a_delay_that_the_phases_show_is_fitted(tmp_path):
+    late, prompt = (knee_log(tmp_path / f"{n}.csv", late=n) for n in (8, 0))
+    path = tmp_path / "late.toml"
+    path.write_text(late.text, encoding="utf-8")
+    delay = so.read_problem(path).experiments()[0].delay_s
+    assert delay.free and delay.value == pytest.approx(0.008, abs=2e-3) and delay.max >= 0.02
+    assert any("late: delay_s is fitted" in note for note in late.notes)
+    assert "# delay_s" in prompt.text and not any("late" in note for note in prompt.notes)
+
+
+def test_outliers_ask_for_a_loss_that_bears_them(tmp_path):
+    def spoil(signals):
+        signals["tau_s"][[700, 2500, 4100, 6000, 8000]] += 400.0
+        return signals
+
+    spoilt, clean = knee_log(tmp_path / "spoilt.csv", change=spoil), knee_log(tmp_path / "clean.csv")
+    path = tmp_path / "spoilt.toml"
+    path.write_text(spoilt.text, encoding="utf-8")
+    assert so.read_problem(path).table.fit.loss == "huber" and any("5 samples stand far off" in n for n in spoilt.notes)
+    assert '# loss = "huber"' in clean.text and not clean.notes
+
+
+def test_a_log_that_excites_nothing_is_said_to_be_one(tmp_path):
+    def mute(signals):
+        rng = np.random.default_rng(0)
+        return {name: rng.normal(size=values.size) for name, values in signals.items()}
+
+    assert any("no parameter can be identified" in note for note in knee_log(tmp_path / "a.csv", change=mute).notes)
+
+
+def test_a_motor_that_stands_still_time_and_again_is_offered_friction_that_sticks(tmp_path):
+    def stick(signals):
+        """Hold the motor for a tenth of a second, where an encoder's reading would stay, a dozen times."""
+        for start in range(500, 9000, 700):
+            signals["theta_m"][start : start + 100] = signals["theta_m"][start]
+        return signals
+
+    proposal = knee_log(tmp_path / "sticks.csv", change=stick)
+    assert any("theta_m stands still time and again: friction that sticks" in note for note in proposal.notes)
+    path = tmp_path / "sticks.toml"
+    taken = [line.removeprefix("# ") if "f_s =" in line or "parts =" in line or "sticks =" in line else line
+             for line in proposal.text.splitlines()]  # fmt: skip
+    path.write_text("\n".join(taken), encoding="utf-8")
+    problem = so.read_problem(path)
+    assert problem.plants["held"].sticks and problem.parameters["f_s"].value > problem.parameters["f_c"].value > 0

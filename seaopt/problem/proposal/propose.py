@@ -5,7 +5,7 @@ the questions it had; whoever asks them calls it again with one answer more, unt
 
 >>> import tempfile
 >>> folder = Path(tempfile.mkdtemp())
->>> _ = (folder / "knee.csv").write_text("t [s],I [A],tau_s [N m]\n0,0,0\n0.01,1,2\n0.02,0.5,3\n")
+>>> _ = (folder / "knee.csv").write_problem_text("t [s],I [A],tau_s [N m]\n0,0,0\n0.01,1,2\n0.02,0.5,3\n")
 >>> proposal = propose([folder / "knee.csv"], {"N": "100"}, folder)
 >>> [question.key for question in proposal.questions][:3], "N     = 100" in proposal.text
 (['roles', 'link:knee.csv', 'N'], True)
@@ -13,29 +13,25 @@ the questions it had; whoever asks them calls it again with one answer more, unt
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError, ProblemError
-from seaopt.formatting import join_words, printable
-from seaopt.logs import assess_quality
-from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality, assess_clock
+from seaopt.formatting import join_words
+from seaopt.logs.quality.clock import assess_clock
 from seaopt.problem.proposal.actuators import (
     Facts,
-    Proposed,
     propose_linear,
     propose_rotary,
-    screw_travel,
 )
+from seaopt.problem.proposal.described_log import GEARED, DescribedLog, doubt_clock, make_table
+from seaopt.problem.proposal.problem_text import write_problem_text
 from seaopt.problem.proposal.questions import Interview, Question
 from seaopt.problem.proposal.roles import (
     DESCRIPTIONS,
@@ -50,22 +46,14 @@ from seaopt.problem.proposal.roles import (
     is_rotary,
 )
 from seaopt.problem.proposal.survey import Survey, SurveyedColumn, regress, slow_sign, survey_log
+from seaopt.problem.proposal.traits import OUTLIERS, Traits, find_traits
 from seaopt.problem.proposal.vocabulary import COUNTS, is_m_open, read_header
 from seaopt.records import record
-from seaopt.signals import Signal, Table
-from seaopt.units import factor, header_unit
+from seaopt.units import factor
 
 FULL_DUTIES = (1, 100, 255, 885, 1000, 1023, 4095, 32767)  # of registers, for a full duty
-ABOVE_RESONANCE = 2.5  # bandwidth over resonance that is asked for first
-USUAL_BANDWIDTHS_HZ = (15.0, 60.0)  # of a problem file that gives no bandwidth_range_hz
-DEFAULT_BANDWIDTH_HZ = 20.0
-LEAST_RATE_HZ = 500.0  # of a controller; a slower log was not its clock
-HOLDOUT_S = 10.0  # a log from which a fifth can be kept back
-GEARED = (1.5, 1000.0)  # slopes of motor over link that are a gear's
-BRIDGE = 5.0  # periods that an irregular clock may skip
-RETUNE = 4
+POSITIONS = {"q", "screw", "phi", "theta_m", "theta_l"}
 LINK_END = re.compile(r"[\s_.\-/]l$")  # of a name, beside one that ends in m: the link, and the motor
-COMMENT_AT = 56  # column of the comments
 
 
 @record
@@ -84,7 +72,8 @@ class ProposedColumn:
 class Proposal:
     """A problem file's text, what was made of the columns, all questions, and those of them that nobody answered.
 
-    `guessed` are the guesses that results rest on, as the file's key of that name has them.
+    `guessed` are the guesses that results rest on, as the file's key of that name has them; `notes` say what the logs
+    show that the file takes care of, or does not.
     """
 
     text: str
@@ -92,41 +81,7 @@ class Proposal:
     questions: tuple[Question, ...]
     guesses: tuple[Question, ...]
     guessed: tuple[str, ...]
-
-
-@record(eq=False)
-class _Log:
-    """A log with its roles."""
-
-    survey: Survey
-    roles: Assignment
-    name: str
-    file: str
-    plant: str
-    units: Mapping[str, str]
-    scales: Mapping[str, float]
-    time_unit: str
-    clock: ClockQuality | None
-    rate_hz: float
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """What is fitted; a link that is held has no angle."""
-        return tuple(role for role in self.roles.outputs if not (role == "theta_l" and self.plant == "held"))
-
-    @property
-    def signals(self) -> dict[str, Float[np.ndarray, " n"]]:
-        """Samples of each role in SI."""
-        return {
-            role: one.values * factor(self.units[role], _SI[role]) * self.scales.get(role, 1.0)
-            for role, one in self.roles.columns.items()
-        }
-
-
-_SI = {
-    "I": "A", "torque": "A", "V": "V", "duty": "-", "goal": "rad", "F1": "N", "F2": "N", "q": "m", "screw": "rad",
-    "phi": "rad", "tau_s": "N m", "theta_m": "rad", "theta_l": "rad", "deflection": "rad",
-}  # fmt: skip
+    notes: tuple[str, ...]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a column with numbers near the largest float
@@ -160,12 +115,12 @@ def propose(logs: Sequence[Path], answers: Mapping[str, str], folder: Path, titl
         outputs=frozenset(role for log in described for role in log.outputs), gear_ratio=_find_ratio(described),
     )  # fmt: skip
     actuator = (propose_rotary if turns else propose_linear)(interview, facts)
-    text = _write(title or described[0].survey.path.stem, described, actuator, interview)
+    text = write_problem_text(title or described[0].survey.path.stem, described, actuator, interview)
     return Proposal(
         text=text, columns=tuple(row for log in described for row in _list_columns(log)),
         questions=tuple(interview.questions),
         guesses=tuple(one for one in interview.questions if one.key not in interview.answers),
-        guessed=tuple(interview.list_guessed()),
+        guessed=tuple(interview.list_guessed()), notes=tuple(note for log in described for note in _list_notes(log)),
     )  # fmt: skip
 
 
@@ -224,7 +179,7 @@ def _check_outputs(roles: Assignment, survey: Survey) -> Assignment:
     return roles
 
 
-def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folder: Path, at: int) -> _Log:
+def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folder: Path, at: int) -> DescribedLog:
     """Return a log with units, clock and plant."""
     unit, sure = survey.clock_unit()
     key = f"unit:{survey.clock.name}" if survey.clock is not None else ""
@@ -239,12 +194,38 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
         clock = assess_clock(survey.clock.values * factor(unit, "s"), str(survey.path))
         rate = clock.rate_hz
     units, scales = _ask_units(roles, interview)
-    log = _Log(
+    log = DescribedLog(
         survey=survey, roles=roles, name=_spell_name(survey.path.stem, at), file=_relative(survey.path, folder),
         plant="", units=units, scales=scales, time_unit=unit, clock=clock, rate_hz=rate,
     )  # fmt: skip
     log = replace(log, scales=scales | _find_signs(log))
-    return replace(log, plant=_ask_link(log, interview))
+    log = replace(log, plant=_ask_link(log, interview))
+    return replace(log, traits=_look_at(log))
+
+
+def _look_at(log: DescribedLog) -> Traits:
+    table = make_table(log, log.outputs)
+    if table is None:
+        return Traits()
+    source, positions = log.roles.input, [name for name in log.outputs if name in POSITIONS]
+    held = not log.roles.columns[source].header.measured
+    return find_traits(table, source, log.outputs, positions, held=held)
+
+
+def _list_notes(log: DescribedLog) -> Iterator[str]:
+    """Yield what a log shows that the file takes care of, or that nothing in it can."""
+    name, traits = log.survey.name, log.traits
+    if traits.unexcited:
+        yield f"{name}: {traits.unexcited}"
+    if traits.delay_s is not None:
+        yield f"{name}: answers about {1e3 * traits.delay_s:.2g} ms late: delay_s is fitted"
+    if traits.outliers >= OUTLIERS:
+        yield f'{name}: {traits.outliers} samples stand far off: loss = "huber" bears them'
+    if traits.standing:
+        yield (
+            f"{name}: {join_words(traits.standing)} stands still time and again: friction that sticks, as lines of "
+            "the file offer, or a sensor that stops (seaopt inspect)"
+        )
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -303,7 +284,7 @@ def _choices_of(role: str) -> tuple[str, ...]:
     }.get(role, angle)  # fmt: skip
 
 
-def _find_signs(log: _Log) -> dict[str, float]:
+def _find_signs(log: DescribedLog) -> dict[str, float]:
     """Return scales that turn a sensor round which falls as the effort rises; the first effort counts as right."""
     signals = log.signals
     effort = next((role for role in ("tau_s", "F1", "F2") if role in signals), None)
@@ -318,7 +299,7 @@ def _find_signs(log: _Log) -> dict[str, float]:
     return turned
 
 
-def _ask_link(log: _Log, interview: Interview) -> str:
+def _ask_link(log: DescribedLog, interview: Interview) -> str:
     """Return which plant a log was recorded on: held, moving, or hanging."""
     roles, key = log.roles, f"link:{log.survey.name}"
     if not roles.rotary:
@@ -332,7 +313,7 @@ def _ask_link(log: _Log, interview: Interview) -> str:
     )  # fmt: skip
 
 
-def _find_ratio(logs: Sequence[_Log]) -> float | None:
+def _find_ratio(logs: Sequence[DescribedLog]) -> float | None:
     """Return the gear ratio that the motion of motor and link suggests; 1 of a servo that reports one side alone."""
     for log in logs:
         signals = log.signals
@@ -345,13 +326,13 @@ def _find_ratio(logs: Sequence[_Log]) -> float | None:
     return None
 
 
-def _list_columns(log: _Log) -> list[ProposedColumn]:
+def _list_columns(log: DescribedLog) -> list[ProposedColumn]:
     survey = log.survey
     rows: list[ProposedColumn] = []
     if survey.clock is not None:
         rows.append(ProposedColumn(
             log=survey.name, column=survey.clock.name, role="time", unit=log.time_unit, description="time",
-            doubt=_doubt_clock(survey),
+            doubt=doubt_clock(survey),
         ))  # fmt: skip
     for role, column in log.roles.columns.items():
         rows.append(ProposedColumn(
@@ -363,243 +344,3 @@ def _list_columns(log: _Log) -> list[ProposedColumn]:
         text = f"not used: {why}" if why else "not used"
         rows.append(ProposedColumn(log=survey.name, column=name, role="", unit="", description=text, doubt=""))
     return rows
-
-
-def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Interview) -> str:
-    """Return the text of the problem file."""
-    head = [
-        "# Written by seaopt new. What a comment calls guessed was not asked, or nobody knew it: look at that first.",
-        "schema = 1",
-        f"title = {_quote(title)}",
-    ]
-    lines = [
-        "",
-        _comment("[parameters]", "SI units; what is free is fitted"),
-        *_align([(f"{line.name} = {line.value}", line.comment) for line in actuator.lines]),
-    ]
-    for name, options in actuator.plants.items():
-        lines += ["", f"[plant.{name}]", *(f"{key} = {_value(value)}" for key, value in options.items())]
-    names: set[str] = set()
-    for log in logs:
-        name = next(one for one in _number_names(log.name) if one not in names)
-        names.add(name)
-        lines += ["", "[[experiment]]", *_align(_describe_experiment(log, name, interview))]
-        lines.append("# delay_s = { value = 0.002, free = true, max = 0.02 }  # where the input takes effect late")
-        if log is not logs[0]:
-            lines.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
-        for table, roles in (("inputs", (log.roles.input,)), ("outputs", log.outputs)):
-            channels = [_describe_channel(log, role, actuator, interview) for role in roles]
-            lines += [f"[experiment.{table}]", *_align(channels)]
-    if all(_lasts(log) for log in logs):
-        lines += [
-            "",
-            "[fit]",
-            _comment("holdout = 0.2", "the last fifth of each log is kept back, to judge the fit by"),
-            '# loss = "huber"  # where single samples are far off',
-        ]
-    if actuator.measured:
-        lines += ["", "[controller]", *_align(_describe_controller(logs, actuator, interview))]
-        lines += ["", "[robustness]", *_align(_describe_robustness(logs, actuator))]
-    else:
-        lines += ["", "# No [controller]: these logs have neither a torque or force, nor both encoders of the spring."]
-    if guessed := interview.list_guessed():
-        head += [
-            "# What was guessed, named in every verdict; take a name out once you know its value and have written it.",
-            f"guessed = {_value(guessed)}",
-        ]
-    return "\n".join([*head, *lines]) + "\n"
-
-
-def _number_names(name: str) -> Iterator[str]:
-    """Yield a name, and then the name with 2, 3, ... at its end."""
-    yield name
-    yield from (f"{name}_{number}" for number in count(2))
-
-
-def _doubt_clock(survey: Survey) -> str:
-    """Return why a log's clock is a guess; "" where its name says that it is one."""
-    return "" if survey.clock is None or survey.clocks else "the time, as it only rises, and evenly"
-
-
-def _describe_experiment(log: _Log, name: str, interview: Interview) -> list[tuple[str, str]]:
-    rows = [(f"name = {_quote(name)}", ""), (f"plant = {_quote(log.plant)}", interview.mark(f"link:{log.survey.name}"))]
-    rows.append((f"log = {_quote(log.file)}", "relative to this file"))
-    clock = log.survey.clock
-    if clock is None:
-        rows.append((f"rate_hz = {log.rate_hz:.10g}", interview.mark(f"rate:{log.survey.name}")))
-    else:
-        marks = [interview.mark(f"unit:{clock.name}"), _mark_role(clock.name, _doubt_clock(log.survey), interview)]
-        text = f"time = {_spell_column(clock.name, log.time_unit, 1.0)}"
-        rows.append((text, "; ".join(filter(None, marks))))
-    if log.roles.columns[log.roles.input].header.measured:
-        rows.append(('hold = "first"', "the input was measured: straight lines between its samples"))
-    return rows + _describe_clock(log)
-
-
-def _describe_channel(log: _Log, role: str, actuator: Proposed, interview: Interview) -> tuple[str, str]:
-    """Return a channel's entry, and what of it is a guess."""
-    column, unit, scale = log.roles.columns[role], log.units[role], log.scales.get(role, 1.0)
-    name, notes = {"torque": "I", "screw": "q"}.get(role, role), [DESCRIPTIONS[role]]
-    guesses = [interview.mark(f"unit:{column.name}", f"counts:{column.name}", f"duty:{column.name}")]
-    guesses.append(_mark_role(column.name, log.roles.doubts.get(column.name, ""), interview))
-    if role == "screw":  # the nut goes r for a radian
-        scale, unit = scale * screw_travel(actuator.lines) * factor(unit, "rad"), "m"
-        notes.append("as the place of the nut, by the lead of the screw")
-    if role == "torque":
-        notes.append("as a current, by K_tau")
-    if role == "theta_m" and log.plant != "held" and _reads_output(log):
-        scale *= next(float(line.value) for line in actuator.lines if line.name == "N")
-        interview.assume(f"gear:{column.name}")
-        guesses.append("guessed: it is given behind the gear, so times N")
-    if scale < 0.0:
-        interview.assume(f"sign:{column.name}")
-        guesses.append("guessed: turned round, as it falls where the effort rises")
-    return f"{name} = {_spell_column(column.name, unit, scale)}", "; ".join([*notes, *filter(None, guesses)])
-
-
-def _mark_role(column: str, doubt: str, interview: Interview) -> str:
-    """Return that a column's role is a guess, as the end of a comment, unless somebody has said that all are right."""
-    if not doubt or "roles" in interview.answers:
-        return ""
-    interview.assume(f"role:{column}")
-    return f"guessed: {doubt}"
-
-
-def _reads_output(log: _Log) -> bool:
-    """Tell whether the motor's angle is given behind the gear: it is that of the link, nearly."""
-    signals = log.signals
-    if "theta_l" not in signals:
-        return False
-    slope, share = regress(signals["theta_m"], signals["theta_l"])
-    return share > FOLLOWS and 1.0 / GEARED[0] < slope < GEARED[0]
-
-
-def _describe_clock(log: _Log) -> list[tuple[str, str]]:
-    """Return what the log's clock needs before it can be fitted."""
-    clock, rows = log.clock, list[tuple[str, str]]()
-    if clock is None:
-        return rows
-    if clock.repeated.size:
-        rows.append(('duplicates = "first"', f"{clock.repeated.size} times occur twice"))
-    if clock.jitter_max > JITTER_LIMIT * clock.period:
-        if clock.rounded_only:
-            rows.append(('resample = "restamp"', "the timestamps are rounded"))
-        else:
-            rate = float(f"{clock.rate_hz:.3g}")
-            rows.append((
-                f"resample = {{ rate_hz = {rate:.10g}, bridge_s = {BRIDGE / rate:.3g} }}", "the clock is irregular",
-            ))  # fmt: skip
-    return rows
-
-
-def _lasts(log: _Log) -> bool:
-    return log.survey.columns[0].values.size / log.rate_hz >= HOLDOUT_S
-
-
-def _describe_controller(logs: Sequence[_Log], actuator: Proposed, interview: Interview) -> list[tuple[str, str]]:
-    rows = [
-        (f"plant = {_quote(actuator.design)}", ""),
-        (f"measured = {_quote(actuator.measured)}", "what is regulated"),
-    ]
-    rows.append(('structure = "pid"', ""))
-    guess, why = _guess_bandwidth(logs)
-    band = interview.number("bandwidth_hz", "Bandwidth of the controller, in Hz", guess, why)
-    rows.append((f"bandwidth_hz = {band:.10g}", interview.mark("bandwidth_hz")))
-    low, high = USUAL_BANDWIDTHS_HZ
-    if not low <= band <= high:
-        rows.append((f"bandwidth_range_hz = [{min(low, band / 4.0):.3g}, {max(high, band):.3g}]", ""))
-    rate = logs[0].rate_hz
-    usual = float(f"{rate:.4g}") if rate >= LEAST_RATE_HZ else 1000.0
-    why = "that of the log" if rate >= LEAST_RATE_HZ else "a usual one"
-    sampled = interview.number("sample_rate_hz", "Rate at which the controller will run, in Hz", usual, why)
-    rows.append((f"sample_rate_hz = {sampled:.10g}", interview.mark("sample_rate_hz")))
-    rows.append(_describe_limit(logs, interview))
-    if actuator.robust_to:
-        rows.append((f"robust_to = {_value(list(actuator.robust_to))}", "Ms and Mt hold there too"))
-    return rows
-
-
-def _describe_limit(logs: Sequence[_Log], interview: Interview) -> tuple[str, str]:
-    """Return the limit of the command, which is at least what the logs have."""
-    role = logs[0].roles.input
-    largest = max(float(np.nanmax(np.abs(log.signals[role]))) for log in logs)
-    what, unit = {"V": ("voltage", "V"), "duty": ("duty", "1 is full")}.get(role, ("current", "A"))
-    unit = "N m, as K_tau takes it" if role == "torque" else unit
-    guess = 1.0 if role == "duty" else float(f"{largest:.2g}")
-    why = "the whole bridge" if role == "duty" else "the largest of the logs"
-    key = "current_limit_A" if role in ("I", "torque") else "command_limit"
-    limit = interview.number(key, f"Largest {what} that the drive may give ({unit})", guess, why)
-    return f"{key} = {limit:.10g}", interview.mark(key)
-
-
-def _describe_robustness(logs: Sequence[_Log], actuator: Proposed) -> list[tuple[str, str]]:
-    rows = [
-        (
-            f"plants = {_value([actuator.design, *actuator.robust_to])}",
-            "what is certified, besides what the fit leaves open",
-        )
-    ]
-    if actuator.ranges:
-        ranges = ", ".join(f"{name} = [{low:.4g}, {high:.4g}]" for name, (low, high) in actuator.ranges.items())
-        rows.append((f"parameters = {{ {ranges} }}", "half to twice what was given"))
-    if actuator.ranges or any("prior_std" in line.value for line in actuator.lines):
-        rows.append((f"retune = {RETUNE}", "rounds of tuning for the worst case that the certificate finds"))
-    noise = [
-        log.roles.columns[actuator.measured].noise * factor(log.units[actuator.measured], _SI[actuator.measured])
-        for log in logs
-        if actuator.measured in log.roles.columns
-    ]
-    if noise and max(noise) > 0.0:
-        level = f"{{ {actuator.measured} = {max(noise):.3g} }}"
-        rows.append((f"sensors = {{ noise_std = {level} }}", "of the log, from sample to sample"))
-    return rows
-
-
-def _guess_bandwidth(logs: Sequence[_Log]) -> tuple[float, str]:
-    """Return a bandwidth above where the effort's response peaks, or falls off, in the first log that shows it."""
-    for log in logs:
-        signals = log.signals
-        role = next((role for role in ("tau_s", "F1", "F2") if role in signals), None)
-        if role is None or log.survey.clock is None:
-            continue
-        time = log.survey.clock.values * factor(log.time_unit, "s")
-        channels = {name: Signal(name=name, values=signals[name].copy(), unit="") for name in (log.roles.input, role)}
-        table = Table(time=time, signals=channels, source=log.survey.name)
-        excitation = assess_quality(table, inputs=[log.roles.input]).excitation
-        for one in excitation.values():
-            if one.rolls_off_hz is not None:
-                place = one.peak_hz or one.rolls_off_hz
-                low, high = USUAL_BANDWIDTHS_HZ
-                guess = min(max(5.0 * round(ABOVE_RESONANCE * place / 5.0), low), high)
-                shown = f"above the resonance, which the log has near {place:.2g} Hz"
-                return guess, shown if one.peak_hz else f"above {place:.2g} Hz, where the response has fallen to half"
-    return DEFAULT_BANDWIDTH_HZ, "a usual one"
-
-
-def _spell_column(name: str, unit: str, scale: float) -> str:
-    """Return a column as a problem file writes it: its header alone where that says its unit."""
-    if scale == 1.0 and header_unit(name) == unit:
-        return _quote(name)
-    more = f", scale = {scale:.10g}" if scale != 1.0 else ""
-    return f"{{ column = {_quote(name)}, unit = {_quote(unit)}{more} }}"
-
-
-def _quote(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
-
-
-def _value(value: object) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"  # pyright: ignore[reportUnknownArgumentType]
-    return _quote(str(value))
-
-
-def _align(rows: Sequence[tuple[str, str]]) -> list[str]:
-    """Return lines with their comments below one another, and the signs of equality too."""
-    width = max(len(text.split(" = ")[0]) for text, _ in rows)
-    named = [(text.split(" = ", 1), comment) for text, comment in rows]
-    return [_comment(f"{name:<{width}} = {value}", comment) for (name, value), comment in named]
-
-
-def _comment(text: str, comment: str) -> str:
-    return f"{text:<{COMMENT_AT - 2}}  # {printable(comment)}" if comment else text

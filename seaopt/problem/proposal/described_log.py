@@ -1,0 +1,68 @@
+"""A log with what was made of its columns: roles, units, clock and plant, as a problem file will describe it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.logs.quality.clock import ClockQuality
+from seaopt.problem.proposal.roles import Assignment
+from seaopt.problem.proposal.survey import Survey
+from seaopt.problem.proposal.traits import Traits
+from seaopt.records import record
+from seaopt.signals import Signal, Table
+from seaopt.units import factor
+
+GEARED = (1.5, 1000.0)  # slopes of motor over link that are a gear's
+
+SI_UNITS = {
+    "I": "A", "torque": "A", "V": "V", "duty": "-", "goal": "rad", "F1": "N", "F2": "N", "q": "m", "screw": "rad",
+    "phi": "rad", "tau_s": "N m", "theta_m": "rad", "theta_l": "rad", "deflection": "rad",
+}  # fmt: skip
+
+
+@record(eq=False)
+class DescribedLog:
+    """A log with its roles."""
+
+    survey: Survey
+    roles: Assignment
+    name: str
+    file: str
+    plant: str
+    units: Mapping[str, str]
+    scales: Mapping[str, float]
+    time_unit: str
+    clock: ClockQuality | None
+    rate_hz: float
+    traits: Traits = Traits()
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """What is fitted; a link that is held has no angle."""
+        return tuple(role for role in self.roles.outputs if not (role == "theta_l" and self.plant == "held"))
+
+    @property
+    def signals(self) -> dict[str, Float[np.ndarray, " n"]]:
+        """Samples of each role in SI."""
+        return {
+            role: one.values * factor(self.units[role], SI_UNITS[role]) * self.scales.get(role, 1.0)
+            for role, one in self.roles.columns.items()
+        }
+
+
+def make_table(log: DescribedLog, outputs: Sequence[str]) -> Table | None:
+    """Return the input and some outputs on the log's clock, in SI; None of a log without one."""
+    if log.survey.clock is None:
+        return None
+    time = log.survey.clock.values * factor(log.time_unit, "s")
+    signals = log.signals
+    channels = {name: Signal(name=name, values=signals[name].copy(), unit="") for name in (log.roles.input, *outputs)}
+    return Table(time=time, signals=channels, source=log.survey.name)
+
+
+def doubt_clock(survey: Survey) -> str:
+    """Return why a log's clock is a guess; "" where its name says that it is one."""
+    return "" if survey.clock is None or survey.clocks else "the time, as it only rises, and evenly"

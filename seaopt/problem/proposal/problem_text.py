@@ -1,0 +1,299 @@
+"""The text of a problem file from described logs and their actuator, with what is guessed in its comments."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from itertools import count
+
+import numpy as np
+
+from seaopt.formatting import printable
+from seaopt.logs import assess_quality
+from seaopt.logs.quality.clock import JITTER_LIMIT
+from seaopt.problem.proposal.actuators import ParameterLine, Proposed, screw_travel
+from seaopt.problem.proposal.described_log import GEARED, SI_UNITS, DescribedLog, doubt_clock, make_table
+from seaopt.problem.proposal.questions import Interview
+from seaopt.problem.proposal.roles import DESCRIPTIONS, FOLLOWS
+from seaopt.problem.proposal.survey import regress
+from seaopt.problem.proposal.traits import OUTLIERS
+from seaopt.units import factor, header_unit
+
+USUAL_BANDWIDTHS_HZ = (15.0, 60.0)  # of a problem file that gives no bandwidth_range_hz
+ABOVE_RESONANCE = 2.5  # bandwidth over resonance that is asked for first
+DEFAULT_BANDWIDTH_HZ = 20.0
+LEAST_RATE_HZ = 500.0  # of a controller; a slower log was not its clock
+HOLDOUT_S = 10.0  # a log from which a fifth can be kept back
+BRIDGE = 5.0  # periods that an irregular clock may skip
+RETUNE = 4
+COMMENT_AT = 56  # column of the comments
+
+
+def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview) -> str:
+    """Return the text of the problem file."""
+    head = [
+        "# Written by seaopt new. What a comment calls guessed was not asked, or nobody knew it: look at that first.",
+        "schema = 1",
+        f"title = {_quote(title)}",
+    ]
+    lines = [
+        "",
+        _comment("[parameters]", "SI units; what is free is fitted"),
+        *_align([(f"{line.name} = {line.value}", line.comment) for line in actuator.lines]),
+    ]
+    sticks = any(log.traits.standing for log in logs)
+    if sticks:
+        lines += _offer_stribeck(actuator.lines)
+    for name, options in actuator.plants.items():
+        lines += ["", f"[plant.{name}]", *(f"{key} = {_value(value)}" for key, value in options.items())]
+        if sticks:
+            parts = options.get("parts", [])
+            assert isinstance(parts, list)
+            lines += [f"# parts = {_value([*parts, 'stribeck'])}", "# sticks = true  # friction jumps at rest"]
+    names: set[str] = set()
+    for log in logs:
+        name = next(one for one in _number_names(log.name) if one not in names)
+        names.add(name)
+        lines += ["", "[[experiment]]", *_align(_describe_experiment(log, name, interview))]
+        lines.append(_describe_delay(log))
+        if log is not logs[0]:
+            lines.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
+        for table, roles in (("inputs", (log.roles.input,)), ("outputs", log.outputs)):
+            channels = [_describe_channel(log, role, actuator, interview) for role in roles]
+            lines += [f"[experiment.{table}]", *_align(channels)]
+    lines += _describe_fit(logs)
+    if actuator.measured:
+        lines += ["", "[controller]", *_align(_describe_controller(logs, actuator, interview))]
+        lines += ["", "[robustness]", *_align(_describe_robustness(logs, actuator))]
+    else:
+        lines += ["", "# No [controller]: these logs have neither a torque or force, nor both encoders of the spring."]
+    if guessed := interview.list_guessed():
+        head += [
+            "# What was guessed, named in every verdict; take a name out once you know its value and have written it.",
+            f"guessed = {_value(guessed)}",
+        ]
+    return "\n".join([*head, *lines]) + "\n"
+
+
+def _offer_stribeck(lines: Sequence[ParameterLine]) -> list[str]:
+    """Return lines, to be taken in by hand, of friction that is larger at rest than as it slides."""
+    sliding = next((line.value for line in lines if line.name == "f_c"), "")
+    start = next(iter(re.findall(r"\d[\d.e+-]*", sliding)), "1.0")
+    return [
+        "# A position stands still time and again. Where friction sticks, take these lines in, here and in the plants:",
+        f"# f_s = {{ value = {1.5 * float(start):.3g}, free = true }}  # breakaway friction, above f_c",
+    ]
+
+
+def _describe_delay(log: DescribedLog) -> str:
+    """Return the line of a log's delay: fitted where the log shows one, else a remark that it may be."""
+    delay = log.traits.delay_s
+    if delay is None:
+        return "# delay_s = { value = 0.002, free = true, max = 0.02 }  # where the input takes effect late"
+    text = f"delay_s = {{ value = {delay:.2g}, free = true, max = {max(4.0 * delay, 0.02):.2g} }}"
+    return _comment(text, "the outputs answer late, by their phase")
+
+
+def _describe_fit(logs: Sequence[DescribedLog]) -> list[str]:
+    """Return [fit], where the logs ask for it."""
+    lasts, outliers = all(_lasts(log) for log in logs), sum(log.traits.outliers for log in logs)
+    far, rows = outliers >= OUTLIERS, list[str]()
+    if lasts:
+        rows.append(_comment("holdout = 0.2", "the last fifth of each log is kept back, to judge the fit by"))
+    if far:
+        rows.append(_comment('loss = "huber"', f"{outliers} samples stand far off"))
+    elif lasts:
+        rows.append('# loss = "huber"  # where single samples are far off')
+    return ["", "[fit]", *rows] if rows else []
+
+
+def _number_names(name: str) -> Iterator[str]:
+    """Yield a name, and then the name with 2, 3, ... at its end."""
+    yield name
+    yield from (f"{name}_{number}" for number in count(2))
+
+
+def _describe_experiment(log: DescribedLog, name: str, interview: Interview) -> list[tuple[str, str]]:
+    rows = [(f"name = {_quote(name)}", ""), (f"plant = {_quote(log.plant)}", interview.mark(f"link:{log.survey.name}"))]
+    rows.append((f"log = {_quote(log.file)}", "relative to this file"))
+    clock = log.survey.clock
+    if clock is None:
+        rows.append((f"rate_hz = {log.rate_hz:.10g}", interview.mark(f"rate:{log.survey.name}")))
+    else:
+        marks = [interview.mark(f"unit:{clock.name}"), _mark_role(clock.name, doubt_clock(log.survey), interview)]
+        text = f"time = {_spell_column(clock.name, log.time_unit, 1.0)}"
+        rows.append((text, "; ".join(filter(None, marks))))
+    if log.roles.columns[log.roles.input].header.measured:
+        rows.append(('hold = "first"', "the input was measured: straight lines between its samples"))
+    return rows + _describe_clock(log)
+
+
+def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, interview: Interview) -> tuple[str, str]:
+    """Return a channel's entry, and what of it is a guess."""
+    column, unit, scale = log.roles.columns[role], log.units[role], log.scales.get(role, 1.0)
+    name, notes = {"torque": "I", "screw": "q"}.get(role, role), [DESCRIPTIONS[role]]
+    guesses = [interview.mark(f"unit:{column.name}", f"counts:{column.name}", f"duty:{column.name}")]
+    guesses.append(_mark_role(column.name, log.roles.doubts.get(column.name, ""), interview))
+    if role == "screw":  # the nut goes r for a radian
+        scale, unit = scale * screw_travel(actuator.lines) * factor(unit, "rad"), "m"
+        notes.append("as the place of the nut, by the lead of the screw")
+    if role == "torque":
+        notes.append("as a current, by K_tau")
+    if role == "theta_m" and log.plant != "held" and reads_output(log):
+        scale *= next(float(line.value) for line in actuator.lines if line.name == "N")
+        interview.assume(f"gear:{column.name}")
+        guesses.append("guessed: it is given behind the gear, so times N")
+    if scale < 0.0:
+        interview.assume(f"sign:{column.name}")
+        guesses.append("guessed: turned round, as it falls where the effort rises")
+    return f"{name} = {_spell_column(column.name, unit, scale)}", "; ".join([*notes, *filter(None, guesses)])
+
+
+def _mark_role(column: str, doubt: str, interview: Interview) -> str:
+    """Return that a column's role is a guess, as the end of a comment, unless somebody has said that all are right."""
+    if not doubt or "roles" in interview.answers:
+        return ""
+    interview.assume(f"role:{column}")
+    return f"guessed: {doubt}"
+
+
+def reads_output(log: DescribedLog) -> bool:
+    """Tell whether the motor's angle is given behind the gear: it is that of the link, nearly."""
+    signals = log.signals
+    if "theta_l" not in signals:
+        return False
+    slope, share = regress(signals["theta_m"], signals["theta_l"])
+    return share > FOLLOWS and 1.0 / GEARED[0] < slope < GEARED[0]
+
+
+def _describe_clock(log: DescribedLog) -> list[tuple[str, str]]:
+    """Return what the log's clock needs before it can be fitted."""
+    clock, rows = log.clock, list[tuple[str, str]]()
+    if clock is None:
+        return rows
+    if clock.repeated.size:
+        rows.append(('duplicates = "first"', f"{clock.repeated.size} times occur twice"))
+    if clock.jitter_max > JITTER_LIMIT * clock.period:
+        if clock.rounded_only:
+            rows.append(('resample = "restamp"', "the timestamps are rounded"))
+        else:
+            rate = float(f"{clock.rate_hz:.3g}")
+            rows.append((
+                f"resample = {{ rate_hz = {rate:.10g}, bridge_s = {BRIDGE / rate:.3g} }}", "the clock is irregular",
+            ))  # fmt: skip
+    return rows
+
+
+def _lasts(log: DescribedLog) -> bool:
+    return log.survey.columns[0].values.size / log.rate_hz >= HOLDOUT_S
+
+
+def _describe_controller(
+    logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview
+) -> list[tuple[str, str]]:
+    rows = [
+        (f"plant = {_quote(actuator.design)}", ""),
+        (f"measured = {_quote(actuator.measured)}", "what is regulated"),
+    ]
+    rows.append(('structure = "pid"', ""))
+    guess, why = _guess_bandwidth(logs)
+    band = interview.number("bandwidth_hz", "Bandwidth of the controller, in Hz", guess, why)
+    rows.append((f"bandwidth_hz = {band:.10g}", interview.mark("bandwidth_hz")))
+    low, high = USUAL_BANDWIDTHS_HZ
+    if not low <= band <= high:
+        rows.append((f"bandwidth_range_hz = [{min(low, band / 4.0):.3g}, {max(high, band):.3g}]", ""))
+    rate = logs[0].rate_hz
+    usual = float(f"{rate:.4g}") if rate >= LEAST_RATE_HZ else 1000.0
+    why = "that of the log" if rate >= LEAST_RATE_HZ else "a usual one"
+    sampled = interview.number("sample_rate_hz", "Rate at which the controller will run, in Hz", usual, why)
+    rows.append((f"sample_rate_hz = {sampled:.10g}", interview.mark("sample_rate_hz")))
+    rows.append(_describe_limit(logs, interview))
+    if actuator.robust_to:
+        rows.append((f"robust_to = {_value(list(actuator.robust_to))}", "Ms and Mt hold there too"))
+    return rows
+
+
+def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple[str, str]:
+    """Return the limit of the command, which is at least what the logs have."""
+    role = logs[0].roles.input
+    largest = max(float(np.nanmax(np.abs(log.signals[role]))) for log in logs)
+    what, unit = {"V": ("voltage", "V"), "duty": ("duty", "1 is full")}.get(role, ("current", "A"))
+    unit = "N m, as K_tau takes it" if role == "torque" else unit
+    guess = 1.0 if role == "duty" else float(f"{largest:.2g}")
+    why = "the whole bridge" if role == "duty" else "the largest of the logs"
+    key = "current_limit_A" if role in ("I", "torque") else "command_limit"
+    limit = interview.number(key, f"Largest {what} that the drive may give ({unit})", guess, why)
+    return f"{key} = {limit:.10g}", interview.mark(key)
+
+
+def _describe_robustness(logs: Sequence[DescribedLog], actuator: Proposed) -> list[tuple[str, str]]:
+    rows = [
+        (
+            f"plants = {_value([actuator.design, *actuator.robust_to])}",
+            "what is certified, besides what the fit leaves open",
+        )
+    ]
+    if actuator.ranges:
+        ranges = ", ".join(f"{name} = [{low:.4g}, {high:.4g}]" for name, (low, high) in actuator.ranges.items())
+        rows.append((f"parameters = {{ {ranges} }}", "half to twice what was given"))
+    if actuator.ranges or any("prior_std" in line.value for line in actuator.lines):
+        rows.append((f"retune = {RETUNE}", "rounds of tuning for the worst case that the certificate finds"))
+    noise = [
+        log.roles.columns[actuator.measured].noise * factor(log.units[actuator.measured], SI_UNITS[actuator.measured])
+        for log in logs
+        if actuator.measured in log.roles.columns
+    ]
+    if noise and max(noise) > 0.0:
+        level = f"{{ {actuator.measured} = {max(noise):.3g} }}"
+        rows.append((f"sensors = {{ noise_std = {level} }}", "of the log, from sample to sample"))
+    return rows
+
+
+def _guess_bandwidth(logs: Sequence[DescribedLog]) -> tuple[float, str]:
+    """Return a bandwidth above where the effort's response peaks, or falls off, in the first log that shows it."""
+    for log in logs:
+        signals = log.signals
+        role = next((role for role in ("tau_s", "F1", "F2") if role in signals), None)
+        if role is None or log.survey.clock is None:
+            continue
+        table = make_table(log, [role])
+        assert table is not None
+        excitation = assess_quality(table, inputs=[log.roles.input]).excitation
+        for one in excitation.values():
+            if one.rolls_off_hz is not None:
+                place = one.peak_hz or one.rolls_off_hz
+                low, high = USUAL_BANDWIDTHS_HZ
+                guess = min(max(5.0 * round(ABOVE_RESONANCE * place / 5.0), low), high)
+                shown = f"above the resonance, which the log has near {place:.2g} Hz"
+                return guess, shown if one.peak_hz else f"above {place:.2g} Hz, where the response has fallen to half"
+    return DEFAULT_BANDWIDTH_HZ, "a usual one"
+
+
+def _spell_column(name: str, unit: str, scale: float) -> str:
+    """Return a column as a problem file writes it: its header alone where that says its unit."""
+    if scale == 1.0 and header_unit(name) == unit:
+        return _quote(name)
+    more = f", scale = {scale:.10g}" if scale != 1.0 else ""
+    return f"{{ column = {_quote(name)}, unit = {_quote(unit)}{more} }}"
+
+
+def _quote(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
+
+
+def _value(value: object) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"  # pyright: ignore[reportUnknownArgumentType]
+    return _quote(str(value))
+
+
+def _align(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Return lines with their comments below one another, and the signs of equality too."""
+    width = max(len(text.split(" = ")[0]) for text, _ in rows)
+    named = [(text.split(" = ", 1), comment) for text, comment in rows]
+    return [_comment(f"{name:<{width}} = {value}", comment) for (name, value), comment in named]
+
+
+def _comment(text: str, comment: str) -> str:
+    return f"{text:<{COMMENT_AT - 2}}  # {printable(comment)}" if comment else text
