@@ -5,7 +5,7 @@ the questions it had; whoever asks them calls it again with one answer more, unt
 
 >>> import tempfile
 >>> folder = Path(tempfile.mkdtemp())
->>> _ = (folder / "knee.csv").write_problem_text("t [s],I [A],tau_s [N m]\n0,0,0\n0.01,1,2\n0.02,0.5,3\n")
+>>> _ = (folder / "knee.csv").write_text("t [s],I [A],tau_s [N m]\n0,0,0\n0.01,1,2\n0.02,0.5,3\n")
 >>> proposal = propose([folder / "knee.csv"], {"N": "100"}, folder)
 >>> [question.key for question in proposal.questions][:3], "N     = 100" in proposal.text
 (['roles', 'link:knee.csv', 'N'], True)
