@@ -183,7 +183,7 @@ def _choose_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
     forward, backward = divide(progress, 1.0, 1.0)
     chains = [_tune_chain(tasks, forward), _tune_chain(tasks[::-1], backward)[::-1]]
     values = np.array([
-        [task.objective(task.grid(place_frequencies(task)), x) for task, (x, _) in zip(tasks, chain, strict=True)]
+        [task.rank(task.grid(place_frequencies(task)), x)[1] for task, (x, _) in zip(tasks, chain, strict=True)]
         for chain in chains
     ])  # fmt: skip
     losses = np.max(values / np.min(values, axis=0), axis=1)

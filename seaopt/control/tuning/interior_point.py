@@ -33,6 +33,7 @@ from seaopt.control.tuning.optimisation_problem import (
     K_I,
     K_P,
     K_V,
+    NOISE,
     NOTCH_DEPTH,
     NOTCH_W,
     NOTCH_WIDTH,
@@ -45,6 +46,7 @@ from seaopt.control.tuning.optimisation_problem import (
     W_R,
     Grid,
     LawNumbers,
+    LawResponse,
     Task,
     choose_prominent,
 )
@@ -151,7 +153,7 @@ def _reached_end(trial: LawNumbers, x: LawNumbers, factor: float) -> bool:
 def _add_missed(task: Task, grid: Grid, x: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
     """Add the points where more of a limit is used than at any chosen one, in place of the last; tell if there are."""
     missed = False
-    for name, curve in task.usage(grid, x).items():
+    for name, curve in task.usage(grid, task.respond(grid, x)).items():
         if np.max(curve) > max(1.0, float(np.max(curve.ravel()[chosen[name]]))) + 1e-4:
             missed = True
             keep = POINTS_PER_LIMIT - SPREAD_POINTS
@@ -163,7 +165,7 @@ def _add_missed(task: Task, grid: Grid, x: LawNumbers, chosen: dict[str, Int[np.
 def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.ndarray, " n"]]:
     """Return flat indices of points for each limit: those that matter most, and some at even distances."""
     chosen: dict[str, Int[np.ndarray, " n"]] = {}
-    for name, curve in task.usage(grid, x).items():
+    for name, curve in task.usage(grid, task.respond(grid, x)).items():
         worst = np.argmax(curve, axis=0)
         used = np.flatnonzero(np.max(curve, axis=0) > UNUSED)
         even = used[np.linspace(0, used.size - 1, SPREAD_POINTS).astype(int)] if used.size else np.zeros(1, dtype=int)
@@ -247,8 +249,8 @@ def _build_program(
     there = law(point)
     bandwidth = 0.5 * ca.log(2 * (there.p * there.c_r).square() / (there.loop + 1.0).square())
     if noise:
-        where = slices["max_noise_gain"]
-        worst = [usage["max_noise_gain"] + data["ln_level"][where] - t]
+        where = slices[NOISE]
+        worst = [usage[NOISE] + data["ln_level"][where] - t]
     else:
         along = law({name: data[name][n:] for name in names})
         size = 1 / ca.sqrt((along.loop + 1.0).square() + SMOOTHING)
@@ -300,12 +302,12 @@ def _solve(
 ) -> LawNumbers | None:
     """Solve the program on the chosen points, numbers within a factor; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    m, kinds, passive, friction = grid.f.size, task.curve_names, task.port is not None, grid.friction_plant.size > 0
+    m, kinds, passive, friction = grid.f.size, tuple(grid.levels), task.port is not None, grid.friction_plant.size > 0
     flat = np.concatenate([chosen[kind] for kind in kinds])
     radii = grid.discs.ravel()[flat]
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
     fixed, speed = grid.fixed.ravel()[flat], grid.speed.ravel()[flat]
-    levels = [task.level(kind, grid.f[chosen[kind] % m]) for kind in kinds]
+    levels = [grid.levels[kind][chosen[kind] % m] for kind in kinds]
     if passive:
         at_port = chosen[PASSIVE]
         levels.append(np.full(at_port.size, 1.0 - spec.reserve))
@@ -316,18 +318,18 @@ def _solve(
         levels.append(grid.friction_level.ravel()[last])
         columns, p = np.concatenate([columns, last % m]), np.concatenate([p, grid.friction_plant.ravel()[last]])
     radii = np.concatenate([radii, np.zeros(columns.size - radii.size)]) if np.any(grid.discs) else np.zeros(0)
-    weights = np.zeros(0)
+    weights, law = np.zeros(0), task.respond(grid, start)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
         padded = np.resize(inside, QUADRATURE_CHUNK * (1 + (inside.size - 1) // QUADRATURE_CHUNK))
         weights = np.where(np.arange(padded.size) < inside.size, task.weights(grid.f)[padded], 0.0)
-        worst = np.resize(np.argsort(-_integrate_sensitivity(task, grid, start))[:WORST_PLANTS], WORST_PLANTS)
+        worst = np.resize(np.argsort(-_integrate_sensitivity(task, grid, law))[:WORST_PLANTS], WORST_PLANTS)
         columns = np.concatenate([columns, np.tile(padded, WORST_PLANTS)])
         p, fixed, speed = (
             np.concatenate([_pad(part, p.size, fill), whole[worst][:, padded].ravel()])
             for part, whole, fill in ((p, grid.p, 0.0), (fixed, grid.fixed, 1.0), (speed, grid.speed, 0.0))
         )
-    at = int(np.argmin(np.abs(grid.f - spec.bandwidth_hz)))
+    at = task.find_bandwidth(grid)
     low, high = task.bounds(start)
     sizes = np.abs(start)
     sizes[[W_R, W_C]] = task.k_ff + start[K_P], start[K_D]
@@ -362,8 +364,8 @@ def _solve(
         spec.notch is not None, noise, radii.size > 0, paths, gains.stop, bool(start[SPEED_RATE] > 0.0),
         "" if spec.reference_filter is None else spec.reference_filter.order,
     )  # fmt: skip
-    used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
-    value = task.objective(grid, start)
+    used = max(float(np.max(curve)) for curve in task.usage(grid, law).values())
+    value = task.objective(grid, law)
     x0 = np.concatenate([start / scale, [np.log(value) if noise else value, max(0.0, np.log(used)) + 0.01]])
     count = int(solver.size_out("g")[0])
     lower, upper = np.full(count, -np.inf), np.zeros(count)
@@ -384,7 +386,6 @@ def _pad(values: Complex[np.ndarray, " k"], count: int, fill: float) -> Complex[
     return np.concatenate([values, np.full(count - values.size, fill, dtype=complex)])
 
 
-def _integrate_sensitivity(task: Task, grid: Grid, x: LawNumbers) -> Float[np.ndarray, " n"]:
+def _integrate_sensitivity(task: Task, grid: Grid, law: LawResponse) -> Float[np.ndarray, " n"]:
     """Return the integral of abs(S) of every plant."""
-    law = task.respond(grid, x)
     return (1.0 / np.abs(law.rest + grid.p * law.c_y)) @ task.weights(grid.f)

@@ -98,7 +98,7 @@ SCOPES: dict[Scope, tuple[str, ...]] = {
     scope: tuple(name for name in CURVES if BY_NAME[name].scope == scope) for scope in ("every plant", "design plant")
 }
 TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r")  # limits on the reference's path
-PASSIVE, FRICTION = "passive_band_hz", "min_friction_margin"
+NOISE, PASSIVE, FRICTION = "max_noise_gain", "passive_band_hz", "min_friction_margin"
 MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
 
 # k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
@@ -129,6 +129,8 @@ class Grid:
         The loop with link 2 held but for C_y, and G_22/abs(G_22), in the passive band; zeros elsewhere.
     friction_plant, friction_level : arrays, shape (frictions, m)
         Plant and level of a `FeedbackLimit` for each plant with friction of which a margin is aimed at.
+    levels : mapping of limit to array, shape (m,)
+        Of every limit that is looked at.
 
     """
 
@@ -145,6 +147,7 @@ class Grid:
     unit: Complex[np.ndarray, " m"]
     friction_plant: Complex[np.ndarray, "k m"]
     friction_level: Float[np.ndarray, "k m"]
+    levels: Mapping[str, Float[np.ndarray, " m"]]
 
     @property
     def reads_more(self) -> bool:
@@ -159,6 +162,7 @@ class Grid:
             kept=self.kept[index], inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
             friction_plant=self.friction_plant[:, index],
             friction_level=self.friction_level[:, index],
+            levels={name: level[index] for name, level in self.levels.items()},
         )  # fmt: skip
 
 
@@ -242,8 +246,14 @@ class Task:
 
     @property
     def curve_names(self) -> tuple[str, ...]:
-        """The limits that are curves: that on a speed loop's own noise gain only where there is one."""
-        return tuple(name for name, curve in CURVES.items() if curve.of != "C_v" or self.speed_loop is not None)
+        """The limits that are curves and imposed, with the noise gain where that is the objective.
+
+        That on a speed loop's own noise gain is one only where there is such a loop.
+        """
+        asked = [name for name in CURVES if self.spec.level(name) is not None]
+        if self.spec.objective == "noise" and NOISE not in asked:
+            asked.append(NOISE)
+        return tuple(name for name in asked if CURVES[name].of != "C_v" or self.speed_loop is not None)
 
     @property
     def asks_margin(self) -> bool:
@@ -397,6 +407,7 @@ class Task:
         return Grid(
             f=f, q=q, p=p, discs=discs, fixed=fixed, speed=speed, rows=rows, kept=kept, inverse=inverse, port=port,
             unit=unit, friction_plant=plants, friction_level=levels,
+            levels={name: self.level(name, f) for name in self.curve_names},
         )  # fmt: skip
 
     def _respond(
@@ -457,11 +468,10 @@ class Task:
         through = x[K_V] * self.terms(grid, x).series
         return through * self.speed_loop.sense(grid.q, self.spec.sample_time_s), grid.fixed + through * grid.speed
 
-    def usage(self, grid: Grid, x: LawNumbers) -> dict[str, Float[np.ndarray, "k m"]]:
+    def usage(self, grid: Grid, law: LawResponse) -> dict[str, Float[np.ndarray, "k m"]]:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
-        law = self.respond(grid, x)
         rows: dict[str, list[Float[np.ndarray, " m"]]] = {}
-        for position in range(len(grid.rows)):
+        for position in (position for position, row in enumerate(grid.rows) if row < self.design_states):
             for name, curve in self.design_usage(grid, position, law).items():
                 rows.setdefault(name, []).append(curve)
         everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | self.friction_usage(grid, law.c_y)
@@ -470,14 +480,14 @@ class Task:
     def curves(
         self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse
     ) -> dict[str, np.ndarray]:  # fmt: skip
-        """Return the usage of some limits on a grid's plants, the worst of what lies in the discs around them."""
+        """Return the usage of the imposed ones of some limits on a grid's plants, in discs around them the worst."""
         p, rest, discs = grid.p[plants], law.rest[plants], grid.discs[plants]
         open_loop = rest - 1.0 + p * law.c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
         measured = bool(np.any(discs))
-        for name in names:
-            curve, level = CURVES[name], self.level(name, grid.f)
+        for name in filter(grid.levels.__contains__, names):
+            curve, level = CURVES[name], grid.levels[name]
             if measured:
                 out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r)
                 continue
@@ -504,10 +514,7 @@ class Task:
         """Return the limits that a plant keeps as the design plant, sliding or stuck; none if it is another."""
         if row >= self.design_states:
             return ()
-        return tuple(
-            name for name in SCOPES["design plant"]
-            if (row == 0 or BY_NAME[name].stuck_too) and name in self.curve_names
-        )  # fmt: skip
+        return tuple(name for name in SCOPES["design plant"] if row == 0 or BY_NAME[name].stuck_too)
 
     def port_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
         """Return the usage of the passive band, where one is asked for."""
@@ -575,24 +582,32 @@ class Task:
         out[first + 1 : last] += step
         return out
 
-    def miss(self, grid: Grid, x: LawNumbers) -> float:
+    def find_bandwidth(self, grid: Grid) -> int:
+        """Return which of a grid's frequencies is the bandwidth."""
+        return int(np.argmin(np.abs(grid.f - self.spec.bandwidth_hz)))
+
+    def miss(self, grid: Grid, law: LawResponse) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
-        at = grid.at(np.array([int(np.argmin(np.abs(grid.f - self.spec.bandwidth_hz)))]))
-        law = self.respond(at, x)
-        return float(np.log(np.abs(np.sqrt(2.0) * at.p[0] * law.c_r / (law.rest[0] + at.p[0] * law.c_y)))[0])
+        at = self.find_bandwidth(grid)
+        p, c_y, c_r = grid.p[0, at], law.c_y[at], law.c_r[at]
+        return float(np.log(np.abs(np.sqrt(2.0) * p * c_r / (law.rest[0, at] + p * c_y))))
 
     def rank(self, grid: Grid, x: LawNumbers) -> tuple[float, float]:
         """Return what to sort laws by: the worst usage if a limit is broken, then the objective.
 
         A bandwidth that is missed counts ten times a limit that is.
         """
-        worst = max(float(np.max(curve)) for curve in self.usage(grid, x).values())
-        worst = max(worst, 1.0 + 10.0 * abs(self.miss(grid, x)))
-        return (worst if worst > NEARLY_KEPT else 0.0), self.objective(grid, x)
+        worst, objective = self.judge(grid, x, bandwidth_price=10.0)
+        return (worst if worst > NEARLY_KEPT else 0.0), objective
 
-    def objective(self, grid: Grid, x: LawNumbers) -> float:
-        """Return the objective on a grid."""
+    def judge(self, grid: Grid, x: LawNumbers, bandwidth_price: float) -> tuple[float, float]:
+        """Return the worst usage on a grid, with the price of a bandwidth that is missed, and the objective."""
         law = self.respond(grid, x)
+        worst = max(float(np.max(curve)) for curve in self.usage(grid, law).values())
+        return max(worst, 1.0 + bandwidth_price * abs(self.miss(grid, law))), self.objective(grid, law)
+
+    def objective(self, grid: Grid, law: LawResponse) -> float:
+        """Return the objective on a grid."""
         distance = np.abs(law.rest + grid.p * law.c_y)
         if self.spec.objective == "noise":
             return float(np.max(np.abs(law.c_y) / distance[: self.design_states]))

@@ -170,12 +170,13 @@ def _quicken_integral(task: Task, grid: Grid, x: LawNumbers) -> LawNumbers:
 
 def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
     """Return frequencies between the grid's at which more of a limit is used than anywhere on it."""
-    allowed = {name: max(1.0, float(np.max(curve))) for name, curve in task.usage(grid, x).items()}
+    allowed = {name: max(1.0, float(np.max(curve))) for name, curve in task.usage(grid, task.respond(grid, x)).items()}
     out: list[float] = []
     for row in range(len(task.plants)):
         dense = task.loop(x, row).grid()
         f = dense[(dense >= LOWEST_HZ) & (dense < grid.f[-1])]
-        for name, curve in task.usage(task.grid(f, [row]), x).items():
+        between = task.grid(f, [row])
+        for name, curve in task.usage(between, task.respond(between, x)).items():
             top = int(np.argmax(curve))
             if curve[0, top] > allowed[name] * (1.0 + max(0.4 * task.spec.reserve, 1e-6)):
                 out.append(float(f[top]))

@@ -31,7 +31,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S
+from seaopt.control.laws.limits import INTEGRAL_RAD_S
 from seaopt.control.laws.spec import HIGHEST_CORNER
 from seaopt.control.laws.structures import CASCADE, LawTerms
 from seaopt.control.tuning.optimisation_problem import (
@@ -173,7 +173,7 @@ def _list_speed_loops(task: Task, grid: Grid) -> list[tuple[float, float]]:
     """Return (k_v, 1/T_v) to try: none, and of a cascade some of each."""
     if task.speed_loop is None:
         return [(0.0, 0.0)]
-    at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
+    at = task.find_bandwidth(grid)
     gains = np.array(SPEED_GAINS) / max(float(np.abs(grid.speed[0, at])), 1e-12)
     shares = SPEED_RATES if task.spec.speed_loop == "PI" else SPEED_RATES[:1]
     rates = [share * 2 * np.pi * task.spec.bandwidth_hz for share in shares]
@@ -256,7 +256,7 @@ def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray,
     x = np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape])
     terms, (c_v, rest) = task.terms(grid, x), task.feed_speed(grid, x)
     terms = LawTerms(*(np.broadcast_to(term, grid.f.shape) for term in terms))
-    at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
+    at = task.find_bandwidth(grid)
     scan = _Scan(task=task, grid=grid, shape=shape, terms=terms, c_v=c_v, rest=rest, at=at)
     parts = [_scan_fixed_weight(scan)]
     if task.spec.structure != "pd" and task.spec.reference_weights != "error":
@@ -357,7 +357,7 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
         worst = np.max(margins, axis=(1, 2))
     for row, p in enumerate(grid.p):
         own = tuple(name for name in task.design_limits(row) if name not in TRACKING)
-        usage = task.curves(_imposed(task, SCOPES["every plant"] + own), grid, row, scan.respond(c_y, c_y))
+        usage = task.curves(SCOPES["every plant"] + own, grid, row, scan.respond(c_y, c_y))
         usage |= task.port_usage(grid, c_y) if row == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
@@ -378,15 +378,10 @@ def _judge_tracking(
     """Return what limits on the reference's path count that are broken."""
     task, grid, worst = scan.task, scan.grid, np.zeros(c_y.shape[0])
     for row in range(task.design_states):
-        names = _imposed(task, tuple(name for name in task.design_limits(row) if name in TRACKING))
+        names = tuple(name for name in task.design_limits(row) if name in TRACKING)
         for curve in task.curves(names, grid, row, scan.respond(c_y, c_r)).values():
             worst = np.maximum(worst, np.max(curve, axis=1))
     return _price(worst)
-
-
-def _imposed(task: Task, names: tuple[str, ...]) -> list[str]:
-    """Return the limits that the specification imposes."""
-    return [name for name in names if task.spec.allowed(BY_NAME[name]) is not None]
 
 
 def _price(worst: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

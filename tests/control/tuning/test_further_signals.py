@@ -76,5 +76,5 @@ def test_some_of_the_frequencies_are_of_the_same_plants() -> None:
     grid = task.grid(place_frequencies(task))
     some = np.array([3, 40, 200])
     part: Grid = grid.at(some)
-    for name, curves in task.usage(part, x).items():
-        np.testing.assert_array_equal(curves, task.usage(grid, x)[name][:, some])
+    for name, curves in task.usage(part, task.respond(part, x)).items():
+        np.testing.assert_array_equal(curves, task.usage(grid, task.respond(grid, x))[name][:, some])
