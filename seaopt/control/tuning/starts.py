@@ -92,14 +92,16 @@ def find_starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
 
     """
     coarse = _thin_grid(task, grid)
-    merits, laws = zip(*(_rank_shape(task, coarse, shape) for shape in _list_shapes(task, coarse)), strict=True)
-    merit, points = np.concatenate(merits), np.concatenate(laws)
+    shapes = list(_list_shapes(task, coarse))
+    merits, scanned = zip(*(_rank_shape(task, coarse, shape) for shape in shapes), strict=True)
+    merit, gains = np.concatenate(merits), np.concatenate(scanned)
+    shape_of = np.repeat(np.arange(len(shapes)), [part.size for part in merits])
     distinct: list[LawNumbers] = []
     tried = 0
     for k in np.argsort(merit):
         if len(distinct) == count or tried == 40 * count or not np.isfinite(merit[k]):
             break
-        x = task.tidy(points[k])
+        x = task.tidy(np.array([*gains[k], *shapes[shape_of[k]]]))
         if any(_are_alike(task, x, other) for other in distinct):
             continue
         tried += 1
@@ -235,24 +237,29 @@ class _Scan:
         """The k_d that makes as much of an error at the bandwidth as a k_p of `inverse`."""
         return self.inverse / float(abs(self.terms.rate[self.at]))
 
+    @property
+    def gained(self) -> Complex[np.ndarray, "3 m"]:
+        """What k_p, k_i and k_d are multiplied with."""
+        return np.array([np.ones_like(self.grid.q), self.terms.integral, self.terms.rate])
+
     def measurement(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
         """Return C_y of laws, without the series part."""
-        k_p, k_i, k_d, _, _ = gains.T[:, :, None]
-        return k_p + k_i * self.terms.integral + k_d * self.terms.rate + self.terms.observer
+        return gains[:, :W_R] @ self.gained + self.terms.observer
 
     def reference(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
         """Return C_r of laws, without the series part and the prefilter."""
-        k_p, k_i, k_d, w_r, w_c = gains.T[:, :, None]
         ahead = self.task.k_ff * self.terms.ahead / self.terms.series
-        return ahead + k_p - w_r + k_i * self.terms.integral + (k_d - w_c) * self.terms.rate
+        behind = gains[:, :W_R].copy()
+        behind[:, [K_P, K_D]] -= gains[:, [W_R, W_C]]
+        return behind @ self.gained + ahead
 
     def behind_prefilter(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
         """Return C_r of laws."""
         return self.terms.series * self.terms.prefilter * self.reference(gains)
 
 
-def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 14"]]:
-    """Return merits (less is better) and numbers of the laws of one shape."""
+def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+    """Return merits (less is better) and gains of the laws of one shape."""
     x = np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape])
     terms, (c_v, rest) = task.terms(grid, x), task.feed_speed(grid, x)
     terms = LawTerms(*(np.broadcast_to(term, grid.f.shape) for term in terms))
@@ -262,7 +269,7 @@ def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray,
     if task.spec.structure != "pd" and task.spec.reference_weights != "error":
         parts.append(_scan_free_weight(scan))
     merit, gains = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return merit, np.column_stack([gains, np.tile(shape, (merit.size, 1))])
+    return merit, gains
 
 
 def _scan_fixed_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
@@ -362,9 +369,9 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = scan.rest[row] + p * c_y
-        turn = np.unwrap(np.angle(distance), axis=1)
+        turn = np.sum(np.angle(distance[:, 1:] * np.conj(distance[:, :-1])), axis=1)
         # A stable loop turns by half a circle more for every pole of the plant that grows.
-        turned = np.minimum(turned, turn[:, -1] - turn[:, 0] - np.pi * count_growing(task.plants[grid.rows[row]]))
+        turned = np.minimum(turned, turn - np.pi * count_growing(task.plants[grid.rows[row]]))
         if task.spec.objective == "disturbance":
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
         elif row < task.design_states:
