@@ -7,6 +7,8 @@ import pytest
 
 import seaopt as so
 from seaopt.control import sweep
+from seaopt.logs import assess_quality
+from seaopt.problem.proposal import propose
 from seaopt.progress import divide
 from seaopt.robustness import Budget, tune_certified
 
@@ -126,3 +128,15 @@ def test_a_certificate_tells_draws_searches_and_scenarios(heard, controller):
 def test_rounds_of_tuning_are_told(heard):
     tune_certified(STAND, THOR, SPEC, {"swing": SWING}, ranges=RANGES, samples=40, rounds=3, progress=heard)
     heard.check("round 1, start 1 of", "round 1, swing, 40 of 40 draws", "certified after")
+
+
+def test_a_log_is_looked_at_channel_by_channel_and_proposed_log_by_log(heard, tmp_path):
+    rng = np.random.default_rng(0)
+    signals = {"I": rng.normal(size=400), "F1": rng.normal(size=400)}
+    assess_quality(so.Log.from_arrays(time=np.arange(400) / 400, **signals), progress=heard)
+    heard.check("channel 1 of 2", "spectra and pairs of channels")
+    heard = Heard()
+    rows = ["t [s],I [A],tau_s [N m]", *(f"{k / 400},{signals['I'][k]},{signals['F1'][k]}" for k in range(400))]
+    (tmp_path / "knee.csv").write_text("\n".join(rows), encoding="utf-8")
+    propose([tmp_path / "knee.csv"], {}, tmp_path, progress=heard)
+    heard.check("reading log 1 of 1", "looking at log 1 of 1")

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from seaopt.cli.session import show_progress
+from seaopt.cli.progress import show_progress
 from seaopt.cli.show import MOST_REASONS, heading, show_verdicts
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import LogError, SeaoptError

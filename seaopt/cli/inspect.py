@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from seaopt.cli.progress import show_progress
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import check_folder, to_json, write_json
@@ -17,8 +18,10 @@ from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, 
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.quality.report import CHANNEL_HEAD, format_channel
 from seaopt.logs.reading.selection import ClockError, is_time_name
+from seaopt.progress import divide
 from seaopt.signals import Table
 
+READING, LOOKING, DRAWING = 1.0, 1.0, 1.0  # of the time, of a long log
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 MAX_DIGITS = 9  # of a count
 MOST_LINES = 200  # of channels, and of findings
@@ -50,14 +53,19 @@ def inspect_log(
         read_table, path, channels=columns or None, align=_parse_rule(align), counter=_parse_counter(counter),
         rate_hz=rate_hz,
     )  # fmt: skip
-    table = _read_on_clock(path, read, time, unit_of.get("time"))
-    quality = assess_quality(table, inputs=list(inputs) or None)
     written: list[Path] = []
-    if folder is not None:
-        from seaopt.reporting import write_quality_figure
+    console = Terminal(stderr=True)
+    with show_progress(console, "inspecting the log", console.say, brief=True) as tell:
+        reading, looking, drawing = divide(tell, READING, LOOKING, DRAWING * (folder is not None))
+        reading("reading", 0.0)
+        table = _read_on_clock(path, read, time, unit_of.get("time"))
+        quality = assess_quality(table, inputs=list(inputs) or None, progress=looking)
+        if folder is not None:
+            from seaopt.reporting import write_quality_figure
 
-        written = [write_json(folder / "quality.json", quality.to_dict())]
-        written += write_quality_figure(table, quality, folder / "quality")
+            drawing("drawing", 0.0)
+            written = [write_json(folder / "quality.json", quality.to_dict())]
+            written += write_quality_figure(table, quality, folder / "quality")
     if json:
         sys.stdout.write(to_json(quality.to_dict()))
         return

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from seaopt.cli.progress import show_progress
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import check_regular, describe_os_error, to_json, write_text
@@ -29,8 +30,9 @@ def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force
     """
     target = _choose_target(logs, output, force=force)
     folder, answers = target.parent, dict[str, str]()
-    proposal = propose(logs, answers, folder, target.stem)
-    console = Terminal(stderr=json)
+    console, errors = Terminal(stderr=json), Terminal(stderr=True)
+    with show_progress(errors, "looking at the logs", errors.say, brief=True) as tell:
+        proposal = propose(logs, answers, folder, target.stem, tell)
     if not yes and not json:
         proposal = _interview(console, logs, answers, folder, proposal, target.stem)
     _write_checked(target, proposal.text)

@@ -6,21 +6,18 @@ import json
 import platform
 import shlex
 import sys
-import time
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from threading import Event, Thread, Timer
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
 
 from seaopt import __version__
 from seaopt.cli.frontier import print_frontier
+from seaopt.cli.progress import show_progress
 from seaopt.cli.provenance import (
     FILES,
     ROBUSTNESS,
@@ -40,7 +37,6 @@ from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentifie
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.executors import Processes
 from seaopt.files import check_folder, read_json, to_json, write_json
-from seaopt.formatting import printable
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -96,13 +92,7 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
-SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
 READING, SIMULATING = 0.1, 0.3  # of the time of a fit, and of a report of earlier results
-LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
-MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
-
-
-REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 FILTERS = ("notch", "prefilter", "link_feedforward")
 OF_THE_LAW = ("structure", *FILTERS, "reference_weights", "sample_rate_hz", "delay_samples")
@@ -113,95 +103,9 @@ SIMULATED = (
 )
 
 
-def format_left(spent_s: float, share: float) -> str:
-    """Return how long a stage still takes, of the share that is done; "" where that cannot be told yet.
-
-    Examples
-    --------
-    >>> format_left(10.0, 0.25), format_left(300.0, 0.5), format_left(1.0, 0.0)
-    ('30 s left', '5 min left', '')
-
-    """
-    if share < LEAST_SHARE:
-        return ""
-    left = spent_s * (1.0 - share) / share
-    return f"{left:.0f} s left" if left < 100.0 else f"{left / 60.0:.0f} min left"
-
-
 def _format_percents(score: ModelledOutputs) -> str:
     """Return how well each output is predicted, on one line."""
     return ", ".join(f"{name} {row['fit_percent']:.2f} %" for name, row in score.to_dict().items())
-
-
-def shorten_note(text: str) -> str:
-    """Return what fits beside the bar."""
-    return text if len(text) <= MOST_NOTE else text[: MOST_NOTE - 1] + "…"
-
-
-@contextmanager
-def show_progress(console: Terminal, label: str, note: Callable[[str], None]) -> Generator[Progress]:
-    """Show a stage's progress on a terminal, with the time left; elsewhere write lines. Remarks go to `note`, and stay.
-
-    A stage that ends in an error is not done.
-    """
-    if not console.is_terminal:
-        with _write_progress(console, label, note) as tell:
-            yield tell
-        return
-    columns = (
-        SpinnerColumn(), TextColumn("{task.description:<22}"), BarColumn(bar_width=12), TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"), TextColumn("{task.fields[note]}", style="dim"),
-    )  # fmt: skip
-    started = time.monotonic()
-    with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(label, total=1.0, note="", left="", visible=False)
-
-        def show(text: str, share: float | None = None, /) -> None:
-            if share is None:
-                note(text)
-                return
-            left = format_left(time.monotonic() - started, share)
-            bar.update(task, completed=share, note=shorten_note(printable(text)), left=left)
-
-        timer = Timer(SHOWN_AFTER_S, lambda: bar.update(task, visible=True))
-        timer.daemon = True
-        timer.start()
-        try:
-            yield show
-        finally:
-            timer.cancel()
-
-
-@contextmanager
-def _write_progress(console: Terminal, label: str, note: Callable[[str], None]) -> Generator[Progress]:
-    """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
-    latest, done, ended, started = "", 0.0, Event(), time.monotonic()
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-    def tell(text: str, share: float | None = None, /) -> None:
-        nonlocal latest, done
-        if share is None:
-            note(text)
-        else:
-            latest, done = text, share
-
-    def write_lines() -> None:
-        with suppress(OSError):  # a stderr that cannot be written is the stage's to find
-            while not ended.wait(REPORT_S):
-                spent = time.monotonic() - started
-                left = format_left(spent, done)
-                say(f"{label}, {spent:.0f} s{f', {left}' if left else ''}: {latest or 'running'}")
-
-    writer = Thread(target=write_lines, daemon=True)
-    writer.start()
-    try:
-        yield tell
-    finally:
-        ended.set()
-        writer.join()
-    say(f"{label}: {latest or 'done'}")
 
 
 class Session:

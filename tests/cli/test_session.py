@@ -316,7 +316,7 @@ def test_what_was_guessed_is_named_by_every_verdict_until_it_is_taken_out(write,
 
 def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch, capsys):
     """At most one line per interval, also while the stage tells nothing; none where it ends before."""
-    monkeypatch.setattr("seaopt.cli.session.REPORT_S", 0.2)
+    monkeypatch.setattr("seaopt.cli.progress.REPORT_S", 0.2)
 
     def take_long(session, tell):
         tell("iteration 3, cost 12.5", 0.5)
@@ -343,7 +343,7 @@ def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch
 
 def test_a_terminal_is_told_the_time_that_is_left(write, tmp_path, monkeypatch):
     """Of real stages, which take longer than a short while; a remark stays below the bar."""
-    monkeypatch.setattr("seaopt.cli.session.SHOWN_AFTER_S", 0.0)
+    monkeypatch.setattr("seaopt.cli.progress.SHOWN_AFTER_S", 0.0)
     text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
     session = Session(write(text), tmp_path / "out")
     for stage, word in (("tune", "start"), ("certify", "scenario")):

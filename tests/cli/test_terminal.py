@@ -13,7 +13,7 @@ import pytest
 
 import seaopt as so
 from seaopt.cli.main import app
-from seaopt.cli.session import format_left
+from seaopt.cli.progress import TimeLeft
 from seaopt.cli.terminal import Terminal
 from seaopt.reporting.verdict import explain_failure
 from seaopt.robustness.certificate.certificate import Requirement
@@ -181,9 +181,34 @@ def test_no_color_and_files_have_no_colours(monkeypatch):
     assert "\x1b[32m" in captured.get()
 
 
-@pytest.mark.parametrize(("spent", "share", "left"), [(10.0, 0.5, "10 s left"), (60.0, 0.1, "9 min left"), (5, 0, "")])
-def test_the_time_left_is_that_of_the_share_that_is_done(spent, share, left):
-    assert format_left(float(spent), float(share)) == left
+def follow(moves, asked):
+    """Return what is told at each of some times, of a stage whose share is that of `moves` from a time on."""
+    now, told, moves = 0.0, [], list(moves)
+    left = TimeLeft(lambda: now)
+    for at in asked:
+        while moves and moves[0][0] <= at:
+            now, share = moves.pop(0)
+            left.move(share)
+        now = at
+        told.append(left.tell())
+    return told
+
+
+def test_the_time_left_is_that_of_the_share_that_is_done():
+    steady = [(float(t), t / 100.0) for t in range(1, 100)]
+    assert follow(steady, [1.0, 20.0, 50.0, 90.0]) == ["", "80 s left", "50 s left", "10 s left"]
+    assert follow([(60.0, 0.1)], [60.0]) == ["9 min left"] and follow([], [5.0]) == [""]
+
+
+def test_what_turns_slow_is_told_to_take_as_long_as_it_does():
+    """A fit that is searched in a second, and then tries thirty causes for a second each."""
+    moves = [(0.1 * k, 0.06 * k) for k in range(1, 11)] + [(1.0 + k, 0.6 + 0.4 * k / 30) for k in range(1, 31)]
+    for at, told in zip((4.0, 11.0, 21.0), follow(moves, [4.0, 11.0, 21.0]), strict=True):
+        assert 0.8 * (31.0 - at) < float(told.split()[0]) < 1.5 * (31.0 - at), (at, told)
+
+
+def test_silence_longer_than_what_was_told_is_no_time_left_of_nothing():
+    assert follow([(1.0, 0.5)], [12.0]) == ["11 s left"]
 
 
 def test_a_fit_that_fails_is_told_with_what_to_do(folder, narrow, stand_alone):

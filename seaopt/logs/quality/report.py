@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
-from seaopt.formatting import format_table, html_list, html_paragraph, html_table
+from seaopt.formatting import format_count, format_table, html_list, html_paragraph, html_table
 from seaopt.logs.quality.channel import ChannelQuality, assess_channel, keep_runs_while_others_move
 from seaopt.logs.quality.clock import ClockQuality, assess_clock
 from seaopt.logs.quality.excitation import InputExcitation, assess_excitation
@@ -30,6 +30,7 @@ from seaopt.logs.quality.findings import (
 )
 from seaopt.logs.quality.lags import ChannelPair, correlate_channels
 from seaopt.logs.quality.spectra import FEWEST_STRETCHES, SHORTEST_STRETCH, Spectra, compute_spectra, find_hum
+from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.signals import Recording
 
@@ -37,6 +38,7 @@ QUALITY_SCHEMA = "seaopt/quality/1"
 INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u", "v", "duty", "goal"})  # names of inputs, in any case
 HOLDING_NAMES = frozenset({"duty", "goal"})  # of inputs that hold a value for as long as they like
 INPUT_UNITS = frozenset({"A", "V"})
+CHANNELS, PAIRS = 0.6, 0.4  # of the time
 MOST_PAIRED = 100  # outputs; of more only F1 and F2 are correlated with each other
 ENOUGH_SAMPLES = FEWEST_STRETCHES * SHORTEST_STRETCH  # for spectra, in one stretch
 
@@ -140,7 +142,7 @@ class Quality:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # numbers near the largest float have no std, and are reported as such
-def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Quality:
+def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, progress: Progress = ignore) -> Quality:
     """Look for every fault in a log.
 
     Parameters
@@ -150,6 +152,8 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     inputs : sequence of str, optional
         Channels that drive the others, and may hold a value. Left out: those named I, V, duty, goal, Fe1, Fe2 or u (a v
         only in V), or else those in A or V.
+    progress : callable, optional
+        Called before each channel (`seaopt.progress.Progress`).
 
     Raises
     ------
@@ -176,7 +180,8 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
                 f'{data.source}: inputs names "{name}", which is not a channel; {suggestion(name, data.signals)}'
             )
     clock = assess_clock(data.time, data.source)
-    channels = {name: assess_channel(signal) for name, signal in data.signals.items()}
+    looking, correlating = divide(progress, CHANNELS, PAIRS)
+    channels = {name: assess_channel(data.signals[name]) for name in count_off(list(data.signals), "channel", looking)}
     holding = {*(inputs or ()), *(name for name in channels if name.lower() in HOLDING_NAMES)}
     channels = {
         name: replace(channel, stuck=RowRanges()) if name in holding else _judge_stuck_runs(channel, channels, data)
@@ -185,6 +190,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     # A constant has no spectrum, and a counter one that means nothing.
     varying = {name: _drop_beyond(data.signals[name].values, channel) for name, channel in channels.items()
                if _varies(channel)}  # fmt: skip
+    correlating("spectra and pairs of channels", 0.0)
     inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)
     spectra = compute_spectra(varying, _stretches(clock, len(data)), clock.period)
     if spectra is not None:
@@ -198,6 +204,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     findings += [describe_excitation(bands) for bands in excitation.values()]
     findings += _list_unjudged(inputs, spectra, clock, data)
     finite = data.time[np.isfinite(data.time)]
+    progress(format_count(len(channels), "channel"), 1.0)
     return Quality(
         source=data.source, duration_s=float(np.ptp(finite)), clock=clock, channels=channels, inputs=inputs,
         pairs=pairs, excitation=excitation, spectra=spectra, findings=sort_findings(findings), notes=data.notes,

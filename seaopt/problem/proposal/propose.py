@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from seaopt.errors import LogError, ProblemError
-from seaopt.formatting import join_words
+from seaopt.formatting import format_count, join_words
 from seaopt.logs.quality.clock import assess_clock
 from seaopt.problem.proposal.actuators import (
     Facts,
@@ -48,9 +48,11 @@ from seaopt.problem.proposal.roles import (
 from seaopt.problem.proposal.survey import Survey, SurveyedColumn, regress, slow_sign, survey_log
 from seaopt.problem.proposal.traits import OUTLIERS, Traits, find_traits
 from seaopt.problem.proposal.vocabulary import COUNTS, is_m_open, read_header
+from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.units import factor
 
+READING, LOOKING = 1.0, 1.0  # of the time
 FULL_DUTIES = (1, 100, 255, 885, 1000, 1023, 4095, 32767)  # of registers, for a full duty
 POSITIONS = {"q", "screw", "phi", "theta_m", "theta_l"}
 LINK_END = re.compile(r"[\s_.\-/]l$")  # of a name, beside one that ends in m: the link, and the motor
@@ -85,8 +87,12 @@ class Proposal:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a column with numbers near the largest float
-def propose(logs: Sequence[Path], answers: Mapping[str, str], folder: Path, title: str = "") -> Proposal:
+def propose(
+    logs: Sequence[Path], answers: Mapping[str, str], folder: Path, title: str = "", progress: Progress = ignore
+) -> Proposal:
     """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's.
+
+    `progress` is called before each log is read, and before each is looked at.
 
     Raises
     ------
@@ -95,7 +101,8 @@ def propose(logs: Sequence[Path], answers: Mapping[str, str], folder: Path, titl
 
     """
     interview = Interview(answers)
-    surveys = [_survey(path, interview) for path in logs]
+    reading, looking = divide(progress, READING, LOOKING)
+    surveys = [_survey(path, interview) for path in count_off(logs, "reading log", reading)]
     turns, doubt = is_rotary([one for survey in surveys for one in survey.columns])
     if doubt:
         kind = interview.ask(
@@ -104,9 +111,12 @@ def propose(logs: Sequence[Path], answers: Mapping[str, str], folder: Path, titl
         )  # fmt: skip
         turns = kind == "rotary"
     assignments = [_assign(survey, interview, turns) for survey in surveys]
+    pairs = list(zip(surveys, assignments, strict=True))
     described = [
-        _describe_log(*pair, interview, folder, at) for at, pair in enumerate(zip(surveys, assignments, strict=True))
+        _describe_log(*pair, interview, folder, at)
+        for at, pair in enumerate(count_off(pairs, "looking at log", looking))
     ]
+    progress(format_count(len(logs), "log"), 1.0)
     if len({log.roles.input for log in described}) > 1:
         names = join_words([f"{log.survey.name} ({log.roles.input})" for log in described])
         raise ProblemError(f"{names} are driven by different inputs; write a problem file for each: seaopt new LOG")

@@ -1,0 +1,156 @@
+"""How far a command has come: a bar with the time left on a terminal, now and then a line elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+from threading import Event, Thread, Timer
+
+from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+from rich.text import Text
+
+from seaopt.cli.terminal import Terminal
+from seaopt.formatting import printable
+from seaopt.progress import Progress
+
+SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
+LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
+RECENT, LEAST_RECENT_S = 0.25, 2.0  # of the time spent: the part whose speed counts by itself
+MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
+REPORT_S = 30.0  # between lines of progress that go to a file
+
+
+def format_left(left_s: float) -> str:
+    """Return a time in words.
+
+    Examples
+    --------
+    >>> format_left(30.2), format_left(300.0)
+    ('30 s left', '5 min left')
+
+    """
+    return f"{left_s:.0f} s left" if left_s < 100.0 else f"{left_s / 60.0:.0f} min left"
+
+
+class TimeLeft:
+    """How long a stage still takes, by the speed of all of it or of its last part, whichever is slower.
+
+    What goes wrong turns slow late: a fit that is done searching in a second looks for causes half a minute.
+
+    Parameters
+    ----------
+    clock : callable
+        Returns seconds.
+
+    Examples
+    --------
+    >>> now = iter([0.0, 10.0, 10.0])
+    >>> left = TimeLeft(lambda: next(now))
+    >>> left.move(0.25)
+    >>> left.tell()
+    '30 s left'
+
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._marks = [(clock(), 0.0)]
+
+    def move(self, share: float) -> None:
+        """Note the share that is done now."""
+        self._marks.append((self._clock(), share))
+
+    def tell(self) -> str:
+        """Return what to say; empty where it cannot be told yet."""
+        now, marks = self._clock(), list(self._marks)  # others may move it meanwhile
+        (started, _), (last, share) = marks[0], marks[-1]
+        part = max(RECENT * (now - started), LEAST_RECENT_S)
+        since, before = next((mark for mark in reversed(marks) if mark[0] <= last - part), marks[0])
+        if share < LEAST_SHARE or share <= before:
+            return ""
+        slowness = max((last - started) / share, (last - since) / (share - before))
+        silent = now - last  # what is silent for longer than was told takes longer
+        return format_left(max((1.0 - share) * slowness - silent, silent) if share < 1.0 else 0.0)
+
+
+class _Left(ProgressColumn):
+    """What is left of a stage, as it is when it is drawn."""
+
+    def render(self, task: Task) -> Text:
+        return Text(task.fields["left"].tell())
+
+
+def shorten_note(text: str) -> str:
+    """Return what fits beside the bar."""
+    return text if len(text) <= MOST_NOTE else text[: MOST_NOTE - 1] + "…"
+
+
+@contextmanager
+def show_progress(
+    console: Terminal, label: str, note: Callable[[str], None], *, brief: bool = False
+) -> Generator[Progress]:
+    """Show a stage's progress on a terminal, with the time left; elsewhere write lines. Remarks go to `note`, and stay.
+
+    A stage that ends in an error is not done. Of a `brief` one nothing is written where it ends before the first line.
+    """
+    if not console.is_terminal:
+        with _write_progress(console, label, note, brief=brief) as tell:
+            yield tell
+        return
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description:<22}"), BarColumn(bar_width=12), TimeElapsedColumn(),
+        _Left(), TextColumn("{task.fields[note]}", style="dim"),
+    )  # fmt: skip
+    left = TimeLeft()
+    with Bar(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(label, total=1.0, note="", left=left, visible=False)
+
+        def show(text: str, share: float | None = None, /) -> None:
+            if share is None:
+                note(text)
+                return
+            left.move(share)
+            bar.update(task, completed=share, note=shorten_note(printable(text)))
+
+        timer = Timer(SHOWN_AFTER_S, lambda: bar.update(task, visible=True))
+        timer.daemon = True
+        timer.start()
+        try:
+            yield show
+        finally:
+            timer.cancel()
+
+
+@contextmanager
+def _write_progress(console: Terminal, label: str, note: Callable[[str], None], *, brief: bool) -> Generator[Progress]:
+    """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
+    latest, ended, started, left = "", Event(), time.monotonic(), TimeLeft()
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def tell(text: str, share: float | None = None, /) -> None:
+        nonlocal latest
+        if share is None:
+            note(text)
+        else:
+            latest = text
+            left.move(share)
+
+    def write_lines() -> None:
+        with suppress(OSError):  # a stderr that cannot be written is the stage's to find
+            while not ended.wait(REPORT_S):
+                spent = time.monotonic() - started
+                say(f"{label}, {spent:.0f} s{f', {told}' if (told := left.tell()) else ''}: {latest or 'running'}")
+
+    writer = Thread(target=write_lines, daemon=True)
+    writer.start()
+    try:
+        yield tell
+    finally:
+        ended.set()
+        writer.join()
+    if not brief or time.monotonic() - started > REPORT_S:
+        say(f"{label}: {latest or 'done'}")
