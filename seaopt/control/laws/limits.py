@@ -31,6 +31,8 @@ BANDWIDTH_TOLERANCE = 0.005
 PASSIVE_ROUNDING = 1e-9  # Re Z/abs(Z) that is still called zero
 PLACED_BELOW = 0.97  # of the bandwidth: up to here abs(F/F_ref) must be above -3 dB, which it reaches at the bandwidth
 INTEGRAL_RAD_S = 2 * math.pi * 0.05  # k_i/(1 + k_p) at least, so that an integral does something
+STEADY = 0.02  # of a step of the reference: how far the force may be off in the end
+STEADY_PERIODS = 80.0  # of the bandwidth, after which that end begins
 
 OTHER_NOISE = "max_other_noise_gain"
 

@@ -293,14 +293,14 @@ def _solve_step(
     rows_of = [
         np.column_stack([slope, np.zeros(value.size), -np.ones(value.size)]),
         np.column_stack([slopes * reach, -np.ones(values.size), np.zeros(values.size)]),
-        np.column_stack([linear * reach, np.zeros((3, 2))]),
+        np.column_stack([linear * reach, np.zeros((least.size, 2))]),
         np.column_stack([np.eye(n), np.zeros((n, 2))]),
         np.eye(n + 2)[-1:],
     ]
     matrix, now = np.concatenate(rows_of), linear @ x[gains]
     upper = np.concatenate([1.0 - value, -values, largest - now, np.minimum(1.0, (high - x[gains]) / reach), [np.inf]])
     lower = np.full(upper.size, -np.inf)
-    lower[-(n + 4) :] = [*(least - now), *np.maximum(-1.0, (low - x[gains]) / reach), 0.0]
+    lower[-(n + least.size + 1) :] = [*(least - now), *np.maximum(-1.0, (low - x[gains]) / reach), 0.0]
     size = np.maximum(1.0, np.max(np.abs(matrix), axis=1))
     quadratic = np.zeros((n + 2, n + 2))
     quadratic[:n, :n] = curvature * np.outer(reach, reach) + 1e-4 * np.eye(n)

@@ -33,6 +33,7 @@ from seaopt.control.tuning.optimisation_problem import (
     K_I,
     K_P,
     K_V,
+    LINEAR_LIMITS,
     NOISE,
     NOTCH_DEPTH,
     NOTCH_W,
@@ -198,7 +199,7 @@ def _build_program(
     complex_data = ("p", "q", "kept", "inverse", *(("fixed", "speed", "sense") if paths else ()))
     shapes = {f"{name}_{part}": total for name in complex_data for part in ("re", "im")} | {
         "weight": quadrature, "ln_level": n, "at": 2 * len(complex_data), "ts": 1, "kff": 1, "scale": 14,
-        "linear": 3 * gains, "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
+        "linear": LINEAR_LIMITS * gains, "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
     v, t, slack = ca.MX.sym("v", 14), ca.MX.sym("t"), ca.MX.sym("slack")
@@ -257,7 +258,7 @@ def _build_program(
         worst = [ca.dot(data["weight"], size[quadrature * i : quadrature * (i + 1)]) - t for i in range(WORST_PLANTS)]
     g = ca.vertcat(
         bandwidth,
-        ca.reshape(data["linear"], 3, gains) @ v[:gains],
+        ca.reshape(data["linear"], LINEAR_LIMITS, gains) @ v[:gains],
         *worst,
         *(rows - slack for rows in usage.values()),
     )
@@ -370,7 +371,7 @@ def _solve(
     count = int(solver.size_out("g")[0])
     lower, upper = np.full(count, -np.inf), np.zeros(count)
     lower[0] = 0.0
-    lower[1:4], upper[1:4] = least / rows, largest / rows
+    lower[1 : 1 + least.size], upper[1 : 1 + least.size] = least / rows, largest / rows
     with IPOPT:
         answer = solver(
             x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,

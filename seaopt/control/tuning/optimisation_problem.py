@@ -22,8 +22,8 @@ and :math:`w_c = (1 - c) k_d`,
 .. math:: C_r = F \,[h/P(0) + g \,(k_p - w_r + k_i I + (k_d - w_c) D)], \qquad C_y = g \,(k_p + k_i I + k_d D + O)
 
 (terms of `LawTerms`; h is g but for the integral of a speed loop, and F the prefilter) are affine in the gains, on
-which there are three linear limits besides: :math:`k_i \ge \omega_i (1 + k_p)`, :math:`w_r \le 1/P(0) + k_p`,
-:math:`w_c \le k_d`.
+which there are four linear limits besides: :math:`k_i \ge \omega_i (1 + k_p)`, :math:`w_r \le 1/P(0) + k_p`,
+:math:`w_c \le k_d`, and what of a step the integral is left with (`Task.most_left_to_integral`).
 
 **Further signals.** The loop is broken at the command: :math:`1 + L = B + P C_y` with
 :math:`B = 1 + \sum_i P_i C_i` over the signals that the law reads besides the regulated one. Of a given filter
@@ -40,11 +40,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, LimitCurve, MeasuredLoop, Scope
+from seaopt.control.laws.limits import (
+    BY_NAME,
+    INTEGRAL_RAD_S,
+    LIMITS,
+    STEADY,
+    STEADY_PERIODS,
+    LimitCurve,
+    MeasuredLoop,
+    Scope,
+)
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import HIGHEST_CORNER, LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import (
@@ -99,6 +109,7 @@ SCOPES: dict[Scope, tuple[str, ...]] = {
 }
 TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r")  # limits on the reference's path
 NOISE, PASSIVE, FRICTION = "max_noise_gain", "passive_band_hz", "min_friction_margin"
+LINEAR_LIMITS = 4
 MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
 
 # k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
@@ -273,21 +284,44 @@ class Task:
         if self.integrates(x):
             x[K_I] = max(x[K_I], least)
         x[W_R] = min(x[W_R], max(self.k_ff + x[K_P], 0.0))
+        if self.integrates(x) and x[SPEED_RATE] == 0.0:
+            x[W_R] = min(x[W_R], self.most_left_to_integral(x[K_P], x[K_I]))
         x[W_C] = x[K_D] if self.spec.reference_weights == "measurement" else min(x[W_C], x[K_D])
         return x
 
     def linear_limits(
         self, x: LawNumbers
-    ) -> tuple[Float[np.ndarray, "3 g"], Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    ) -> tuple[Float[np.ndarray, "4 g"], Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]]:
         """Return matrix, least and largest value of the linear limits on the gains of a law that integrates as x does.
 
-        They are what an integral does at least, and the least weights, k_r = 0 and c = 0.
+        They are what an integral does at least, the least weights, k_r = 0 and c = 0, and what of a step is left to
+        the integral at most, behind a speed loop's own none.
         """
         rate = least_integral_rate(x) if self.integrates(x) else 0.0
-        matrix = np.zeros((3, self.gains_tuned.stop))
-        matrix[:, :K_V] = [[-rate, 1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, -1.0, 0.0, 1.0]]
+        weighed = self.integrates(x) and x[SPEED_RATE] == 0.0 and self.spec.reference_weights != "error"
+        left = STEADY if weighed else 0.0
+        matrix = np.zeros((LINEAR_LIMITS, self.gains_tuned.stop))
+        matrix[:, :K_V] = [
+            [-rate, 1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, -1.0, 0.0, 1.0],
+            [-left, -left * self.steady_s, 0.0, 1.0, 0.0],
+        ]  # fmt: skip
         least_c = 0.0 if self.spec.reference_weights == "measurement" else -np.inf
-        return matrix, np.array([rate, -np.inf, least_c]), np.array([np.inf, max(self.k_ff, 0.0), 0.0])
+        most = np.array([np.inf, max(self.k_ff, 0.0), 0.0, left * max(self.k_ff, 0.0) if left else np.inf])
+        return matrix, np.array([rate, -np.inf, least_c, -np.inf]), most
+
+    @property
+    def steady_s(self) -> float:
+        """When the force of a step is to be at its reference, as the certificate judges it."""
+        return STEADY_PERIODS / self.spec.bandwidth_hz
+
+    def most_left_to_integral(self, k_p: Any, k_i: Any) -> Any:
+        r"""Return the largest w_r, of gains or arrays of them, with which a step is within 2 % when its end is judged.
+
+        The feedback alone leaves a step off by :math:`w_r/(1/P(0) + k_p)`, which the integral takes away at the rate
+        :math:`\rho = k_i/(1/P(0) + k_p)`. As :math:`e^{\rho t} \ge 1 + \rho t` it is enough that
+        :math:`w_r \le 0.02\,(1/P(0) + k_p + k_i t)`, which is linear in the gains.
+        """
+        return STEADY * (max(self.k_ff, 0.0) + k_p + k_i * self.steady_s)
 
     def level(self, name: str, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return a curve's level, with the reserve taken off; one that is never reached where none is imposed."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.bench import Chirp, Excitation
 from seaopt.control import Controller
-from seaopt.control.laws.limits import BY_NAME
+from seaopt.control.laws.limits import BY_NAME, STEADY, STEADY_PERIODS
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import ControlError
@@ -36,7 +36,7 @@ WAITING_PERIODS = 20.0  # of the bandwidth, until friction that sticks lets go o
 SETTLED = 0.1  # of a step: how far the force may be off once it has settled
 SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
 LONGEST_S = 20.0
-JUDGED_PERIODS = 100.0  # of the bandwidth: after a fifth of settling, eight periods of a tenth of it
+JUDGED_PERIODS = 1.25 * STEADY_PERIODS  # of the bandwidth: after a fifth of settling, eight periods of a tenth of it
 LONGEST_SLOW_S = 200.0
 
 
@@ -301,7 +301,7 @@ def _step(controller: Controller, plant: Plant, name: str, force: float, tail: f
     return Scenario(
         name=name,
         phases=(Phase(duration_s=lasting), Phase(duration_s=max(tail, 2.0 * settling_s), force_N=force)),
-        final_error=0.02 * force,
+        final_error=STEADY * force,
         settling_s=settling_s,
         max_overshoot=PEAK_GRACE * peak if peak else None,
     )
