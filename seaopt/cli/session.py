@@ -13,10 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from seaopt import __version__
-from seaopt.cli.frontier import print_frontier
 from seaopt.cli.progress import show_progress
 from seaopt.cli.provenance import (
     FILES,
@@ -27,7 +24,7 @@ from seaopt.cli.provenance import (
     name_file,
 )
 from seaopt.cli.responses import estimate_responses
-from seaopt.cli.show import show_certified, show_designed, show_fit, show_plan, show_verdicts
+from seaopt.cli.show import show_all, show_figures, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
@@ -38,7 +35,7 @@ from seaopt.estimation.result.findings import state_guesses
 from seaopt.executors import Processes
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.logs import Log, write_log
-from seaopt.parameters import Parameter, ParameterSet
+from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
 from seaopt.problem.problem import WRITE_ONE
@@ -52,6 +49,7 @@ from seaopt.problem.stages import (
     fit_problem,
     list_plants,
     score_problem,
+    simulate_experiment,
     tune_problem,
     tune_schedule_problem,
 )
@@ -71,8 +69,6 @@ from seaopt.reporting.verdict import (
     name_guesses,
 )
 from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate
-from seaopt.signals import Signal
-from seaopt.simulation import simulate
 from seaopt.testing.expectations import list_expectations
 
 SCHEMAS = {
@@ -97,10 +93,6 @@ READING, SIMULATING = 0.1, 0.3  # of the time of a fit, and of a report of earli
 FILTERS = ("notch", "prefilter", "link_feedforward")
 OF_THE_LAW = ("structure", *FILTERS, "reference_weights", "sample_rate_hz", "delay_samples")
 IN_PARTS = ("tune", "sweep", "certify")  # stages that several processes can work on
-SIMULATED = (
-    "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
-    "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
-)
 
 
 def _format_percents(score: ModelledOutputs) -> str:
@@ -361,30 +353,12 @@ class Session:
         tables = {table.name: table for table in self.problem.table.experiment}
         for experiment in count_off(self.experiments(), "experiment", tell):
             name, table = experiment.name, tables[experiment.name]
-            runs[name] = self._simulate_stretches(experiment)
+            runs[name] = simulate_experiment(self.problem, experiment)
             self.written.append(write_log(runs[name], self.folder / f"simulation_{name}.csv"))
             if table.virtual is not None:
                 self.written.append(write_log(experiment.log, self.folder / f"virtual_{name}.csv"))
         tell(", ".join(runs), 1.0)
         self.results["simulate"] = runs
-
-    def _simulate_stretches(self, experiment: Experiment) -> Log:
-        """Simulate the stretches of an experiment, each from its initial state (zero where that is to be estimated)."""
-        delay, start = experiment.delay_s, experiment.initial_state
-        options: dict[str, Any] = {
-            "delay_s": delay.value if isinstance(delay, Parameter) else delay,
-            "initial_state": None if isinstance(start, str) else start,
-            "hold": experiment.hold,
-        }
-        log, plant = experiment.log, experiment.plant
-        clock = log.time - log.time[0]
-        stretches = [log.between(float(clock[p.start]), float(clock[p.stop - 1])) for p in log.segments]
-        pieces = [simulate(plant, self.problem.parameters, stretch, **options) for stretch in stretches]
-        signals = {
-            name: Signal(name=name, values=np.concatenate([piece[name] for piece in pieces]), unit=signal.unit)
-            for name, signal in pieces[0].signals.items()
-        }
-        return Log(time=np.concatenate([piece.time for piece in pieces]), signals=signals, source=pieces[0].source)
 
     def _fit(self, tell: Progress) -> None:
         reading, fitting = divide(tell, READING, 1.0 - READING)
@@ -606,49 +580,14 @@ class Session:
         if amount == "quiet" and judged:
             return
         for stage in stages if amount != "quiet" else ():
-            if amount == "verbose" and stage not in ("report", "expect"):
-                self._show_all(console, stage)
-            else:
-                self._show_figures(console, stage)
+            if amount != "verbose" or stage in ("report", "expect"):
+                show_figures(console, stage, self.results, self.problem)
+                continue
+            show_all(console, stage, self.results, self.problem)
+            for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
+                console.say(f"  note: {remark}")
         if self.written:
             console.list_files(self.written)
-
-    def _show_figures(self, console: Terminal, stage: str) -> None:
-        """Print one screen of a stage's figures."""
-        match stage:
-            case "simulate":
-                for line in SIMULATED[: 2 if any(table.virtual for table in self.problem.table.experiment) else 1]:
-                    console.wrap(line)
-            case "frf":
-                self.results[stage].show(console)
-            case "sweep":
-                print_frontier(self.results[stage], console)
-            case "fit":
-                show_fit(console, self.results[stage], self.results.get("scores", ()))
-            case "tune":
-                show_designed(console, self.results[stage])
-                if self.problem.mpc is not None:
-                    show_plan(console, self.plan())
-            case "certify":
-                show_certified(console, self.results[stage])
-            case _:
-                pass
-
-    def _show_all(self, console: Terminal, stage: str) -> None:
-        """Print all that a result has to say."""
-        if stage in ("frf", "simulate"):
-            self._show_figures(console, stage)
-            for part in self.results[stage].values() if stage == "simulate" else self.results[stage].list_forms():
-                console.say(repr(part))
-            return
-        console.say("")
-        if stage == "tune" and "joint" in self.results:
-            console.say(repr(self.results["joint"]))
-        console.say(repr(self.results[stage]))
-        for score in self.results.get("scores", ()) if stage == "fit" else ():
-            console.say(repr(score))
-        for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
-            console.say(f"  note: {remark}")
 
     def _json(self, stage: str) -> dict[str, Any]:
         if stage == "simulate":

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+from seaopt.cli.frontier import print_frontier
 from seaopt.cli.terminal import Terminal
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.laws.controller import name_gain_units
 from seaopt.estimation import Fit, ModelledOutputs
 from seaopt.formatting import MISSING, format_count, format_number, printable
 from seaopt.parameters import Parameter
+from seaopt.problem import Problem
 from seaopt.reporting.verdict import Reason, StageVerdict
 from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.units import unit_after
@@ -19,6 +22,49 @@ MOST_REASONS = 8
 MOST_NOTES = 4
 MOST_CHARACTERS = 240  # of a reason
 MET, UNMET = ("met    ", "green"), ("not met", "red")
+
+
+SIMULATED = (
+    "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
+    "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
+)
+
+
+def show_figures(console: Terminal, stage: str, results: Mapping[str, Any], problem: Problem) -> None:
+    """Print one screen of a stage's figures."""
+    match stage:
+        case "simulate":
+            for line in SIMULATED[: 2 if any(table.virtual for table in problem.table.experiment) else 1]:
+                console.wrap(line)
+        case "frf":
+            results[stage].show(console)
+        case "sweep":
+            print_frontier(results[stage], console)
+        case "fit":
+            show_fit(console, results[stage], results.get("scores", ()))
+        case "tune":
+            show_designed(console, results[stage])
+            if problem.mpc is not None:
+                show_plan(console, results["mpc"])
+        case "certify":
+            show_certified(console, results[stage])
+        case _:
+            pass
+
+
+def show_all(console: Terminal, stage: str, results: Mapping[str, Any], problem: Problem) -> None:
+    """Print all that a result has to say."""
+    if stage in ("frf", "simulate"):
+        show_figures(console, stage, results, problem)
+        for part in results[stage].values() if stage == "simulate" else results[stage].list_forms():
+            console.say(repr(part))
+        return
+    console.say("")
+    if stage == "tune" and "joint" in results:
+        console.say(repr(results["joint"]))
+    console.say(repr(results[stage]))
+    for score in results.get("scores", ()) if stage == "fit" else ():
+        console.say(repr(score))
 
 
 def show_verdicts(console: Terminal, verdicts: Sequence[StageVerdict], *, verbose: bool = False) -> None:

@@ -35,7 +35,8 @@ from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
 from seaopt.frequency import MeasuredResponse
-from seaopt.parameters import ParameterSet
+from seaopt.logs import Log
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.problem import WRITE_ONE, Problem
 from seaopt.progress import Progress, ignore
@@ -50,6 +51,8 @@ from seaopt.robustness import (
     linear_controller,
     tune_certified,
 )
+from seaopt.signals import Signal
+from seaopt.simulation import simulate
 
 
 def fit_problem(
@@ -86,6 +89,34 @@ def fit_problem(
     )  # fmt: skip
     guesses = find_guesses(problem.table.guessed)
     return replace(result, findings=order_findings((*result.findings, *guesses))) if guesses else result
+
+
+def simulate_experiment(problem: Problem, experiment: Experiment) -> Log:
+    """Simulate the stretches of an experiment, each from its initial state (zero where that is to be estimated).
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose values are taken.
+    experiment : Experiment
+        One of it.
+
+    """
+    delay, start = experiment.delay_s, experiment.initial_state
+    options: dict[str, Any] = {
+        "delay_s": delay.value if isinstance(delay, Parameter) else delay,
+        "initial_state": None if isinstance(start, str) else start,
+        "hold": experiment.hold,
+    }
+    log, plant = experiment.log, experiment.plant
+    clock = log.time - log.time[0]
+    stretches = [log.between(float(clock[p.start]), float(clock[p.stop - 1])) for p in log.segments]
+    pieces = [simulate(plant, problem.parameters, stretch, **options) for stretch in stretches]
+    signals = {
+        name: Signal(name=name, values=np.concatenate([piece[name] for piece in pieces]), unit=signal.unit)
+        for name, signal in pieces[0].signals.items()
+    }
+    return Log(time=np.concatenate([piece.time for piece in pieces]), signals=signals, source=pieces[0].source)
 
 
 def score_problem(problem: Problem, result: Fit, experiments: Sequence[Experiment]) -> list[ModelledOutputs]:
