@@ -5,10 +5,12 @@
 
 Random rotary actuators and specifications (Ms, Mt, reference peak, droop, noise gains, bandwidth, delay), on the stand
 and with the shank free, friction sliding and stuck. Plants, laws, limits and objective are computed here by NumPy
-alone: scipy's differential evolution minimises the same objective with the reference's weight from the bandwidth
-equation, and what `so.tune` calls feasible is judged on 4000 frequencies and by the eigenvalues of a loop that is
-assembled from the gains. Times are of the processor. Speed loops are
-P in even cases and PI in odd ones. With `knee`: what they win and cost on problems/knee.toml.
+alone: scipy's differential evolution, from several seeds, minimises the same objective under the limits that the tuner
+has, less the same reserve, with the reference's weight from the bandwidth equation. In two things it is freer: its
+frequencies are fewer, and it takes any T_v at which both integrals together are quick enough, the tuner only those
+below 0.8 s. What `so.tune` calls feasible is judged on 4000 frequencies and by the eigenvalues of a loop that is
+assembled from the gains. Times are of the processor. Speed loops are P in even cases and PI in odd ones. Each case is
+printed as it ends. With `knee`: what speed loops win and cost on problems/knee.toml.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ KNEE = {"J_m": 2.4e-5, "b_r": 1e-4, "K_tau": 0.0369, "N": 100.0, "eta": 0.7, "k_
 KNEE_LIMITS = {"bandwidth_hz": 15.0, "max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3,
                "max_noise_gain": 45.0}  # fmt: skip
 INTEGRAL = 2 * np.pi * 0.05
-SEARCHED, GENERATIONS = 160, 300
+RESERVE = 0.005  # that the tuner keeps on its limits
+SEARCHED, GENERATIONS, SEARCHES = 160, 400, (1, 2, 3)
+KEPT = 1.0001  # usage of a law that keeps the limits, in the search
 OFFSET = 0.05  # of the rate 1/T_v in the search: below it there is no integral inside
 
 
@@ -131,12 +135,15 @@ class Case:
         return np.array([-middle.real + half, -middle.real - half])
 
     def judge(self, x: np.ndarray, k_r: np.ndarray, keep: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return the largest usage of a limit and the objective, the integral of abs(S) over ln f, of n laws."""
+        """Return the largest usage of a limit, of each weight, and the objective, the integral of abs(S) over ln f.
+
+        Of n laws, each with a column of weights.
+        """
         c_y, c_v, series, rest = self.respond(x)
-        c_r, lim, f = series * k_r[:, None] + rest, self.limits, self.f
-        f_b, rate = lim["bandwidth_hz"], x[:, 5]
+        lim, f, f_b, rate = self.limits, self.f, self.limits["bandwidth_hz"], x[:, 5]
         slow = np.where(rate > 0.0, 1.0 / (1.0 / np.maximum(rate, 1e-9) + x[:, 0] / x[:, 1]), x[:, 1] / (1 + x[:, 0]))
-        used, objective = np.maximum(INTEGRAL / slow, 1.0 - (k_r + 1.0)), np.zeros(len(x))
+        used, objective = INTEGRAL / slow, np.zeros(len(x))
+        tracked = 1.0 - (k_r + 1.0)
 
         def most(curve: np.ndarray, where: Any = slice(None)) -> None:
             nonlocal used
@@ -144,54 +151,68 @@ class Case:
 
         for number, (torque, position) in enumerate(self.seen):
             distance = 1.0 + torque * c_y + position * c_v
-            s, turn = 1.0 / distance, np.unwrap(np.angle(distance), axis=1)
-            used = np.where(turn[:, -1] - turn[:, 0] < -0.3 * np.pi, 1e3, used)  # an encirclement
-            most(np.abs(s) / (keep * lim["max_sensitivity"]))
+            s = 1.0 / distance
+            size = np.abs(s)
+            turn = np.sum(np.angle(distance[:, 1:] * np.conj(distance[:, :-1])), axis=1)
+            used = np.where(turn < -0.3 * np.pi, 1e3, used)  # an encirclement
+            most(size / (keep * lim["max_sensitivity"]))
             most(np.abs(1.0 - s) / (keep * lim["max_complementary"]))
-            objective = np.maximum(objective, np.abs(s) @ self.weights)
+            objective = np.maximum(objective, size @ self.weights)
             if number >= 2:
                 continue
-            tracking = np.abs(torque * c_r * s)
-            most(tracking / (keep * lim["max_reference_peak"]))
-            most(np.abs(c_y * s) / (keep * lim["max_noise_gain"]))
-            most(np.abs(c_v * s) / (keep * lim.get("max_other_noise_gain", np.inf)))
+            most(np.abs(c_y) * size / (keep * lim["max_noise_gain"]))
+            if "max_other_noise_gain" in lim:
+                most(np.abs(c_v) * size / (keep * lim["max_other_noise_gain"]))
             if number == 0:  # the stand, sliding
-                most(np.abs(s) * np.sqrt(2.0) / keep, f <= f_b / 5 * (1 + 1e-9))
-                most(10 ** (-keep / 20) / tracking, f <= f_b / 3 * (1 + 1e-9))
-                most(np.sqrt(0.5) / tracking, f < 0.97 * f_b * (1 - 1e-9))
-                later = (f >= 1.03 * f_b * (1 - 1e-9)) & (f <= 3.0 * f_b * (1 + 1e-9))
-                most(tracking * np.sqrt(2.0) * (f / f_b) ** 0.25 / keep, later)
-        return np.nan_to_num(used, nan=1e3), objective
+                most(size * np.sqrt(2.0) / keep, f <= f_b / 5 * (1 + 1e-9))
+            for row, weight in enumerate(k_r):
+                tracking = np.abs(torque * s * (series * weight[:, None] + rest))
+                worst = [np.max(tracking, axis=1) / (keep * lim["max_reference_peak"])]
+                if number == 0:
+                    later = (f >= 1.03 * f_b * (1 - 1e-9)) & (f <= 3.0 * f_b * (1 + 1e-9))
+                    worst += [
+                        10 ** (-keep / 20) / np.min(tracking[:, f <= f_b / 3 * (1 + 1e-9)], axis=1),
+                        np.sqrt(0.5) / np.min(tracking[:, f <= 0.97 * f_b * (1 + 1e-9)], axis=1),
+                        np.max(tracking[:, later] * (f[later] / f_b) ** 0.25, axis=1) * np.sqrt(2.0) / keep,
+                    ]
+                tracked[row] = np.maximum(tracked[row], np.max(worst, axis=0))
+        return np.nan_to_num(np.maximum(used, tracked), nan=1e3), objective
 
-    def search(self, seed: int) -> tuple[float, float, np.ndarray]:
-        """Return usage, objective and numbers of the best law that differential evolution finds."""
-        f_b = self.limits["bandwidth_hz"]
-        low = np.log([0.1, 0.3, 1e-6, self.ts, 1e-3, OFFSET, 1e-3])
-        high = np.log([100.0, 3e3, 1.0, 4 / (2 * np.pi * f_b), 3.0, 300.0, 1.0])
-        keep = 0.995  # the tuner's reserve, on the same curves
+    def search(self) -> tuple[float, float, np.ndarray]:
+        """Return usage, objective and numbers of the best law that differential evolution finds from any seed."""
+        return min(map(self.evolve, SEARCHES), key=lambda found: (max(found[0], KEPT), found[1]))
+
+    def evolve(self, seed: int) -> tuple[float, float, np.ndarray]:
+        """Return the same of one seed: of laws that keep the limits the objective counts, of others the usage."""
+        slowest = 4.0 / (2 * np.pi * self.limits["bandwidth_hz"])
+        # k_p, the rate k_i/(1 + k_p), k_d/k_p, T_f, k_v and 1/T_v, as logarithms; and c
+        low = np.array([*np.log([0.1, INTEGRAL, 1e-5, self.ts, 1e-3, OFFSET]), 0.0])
+        high = np.array([*np.log([100.0, 500.0, 0.1, slowest, 3.0, 1.0 / self.ts]), 1.0])
 
         def unpack(z: np.ndarray) -> np.ndarray:
-            x = np.exp(z.T)
+            x = np.column_stack([np.exp(z[:6].T), z[6]])
+            x[:, 1] *= 1.0 + x[:, 0]
+            x[:, 2] *= x[:, 0]
             x[:, 5] = np.where((x[:, 5] > 2 * OFFSET) & (self.speed_loop == "PI"), x[:, 5], 0.0)
             return x
 
+        def weigh(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            k_r = self.weigh(x)
+            used, value = self.judge(x, np.where(np.isfinite(k_r), k_r, 0.0), 1.0 - RESERVE)
+            used = np.maximum(used, 1.0 + (k_r - x[:, 0]) / (1.0 + x[:, 0]))  # no more weight than feedback
+            return np.min(np.where(np.isfinite(k_r), used, 1e2), axis=0), value
+
         def cost(z: np.ndarray) -> np.ndarray:
-            x = unpack(z)
-            merits = []
-            for k_r in self.weigh(x):
-                used, value = self.judge(x, np.where(np.isfinite(k_r), k_r, 0.0), keep)
-                used = np.where(np.isfinite(k_r) & (k_r <= x[:, 0]) & (k_r >= -1.0), used, 1e2)
-                merits.append(np.log(np.maximum(value, 1e-9)) + 30.0 * np.log(np.maximum(used, 1.0)))
-            return np.minimum(*merits)
+            used, value = weigh(unpack(z))
+            return np.where(used <= KEPT, np.log(np.maximum(value, 1e-9)), 10.0 + np.log(used))
 
         found = differential_evolution(
             cost, list(zip(low, high, strict=True)), seed=seed, maxiter=GENERATIONS, popsize=14, tol=1e-10,
             polish=False, vectorized=True, updating="deferred", init="sobol",
         )  # fmt: skip
         x = unpack(np.asarray(found.x)[:, None])
-        both = [self.judge(x, k_r, keep) for k_r in self.weigh(x) if np.isfinite(k_r[0]) and -1.0 <= k_r[0] <= x[0, 0]]
-        return min(((float(u[0]), float(v[0]), x[0]) for u, v in both), key=lambda p: (max(p[0], 1.001), p[1]),
-                   default=(np.inf, np.inf, x[0]))  # fmt: skip
+        used, value = weigh(x)
+        return float(used[0]), float(value[0]), x[0]
 
     def radius(self, gains: dict[str, float]) -> float:
         """Return the largest magnitude of an eigenvalue of all loops, assembled from the gains here."""
@@ -231,50 +252,45 @@ class Case:
         self.see(np.unique(np.concatenate([np.geomspace(0.1, 499.9, 4000), marks])))
         x = np.array([[gains["k_p"], gains["k_i"], gains["k_d"], gains["T_f"], gains["k_v"],
                        1.0 / gains.get("T_v", np.inf), gains["c"]]])  # fmt: skip
-        used, value = self.judge(x, np.array([gains["k_r"]]))
+        used, value = self.judge(x, np.array([[gains["k_r"]]]))
         miss = min(abs(gains["k_r"] - float(one[0])) for one in self.weigh(x)) / (1.0 + gains["k_p"])
         self.see(searched)
         stable = self.radius(gains) < 1.0
-        return (max(float(used[0]), 1.0 + max(0.0, miss - 0.01)) if stable else np.inf), float(value[0])
+        return (max(float(used[0, 0]), 1.0 + max(0.0, miss - 0.01)) if stable else np.inf), float(value[0])
 
 
 def run(seed: int) -> dict[str, Any]:
-    """Return what tuner, judge and search say of one case."""
+    """Return what tuner, judge and search say of one case, and print it."""
     case = Case.draw(seed)
     params = SWING.defaults.update(**case.values)
     started = time.process_time()
     tuned = so.tune(STAND, params, case.spec("cascade"), case.plants)
     took = time.process_time() - started
-    gains = dict(tuned.gains)
-    used, value = case.look(gains)
+    used, value = case.look(dict(tuned.gains))
     started = time.process_time()
-    search_used, search_value, found = case.search(1)
-    return {"seed": seed, "time": took, "feasible": tuned.feasible, "usage": used, "value": value,
-            "search_usage": search_used, "search_value": search_value, "search_time": time.process_time() - started,
-            "gains": gains, "found": found}  # fmt: skip
+    search_used, search_value, found = case.search()
+    searched = search_used <= KEPT
+    ratio = value / search_value if searched and tuned.feasible else np.nan
+    gains = ", ".join(f"{name} {number:.3g}" for name, number in tuned.gains.items())
+    print(f"{seed:4d} {case.speed_loop:2s} {'feasible' if tuned.feasible else 'not     '} {took:6.2f} s  usage "
+          f"{used:.4f}  integral {value:.4f}  search {search_value:.4f} ({search_used:.4f}, "
+          f"{time.process_time() - started:.0f} s)  ratio {ratio:.3f}  {gains}; found "
+          f"{np.array2string(found, precision=3, max_line_width=200)}", flush=True)  # fmt: skip
+    return {"seed": seed, "time": took, "feasible": tuned.feasible, "usage": used, "ratio": ratio, "searched": searched}
 
 
 def report(rows: list[dict[str, Any]]) -> None:
-    """Print each case, and what counts."""
-    for row in rows:
-        found = row["search_usage"] <= 1.001
-        ratio = row["value"] / row["search_value"] if found and row["feasible"] else np.nan
-        gains = ", ".join(f"{name} {value:.3g}" for name, value in row["gains"].items())
-        print(f"{row['seed']:4d} {'feasible' if row['feasible'] else 'not     '} {row['time']:6.2f} s  usage "
-              f"{row['usage']:.4f}  integral {row['value']:.4f}  search {row['search_value']:.4f} "
-              f"({row['search_usage']:.4f}, {row['search_time']:.0f} s)  ratio {ratio:.3f}  {gains}; "
-              f"found {np.array2string(row['found'], precision=3)}")  # fmt: skip
-        row["ratio"] = ratio
-    ratios = np.array([row["ratio"] for row in rows])
-    ratios = ratios[np.isfinite(ratios)]
+    """Print what counts."""
+    ratios = np.array([row["ratio"] for row in rows if np.isfinite(row["ratio"])])
     times = np.array([row["time"] for row in rows])
     kept = [row for row in rows if row["feasible"]]
-    lost = [row["seed"] for row in rows if not row["feasible"] and row["search_usage"] <= 1.001]
-    print(f"{len(rows)} cases, {len(kept)} feasible; feasible to the search alone: {lost}")
+    lost = [row["seed"] for row in rows if not row["feasible"] and row["searched"]]
+    print(f"{len(rows)} cases, {len(kept)} feasible, {ratios.size} of these to the search; to the search alone: {lost}")
+    soon = np.array([row["time"] for row in kept])
     print(f"processor time of a tune: median {np.median(times):.2f} s, largest {np.max(times):.2f} s; of a feasible "
-          f"one {np.median([row['time'] for row in kept]):.2f} s")  # fmt: skip
-    print(f"objective over the search's: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f}, "
-          f"within 3 %: {np.count_nonzero(ratios <= 1.03)} of {ratios.size}")  # fmt: skip
+          f"one {np.median(soon):.2f} s, {np.max(soon):.2f} s")  # fmt: skip
+    print(f"objective over the search's: least {np.min(ratios):.4f}, median {np.median(ratios):.4f}, largest "
+          f"{np.max(ratios):.4f}, within 3 %: {np.count_nonzero(ratios <= 1.03)} of {ratios.size}")  # fmt: skip
     print("refused by the judge:", [row["seed"] for row in kept if row["usage"] > 1.001] or "none")
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from seaopt.errors import ProblemError
 from seaopt.problem import Problem
 from seaopt.problem.columns import list_log_files
-from seaopt.problem.problem import make_problem
+from seaopt.problem.reading import make_problem
 from seaopt.problem.schema import ProblemTable, UnknownTable
 from seaopt.records import record
 

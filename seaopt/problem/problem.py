@@ -1,25 +1,20 @@
-"""A problem: plants, parameters, experiments, controller specification and robustness, read from one TOML file."""
+"""A problem: plants, parameters, experiments, controller specification and robustness, as one TOML file states them."""
 
 from __future__ import annotations
 
-import math
 import re
-import shlex
-import tomllib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
-from seaopt.control import ControllerSpec, LinkFeedforward, MPCSpec, Notch, Prefilter
+from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
 from seaopt.control.loops.sampled_plant import list_names
-from seaopt.documents import check_table
-from seaopt.errors import FileError, ProblemError, SeaoptError, UnitError, require_type, suggestion
+from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
     Experiment,
     Fit,
@@ -31,26 +26,18 @@ from seaopt.estimation import (
     SoftL1,
     Squares,
 )
-from seaopt.files import check_regular, parse_file
-from seaopt.formatting import join_words
 from seaopt.frequency import MeasuredResponse, measure_response
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Difference, Plant, known_parameters, plant_of_kind
-from seaopt.plants.motor.thermal import list_guessed_heat
+from seaopt.plants import Difference, Plant
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
-from seaopt.problem.equations import list_partners, list_unused, make_plant, order_plants
-from seaopt.problem.predictive import make_mpc_spec
-from seaopt.problem.references import RESPONSE, check_references, guess_remarks, range_remarks
+from seaopt.problem.equations import list_partners, list_unused, order_plants
+from seaopt.problem.references import RESPONSE, guess_remarks, range_remarks
 from seaopt.problem.schema import (
-    AnyPlant,
     ColumnTable,
     EquationsTable,
     ExperimentTable,
     FitTable,
-    ParameterTable,
-    PlantTable,
-    PrefilterTable,
     ProblemTable,
     RobustnessTable,
     ScheduleTable,
@@ -60,10 +47,9 @@ from seaopt.problem.schema import (
 )
 from seaopt.records import record
 from seaopt.robustness import place_value
-from seaopt.robustness.certificate.predictive import linear_spec
 from seaopt.signals import Signal
 from seaopt.simulation import Clock
-from seaopt.units import ROTARY, factor, same_dimension, unit_after
+from seaopt.units import same_dimension
 
 WRITE_ONE = "add one, or write a file from a log: seaopt new LOG"
 OWN = "parameter "  # before the name of a parameter that is read as a channel
@@ -476,256 +462,3 @@ def _make_unknown(name: str, unit: str, table: float | UnknownTable) -> float | 
     known = Parameter(name=name, value=table.value, unit=unit, free=free, prior_std=table.prior_std)
     low = known.min if table.min is None else table.min
     return replace(known, min=low, max=known.max if table.max is None else table.max)
-
-
-def demo_path() -> Path:
-    """Return the path of the THOR problem that comes with the package."""
-    return Path(str(files("seaopt.problem").joinpath("thor.toml")))
-
-
-def read_problem(path: Path | str) -> Problem:
-    """Read and check a problem file.
-
-    Raises
-    ------
-    ProblemError
-        The file is missing or not TOML, a key is unknown or missing, or a value is out of range; the message names
-        the file, the key, the value and the remedy.
-    SeaoptError
-        The plants, the parameters or the controller specification are refused.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> problem = so.read_problem(so.demo_path())
-    >>> problem.title, list(problem.plants)
-    ('THOR linear SEA', ['stand', 'swing'])
-
-    """
-    require_type(path, (str, Path), "path", "give the path of a problem file", ProblemError)
-    source = Path(path)
-    return make_problem(_read_table(source), str(path), source.parent)
-
-
-def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
-    """Make the objects that a validated problem file stands for.
-
-    Parameters
-    ----------
-    table : ProblemTable
-        The file.
-    source : str
-        Its path, for messages.
-    folder : Path
-        Where relative paths of logs start.
-
-    Raises
-    ------
-    SeaoptError
-        As `read_problem`.
-
-    """
-    try:
-        plants = _make_plants(table.plant)
-        parameters = _make_parameters(table, plants)
-        check_references(table, plants, parameters)
-        table = _name_guesses(table, plants)
-        mpc = make_mpc_spec(table)
-        spec = _make_spec(table) if mpc is None else linear_spec(mpc)
-    except SeaoptError as error:
-        raise type(error)(f"{source}: {error}") from error
-    return Problem(
-        title=table.title,
-        source=source,
-        folder=folder,
-        parameters=parameters,
-        plants=plants,
-        table=table,
-        spec=spec,
-        mpc=mpc,
-    )
-
-
-def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:
-    """Return the plants of a file in its order; those that others hold or probe with are made first."""
-    plants: dict[str, Plant] = {}
-    for name in order_plants(tables):
-        table = tables[name]
-        try:
-            own = isinstance(table, EquationsTable)
-            plants[name] = make_plant(name, table, plants) if own else _make_plant_of_kind(table)
-        except SeaoptError as error:
-            text = str(error).removeprefix(f"plant {name}: ")
-            raise type(error)(f"plant.{name}: {text}") from error
-    return {name: plants[name] for name in tables}
-
-
-def _make_plant_of_kind(table: PlantTable) -> Plant:
-    options = table.model_extra or {}
-    equations = ", ".join(name for name in ("f", "h", "states", "outputs") if name in options)
-    if equations:
-        raise ProblemError(f"a plant has either a kind or {equations} of its own; take one out")
-    return plant_of_kind(table.kind, **options)
-
-
-def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> ParameterSet:
-    tables = table.parameters
-    for experiment in table.experiment:
-        known = plants[experiment.plant].parameters if experiment.plant in plants else experiment.parameters
-        for name in experiment.parameters:
-            if name not in known:
-                raise ProblemError(
-                    f'experiment {experiment.name}: parameters names "{name}"; {suggestion(name, known)}'
-                )
-    # What each log states for itself need not be stated for all.
-    own = {key: [set(e.parameters) for e in table.experiment if e.plant == key] for key in plants}
-    declared = {name: default for plant in plants.values() for name, default in plant.defaults.items()}
-    turns = any(plant.actuation is not None and plant.actuation.unit == ROTARY.unit for plant in plants.values())
-    built_in = known_parameters(rotary_first=turns)
-    for key, plant in plants.items():
-        undeclared = [name for name in plant.parameters if name not in declared]
-        stated = [name for name in undeclared if own[key] and all(name in given for given in own[key])]
-        missing = [name for name in undeclared if name not in tables and name not in stated]
-        if missing:
-            raise ProblemError(_ask_for(key, plant, missing, built_in))
-        declared |= {
-            name: Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
-            for name in undeclared
-            if name in tables
-        }
-    _check_units(plants)
-    _check_defaults(
-        plants, {key: set(tables).union(set[str].intersection(*given) if given else ()) for key, given in own.items()}
-    )
-    # A plant of the file may use a built-in plant's name for something else.
-    known = built_in | declared
-    parameters = {name: known[name] for name in known if name in declared or name in tables}
-    for name, value in tables.items():
-        if name not in known:
-            remedy = suggestion(name, known)
-            if name.lower().replace("_", "") == "ke":
-                remedy = "a back-EMF constant in V s/rad is the torque constant in N m/A: give K_tau alone"
-            raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
-        given = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
-        try:
-            parameters[name] = _make_parameter(parameters[name], given)
-        except UnitError as error:
-            raise UnitError(f"parameters.{name}: {error}") from error
-    return ParameterSet(parameters.values())
-
-
-def _name_guesses(table: ProblemTable, plants: Mapping[str, Plant]) -> ProblemTable:
-    """Return the file with what it leaves out of a motor's heat among its guesses: no default is right for a motor."""
-    names = list(table.guessed)
-    for key, plant in plants.items():
-        own = [set(experiment.parameters) for experiment in table.experiment if experiment.plant == key]
-        stated = set(table.parameters).union(set[str].intersection(*own) if own else ())
-        names += list_guessed_heat(plant, stated)
-    return table.model_copy(update={"guessed": list(dict.fromkeys(names))})
-
-
-def _ask_for(key: str, plant: Plant, missing: Sequence[str], known: Mapping[str, Parameter]) -> str:
-    """Return what to say of parameters without a value or a default: what they are, in which unit, where they go."""
-    words: list[str] = []
-    for name in missing:
-        unit = plant.parameter_unit(name)
-        same = name in known and known[name].unit == unit
-        about = [text for text in (known[name].description if same else "", unit_after(unit).strip()) if text]
-        words.append(f"{name} ({', '.join(about)})" if about else name)
-    example = ", ".join(f"{name} = ..." for name in missing)
-    return (
-        f"parameters.{missing[0]} is missing: plant.{key} needs {join_words(words)} and has no default; give {example} "
-        "in [parameters], or in the parameters of each of its experiments"
-    )
-
-
-def _check_units(plants: Mapping[str, Plant]) -> None:
-    """Refuse plants of which one has a parameter in N, say, and another one of the same name in N m."""
-    first: dict[str, tuple[str, str]] = {}
-    for key, plant in plants.items():
-        for name in plant.parameters:
-            unit = plant.parameter_unit(name)
-            other, known = first.setdefault(name, (key, unit))
-            try:
-                factor(unit, known)
-            except UnitError as error:
-                raise ProblemError(
-                    f"parameters.{name} is in {known} for plant.{other} and in {unit} for plant.{key}; "
-                    "give each a problem file of its own"
-                ) from error
-
-
-def _check_defaults(plants: Mapping[str, Plant], stated: Mapping[str, Collection[str]]) -> None:
-    """Refuse plants whose defaults of a parameter differ, where neither the file nor their experiments state it."""
-    first: dict[str, tuple[str, Parameter]] = {}
-    for key, plant in plants.items():
-        for name, default in plant.defaults.items():
-            if name in stated[key]:
-                continue
-            other, known = first.setdefault(name, (key, default))
-            value = default.value * factor(default.unit, known.unit)
-            if not math.isclose(value, known.value, rel_tol=1e-12):
-                raise ProblemError(
-                    f"parameters.{name} is missing: its default is {known.value:g} {known.unit} for plant.{other} and "
-                    f"{value:g} {known.unit} for plant.{key}; give {name} = ... in [parameters]"
-                )
-
-
-def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
-    scale = factor(table.unit, default.unit) if table.unit is not None else 1.0
-    prior = None if table.prior_std is None else table.prior_std * scale
-    free = table.free if table.free is not None else prior is not None
-    low = default.min if table.min is None else table.min * scale
-    high = default.max if table.max is None else table.max * scale
-    return replace(default, value=table.value * scale, free=free, min=low, max=high, prior_std=prior)
-
-
-def _make_spec(table: ProblemTable) -> ControllerSpec | None:
-    if table.controller is None:
-        return None
-    built = {"notch", "prefilter", "link_feedforward", "compensate", "schedule"}
-    fields = table.controller.model_dump(exclude={"plant", "robust_to", "frf_confidence", "draws", *built})
-    low_pass = table.controller.prefilter
-    prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass
-    fed = table.controller.link_feedforward
-    link = (LinkFeedforward() if fed else None) if isinstance(fed, bool) else LinkFeedforward(**fed.model_dump())
-    notch = table.controller.notch
-    tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
-    if table.robustness is not None and table.robustness.min_friction_margin is not None:
-        designed, certified = fields["min_friction_margin"], table.robustness.min_friction_margin
-        fields["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
-    return ControllerSpec(**fields, notch=tuned, prefilter=prefilter, link_feedforward=link)
-
-
-def _read_table(source: Path) -> ProblemTable:
-    """Return a problem file's table.
-
-    Raises
-    ------
-    ProblemError
-        The file is missing or not TOML, a key is unknown or missing, or a value is out of range.
-
-    """
-    return check_table(ProblemTable, _read_toml(source), str(source), error=ProblemError)
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # a name that no file can have
-        return False
-
-
-def _read_toml(source: Path) -> dict[str, Any]:
-    try:
-        check_regular(source)
-    except FileError as error:
-        found = shlex.quote(str(next(iter(sorted(source.glob("*.toml"))), "problem.toml")))
-        folder = f" -o {shlex.quote(str(source))}" if any(source.glob("fit.json")) else ""
-        raise ProblemError(f"{error}, the problem's: seaopt run {found}{folder}") from error
-    # What is there under another suffix is likely the log itself, which must not be offered as the file to write.
-    is_log = source.suffix.lower() != ".toml"
-    remedy = "write one from a log: " + shlex.join(
-        ["seaopt", "new", str(source)] if is_log and _exists(source) else ["seaopt", "new", "LOG", "-o", str(source)]
-    )
-    return parse_file(source, tomllib.loads, "TOML", remedy=remedy, error=ProblemError)

@@ -271,6 +271,8 @@ class ForceMPC:
         solution = self.solver.solve(q, low, high, state.sides, self.spec.max_iterations)
         theta, status = solution.x, self._fault(solution, low, high)
         planned, age, sides = limit * theta[: shifted.size] + u_s, 0, solution.sides
+        if not np.all(np.isfinite(theta)):
+            sides = np.zeros_like(sides)  # the next step starts afresh
         if status:  # the last plan goes on for as long as its horizon
             old = state.age >= self.spec.samples
             planned, age = (np.full(shifted.size, u_s) if old else shifted), min(state.age + 1, self.spec.samples)

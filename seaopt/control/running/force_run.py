@@ -93,7 +93,7 @@ class ForceRun:
 
 
 def close_loop(
-    step: Callable[[State, Any, float], tuple[float, State]],
+    step: Callable[..., tuple[float, State]],
     start: State,
     plant: Plant,
     params: ParameterSet,
@@ -108,6 +108,7 @@ def close_loop(
     seed: int = 0,
     start_state: Float[np.ndarray, " nx"] | None = None,
     start_command: float = 0.0,
+    place: str | None = None,
     rtol: float = RTOL,
 ) -> ForceRun:
     """Run a law on a plant, from rest at zero where no other start is given.
@@ -143,14 +144,16 @@ def close_loop(
         Of the plant, at the first sample.
     start_command : float
         What acts until the first command does.
+    place : str, optional
+        A state of the plant that the law is given too, after the measurement, as it stands at the sample.
     rtol : float
         Of the integration, of each state's largest value so far.
 
     Raises
     ------
     ControlError
-        `preview_samples` is no number of samples, the plant has no such output or that output responds to the current
-        at once, the parameters contain another condition than `delay_s`, or the loop diverges.
+        `preview_samples` is no number of samples, the plant has no such output or state, or that output responds to the
+        current at once, the parameters contain another condition than `delay_s`, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
 
@@ -166,6 +169,9 @@ def close_loop(
     noise = sensor_std * np.random.default_rng(seed).normal(size=n)
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
     x = np.zeros(len(plant.states)) if start_state is None else start_state
+    if place is not None and place not in plant.states:
+        raise ControlError(f'place = "{place}" is not a state of {plant.name}; {suggestion(place, plant.states)}')
+    seen = [] if place is None else [list(plant.states).index(place)]
     law, time_s = start, sample_time_s * np.arange(n)
     force, current, law_time_s, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
 
@@ -177,7 +183,7 @@ def close_loop(
         force[k] = float(output(time_s[k], x, inputs(k, min(older, k - 1)), p)[row])
         call_start_s = time.perf_counter()
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
-        current[k], law = step(law, coming, float(force[k] + noise[k]))
+        current[k], law = step(law, coming, float(force[k] + noise[k]), *x[seen].tolist())
         law_time_s[k] = time.perf_counter() - call_start_s
         states[k] = x
         if rest_s > 0.0:

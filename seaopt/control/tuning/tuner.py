@@ -86,7 +86,7 @@ FRACTION_FREQUENCIES = 1500
 NO_FORCE = 0.02  # of the design plant's static gain: where the force answers less, the feedback does next to nothing
 LOWER_FRACTIONS = 4  # by a fifth each
 USUAL_MS = 1.7  # that the fraction of a feedforward is chosen for where no Ms is asked
-SOLUTION, BANDWIDTHS = 1.0, 2.0  # of the time of a tune that is not possible as asked
+SOLUTION, BANDWIDTHS, EASING = 1.0, 2.0, 2.0  # of the time of a tune that is not possible as asked
 
 RobustTo = Mapping[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse]
 
@@ -163,7 +163,8 @@ def tune(
         check_delay(spec, task.plants[0])
     command = command_of(model, values, spec.regulated)
     check_current(spec, task.k_ff, command, {} if model is not plant else find_dry_friction(model, values))
-    solving, seeking, again = divide(progress, SOLUTION * (8.0 if task.asks_margin else 1.0), BANDWIDTHS, SOLUTION)
+    first = SOLUTION * (8.0 if task.asks_margin else 1.0)
+    solving, seeking, again, easing = divide(progress, first, BANDWIDTHS, SOLUTION, EASING)
     x, loops = solve(task, progress=solving)
     task, x, loops = lower_fraction(task, x, loops)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
@@ -173,7 +174,7 @@ def tune(
         if near:
             x, loops = solve(task, (x, *near), again)
         if list_broken_limits(spec, loops, task.design_states):
-            x, loops = ease_limits(task, x, loops, again)
+            x, loops = ease_limits(task, x, loops, easing)
     controller = make_controller(task, x, loops, (plant, params), possible)
     progress(f"{spec.structure}, {spec.bandwidth_hz:g} Hz", 1.0)
     return controller

@@ -28,6 +28,7 @@ from seaopt.records import record
 STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
 SHORTEST = 32  # samples of a stretch
 FEWEST, MOST = 6, 256  # stretches that are averaged
+TOGETHER = 16384  # samples of as many stretches as are transformed at once: they stay in the cache
 INDEPENDENT = 0.947  # averages per overlapping stretch (Welch 1967, Hann)
 OUTLIER = 4.0  # robust standard deviations beyond which a residual tells nothing of its spectrum
 OCTAVES = 24  # below the Nyquist frequency, at most
@@ -192,7 +193,7 @@ def _make_spectra(
 ) -> _Spectra | None:  # fmt: skip
     """Return the spectra over stretches of one length; None where there are too few of them.
 
-    Stretches are summed as they come: the memory is that of one, however long the logs are.
+    Stretches are summed as they come, short ones several at a time: the memory is small, however long the logs are.
     """
     starts = [
         (i, row) for i, rows in enumerate(inputs) for row in range(0, len(rows) - length + 1, max(length // 2, 1))
@@ -204,27 +205,37 @@ def _make_spectra(
         return None
     frequency = np.fft.rfftfreq(length, experiment.period)
     low, high = experiment.band_hz or (0.0, np.inf)
-    kept = (frequency > 0.0) & (frequency >= low) & (frequency <= high)
-    if np.count_nonzero(kept) < 3:
+    kept = slice(max(int(np.searchsorted(frequency, low)), 1), int(np.searchsorted(frequency, high, side="right")))
+    lines = frequency[kept].size
+    if lines < 3:
         return None
     window = np.hanning(length + 1)[:length]
-    lines, s = np.count_nonzero(kept), outputs[0].shape[1]
+    s = outputs[0].shape[1]
     of_inputs, across = np.zeros((m, m, lines), dtype=complex), np.zeros((m, s, lines), dtype=complex)
     power = np.zeros((s, lines))
-    for i, a in starts:
-        u, y = (_transform(rows[i][a : a + length], window)[:, kept] for rows in (inputs, outputs))
-        conjugate = np.conj(u)[:, None]
-        of_inputs += conjugate * u
-        across += conjugate * y
-        power += np.real(y) ** 2 + np.imag(y) ** 2
+    together = max(TOGETHER // length, 1)
+    for first in range(0, len(starts), together):
+        cuts = [
+            np.concatenate([rows[i][a : a + length].T for rows in (inputs, outputs)])
+            for i, a in starts[first : first + together]
+        ]
+        u, y = np.split(_transform(cuts, window)[..., kept], [m], axis=1)
+        conjugate = np.conj(u)[:, :, None]
+        of_inputs += np.sum(conjugate * u[:, None], axis=0)
+        across += np.sum(conjugate * y[:, None], axis=0)
+        power += np.sum(np.real(y) ** 2 + np.imag(y) ** 2, axis=0)
     coherent = _project(np.moveaxis(of_inputs, 2, 0), np.moveaxis(across, 2, 0))
     return _Spectra(frequency_hz=frequency[kept], power=power.T, coherent=coherent, averages=averages, inputs=m)
 
 
-def _transform(cut: Float[np.ndarray, "n s"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "s f"]:
-    """Return the spectra of a stretch without its means."""
-    rows = np.ascontiguousarray(cut.T)
-    return np.asarray(load_transforms()[2]((rows - np.mean(rows, axis=1, keepdims=True)) * window))
+def _transform(
+    cuts: Sequence[Float[np.ndarray, "s n"]], window: Float[np.ndarray, " n"]
+) -> Complex[np.ndarray, "c s f"]:  # fmt: skip
+    """Return the spectra of stretches without their means."""
+    signals = np.stack(cuts)
+    signals -= np.mean(signals, axis=-1, keepdims=True)
+    signals *= window
+    return np.asarray(load_transforms()[2](signals))
 
 
 def _project(of_inputs: Complex[np.ndarray, "f m m"], across: Complex[np.ndarray, "f m s"]) -> Float[np.ndarray, "f s"]:

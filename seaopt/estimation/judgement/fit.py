@@ -32,7 +32,7 @@ from seaopt.progress import Progress, divide, ignore
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import unit_after
 
-SEARCH, JUDGEMENT = 0.6, 0.4  # of the time of a fit
+SEARCH, JUDGEMENT = 0.25, 0.75  # of the time of a fit that goes wrong; one that does not ends early
 USUAL_ITERATIONS = 10  # of a whole fit
 SLOW_STEPS, SLOW = 2.0, 1e5  # steps in a sample, and in a pass, from which smoothed friction is said to be slow
 

@@ -9,7 +9,9 @@ What is said, and how it is known:
   and its Ms below a bound (`seaopt.robustness.bounds.stretch`);
 - **while the variable moves** (simulated): sweeps at growing rates with the law as it is exported
   (`seaopt.robustness.verification.schedule_sweep`). That the variable moves slowly is an assumption of all the rest,
-  and the fastest sweep that keeps its judgement puts a number to it.
+  and the fastest sweep that keeps its judgement puts a number to it;
+- **while the plant moves the variable** (simulated): pushes of the reference that move it at that rate, or the one that
+  is required (`seaopt.robustness.verification.schedule_motion`).
 """
 
 from __future__ import annotations
@@ -43,6 +45,7 @@ from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty, find_modes
 from seaopt.robustness.uncertainty.severity import limits
 from seaopt.robustness.uncertainty.worst import Worst, find_worst
+from seaopt.robustness.verification.schedule_motion import Motion, describe_motion, move_plants
 from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps, find_fastest, sweep_schedule
 from seaopt.units import unit_after
 
@@ -112,6 +115,8 @@ class ScheduleCertificate:
         What is proved between neighbouring places.
     sweeps : mapping of name to tuple of Sweep
         Of each plant that has the variable.
+    motions : mapping of name to Motion
+        Of each plant that moves the variable.
     requirements : tuple of Requirement
         All of them.
 
@@ -122,6 +127,7 @@ class ScheduleCertificate:
     monte_carlo: MonteCarlo
     stretches: tuple[StretchBound, ...]
     sweeps: Mapping[str, tuple[Sweep, ...]]
+    motions: Mapping[str, Motion]
     requirements: tuple[Requirement, ...]
 
     @property
@@ -174,7 +180,8 @@ class ScheduleCertificate:
     def notes(self) -> tuple[str, ...]:
         """What is proved, assumed and simulated, one sentence each."""
         swept = (describe_sweeps(sweeps, self.schedule.unit) for sweeps in self.sweeps.values())
-        return (self.proof, self.assumption, *swept)
+        moved = (describe_motion(motion, self.schedule.over, self.schedule.unit) for motion in self.motions.values())
+        return (self.proof, self.assumption, *swept, *moved)
 
     def list_rows(self) -> list[tuple[str, ...]]:
         """Return the points as text: value, largest Ms and Mt nominal, worst Ms found, draws that fail."""
@@ -222,6 +229,7 @@ class ScheduleCertificate:
             "monte_carlo": _list_fields(self.monte_carlo),
             "stretches": [_list_fields(one) for one in self.stretches],
             "sweeps": {name: [_list_fields(one) for one in sweeps] for name, sweeps in self.sweeps.items()},
+            "motions": {name: _list_fields(one) for name, one in self.motions.items()},
             "fastest_rate": self.fastest,
             "rate_unit": self.rate_unit,
             "proof": self.proof,
@@ -342,14 +350,24 @@ def certify_schedule(
     draws = _count_draws(places, seed, confidence)
     certificate = ScheduleCertificate(
         schedule=schedule, places=tuple(places), monte_carlo=draws, stretches=tuple(stretches), sweeps=sweeps,
+        motions={},
         requirements=(
             *(row for place in places for row in place.requirements),
             *_require_limits_between(schedule), *_require_draws(places, draws, max_failure_probability),
         ),
     )  # fmt: skip
     progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
-    rate = _require_rate(certificate, min_rate) if simulations else []
-    return replace(certificate, requirements=(*certificate.requirements, *rate))
+    if not sweeps:
+        return certificate
+    slowest = min(found[0].rate for found in sweeps.values())
+    motions = move_plants(schedule, models, nominal, min_rate or certificate.fastest or slowest)
+    return replace(
+        certificate, motions=motions,
+        requirements=(
+            *certificate.requirements, *_require_rate(certificate, min_rate),
+            *(_require_motion(motion, schedule) for motion in motions.values()),
+        ),
+    )  # fmt: skip
 
 
 def _check_variable(
@@ -498,6 +516,13 @@ def _require_rate(certificate: ScheduleCertificate, least: float | None) -> list
             )
         )  # fmt: skip
     return rows
+
+
+def _require_motion(motion: Motion, schedule: ScheduledController) -> Requirement:
+    return Requirement(
+        name="schedule_motion", limit=0.0, value=float(bool(motion.fault)), met=not motion.fault,
+        where=describe_motion(motion, schedule.over, schedule.unit),
+    )  # fmt: skip
 
 
 def _digest(schedule: ScheduledController) -> tuple[int, ...]:

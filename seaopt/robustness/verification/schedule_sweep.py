@@ -155,9 +155,6 @@ def describe_sweeps(sweeps: Sequence[Sweep], unit: str) -> str:
 def _choose_pulses(schedule: ScheduledController, plant: Plant, params: ParameterSet) -> _Pulses:
     """Return pulses small enough for the command's limit at every point, and what is allowed of their response."""
     spec, ts = schedule.spec, schedule.spec.sample_time_s
-    limits = [one.force_limit(0.0) for one in schedule.controllers]
-    fast = [one.force_limit(one.spec.bandwidth_hz) for one in schedule.controllers]
-    known = [abs(value) for value in (*limits, *fast) if value is not None and math.isfinite(value)]
     samples = math.ceil(PULSE_PERIODS / min(schedule.bandwidths_hz) / ts)
     left = max(
         abs(loop.measure_step_left(JUDGED_FROM * samples * ts)) / max(abs(loop.tracking(np.zeros(1))[0]), 1e-9)
@@ -165,10 +162,18 @@ def _choose_pulses(schedule: ScheduledController, plant: Plant, params: Paramete
         for loop in [one.close(plant, place_variable(plant, params, schedule.over, point))]
     )
     return _Pulses(
-        size=STEP_SHARE * min(known, default=1.0 / STEP_SHARE), samples=samples,
+        size=STEP_SHARE * find_least_effort(schedule), samples=samples,
         allowed_peak=PEAK_GRACE * (spec.level("max_reference_peak") or DEFAULT_PEAK),
         allowed_left=max(SETTLED, 2.0 * left),
     )  # fmt: skip
+
+
+def find_least_effort(schedule: ScheduledController) -> float:
+    """Return what the command's limit leaves of the output at every point, at rest and at the bandwidth."""
+    limits = [one.force_limit(0.0) for one in schedule.controllers]
+    fast = [one.force_limit(one.spec.bandwidth_hz) for one in schedule.controllers]
+    known = [abs(value) for value in (*limits, *fast) if value is not None and math.isfinite(value)]
+    return min(known, default=1.0 / STEP_SHARE)
 
 
 def _run_sweep(
@@ -181,7 +186,7 @@ def _run_sweep(
     count = max(LEAST_PULSES, math.ceil(1.0 / frequency_hz / (2 * pulses.samples * ts)))
     pulse = np.tile(np.repeat([1.0, 0.0], pulses.samples), count)
     place = low + 0.5 * (high - low) * (1.0 - np.cos(omega * ts * np.arange(pulse.size)))
-    start = _Start.at_rest(schedule, plant, params)
+    start = RestStart.at_rest(schedule, plant, params, low)
     swept = make_swept_plant(plant, schedule.over)
     values = start.params.with_parameters(
         *(Parameter(name=key, value=value, unit=unit) for key, value, unit in zip(
@@ -237,8 +242,8 @@ def _follow(law: RunnableSchedule, place: Float[np.ndarray, " n"]) -> Callable[.
 
 
 @record(eq=False)
-class _Start:
-    """Where a sweep starts: the plant at rest at the first point, what it measures there, and what holds it."""
+class RestStart:
+    """Where a run starts: the plant at rest at a value of the variable, what it measures there, and what holds it."""
 
     params: ParameterSet
     states: dict[str, float]
@@ -246,8 +251,9 @@ class _Start:
     command: float
 
     @classmethod
-    def at_rest(cls, schedule: ScheduledController, plant: Plant, params: ParameterSet) -> _Start:
-        placed = plant.complete(place_variable(plant, params, schedule.over, schedule.points[0]))
+    def at_rest(cls, schedule: ScheduledController, plant: Plant, params: ParameterSet, value: float) -> RestStart:
+        """Return where a plant rests with the variable at a value."""
+        placed = plant.complete(place_variable(plant, params, schedule.over, value))
         x, u = find_rest(plant, placed)
         row = list(plant.outputs).index(schedule.spec.regulated)
         output = float(output_function(plant)(0.0, x, u, placed.vector)[row])

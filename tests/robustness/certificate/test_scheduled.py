@@ -103,4 +103,7 @@ def test_with_simulations_it_states_how_fast_the_variable_may_move():
     )
     assert found.passed, found
     assert 0.5 < found.fastest < np.inf and set(found.sweeps) == {"stand", "swing"}
+    assert set(found.motions) == {"swing"} and found.motions["swing"].rate == pytest.approx(0.5, rel=0.05)
+    (row,) = (row for row in found.requirements if row.name == "schedule_motion")
+    assert row.met and "moves phi by itself" in row.where and row.where in found.notes
     assert all(place.simulated is not None for place in found.places if place.point)

@@ -113,7 +113,11 @@ static int solve(force_mpc *s, real *plan, const real *error, const real *delta,
   force_mpc_ending ending = force_mpc_minimise(&s->program, q, low, high, theta);
   s->iterations = s->program.iterations;
   if (ending == FORCE_MPC_INFEASIBLE) return 0;
-  for (int i = 0; i < VARIABLES; i++) if (!finite_number(theta[i])) return 0;
+  for (int i = 0; i < VARIABLES; i++)
+    if (!finite_number(theta[i])) {
+      memset(s->program.side, 0, sizeof s->program.side); /* the next step starts afresh */
+      return 0;
+    }
   for (int i = 0; i < ROWS; i++) {
     real value = row(theta, i);
     if (value < low[i] - mpc_violation || value > high[i] + mpc_violation) return 0;

@@ -1,0 +1,140 @@
+"""The parameters of a problem file: its values over the plants' defaults, each in its plant's own unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+from seaopt.errors import ProblemError, UnitError, suggestion
+from seaopt.formatting import join_words
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant, known_parameters
+from seaopt.plants.motor.thermal import list_guessed_heat
+from seaopt.problem.schema import (
+    ParameterTable,
+    ProblemTable,
+)
+from seaopt.units import ROTARY, factor, unit_after
+
+
+def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> ParameterSet:
+    """Return the file's values over the plants' defaults, in the plants' units.
+
+    Raises
+    ------
+    ProblemError
+        A name is of no plant, or a value is missing that has no default, or several.
+    UnitError
+        A value's unit has another dimension than its parameter's.
+
+    """
+    tables = table.parameters
+    for experiment in table.experiment:
+        known = plants[experiment.plant].parameters if experiment.plant in plants else experiment.parameters
+        for name in experiment.parameters:
+            if name not in known:
+                raise ProblemError(
+                    f'experiment {experiment.name}: parameters names "{name}"; {suggestion(name, known)}'
+                )
+    # What each log states for itself need not be stated for all.
+    own = {key: [set(e.parameters) for e in table.experiment if e.plant == key] for key in plants}
+    declared = {name: default for plant in plants.values() for name, default in plant.defaults.items()}
+    turns = any(plant.actuation is not None and plant.actuation.unit == ROTARY.unit for plant in plants.values())
+    built_in = known_parameters(rotary_first=turns)
+    for key, plant in plants.items():
+        undeclared = [name for name in plant.parameters if name not in declared]
+        stated = [name for name in undeclared if own[key] and all(name in given for given in own[key])]
+        missing = [name for name in undeclared if name not in tables and name not in stated]
+        if missing:
+            raise ProblemError(_ask_for(key, plant, missing, built_in))
+        declared |= {
+            name: Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
+            for name in undeclared
+            if name in tables
+        }
+    _check_units(plants)
+    _check_defaults(
+        plants, {key: set(tables).union(set[str].intersection(*given) if given else ()) for key, given in own.items()}
+    )
+    # A plant of the file may use a built-in plant's name for something else.
+    known = built_in | declared
+    parameters = {name: known[name] for name in known if name in declared or name in tables}
+    for name, value in tables.items():
+        if name not in known:
+            remedy = suggestion(name, known)
+            if name.lower().replace("_", "") == "ke":
+                remedy = "a back-EMF constant in V s/rad is the torque constant in N m/A: give K_tau alone"
+            raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
+        given = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
+        try:
+            parameters[name] = _make_parameter(parameters[name], given)
+        except UnitError as error:
+            raise UnitError(f"parameters.{name}: {error}") from error
+    return ParameterSet(parameters.values())
+
+
+def name_guesses(table: ProblemTable, plants: Mapping[str, Plant]) -> ProblemTable:
+    """Return the file with what it leaves out of a motor's heat among its guesses: no default is right for a motor."""
+    names = list(table.guessed)
+    for key, plant in plants.items():
+        own = [set(experiment.parameters) for experiment in table.experiment if experiment.plant == key]
+        stated = set(table.parameters).union(set[str].intersection(*own) if own else ())
+        names += list_guessed_heat(plant, stated)
+    return table.model_copy(update={"guessed": list(dict.fromkeys(names))})
+
+
+def _ask_for(key: str, plant: Plant, missing: Sequence[str], known: Mapping[str, Parameter]) -> str:
+    """Return what to say of parameters without a value or a default: what they are, in which unit, where they go."""
+    words: list[str] = []
+    for name in missing:
+        unit = plant.parameter_unit(name)
+        same = name in known and known[name].unit == unit
+        about = [text for text in (known[name].description if same else "", unit_after(unit).strip()) if text]
+        words.append(f"{name} ({', '.join(about)})" if about else name)
+    example = ", ".join(f"{name} = ..." for name in missing)
+    return (
+        f"parameters.{missing[0]} is missing: plant.{key} needs {join_words(words)} and has no default; give {example} "
+        "in [parameters], or in the parameters of each of its experiments"
+    )
+
+
+def _check_units(plants: Mapping[str, Plant]) -> None:
+    """Refuse plants of which one has a parameter in N, say, and another one of the same name in N m."""
+    first: dict[str, tuple[str, str]] = {}
+    for key, plant in plants.items():
+        for name in plant.parameters:
+            unit = plant.parameter_unit(name)
+            other, known = first.setdefault(name, (key, unit))
+            try:
+                factor(unit, known)
+            except UnitError as error:
+                raise ProblemError(
+                    f"parameters.{name} is in {known} for plant.{other} and in {unit} for plant.{key}; "
+                    "give each a problem file of its own"
+                ) from error
+
+
+def _check_defaults(plants: Mapping[str, Plant], stated: Mapping[str, Collection[str]]) -> None:
+    """Refuse plants whose defaults of a parameter differ, where neither the file nor their experiments state it."""
+    first: dict[str, tuple[str, Parameter]] = {}
+    for key, plant in plants.items():
+        for name, default in plant.defaults.items():
+            if name in stated[key]:
+                continue
+            other, known = first.setdefault(name, (key, default))
+            value = default.value * factor(default.unit, known.unit)
+            if not math.isclose(value, known.value, rel_tol=1e-12):
+                raise ProblemError(
+                    f"parameters.{name} is missing: its default is {known.value:g} {known.unit} for plant.{other} and "
+                    f"{value:g} {known.unit} for plant.{key}; give {name} = ... in [parameters]"
+                )
+
+
+def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
+    scale = factor(table.unit, default.unit) if table.unit is not None else 1.0
+    prior = None if table.prior_std is None else table.prior_std * scale
+    free = table.free if table.free is not None else prior is not None
+    low = default.min if table.min is None else table.min * scale
+    high = default.max if table.max is None else table.max * scale
+    return replace(default, value=table.value * scale, free=free, min=low, max=high, prior_std=prior)

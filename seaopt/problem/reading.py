@@ -1,0 +1,164 @@
+"""A problem file read and checked: from TOML to the objects that it stands for."""
+
+from __future__ import annotations
+
+import shlex
+import tomllib
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from seaopt.control import ControllerSpec, LinkFeedforward, Notch, Prefilter
+from seaopt.documents import check_table
+from seaopt.errors import FileError, ProblemError, SeaoptError, require_type
+from seaopt.files import check_regular, parse_file
+from seaopt.plants import Plant, plant_of_kind
+from seaopt.problem.equations import make_plant, order_plants
+from seaopt.problem.parameters import make_parameters, name_guesses
+from seaopt.problem.predictive import make_mpc_spec
+from seaopt.problem.problem import Problem
+from seaopt.problem.references import check_references
+from seaopt.problem.schema import AnyPlant, EquationsTable, PlantTable, PrefilterTable, ProblemTable
+from seaopt.robustness.certificate.predictive import linear_spec
+
+
+def demo_path() -> Path:
+    """Return the path of the THOR problem that comes with the package."""
+    return Path(str(files("seaopt.problem").joinpath("thor.toml")))
+
+
+def read_problem(path: Path | str) -> Problem:
+    """Read and check a problem file.
+
+    Raises
+    ------
+    ProblemError
+        The file is missing or not TOML, a key is unknown or missing, or a value is out of range; the message names
+        the file, the key, the value and the remedy.
+    SeaoptError
+        The plants, the parameters or the controller specification are refused.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> problem = so.read_problem(so.demo_path())
+    >>> problem.title, list(problem.plants)
+    ('THOR linear SEA', ['stand', 'swing'])
+
+    """
+    require_type(path, (str, Path), "path", "give the path of a problem file", ProblemError)
+    source = Path(path)
+    return make_problem(_read_table(source), str(path), source.parent)
+
+
+def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
+    """Make the objects that a validated problem file stands for.
+
+    Parameters
+    ----------
+    table : ProblemTable
+        The file.
+    source : str
+        Its path, for messages.
+    folder : Path
+        Where relative paths of logs start.
+
+    Raises
+    ------
+    SeaoptError
+        As `read_problem`.
+
+    """
+    try:
+        plants = _make_plants(table.plant)
+        parameters = make_parameters(table, plants)
+        check_references(table, plants, parameters)
+        table = name_guesses(table, plants)
+        mpc = make_mpc_spec(table)
+        spec = _make_spec(table) if mpc is None else linear_spec(mpc)
+    except SeaoptError as error:
+        raise type(error)(f"{source}: {error}") from error
+    return Problem(
+        title=table.title,
+        source=source,
+        folder=folder,
+        parameters=parameters,
+        plants=plants,
+        table=table,
+        spec=spec,
+        mpc=mpc,
+    )
+
+
+def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:
+    """Return the plants of a file in its order; those that others hold or probe with are made first."""
+    plants: dict[str, Plant] = {}
+    for name in order_plants(tables):
+        table = tables[name]
+        try:
+            own = isinstance(table, EquationsTable)
+            plants[name] = make_plant(name, table, plants) if own else _make_plant_of_kind(table)
+        except SeaoptError as error:
+            text = str(error).removeprefix(f"plant {name}: ")
+            raise type(error)(f"plant.{name}: {text}") from error
+    return {name: plants[name] for name in tables}
+
+
+def _make_plant_of_kind(table: PlantTable) -> Plant:
+    options = table.model_extra or {}
+    equations = ", ".join(name for name in ("f", "h", "states", "outputs") if name in options)
+    if equations:
+        raise ProblemError(f"a plant has either a kind or {equations} of its own; take one out")
+    return plant_of_kind(table.kind, **options)
+
+
+def _make_spec(table: ProblemTable) -> ControllerSpec | None:
+    if table.controller is None:
+        return None
+    built = {"notch", "prefilter", "link_feedforward", "compensate", "schedule"}
+    fields = table.controller.model_dump(exclude={"plant", "robust_to", "frf_confidence", "draws", *built})
+    low_pass = table.controller.prefilter
+    prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass
+    fed = table.controller.link_feedforward
+    link = (LinkFeedforward() if fed else None) if isinstance(fed, bool) else LinkFeedforward(**fed.model_dump())
+    notch = table.controller.notch
+    tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
+    if table.robustness is not None and table.robustness.min_friction_margin is not None:
+        designed, certified = fields["min_friction_margin"], table.robustness.min_friction_margin
+        fields["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
+    return ControllerSpec(**fields, notch=tuned, prefilter=prefilter, link_feedforward=link)
+
+
+def _read_table(source: Path) -> ProblemTable:
+    """Return a problem file's table.
+
+    Raises
+    ------
+    ProblemError
+        The file is missing or not TOML, a key is unknown or missing, or a value is out of range.
+
+    """
+    return check_table(ProblemTable, _read_toml(source), str(source), error=ProblemError)
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that no file can have
+        return False
+
+
+def _read_toml(source: Path) -> dict[str, Any]:
+    try:
+        check_regular(source)
+    except FileError as error:
+        found = shlex.quote(str(next(iter(sorted(source.glob("*.toml"))), "problem.toml")))
+        folder = f" -o {shlex.quote(str(source))}" if any(source.glob("fit.json")) else ""
+        raise ProblemError(f"{error}, the problem's: seaopt run {found}{folder}") from error
+    # What is there under another suffix is likely the log itself, which must not be offered as the file to write.
+    is_log = source.suffix.lower() != ".toml"
+    remedy = "write one from a log: " + shlex.join(
+        ["seaopt", "new", str(source)] if is_log and _exists(source) else ["seaopt", "new", "LOG", "-o", str(source)]
+    )
+    return parse_file(source, tomllib.loads, "TOML", remedy=remedy, error=ProblemError)
