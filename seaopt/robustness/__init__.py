@@ -2,7 +2,7 @@
 
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.bounds.stretch import StretchBound
-from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, PlantMargins, Requirement, plant_margins
+from seaopt.robustness.certificate.certificate import Certificate, Requirement
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
@@ -11,7 +11,8 @@ from seaopt.robustness.certificate.scheduled import PlaceCertificate, ScheduleCe
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value
-from seaopt.robustness.uncertainty.failure_probability import failure_bound
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, failure_bound
+from seaopt.robustness.uncertainty.plant_margins import PlantMargins, plant_margins
 from seaopt.robustness.uncertainty.worst import Witness, Worst
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import Outcome

@@ -16,7 +16,6 @@ from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import BY_NAME, BY_REQUIREMENT
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
-from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
 from seaopt.executors import Shared, map_ordered
@@ -54,13 +53,13 @@ from seaopt.robustness.certificate.simulated import (
     run_simulations,
     simulate_steps,
 )
-from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import Varied
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, format_draws
+from seaopt.robustness.uncertainty.plant_margins import PlantMargins, plant_margins
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
 from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cycles, seek_limit_cycles
 from seaopt.robustness.verification.verification import Verification
 
-SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
 ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
 MIN_FRICTION_MARGIN = "min_friction_margin"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
@@ -90,97 +89,6 @@ class Requirement:
         if self.name in BY_REQUIREMENT:
             return BY_REQUIREMENT[self.name].symbol
         return "≥" if self.name == FRICTION_COMPENSATION or self.name.startswith("min_") else "≤"
-
-
-@record
-class MonteCarlo:
-    """Draws and failures; with `confidence`, the probability of failure is below `failure_probability_bound`.
-
-    Of the failures, `unstable` draws are unstable on some plant; of the others, `over_ms` break Ms, and `over_mt` Mt
-    alone.
-    """
-
-    samples: int
-    failures: int
-    seed: int
-    failure_probability_bound: float
-    confidence: float
-    unstable: int = 0
-    over_ms: int = 0
-    over_mt: int = 0
-
-    def __str__(self) -> str:
-        if not self.samples:
-            return "no draws: nothing is uncertain; give a fit, prior_std or ranges for a statement on robustness"
-        counts = ((self.unstable, "unstable"), (self.over_ms, "over Ms"), (self.over_mt, "over Mt"))
-        kinds = ", ".join(f"{count} {kind}" for count, kind in counts if count)
-        head = f"{self.failures} failures in {self.samples} draws" + (f" ({kinds})" if kinds else "")
-        if self.failures == self.samples:
-            return head
-        return (
-            f"{head}: failure probability below {self.failure_probability_bound:.3g} at a confidence of "
-            f"{_format_confidence(self.confidence)}"
-        )
-
-    def _repr_html_(self) -> str:
-        return format_draws(self)
-
-
-@record
-class PlantMargins:
-    """Margins of a plant's loop.
-
-    Parameters
-    ----------
-    margins : Margins
-        Gain, phase and delay both ways, every crossing, and disk margins with their witnesses.
-    sampled_delay_s : float or None
-        The smallest extra delay that makes the loop unstable when the plant is sampled with that delay in it; None:
-        none up to `searched_delay_s`. The classical `margins.delay_s` treats the delay as a phase,
-        which is exact for whole samples only.
-    searched_delay_s : float
-        The end of the search: three times the classical margin and two samples, up to 20,000 samples. A delay
-        that long is beyond what the loop's model means.
-    nu_gap, nu_gap_hz : float and float or None
-        Vinnicombe's gap of this plant's loop gain to the design plant's. It says little here: docs/theory/margins.md.
-
-    """
-
-    margins: Margins
-    sampled_delay_s: float | None
-    searched_delay_s: float
-    nu_gap: float
-    nu_gap_hz: float | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields as they stand in robustness.json."""
-        return {
-            "gain_margin_up_db": self.margins.gain_up_db,
-            "gain_margin_down_db": self.margins.gain_down_db,
-            "sampled_delay_margin_s": self.sampled_delay_s,
-            "disk_margins": {
-                kind: {
-                    "alpha": disk.alpha, "frequency_hz": disk.frequency_hz,
-                    "perturbation": [disk.perturbation.real, disk.perturbation.imag],
-                    "gain_range": list(disk.gain_range), "phase_deg": disk.phase_deg,
-                }
-                for kind, disk in self.margins.disks.items()
-            },
-            "nu_gap": self.nu_gap,
-        }  # fmt: skip
-
-
-def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) -> PlantMargins:
-    """Measure the margins of a controller on a plant; the controller knows its design plant."""
-    loop = controller.close(plant, params)
-    classical = margins(loop)
-    assert controller.design is not None
-    design, values = controller.design
-    gap, gap_hz = nu_gap(controller.close(design, values), loop)
-    period = controller.sample_time_s
-    reach = min(SEARCHED_DELAYS * ((classical.delay_s or 0.0) + 2 * period), LONGEST_DELAY * period)
-    exact = sampled_delay_margin(controller, plant, params, reach) if classical.disks else 0.0
-    return PlantMargins(margins=classical, sampled_delay_s=exact, searched_delay_s=reach, nu_gap=gap, nu_gap_hz=gap_hz)
 
 
 @record(eq=False)
@@ -645,11 +553,6 @@ def _format_place(worst: Worst) -> str:
     return format_values(worst.parameters) + "".join(others)
 
 
-def _format_confidence(value: float) -> str:
-    rest = 1.0 - value
-    return f"1 - {rest:.0e}" if rest < 1e-3 else f"{value:.3%}"
-
-
 def _list_fields(data: Any) -> dict[str, Any]:
     return {field.name: getattr(data, field.name) for field in fields(data)}
 
@@ -684,12 +587,6 @@ def format_certificate(certificate: Certificate) -> str:
         + required
         + simulated
     )
-
-
-def format_draws(draws: MonteCarlo) -> str:
-    """Return as HTML the numbers of draws and failures, and the bound."""
-    rows = [(field.name.replace("_", " "), f"{getattr(draws, field.name):.7g}") for field in fields(draws)]
-    return html_table(("draws", ""), rows)
 
 
 def _format_plant(certificate: Certificate, name: str) -> tuple[str, ...]:

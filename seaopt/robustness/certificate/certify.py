@@ -38,9 +38,7 @@ from seaopt.robustness.certificate.certificate import (
     MIN_FRICTION_MARGIN,
     NO_MODEL,
     Certificate,
-    MonteCarlo,
     Requirement,
-    plant_margins,
 )
 from seaopt.robustness.certificate.compensation import (
     find_compensation_at_draws,
@@ -63,7 +61,8 @@ from seaopt.robustness.certificate.requirements import (
     plant_requirements,
 )
 from seaopt.robustness.uncertainty.draws import check_ranges, combine_uncertainty
-from seaopt.robustness.uncertainty.failure_probability import failure_bound
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, failure_bound
+from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
 

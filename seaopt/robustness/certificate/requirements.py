@@ -19,7 +19,7 @@ from seaopt.formatting import format_values
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, MonteCarlo, Requirement
+from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, Requirement
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
     GRAVITY_COMPENSATION,
@@ -31,6 +31,7 @@ from seaopt.robustness.certificate.compensation import (
 )
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.impedance_steps import AT_REST

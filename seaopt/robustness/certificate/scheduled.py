@@ -38,11 +38,12 @@ from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
-from seaopt.robustness.certificate.certificate import DESIGN_PLANT, Certificate, MonteCarlo, Requirement
+from seaopt.robustness.certificate.certificate import DESIGN_PLANT, Certificate, Requirement
 from seaopt.robustness.certificate.certify import CONFIDENCE, certify, failure_bound
 from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty, find_modes
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.severity import limits
 from seaopt.robustness.uncertainty.worst import Worst, find_worst
 from seaopt.robustness.verification.schedule_motion import Motion, describe_motion, move_plants

@@ -2,6 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
+from seaopt.formatting import html_table
+from seaopt.records import record
+
+
+@record
+class MonteCarlo:
+    """Draws and failures; with `confidence`, the probability of failure is below `failure_probability_bound`.
+
+    Of the failures, `unstable` draws are unstable on some plant; of the others, `over_ms` break Ms, and `over_mt` Mt
+    alone.
+    """
+
+    samples: int
+    failures: int
+    seed: int
+    failure_probability_bound: float
+    confidence: float
+    unstable: int = 0
+    over_ms: int = 0
+    over_mt: int = 0
+
+    def __str__(self) -> str:
+        if not self.samples:
+            return "no draws: nothing is uncertain; give a fit, prior_std or ranges for a statement on robustness"
+        counts = ((self.unstable, "unstable"), (self.over_ms, "over Ms"), (self.over_mt, "over Mt"))
+        kinds = ", ".join(f"{count} {kind}" for count, kind in counts if count)
+        head = f"{self.failures} failures in {self.samples} draws" + (f" ({kinds})" if kinds else "")
+        if self.failures == self.samples:
+            return head
+        return (
+            f"{head}: failure probability below {self.failure_probability_bound:.3g} at a confidence of "
+            f"{_format_confidence(self.confidence)}"
+        )
+
+    def _repr_html_(self) -> str:
+        return format_draws(self)
+
 
 def failure_bound(samples: int, failures: int, confidence: float) -> float:
     """Return the upper Clopper-Pearson bound of a failure probability (Biometrika 26, 1934).
@@ -18,3 +57,14 @@ def failure_bound(samples: int, failures: int, confidence: float) -> float:
     from scipy.special import betaincinv
 
     return float(betaincinv(failures + 1, samples - failures, confidence))
+
+
+def format_draws(draws: MonteCarlo) -> str:
+    """Return as HTML the numbers of draws and failures, and the bound."""
+    rows = [(field.name.replace("_", " "), f"{getattr(draws, field.name):.7g}") for field in fields(draws)]
+    return html_table(("draws", ""), rows)
+
+
+def _format_confidence(value: float) -> str:
+    rest = 1.0 - value
+    return f"1 - {rest:.0e}" if rest < 1e-3 else f"{value:.3%}"
