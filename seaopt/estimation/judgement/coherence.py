@@ -215,11 +215,8 @@ def _make_spectra(
     power = np.zeros((s, lines))
     together = max(TOGETHER // length, 1)
     for first in range(0, len(starts), together):
-        cuts = [
-            np.concatenate([rows[i][a : a + length].T for rows in (inputs, outputs)])
-            for i, a in starts[first : first + together]
-        ]
-        u, y = np.split(_transform(cuts, window)[..., kept], [m], axis=1)
+        cuts = starts[first : first + together]
+        u, y = (_transform([rows[i][a : a + length] for i, a in cuts], window)[..., kept] for rows in (inputs, outputs))
         conjugate = np.conj(u)[:, :, None]
         of_inputs += np.sum(conjugate * u[:, None], axis=0)
         across += np.sum(conjugate * y[:, None], axis=0)
@@ -229,10 +226,10 @@ def _make_spectra(
 
 
 def _transform(
-    cuts: Sequence[Float[np.ndarray, "s n"]], window: Float[np.ndarray, " n"]
+    cuts: Sequence[Float[np.ndarray, "n s"]], window: Float[np.ndarray, " n"]
 ) -> Complex[np.ndarray, "c s f"]:  # fmt: skip
     """Return the spectra of stretches without their means."""
-    signals = np.stack(cuts)
+    signals = np.stack([cut.T for cut in cuts])
     signals -= np.mean(signals, axis=-1, keepdims=True)
     signals *= window
     return np.asarray(load_transforms()[2](signals))
