@@ -8,7 +8,7 @@ from typing import Any
 from seaopt.cli.frontier import print_frontier
 from seaopt.cli.terminal import Terminal
 from seaopt.control import Controller, ForceMPC, ScheduledController
-from seaopt.control.laws.controller import name_gain_units
+from seaopt.control.laws.command import name_gain_units
 from seaopt.estimation import Fit, ModelledOutputs
 from seaopt.formatting import MISSING, format_count, format_number, printable
 from seaopt.parameters import Parameter

@@ -27,7 +27,8 @@ from seaopt.control.deploy.c_text import (
     strip_markup,
 )
 from seaopt.control.deploy.schedule_export import export_schedule, is_schedule
-from seaopt.control.laws.controller import Controller, name_gain_units
+from seaopt.control.laws.command import name_gain_units
+from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
 from seaopt.control.laws.spec import check_command_limits

@@ -24,7 +24,7 @@ from seaopt.control.deploy.c_text import (
     render,
     strip_markup,
 )
-from seaopt.control.laws.controller import name_gain_units
+from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.realisation import choose_limit
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES, LAW_GAINS

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from seaopt.control.laws.controller import Controller, count_filter_samples, find_integral_rate
+from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
-from seaopt.control.loops.law import Law
+from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.sampled_plant import find_signals, list_names
 from seaopt.control.tuning.tuner import RobustTo, describe_law, make_task
 from seaopt.errors import ControlError, require_type

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
+from seaopt.control.laws.structures import PREFILTER
 from seaopt.control.loops.sampled_plant import static_gain
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
@@ -14,6 +16,8 @@ from seaopt.plants import Plant
 from seaopt.plants.plant import describe_parameters, evaluate, find_range
 from seaopt.records import record
 from seaopt.units import Mechanics, divide_units, mechanics_of, name_command, show_command, unit_after
+
+GAIN_UNITS = {"T_f": "s", "T_q": "s", "T_v": "s", PREFILTER: "Hz"}  # besides those of effort over what is measured
 
 
 @record
@@ -173,3 +177,30 @@ def actuation_notes(plant: Plant, command: Command) -> tuple[str, ...]:
         f"{plant.name} states no actuation: one {command.unit} of {command.input} was taken to make "
         f"{1.0 / command.per_effort:.4g} {command.effort_unit}, its static gain; give it actuation where that is wrong",
     )
+
+
+def name_gain_units(command: Command) -> dict[str, str]:
+    """Return the units of the gains of a law that gives efforts, by name; what is not there has none."""
+    units = name_rates(command.effort_unit, command.reference_unit, command.mechanics)
+    if command.effort_unit == command.reference_unit:
+        units |= {"k_i": "1/s", "k_d": "s"}
+    return GAIN_UNITS | units
+
+
+def name_rates(unit: str, measured: str, mechanics: Mechanics) -> dict[str, str]:
+    """Return the units of gains from a measured signal, its integral and rate, and a motor's speed, to some unit."""
+    ratio, seconds = divide_units(unit, measured), f"{unit_after(unit).strip()} s".strip()
+    return {
+        "k_p": ratio, "k_i": divide_units(unit, f"{measured} s"), "k_d": divide_units(seconds, measured), "k_r": ratio,
+        "k_ff": ratio, "k_v": divide_units(seconds, mechanics.place),
+    }  # fmt: skip
+
+
+def describe_cascade(gains: Mapping[str, float], command: Command) -> str:
+    """Return the gains of a cascade as a drive with a speed loop is set: speeds per force error."""
+    called = command.mechanics
+    units = name_rates(f"{called.place}/s", command.reference_unit, called)
+    drive = ", ".join(f"{name} = {gains[name] / gains['k_v']:.5g} {units[name]}"
+                      for name in ("k_p", "k_i", "k_d", "k_r"))  # fmt: skip
+    inside = f"a PI of T_v = {gains['T_v']:.4g} s" if "T_v" in gains else "a P"
+    return f"as speeds asked of the motor's speed loop, {inside} of k_v: {drive}"

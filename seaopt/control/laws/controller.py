@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from seaopt.control.laws.command import Command, actuation_notes, limit_notes
+from seaopt.control.laws.command import (
+    Command,
+    actuation_notes,
+    describe_cascade,
+    limit_notes,
+    name_gain_units,
+    name_rates,
+)
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
-from seaopt.control.laws.structures import LAW_GAINS, PREFILTER, DisturbanceObserver, Gains, Prefilter, SpeedLoop
+from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Prefilter, SpeedLoop
 from seaopt.control.laws.verdict import (
-    DesignFigure,
     PossibleBandwidths,
     join_labels,
     list_broken_figures,
@@ -24,7 +30,7 @@ from seaopt.control.loops.absolute_stability import FrictionMargin, friction_mar
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.friction_loop import make_friction_loops
-from seaopt.control.loops.law import Law
+from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.measured.loop import DiscLoop
@@ -50,7 +56,7 @@ from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
 from seaopt.records import PlotAccessor, record
-from seaopt.units import Mechanics, divide_units, mechanics_of, unit_after
+from seaopt.units import divide_units
 
 if TYPE_CHECKING:
     import control
@@ -58,10 +64,7 @@ if TYPE_CHECKING:
 # Among what controller.json says is achieved:
 FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
 CONTROLLER_SCHEMA = "seaopt/controller/2"
-GAIN_UNITS = {"T_f": "s", "T_q": "s", "T_v": "s", PREFILTER: "Hz"}  # besides those of effort over what is measured
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
-SAME_POLE = 1e-3  # to which poles that are equal are computed
-NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
@@ -325,7 +328,7 @@ class Controller:
     @property
     def engineering(self) -> dict[str, tuple[float, str]]:
         """The gains as a drive is set, values and units: the command per force error, its integral and its rate."""
-        units = _name_rates(self.command.unit, self.command.reference_unit, self.command.mechanics)
+        units = name_rates(self.command.unit, self.command.reference_unit, self.command.mechanics)
         scale = self.command.per_effort
         return {name: (scale * value, units[name]) for name, value in self.gains.items() if name in units}
 
@@ -392,7 +395,7 @@ class Controller:
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
-            "observer": self._observer_dict(),
+            "observer": None if self.observer is None else self.observer.to_dict(self.sample_time_s),
             "heat": self._heat_dict(),
             "link_feedforward": None if self.link is None else asdict(self.link),
             "impedance": None if self.outer is None else asdict(self.outer),
@@ -412,21 +415,6 @@ class Controller:
         """Return what the motor can do without overheating, and what an exported law takes to keep to it."""
         rating, guard = self.rating, self.heat_guard
         return None if rating is None else rating.to_dict() | {"guard": None if guard is None else asdict(guard)}
-
-    def _observer_dict(self) -> dict[str, Any] | None:
-        """Return the observer's filters, and what it takes to build it again."""
-        if self.observer is None:
-            return None
-        q, inverse = self.observer.filters(self.sample_time_s)
-        nominal = self.observer.nominal
-        return {
-            "T_q": self.observer.T_q,
-            "bandwidth_hz": self.observer.bandwidth_hz,
-            "Q": {"num": q.num, "den": q.den},
-            "Q_over_P_n": {"num": inverse.num, "den": inverse.den},
-            "kept": nominal.kept,
-            "inverse": [{"num": part.num, "den": part.den} for part in nominal.inverse],
-        }
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], plant: Plant | MeasuredResponse, params: ParameterSet) -> Controller:
@@ -509,7 +497,7 @@ class Controller:
                 f"  {a.describe_margins()}",
                 *self._friction_lines(),
                 *self._force_lines(),
-                *self._outer_lines(),
+                *([] if self.outer is None else [f"  {self.outer.describe()}"]),
                 *self._compensation_lines(),
                 *(f"  {line}" for line in (self.rating.describe() if self.rating is not None else ())),
                 f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
@@ -558,7 +546,7 @@ class Controller:
             ),
         ]  # fmt: skip
         if self.gains.get("k_v"):
-            lines.append(self._describe_cascade())
+            lines.append(f"  {describe_cascade(self.gains, self.command)}")
         if self.observer is not None:
             lines.append(f"  disturbance observer: Q is 3 dB down at {self.observer.bandwidth_hz:.4g} Hz")
         if "notch_depth" in self.gains:
@@ -574,25 +562,6 @@ class Controller:
                 f"the bandwidth is {bare} Hz"
             )
         return lines
-
-    def _describe_cascade(self) -> str:
-        """Return the gains as a drive with a speed loop is set: speed per force error, its integral and its rate."""
-        called = self.command.mechanics
-        units = _name_rates(f"{called.place}/s", self.command.reference_unit, called)
-        drive = ", ".join(f"{name} = {self.gains[name] / self.gains['k_v']:.5g} {units[name]}"
-                          for name in ("k_p", "k_i", "k_d", "k_r"))  # fmt: skip
-        inside = f"a PI of T_v = {self.gains['T_v']:.4g} s" if "T_v" in self.gains else "a P"
-        return f"  as speeds asked of the motor's speed loop, {inside} of k_v: {drive}"
-
-    def _outer_lines(self) -> list[str]:
-        """Say what the outer loop renders."""
-        if self.outer is None:
-            return []
-        called = mechanics_of(self.outer.place_unit)
-        return [
-            f"  renders {self.outer.stiffness:.4g} {called.stiffness} and {self.outer.damping:.4g} {called.damping} at "
-            f"the link, the speed filtered with {1e3 * self.outer.velocity_filter_s:.3g} ms"
-        ]
 
     def _compensation_lines(self) -> list[str]:
         """Say what is compensated."""
@@ -626,7 +595,7 @@ class Controller:
         """Return the figures of the design plant as text: what each is, what was achieved, what was asked."""
         a = self.achieved
         limited = [
-            (row.limit.label, format_figure(row.value, row.unit), _format_allowed(row))
+            (row.limit.label, format_figure(row.value, row.unit), row.allowed_text)
             for row in list_design_figures(self.spec, self.design_loop)
         ]
         return [
@@ -645,73 +614,8 @@ class Controller:
         return [("bandwidth without prefilter", format_figure(self.bandwidth_without_prefilter_hz, "Hz"), "")]
 
 
-def name_gain_units(command: Command) -> dict[str, str]:
-    """Return the units of the gains of a law that gives efforts, by name; what is not there has none."""
-    units = _name_rates(command.effort_unit, command.reference_unit, command.mechanics)
-    if command.effort_unit == command.reference_unit:
-        units |= {"k_i": "1/s", "k_d": "s"}
-    return GAIN_UNITS | units
-
-
-def _name_rates(unit: str, measured: str, mechanics: Mechanics) -> dict[str, str]:
-    """Return the units of gains from a measured signal, its integral and rate, and a motor's speed, to some unit."""
-    ratio, seconds = divide_units(unit, measured), f"{unit_after(unit).strip()} s".strip()
-    return {
-        "k_p": ratio, "k_i": divide_units(unit, f"{measured} s"), "k_d": divide_units(seconds, measured), "k_r": ratio,
-        "k_ff": ratio, "k_v": divide_units(seconds, mechanics.place),
-    }  # fmt: skip
-
-
-def _format_allowed(row: DesignFigure) -> str:
-    if row.allowed is None:
-        return ""
-    sense = "" if row.limit.sense == "equal to" else f"{row.limit.sense} "
-    return f"{sense}{row.allowed:g} {row.unit}".rstrip()
-
-
 def _list_achieved(figures: LoopFigures) -> dict[str, Any]:
     """Return the figures of the loop that controller.json states."""
     values = {field.name: getattr(figures, field.name) for field in fields(LoopFigures)}
     left_out = _NOT_ACHIEVED if figures.other_noise_gains else (*_NOT_ACHIEVED, "other_noise_gains")
     return {name: value for name, value in values.items() if name not in left_out}
-
-
-def count_filter_samples(law: Law) -> float:
-    """Return the shortest time constant of a law, in samples, that can be a derivative's filter; infinite without one.
-
-    Such a filter is a real pole between 0 and 1, T/(T + 1) of T samples. A pole at zero is a delay, as averages over
-    samples have it, and a negative or complex one no lag at all.
-
-    Examples
-    --------
-    >>> lag = TransferFunction(num=np.array([2.0, -2.0]), den=np.array([1.0, -0.75]))
-    >>> round(count_filter_samples(Law.from_transfer_functions(lag, lag, sample_time_s=1e-3)), 9)
-    3.0
-
-    """
-    # Poles at zero are computed apart from it, far apart where they are many; their polynomial still ends in zeros.
-    polynomial = np.atleast_1d(np.poly(law.poles[law.integrators :])).real
-    poles = np.roots(np.where(np.abs(polynomial) > NO_COEFFICIENT, polynomial, 0.0))
-    lags = poles.real[(np.abs(poles.imag) < SAME_POLE) & (poles.real > SAME_POLE) & (poles.real < 1.0)]
-    return float(np.min(lags / (1.0 - lags), initial=np.inf))
-
-
-def find_integral_rate(law: Law) -> float:
-    """Return k_i/(1 + k_p), rad/s, of a law: how fast its slowest integral acts; infinite without one.
-
-    The gains are those of powers of 1/s, s = (2/T_s)(z - 1)/(z + 1): of two integrals it is the ratio of their gains.
-
-    Examples
-    --------
-    >>> pi = Gains(k_p=0.5, k_i=6.0, k_d=0.0, T_f=1e-3, k_r=1.5).law("pid", 1e-3)
-    >>> round(find_integral_rate(pi), 9)
-    4.0
-
-    """
-    m = law.integrators
-    if not m:
-        return np.inf
-    a, b, c = law.rest
-    static = float(law.d[1] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, 1]))
-    last, before = -law.b[m - 1, 1], 1.0 - static if m == 1 else -law.b[m - 2, 1]
-    return float(last / (law.sample_time_s * (before - 0.5 * m * last)))

@@ -252,6 +252,18 @@ class DisturbanceObserver:
             TransferFunction(num=gain * num, den=np.convolve(lags, den)),
         )
 
+    def to_dict(self, sample_time_s: float) -> dict[str, Any]:
+        """Return the filters, and what it takes to build it again, as they stand in controller.json."""
+        q, inverse = self.filters(sample_time_s)
+        return {
+            "T_q": self.T_q,
+            "bandwidth_hz": self.bandwidth_hz,
+            "Q": {"num": q.num, "den": q.den},
+            "Q_over_P_n": {"num": inverse.num, "den": inverse.den},
+            "kept": self.nominal.kept,
+            "inverse": [{"num": part.num, "den": part.den} for part in self.nominal.inverse],
+        }
+
     def correct(self, law: Assembly, surplus: float, sample_time_s: float) -> Assembly:
         """Return (law - Q/P_n measurement)/(1 - Q), of the inputs error and reference.
 

@@ -232,6 +232,14 @@ class DesignFigure:
     allowed: float | None
     unit: str
 
+    @property
+    def allowed_text(self) -> str:
+        """What is allowed, with its sense and unit; empty where nothing is imposed."""
+        if self.allowed is None:
+            return ""
+        sense = "" if self.limit.sense == "equal to" else f"{self.limit.sense} "
+        return f"{sense}{self.allowed:g} {self.unit}".rstrip()
+
 
 def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[DesignFigure]:
     """Return each limit of one loop's figures; of friction and of further signals only where there are, or one asks."""

@@ -41,6 +41,8 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.records import record
 
+SAME_POLE = 1e-3  # to which poles that are equal are computed
+NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
 if TYPE_CHECKING:
     import control
 
@@ -386,3 +388,45 @@ def make_static_law(gain: float, sample_time_s: float, measured: int = 1) -> Law
         a=np.zeros((0, 0)), b=np.zeros((0, 1 + measured)), c=np.zeros(0),
         d=np.array([gain, -gain] + [0.0] * (measured - 1)), sample_time_s=sample_time_s,
     )  # fmt: skip
+
+
+def count_filter_samples(law: Law) -> float:
+    """Return the shortest time constant of a law, in samples, that can be a derivative's filter; infinite without one.
+
+    Such a filter is a real pole between 0 and 1, T/(T + 1) of T samples. A pole at zero is a delay, as averages over
+    samples have it, and a negative or complex one no lag at all.
+
+    Examples
+    --------
+    >>> lag = TransferFunction(num=np.array([2.0, -2.0]), den=np.array([1.0, -0.75]))
+    >>> round(count_filter_samples(Law.from_transfer_functions(lag, lag, sample_time_s=1e-3)), 9)
+    3.0
+
+    """
+    # Poles at zero are computed apart from it, far apart where they are many; their polynomial still ends in zeros.
+    polynomial = np.atleast_1d(np.poly(law.poles[law.integrators :])).real
+    poles = np.roots(np.where(np.abs(polynomial) > NO_COEFFICIENT, polynomial, 0.0))
+    lags = poles.real[(np.abs(poles.imag) < SAME_POLE) & (poles.real > SAME_POLE) & (poles.real < 1.0)]
+    return float(np.min(lags / (1.0 - lags), initial=np.inf))
+
+
+def find_integral_rate(law: Law) -> float:
+    """Return k_i/(1 + k_p), rad/s, of a law: how fast its slowest integral acts; infinite without one.
+
+    The gains are those of powers of 1/s, s = (2/T_s)(z - 1)/(z + 1): of two integrals it is the ratio of their gains.
+
+    Examples
+    --------
+    >>> gains = TransferFunction(num=np.array([0.503, -0.497]), den=np.array([1.0, -1.0]))  # k_p 0.5, k_i 6
+    >>> pi = Law.from_transfer_functions(gains, gains, sample_time_s=1e-3)
+    >>> round(find_integral_rate(pi), 9)
+    4.0
+
+    """
+    m = law.integrators
+    if not m:
+        return np.inf
+    a, b, c = law.rest
+    static = float(law.d[1] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, 1]))
+    last, before = -law.b[m - 1, 1], 1.0 - static if m == 1 else -law.b[m - 2, 1]
+    return float(last / (law.sample_time_s * (before - 0.5 * m * last)))

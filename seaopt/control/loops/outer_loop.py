@@ -15,6 +15,7 @@ from jaxtyping import Complex, Float
 
 from seaopt.errors import ControlError, require_number
 from seaopt.records import record
+from seaopt.units import mechanics_of
 
 
 @record
@@ -105,6 +106,14 @@ class OuterLoop:
         return Impedance(
             stiffness=self.stiffness, damping=self.damping, velocity_filter_s=self.velocity_filter_s
         )  # fmt: skip
+
+    def describe(self) -> str:
+        """Return what it renders, in words."""
+        called = mechanics_of(self.place_unit)
+        return (
+            f"renders {self.stiffness:.4g} {called.stiffness} and {self.damping:.4g} {called.damping} at the link, the "
+            f"speed filtered with {1e3 * self.velocity_filter_s:.3g} ms"
+        )
 
     @property
     def pole(self) -> float:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control.laws.command import Command
-from seaopt.control.laws.controller import Controller, name_gain_units
+from seaopt.control.laws.command import Command, name_gain_units
+from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.sampled_plant import conditions

@@ -12,7 +12,7 @@ from typing import Any
 from seaopt.control import Controller, ForceMPC, ScheduledController, Scorecard, scorecard
 from seaopt.control.deploy.export import export
 from seaopt.control.impedance.scorecard import HEADS
-from seaopt.control.laws.controller import name_gain_units
+from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.laws.verdict import list_design_figures
 from seaopt.errors import FileError, SeaoptError, require_type

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control.laws.controller import count_filter_samples, find_integral_rate
 from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import LIFTABLE
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal
 from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken, shorten_blocked
-from seaopt.control.loops.law import Law
+from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.spec import MPC_LIMITS, MPCSpec
 from seaopt.errors import ControlError
