@@ -253,8 +253,14 @@ def passivity_rows(
 
     """
     port = port_of(plant, params, spec.regulated, per_effort)
-    loop, unit = weigh_passivity(port, spec.sample_time_s, spec.loop_delay_samples, f)
-    return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
+    condition = weigh_passivity(port, spec.sample_time_s, spec.loop_delay_samples, f)
+    if np.any(condition.forces):
+        raise ControlError(
+            "the force at the port does not follow from the measured one alone (an elastic screw between them), so "
+            "that passivity is not affine in the gains; measure the force at the port, or give the band to tune: "
+            "passive_band_hz"
+        )
+    return np.real(condition.unit[:, None] * np.conj(condition.loops[0][:, None] * basis)), -np.real(condition.unit)
 
 
 def is_held_stable(port: PortModel, law: Law, sample_time_s: float, delay_samples: int) -> bool:

@@ -58,6 +58,7 @@ MULTIPLIER_POINTS = 9  # corner frequencies tried
 ZAMES_FALB_AREAS = (0.5, 0.9, 0.99)
 SMALLEST_INVERSE, LARGEST_INVERSE = 1e-6, 1e6  # 1/kappa looked at, in units of the curves' own 1/slope
 MARGIN_PRECISION = 1e-2
+NO_FEEDBACK = 1e9  # weight where a multiplier shows nothing, whatever the feedback
 SIMPLEST = "circle"  # the multiplier that is 1
 WORTHWHILE = 0.9  # of the inverse: a multiplier that gains less is not looked at further
 
@@ -194,30 +195,34 @@ def _settle(
 
 @record(eq=False)
 class LoopResponses:
-    """The loop's responses at m angles and k aliases, efforts in units that make each curve's steepest slope 1."""
+    """The loop's responses at m angles and k aliases, efforts in units that make each curve's steepest slope 1.
+
+    b (`sensed`) is that of the law's feedback; or one for each of y signals, per unit of its feedback.
+    """
 
     theta: Angles
     s: Complex[np.ndarray, "m k"]
     mobility: Complex[np.ndarray, "m k p p"]
     command: Complex[np.ndarray, "m k p"]
-    sensed: Complex[np.ndarray, "m k p"]
+    sensed: Complex[np.ndarray, "m k p *y"]
     tail: Float[np.ndarray, " m"]
     order: Float[np.ndarray, " m"]
 
 
 def find_responses(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> LoopResponses:
-    """Return G_v, a (without M) and b at angles; a per unit of K without the feedback."""
+    """Return G_v, a (without M) and b at angles; b of each signal, per unit of its K, without the feedback."""
     period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
     orders = np.arange(-ALIASES, ALIASES + 1)
     rows, through = loop.sensed
     seen = np.vstack([root[:, None] * loop.velocity, rows])  # phi = slope v: the slope of phi / root is 1
     response, ports = loop.respond(theta, orders, seen), len(root)
     by_friction = root * response.by_friction
-    gains = loop.feedback(theta) if feedback else np.ones((len(rows), theta.size))
-    read = by_friction[..., ports:, :] + through * root
+    read = np.swapaxes(by_friction[..., ports:, :] + through * root, -1, -2)
+    if feedback:
+        read = np.einsum("ym,mkpy->mkp", loop.feedback(theta), read)
     return LoopResponses(
         theta=theta, s=1j * (theta[:, None] + 2 * np.pi * orders) / period, mobility=by_friction[..., :ports, :],
-        command=-response.by_motor[..., :ports], sensed=np.conj(np.einsum("ym,mkyp->mkp", gains, read)),
+        command=-response.by_motor[..., :ports], sensed=np.conj(read),
         tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
         order=ALIASES + theta / (2 * np.pi),
     )  # fmt: skip
@@ -365,28 +370,28 @@ def list_multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
 
 @record(eq=False)
 class FeedbackLimit:
-    r"""What a multiplier asks of the feedback, at m angles: abs(C_y) < level abs(1 + plant C_y).
+    r"""What a multiplier asks of the feedback C, one row per signal, at m angles: |weights C| < |1 + plants C|.
 
-    K, to which a is proportional, is :math:`C_y/(1 + P C_y)`. So :math:`\alpha = |K|^2 \alpha_1`,
-    :math:`\gamma = K \gamma_1`, and :math:`|2 + \gamma|^2 > \alpha\beta` reads
+    K, to which b is proportional, is :math:`C/(1 + P^T C)`. So :math:`\gamma = \gamma_1^T K`,
+    :math:`\beta = K^* B K`, and :math:`|2 + \gamma|^2 > \alpha\beta` reads
 
-    .. math:: |1 + (P + \tfrac12 \gamma_1) C_y| > \tfrac12 \sqrt{\alpha_1 \beta}\, |C_y| .
+    .. math:: |1 + (P + \tfrac12 \gamma_1)^T C| > \tfrac12 \sqrt{\alpha\, C^* B C} .
 
     Parameters
     ----------
-    plant : array, shape (m,)
+    plants : array, shape (y, m)
         :math:`P + \gamma_1/2`, with the loop's delay.
-    level : array, shape (m,)
-        :math:`2/\sqrt{\alpha_1 \beta}`, less what is beyond the aliases; zero where no feedback does.
+    weights : array, shape (y, y, m)
+        A root of :math:`\alpha B/4`, with what is beyond the aliases; `NO_FEEDBACK` where no feedback does.
 
     """
 
-    plant: Complex[np.ndarray, " m"]
-    level: Float[np.ndarray, " m"]
+    plants: Complex[np.ndarray, "y m"]
+    weights: Complex[np.ndarray, "y y m"]
 
 
 def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: float) -> FeedbackLimit:
-    """Return what is asked of C_y so that a multiplier shows stability for curves `factor` times as steep as they are.
+    """Return what is asked of C so that a multiplier shows stability for curves `factor` times as steep as they are.
 
     Parameters
     ----------
@@ -401,9 +406,34 @@ def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: f
 
     """
     at = find_responses(loop, theta, feedback=False)
-    through = loop.plant.response(theta / (2 * np.pi * loop.plant.sample_time_s))
+    through = loop.plant.responses(theta / (2 * np.pi * loop.plant.sample_time_s))
     weight = dict(list_multipliers(loop))[multiplier](at.s)
-    possible, alpha, beta, gamma = _form_terms(at, weight)(1.0 / factor, EVERY)
-    alpha, beta = (np.sum(terms, axis=1) + bound_rest(at, terms) for terms in (alpha, beta))
-    size = np.sqrt(alpha * beta) + bound_rest(at, gamma)
-    return FeedbackLimit(plant=through + 0.5 * np.sum(gamma, axis=1), level=np.where(possible, 2.0 / size, 0.0))
+    possible, inverse = _invert_mobility(weight, at.mobility, 1.0 / factor)
+    right = np.concatenate([(weight[..., None] * at.command)[..., None], at.sensed], axis=-1)
+    terms = np.conj(np.swapaxes(right, -1, -2)) @ (inverse @ right)
+    reach = TAIL_GROWTH * at.order**2 * at.tail
+    sums, ends = np.sum(terms, axis=1), terms[:, [0, -1]]
+    far = reach[:, None, None] * np.sum(ends, axis=1)
+    alpha = np.real(sums[:, 0, 0] + far[:, 0, 0])
+    b = alpha[:, None, None] * np.conj(sums[:, 1:, 1:] + far[:, 1:, 1:])
+    beyond = reach[:, None, None] * ends[:, :, 1:, 0]  # of gamma
+    both = np.einsum("mki,mkj->mij", np.conj(beyond), beyond)
+    # |x| + |y| <= |(sqrt(1 + e) x, sqrt(1 + 1/e) y)| for every e > 0, and is equal where e = |y|/|x|
+    share = np.sqrt(np.trace(both, axis1=1, axis2=2).real / np.trace(b, axis1=1, axis2=2).real)[:, None, None] + 1e-9
+    values, basis = np.linalg.eigh(0.25 * ((1.0 + share) * b + (1.0 + 1.0 / share) * both))
+    root = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.conj(np.swapaxes(basis, -1, -2))
+    root = np.where(possible[:, None, None], root, NO_FEEDBACK * np.eye(len(through)))
+    return FeedbackLimit(plants=through + 0.5 * sums[:, 1:, 0].T, weights=np.moveaxis(root, 0, -1))
+
+
+def _invert_mobility(
+    weight: Complex[np.ndarray, "m k"], mobility: Complex[np.ndarray, "m k p p"], inverse: float
+) -> tuple[Bool[np.ndarray, " m"], Complex[np.ndarray, "m k p p"]]:
+    """Return where all D_k are positive definite at a 1/kappa, and their inverses; the identity where not."""
+    block = weight[..., None, None] * (mobility + inverse * np.eye(mobility.shape[-1]))
+    block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
+    if block.shape[-1] == 1:  # numbers, of which LAPACK is slow
+        possible = np.all(block[..., 0, 0].real > 0.0, axis=1)
+        return possible, 1.0 / np.where(possible[:, None, None, None], block, 1.0)
+    possible = np.all(np.linalg.eigvalsh(block) > 0.0, axis=(-2, -1))
+    return possible, np.linalg.inv(np.where(possible[:, None, None, None], block, np.eye(block.shape[-1])))

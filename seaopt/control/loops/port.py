@@ -233,23 +233,31 @@ def hold_response(f: Frequencies, sample_time_s: float, delay_samples: int) -> R
     return np.sinc(f * sample_time_s) * np.exp(-2j * np.pi * f * sample_time_s * (0.5 + delay_samples))
 
 
-def weigh_passivity(
-    port: PortModel, sample_time_s: float, delay_samples: int, f: Frequencies
-) -> tuple[Response, Response]:
-    """Return G_11 with delay and hold, and G_22/abs(G_22), with which passivity is affine in the gains.
+@record(eq=False)
+class PassivityCondition:
+    r"""Re Z >= 0 as a condition on the feedback C, one row per signal: Re[unit (1 + forces C) conj(1 + loops C)] >= 0.
 
-    Raises
-    ------
-    ControlError
-        The measured force does not tell the force at the port.
+    :math:`Z/|G_{22}|` is that over :math:`|1 + \text{loops}\,C|^2`.
+
+    Parameters
+    ----------
+    unit : array, shape (m,)
+        :math:`G_{22}/|G_{22}|`.
+    loops, forces : arrays, shape (y, m)
+        :math:`G_{11}` and :math:`\Delta/G_{22}` with delay and hold, of every signal; `forces` is zero where what is
+        measured tells the force at the port, and the condition is then affine in C.
 
     """
-    response = port.response(f)
-    g11, g22 = response.motor_to_feedback, response.motion_to_port
-    size = np.abs(g11 * g22) + np.abs(response.motion_to_feedback * response.motor_to_port)
-    if np.any(np.abs(response.determinant[0]) > NOT_AFFINE * size):
-        raise ControlError(
-            "the force at the port does not follow from the measured one alone (an elastic screw between them), so "
-            "that passivity is not affine in the gains; leave the constraint out and read the band that is reported"
-        )
-    return g11 * hold_response(f, sample_time_s, delay_samples), g22 / np.abs(g22)
+
+    unit: Response
+    loops: Complex[np.ndarray, "y m"]
+    forces: Complex[np.ndarray, "y m"]
+
+
+def weigh_passivity(port: PortModel, sample_time_s: float, delay_samples: int, f: Frequencies) -> PassivityCondition:
+    """Return what passivity asks of the feedback at frequencies."""
+    response, late = port.response(f), hold_response(f, sample_time_s, delay_samples)
+    loops, own, delta = response.motor_to_read, response.motion_to_port, response.determinant
+    size = np.abs(loops * own) + np.abs(response.motion_to_read * response.motor_to_port)
+    delta = np.where(np.abs(delta) > NOT_AFFINE * size, delta, 0.0)
+    return PassivityCondition(unit=own / np.abs(own), loops=loops * late, forces=delta * late / own)

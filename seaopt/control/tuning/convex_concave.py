@@ -15,7 +15,8 @@ one of L, 1 - L, C_y, P C_r, becomes
 .. math:: \mathrm{Re}\, e^{-j \arg X_k} X(\theta) \le M \rho(\theta),
 
 one side of the disk, whose other points a trust region keeps in reach. Passivity of the port, Re
-conj(u) (1 + G C_y) >= 0 with u and G known, is affine as it stands. The objective
+conj(u) (1 + G C_y) >= 0 with u and G known, is affine as it stands where the regulated force tells that at the port;
+with further signals it is linearised. The objective
 :math:`\int |S|\, d\ln f \le \int d\ln f / \rho` is majorised by a convex function, of which the program takes value,
 gradient and curvature; the peak of :math:`|C_y S|` enters by its own rows. Bandwidth is a linearised equality. One
 slack, at a price, is added to every row, so that the program always has a solution and a start that breaks limits
@@ -45,6 +46,7 @@ from seaopt.control.tuning.optimisation_problem import (
     Grid,
     LawNumbers,
     LawResponse,
+    Path,
     Task,
     choose_prominent,
     use_disc,
@@ -185,18 +187,29 @@ def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> _LinearLimits:
     if task.port is not None:
         index = choose_near(usage[PASSIVE])
         used, column = usage[PASSIVE].ravel()[index], index % grid.f.size
-        turned, one = np.conj(grid.unit[column]) * grid.port[column], 1.0 + grid.port[column] * law.law.c_y[column]
-        slope = -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * np.abs(one)[:, None])
-        rows.add(used, slope)
+        (one, by_one), (top, by_top) = (_change_path(path.at(column), law, column) for path in (grid.port, grid.force))
+        slope = np.real(grid.unit[column] * (by_top * np.conj(one) + top * np.conj(by_one))) / np.abs(top * one)
+        rows.add(used, -slope.T / (1.0 - task.spec.reserve))
     if FRICTION in usage:
         index = choose_near(usage[FRICTION])
-        used, column, p = usage[FRICTION].ravel()[index], index % grid.f.size, grid.friction_plant.ravel()[index]
-        c_y, by_y = law.law.c_y[column], law.by_y[:, column]
-        one = 1.0 + p * c_y
-        near = _differentiate_size(one, p * by_y) / np.abs(one)[:, None]
-        rows.add(used, used[:, None] * (_differentiate_size(c_y, by_y) / np.abs(c_y)[:, None] - near))
+        used, (row, column) = usage[FRICTION].ravel()[index], np.divmod(index, grid.f.size)
+        one, by_one = _change_path(grid.friction.at((row, column)), law, column)
+        parts, by_parts = _change_path(grid.friction_size.at((row, slice(None), column)), law, column)
+        relative = np.real(np.sum(np.conj(parts) * by_parts, axis=-1)) / np.sum(np.abs(parts) ** 2, axis=-1)
+        near = _differentiate_size(one, by_one) / np.abs(one)[:, None]
+        rows.add(used, used[:, None] * (relative.T - near))
     _add_bandwidth(task, grid, law, rows)
     return rows
+
+
+def _change_path(
+    path: Path, law: _Affine, column: Int[np.ndarray, " c"]
+) -> tuple[Complex[np.ndarray, "c ..."], Complex[np.ndarray, "g c ..."]]:
+    """Return a path's sums at c points, of one row or one per signal, and their derivatives by the g gains."""
+    c_y, c_v, by_y, by_v = law.law.c_y[column], law.law.c_v[column], law.by_y[:, column], law.by_v[:, column]
+    if path.y.ndim > 1:
+        c_y, c_v, by_y, by_v = (part[..., None] for part in (c_y, c_v, by_y, by_v))
+    return path.add_up(c_y, c_v), path.change(by_y, by_v)
 
 
 def _differentiate_curve(

@@ -14,13 +14,14 @@ of given numbers of points is built once and used for every plant and specificat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Float, Int
 
 from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
@@ -48,6 +49,7 @@ from seaopt.control.tuning.optimisation_problem import (
     Grid,
     LawNumbers,
     LawResponse,
+    Path,
     Task,
     choose_prominent,
 )
@@ -110,6 +112,10 @@ class _Complex:
     def conjugate(self) -> _Complex:
         """Return the conjugate."""
         return _Complex(self.re, -self.im)
+
+    def at(self, where: slice) -> _Complex:
+        """Return some of the rows."""
+        return _Complex(self.re[where], self.im[where])
 
 
 def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNumbers:
@@ -190,17 +196,17 @@ class _Points(NamedTuple):
 @lru_cache(maxsize=32)
 def _build_program(
     quadrature: int, kinds: tuple[str, ...], observer: bool, notch: bool, noise: bool, discs: bool, paths: bool,
-    gains: int, inside: bool, prefilter: str,
+    gains: int, inside: bool, prefilter: str, signals: int,
 ) -> tuple[Any, list[str]]:  # fmt: skip
     """Return the IPOPT solver and the names of its data, in order."""
-    passive = PASSIVE in kinds
+    passive, tops = PASSIVE in kinds, POINTS_PER_LIMIT * ((PASSIVE in kinds) + signals * (FRICTION in kinds))
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
     complex_data = ("p", "q", "kept", "inverse", *(("fixed", "speed", "sense") if paths else ()))
     shapes = {f"{name}_{part}": total for name in complex_data for part in ("re", "im")} | {
         "weight": quadrature, "ln_level": n, "at": 2 * len(complex_data), "ts": 1, "kff": 1, "scale": 14,
         "linear": LINEAR_LIMITS * gains, "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
-    }  # fmt: skip
+    } | {f"top_{name}_{part}": tops for name in ("fixed", "y", "v") for part in ("re", "im")}  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
     v, t, slack = ca.MX.sym("v", 14), ca.MX.sym("t"), ca.MX.sym("slack")
     x = v * data["scale"]
@@ -222,20 +228,29 @@ def _build_program(
             loop, c_v = loop + (at["fixed"] - 1.0) + through * at["speed"], through * at["sense"]
         return _Points(p=at["p"], c_y=c_y, c_r=c_r, c_v=c_v, loop=loop)
 
-    names = [name for name in shapes if name.endswith(("_re", "_im"))]
+    names = [f"{name}_{part}" for name in complex_data for part in ("re", "im")]
     p, c_y, c_r, c_v, open_loop = law({name: data[name][:n] for name in names})
     distance = (open_loop + 1.0).square() + SMOOTHING
     slices = {kind: slice(POINTS_PER_LIMIT * i, POINTS_PER_LIMIT * (i + 1)) for i, kind in enumerate(kinds)}
+
+    def add_up(number: int, where: slice) -> _Complex:
+        """Return the sums of a block of `Path`s on the law at the points of a limit."""
+        rows = slice(POINTS_PER_LIMIT * number, POINTS_PER_LIMIT * (number + 1))
+        fixed, y, v = (_Complex(data[f"top_{k}_re"][rows], data[f"top_{k}_im"][rows]) for k in ("fixed", "y", "v"))
+        return fixed + y * c_y.at(where) + (v * c_v.at(where) if paths else 0.0)
+
     usage: dict[str, Any] = {}
     for kind, where in slices.items():
-        if kind == PASSIVE:  # P is the port's loop here
+        if kind == PASSIVE:  # the plant is the port here
             u, one = _Complex(data["unit"][:POINTS_PER_LIMIT], data["unit"][POINTS_PER_LIMIT:]), open_loop + 1.0
-            cosine = (u.re * one.re[where] + u.im * one.im[where]) / ca.sqrt(distance[where])
+            top = add_up(0, where)
+            turned = u * top * one.at(where).conjugate()
+            cosine = turned.re / ca.sqrt((top.square() + SMOOTHING) * distance[where])
             usage[kind] = (1 - cosine) / ca.exp(data["ln_level"][where]) - 1
             continue
-        if kind == FRICTION:  # a noise gain, on a plant of its own
-            size = (c_y.square()[where] + SMOOTHING) / distance[where]
-            usage[kind] = 0.5 * ca.log(size) - data["ln_level"][where]
+        if kind == FRICTION:  # a noise gain, weighted, on a plant of its own
+            size = sum(add_up(passive + k, where).square() for k in range(signals))
+            usage[kind] = 0.5 * ca.log((size + SMOOTHING) / distance[where]) - data["ln_level"][where]
             continue
         curve = CURVES[kind]
         if discs:
@@ -303,21 +318,33 @@ def _solve(
 ) -> LawNumbers | None:
     """Solve the program on the chosen points, numbers within a factor; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    m, kinds, passive, friction = grid.f.size, tuple(grid.levels), task.port is not None, grid.friction_plant.size > 0
+    m, kinds, passive, friction = grid.f.size, tuple(grid.levels), task.port is not None, grid.friction.y.size > 0
     flat = np.concatenate([chosen[kind] for kind in kinds])
     radii = grid.discs.ravel()[flat]
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
     fixed, speed = grid.fixed.ravel()[flat], grid.speed.ravel()[flat]
     levels = [grid.levels[kind][chosen[kind] % m] for kind in kinds]
+    bottoms: list[Path] = []  # of the limits whose plant is none of the task's
+    tops: list[Path] = []
     if passive:
         at_port = chosen[PASSIVE]
         levels.append(np.full(at_port.size, 1.0 - spec.reserve))
-        columns, p = np.concatenate([columns, at_port]), np.concatenate([p, grid.port[at_port]])
-        unit = np.where(grid.unit[at_port] == 0.0, 1.0, grid.unit[at_port])  # outside the band nothing is asked
+        columns, unit = np.concatenate([columns, at_port]), grid.unit[at_port]
+        unit = np.where(unit == 0.0, 1.0, unit)  # outside the band nothing is asked
+        bottoms.append(grid.port.at(at_port))
+        tops.append(grid.force.at(at_port))
     if friction:
-        last = chosen[FRICTION]
-        levels.append(grid.friction_level.ravel()[last])
-        columns, p = np.concatenate([columns, last % m]), np.concatenate([p, grid.friction_plant.ravel()[last]])
+        row, column = np.divmod(chosen[FRICTION], m)
+        levels.append(np.ones(column.size))
+        columns = np.concatenate([columns, column])
+        bottoms.append(grid.friction.at((row, column)))
+        tops += [grid.friction_size.at((row, k, column)) for k in range(grid.friction_size.y.shape[1])]
+    sense = np.zeros_like(grid.q) if task.speed_loop is None else task.speed_loop.sense(grid.q, spec.sample_time_s)
+    if bottoms:
+        own = sense[columns[p.size :]]
+        p = np.concatenate([p, *(path.y for path in bottoms)])
+        fixed = np.concatenate([fixed, *(path.fixed for path in bottoms)])
+        speed = np.concatenate([speed, own * np.concatenate([path.v for path in bottoms])])
     radii = np.concatenate([radii, np.zeros(columns.size - radii.size)]) if np.any(grid.discs) else np.zeros(0)
     weights, law = np.zeros(0), task.respond(grid, start)
     if not noise:
@@ -327,8 +354,8 @@ def _solve(
         worst = np.resize(np.argsort(-_integrate_sensitivity(task, grid, law))[:WORST_PLANTS], WORST_PLANTS)
         columns = np.concatenate([columns, np.tile(padded, WORST_PLANTS)])
         p, fixed, speed = (
-            np.concatenate([_pad(part, p.size, fill), whole[worst][:, padded].ravel()])
-            for part, whole, fill in ((p, grid.p, 0.0), (fixed, grid.fixed, 1.0), (speed, grid.speed, 0.0))
+            np.concatenate([part, whole[worst][:, padded].ravel()])
+            for part, whole in ((p, grid.p), (fixed, grid.fixed), (speed, grid.speed))
         )
     at = task.find_bandwidth(grid)
     low, high = task.bounds(start)
@@ -349,21 +376,19 @@ def _solve(
     one = [z[at] for z in (grid.p[0], grid.q, grid.kept, grid.inverse)]
     paths = grid.reads_more
     if paths:
-        sense = np.zeros_like(grid.q)
-        if task.speed_loop is not None:
-            sense = task.speed_loop.sense(grid.q, spec.sample_time_s)
-        every += [_pad(fixed, columns.size, 1.0), _pad(speed, columns.size, 0.0), sense[columns]]
+        every += [fixed, speed, sense[columns]]
         one += [grid.fixed[0, at], grid.speed[0, at], sense[at]]
     parts = [part for z in every for part in (np.real(z), np.imag(z))]
     data = [
         *parts, weights, np.log(np.concatenate(levels)),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
         (linear * scale[gains] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit), radii,
+        *_stack(tops),
     ]  # fmt: skip
     solver, _ = _build_program(
         weights.size, (*kinds, *([PASSIVE] * passive), *([FRICTION] * friction)), task.nominal is not None,
         spec.notch is not None, noise, radii.size > 0, paths, gains.stop, bool(start[SPEED_RATE] > 0.0),
-        "" if spec.reference_filter is None else spec.reference_filter.order,
+        "" if spec.reference_filter is None else spec.reference_filter.order, grid.friction_size.y.shape[1],
     )  # fmt: skip
     used = max(float(np.max(curve)) for curve in task.usage(grid, law).values())
     value = task.objective(grid, law)
@@ -382,9 +407,10 @@ def _solve(
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 
 
-def _pad(values: Complex[np.ndarray, " k"], count: int, fill: float) -> Complex[np.ndarray, " n"]:
-    """Return values followed by as many of another as make up a count."""
-    return np.concatenate([values, np.full(count - values.size, fill, dtype=complex)])
+def _stack(paths: Sequence[Path]) -> list[Float[np.ndarray, " n"]]:
+    """Return real and imaginary parts of the paths' fixed parts, then those of y, and of v."""
+    whole = [np.concatenate([np.zeros(0), *(getattr(path, name) for path in paths)]) for name in ("fixed", "y", "v")]
+    return [part for values in whole for part in (np.real(values), np.imag(values))]
 
 
 def _integrate_sensitivity(task: Task, grid: Grid, law: LawResponse) -> Float[np.ndarray, " n"]:

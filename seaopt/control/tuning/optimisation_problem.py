@@ -12,9 +12,9 @@ reserve, these are for the rows of today
     \qquad \text{(design plant)}
 
 with :math:`\alpha` the disk margin. The last is equal to 1 at :math:`f_b`. In the passive band there is a further one,
-1 - Re Z/abs(Z) of the design plant's port impedance (`seaopt.control.laws.passivity`), the gap that the reserve leaves
-taken off; and where a friction margin is asked for, one of each plant with friction, the test with one multiplier
-(`seaopt.control.loops.absolute_stability.FeedbackLimit`): a noise gain, on another plant and below a level of its own.
+1 - Re Z/abs(Z) of the design plant's port impedance (`seaopt.control.loops.port.PassivityCondition`), the gap that the
+reserve leaves taken off; and where a friction margin is asked for, one of each plant with friction, the test with one
+multiplier (`seaopt.control.loops.absolute_stability.FeedbackLimit`): a noise gain, weighted, on another plant.
 
 The reference's weights are counted from feedforward and feedback of the error: with :math:`w_r = 1/P(0) + k_p - k_r`
 and :math:`w_c = (1 - c) k_d`,
@@ -118,6 +118,27 @@ K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_
 
 
 @record(eq=False)
+class Path:
+    """A sum over the signals that a law reads, affine in its feedback: fixed + y C_y + v C_v, C_v of a speed loop."""
+
+    fixed: Complex[np.ndarray, "..."]
+    y: Complex[np.ndarray, "..."]
+    v: Complex[np.ndarray, "..."]
+
+    def add_up(self, c_y: Complex[np.ndarray, "..."], c_v: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
+        """Return the sum of a law."""
+        return self.fixed + self.y * c_y + self.v * c_v
+
+    def change(self, by_y: Complex[np.ndarray, "..."], by_v: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
+        """Return the change of the sum with those of C_y and C_v."""
+        return self.y * by_y + self.v * by_v
+
+    def at(self, index: Any) -> Path:
+        """Return some of the frequencies, or rows and frequencies."""
+        return Path(fixed=self.fixed[index], y=self.y[index], v=self.v[index])
+
+
+@record(eq=False)
 class Grid:
     """Responses at frequencies.
 
@@ -136,10 +157,12 @@ class Grid:
         Which of the task's plants they are.
     kept, inverse
         The nominal plant's parts at q; zeros without an observer.
-    port, unit
-        The loop with link 2 held but for C_y, and G_22/abs(G_22), in the passive band; zeros elsewhere.
-    friction_plant, friction_level : arrays, shape (frictions, m)
-        Plant and level of a `FeedbackLimit` for each plant with friction of which a margin is aimed at.
+    port, force : Path
+        The loop with link 2 held and the force on it, of a `PassivityCondition`, in the passive band; 1 elsewhere.
+    unit
+        G_22/abs(G_22) there; zero elsewhere.
+    friction, friction_size : Path, shapes (frictions, m) and (frictions, signals, m)
+        1 + plants C and weights C of a `FeedbackLimit` for each plant with friction of which a margin is aimed at.
     levels : mapping of limit to array, shape (m,)
         Of every limit that is looked at.
 
@@ -154,10 +177,11 @@ class Grid:
     rows: tuple[int, ...]
     kept: Complex[np.ndarray, " m"]
     inverse: Complex[np.ndarray, " m"]
-    port: Complex[np.ndarray, " m"]
+    port: Path
+    force: Path
     unit: Complex[np.ndarray, " m"]
-    friction_plant: Complex[np.ndarray, "k m"]
-    friction_level: Float[np.ndarray, "k m"]
+    friction: Path
+    friction_size: Path
     levels: Mapping[str, Float[np.ndarray, " m"]]
 
     @property
@@ -170,9 +194,9 @@ class Grid:
         return Grid(
             f=self.f[index], q=self.q[index], p=self.p[:, index], discs=self.discs[:, index],
             fixed=self.fixed[:, index], speed=self.speed[:, index], rows=self.rows,
-            kept=self.kept[index], inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
-            friction_plant=self.friction_plant[:, index],
-            friction_level=self.friction_level[:, index],
+            kept=self.kept[index], inverse=self.inverse[index], port=self.port.at(index), force=self.force.at(index),
+            unit=self.unit[index], friction=self.friction.at((..., index)),
+            friction_size=self.friction_size.at((..., index)),
             levels={name: level[index] for name, level in self.levels.items()},
         )  # fmt: skip
 
@@ -427,22 +451,36 @@ class Task:
         rows = tuple(range(len(self.plants)) if rows is None else rows)
         p, fixed, speed = (np.array(part) for part in zip(*(self._respond(row, f, q) for row in rows), strict=True))
         discs = np.array([measured_discs(self.plants[row], f) for row in rows])
-        port, unit = np.zeros(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
+        unit = np.zeros(f.size, dtype=complex)
+        count = 1 + len(self.further)
+        loops, forces = np.zeros((2, count, f.size), dtype=complex)
         if self.port is not None and self.spec.passive_band_hz is not None:
             low, high = self.spec.passive_band_hz
             inside = np.flatnonzero((f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9)))
-            port[inside], unit[inside] = weigh_passivity(
-                self.port, self.spec.sample_time_s, self.spec.loop_delay_samples, f[inside]
-            )  # fmt: skip
-        asked = [one for one in self.frictions if one.multiplier and one.plant in rows]
-        plants, levels = np.zeros((len(asked), f.size), dtype=complex), np.zeros((len(asked), f.size))
-        for k, one in enumerate(asked):
-            plants[k], levels[k] = self._limit_feedback(one, f)
+            asked = weigh_passivity(self.port, self.spec.sample_time_s, self.spec.loop_delay_samples, f[inside])
+            unit[inside], loops[:, inside], forces[:, inside] = asked.unit, asked.loops, asked.forces
+        aimed = [one for one in self.frictions if one.multiplier and one.plant in rows]
+        plants = np.zeros((len(aimed), count, f.size), dtype=complex)
+        weights = np.zeros((len(aimed), count, count, f.size), dtype=complex)
+        for k, one in enumerate(aimed):
+            plants[k], weights[k] = self._limit_feedback(one, f)
         return Grid(
-            f=f, q=q, p=p, discs=discs, fixed=fixed, speed=speed, rows=rows, kept=kept, inverse=inverse, port=port,
-            unit=unit, friction_plant=plants, friction_level=levels,
+            f=f, q=q, p=p, discs=discs, fixed=fixed, speed=speed, rows=rows, kept=kept, inverse=inverse,
+            port=self._feed(loops, 1.0, f), force=self._feed(forces, 1.0, f), unit=unit,
+            friction=self._feed(plants, 1.0, f), friction_size=self._feed(weights, 0.0, f),
             levels={name: self.level(name, f) for name in self.curve_names},
         )  # fmt: skip
+
+    def _feed(self, signals: Complex[np.ndarray, "... y m"], start: float, f: Float[np.ndarray, " m"]) -> Path:
+        """Return a number and a weighted sum over the signals fed back, of one row per signal."""
+        y, none = signals[..., 0, :], np.zeros_like(signals[..., 0, :])
+        fixed, v = none + start, none
+        for row, one in enumerate(self.further, start=1):
+            if isinstance(one, SpeedLoop):
+                v = signals[..., row, :]
+            else:
+                fixed = fixed + signals[..., row, :] * one.response(f, self.spec.sample_time_s)
+        return Path(fixed=fixed, y=y, v=v)
 
     def _respond(
         self, row: int, f: Float[np.ndarray, " m"], q: Complex[np.ndarray, " m"]
@@ -462,17 +500,17 @@ class Task:
 
     def _limit_feedback(
         self, aimed: PlantWithFriction, f: Float[np.ndarray, " m"]
-    ) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Return plant and level of what a multiplier asks; nothing is asked below the test's lowest angle."""
+    ) -> tuple[Complex[np.ndarray, "y m"], Complex[np.ndarray, "y y m"]]:
+        """Return plants and weights of what a multiplier asks; nothing is asked below the test's lowest angle."""
         slope, own = self.spec.level(FRICTION), aimed.loop.slopes
         assert slope is not None, "it belongs to a specification with a friction margin"
         factor = slope * (1.0 + self.spec.reserve + MARGIN_RESERVE) / float(np.min(own[own > 0.0]))
-        theta = 2 * np.pi * f * self.spec.sample_time_s
+        theta, count = 2 * np.pi * f * self.spec.sample_time_s, 1 + len(self.further)
         asked = theta >= LOWEST_ANGLE
         limit = limit_feedback(aimed.loop, theta[asked], aimed.multiplier, factor)
-        plant, level = np.zeros(f.size, dtype=complex), np.full(f.size, NO_LIMIT)
-        plant[asked], level[asked] = limit.plant, np.maximum(limit.level, 1.0 / NO_LIMIT)
-        return plant, level
+        plants, weights = np.zeros((count, f.size), dtype=complex), np.zeros((count, count, f.size), dtype=complex)
+        plants[:, asked], weights[:, :, asked] = limit.plants, limit.weights
+        return plants, weights
 
     def terms(self, grid: Grid, x: LawNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
@@ -508,7 +546,7 @@ class Task:
         for position in (position for position, row in enumerate(grid.rows) if row < self.design_states):
             for name, curve in self.design_usage(grid, position, law).items():
                 rows.setdefault(name, []).append(curve)
-        everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | self.friction_usage(grid, law.c_y)
+        everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | self.friction_usage(grid, law)
         return everywhere | {name: np.array(curves) for name, curves in rows.items()}
 
     def curves(
@@ -542,7 +580,7 @@ class Task:
         """Return the usage of the limits that one of the grid's plants keeps as the design plant, sliding or stuck."""
         row = grid.rows[position]
         out = self.curves(self.design_limits(row), grid, position, law)
-        return out | (self.port_usage(grid, law.c_y) if row == 0 else {})
+        return out | (self.port_usage(grid, law) if row == 0 else {})
 
     def design_limits(self, row: int) -> tuple[str, ...]:
         """Return the limits that a plant keeps as the design plant, sliding or stuck; none if it is another."""
@@ -550,20 +588,21 @@ class Task:
             return ()
         return tuple(name for name in SCOPES["design plant"] if row == 0 or BY_NAME[name].stuck_too)
 
-    def port_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
+    def port_usage(self, grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
         """Return the usage of the passive band, where one is asked for."""
         if self.port is None:
             return {}
-        one = 1.0 + grid.port * c_y
-        cosine = np.real(grid.unit * np.conj(one)) / np.maximum(np.abs(one), 1e-300)
+        turned = grid.force.add_up(law.c_y, law.c_v) * np.conj(grid.port.add_up(law.c_y, law.c_v))
+        cosine = np.real(grid.unit * turned) / np.maximum(np.abs(turned), 1e-300)
         return {PASSIVE: np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)}
 
-    def friction_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
+    def friction_usage(self, grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
         """Return the usage of the friction margins aimed at, of each law one row per plant, where there are any."""
-        if not grid.friction_plant.size:
+        if not grid.friction.y.size:
             return {}
-        own = c_y[..., None, :]
-        return {FRICTION: np.abs(own) / (grid.friction_level * np.abs(1.0 + grid.friction_plant * own))}
+        c_y = law.c_y[..., None, :]
+        size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], law.c_v), axis=-2)
+        return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, law.c_v)), 1e-300)}
 
     def aim_multipliers(self, x: LawNumbers, multiplier: str = "") -> Task:
         """Return the task with one multiplier per plant with friction: that named, or the one that shows most of x."""

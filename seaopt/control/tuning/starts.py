@@ -363,12 +363,12 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
     task, grid = scan.task, scan.grid
     weights, worst = task.weights(grid.f), np.zeros(c_y.shape[0])
     value, turned = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
-    for margins in task.friction_usage(grid, c_y).values():
+    for margins in task.friction_usage(grid, scan.respond(c_y, c_y)).values():
         worst = np.max(margins, axis=(1, 2))
     for row, p in enumerate(grid.p):
         own = tuple(name for name in task.design_limits(row) if name not in TRACKING)
         usage = task.curves(SCOPES["every plant"] + own, grid, row, scan.respond(c_y, c_y))
-        usage |= task.port_usage(grid, c_y) if row == 0 else {}
+        usage |= task.port_usage(grid, scan.respond(c_y, c_y)) if row == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = scan.rest[row] + p * c_y

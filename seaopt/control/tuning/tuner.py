@@ -132,8 +132,8 @@ def tune(
     ControlError
         The measured output does not respond to the motor at 0 Hz, a draw names a parameter that no plant has, delay or
         current limit make the request impossible for every controller, a passive band is required of a plant without
-        a port at link 2, or with an elastic screw before it, or a friction margin where friction acts on the measured
-        output itself or the plant is not linear besides it.
+        a port at link 2, or a friction margin where friction acts on the measured output itself or the plant is not
+        linear besides it.
 
     Examples
     --------
@@ -303,7 +303,7 @@ def make_task(
 
 
 def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
-    """Refuse a cascade whose second signal is not the motor's speed, or of which a limit is asked that it has not.
+    """Refuse a cascade whose second signal is not the motor's speed.
 
     Raises
     ------
@@ -318,7 +318,6 @@ def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
             f'measured = {[first, name]}: a cascade reads the motor\'s speed second, and "{name}" is not that of '
             f'{design.name}; give measured = ["{first}", "{speed}"]'
         )
-    _refuse_limits(spec, 'structure = "cascade"', 'give structure = "pid"')
 
 
 def _find_link(

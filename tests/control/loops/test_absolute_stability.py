@@ -237,7 +237,7 @@ def read_multiplier(name):
 
 @pytest.mark.parametrize("factor", [0.1, 10.0, *(pytest.param(f, marks=pytest.mark.slow) for f in (1.0, 100.0))])
 def test_what_a_multiplier_asks_of_the_feedback_is_the_circle_criterion(factor):
-    """|C_y| below level |1 + plant C_y| at an angle, for laws and multipliers of every kind."""
+    """|weight C_y| below |1 + plant C_y| at an angle, for laws and multipliers of every kind."""
     rng, theta = np.random.default_rng(1), np.linspace(0.01, 3.1, 20)
     agreed = []
     for _ in range(5):
@@ -245,7 +245,7 @@ def test_what_a_multiplier_asks_of_the_feedback_is_the_circle_criterion(factor):
         loop, c_y = loop_of(law, slope=6250.0), law.measurement_response(theta / (2 * np.pi * PERIOD))
         for name, multiplier in list(proof.list_multipliers(loop))[::7]:
             limit = proof.limit_feedback(loop, theta, name, factor)
-            kept = np.abs(c_y) < limit.level * np.abs(1.0 + limit.plant * c_y)
+            kept = np.abs(limit.weights[0, 0] * c_y) < np.abs(1.0 + limit.plants[0] * c_y)
             value = evaluate_circle(c_y, multiplier, factor * 6250.0, theta)
             assert np.all(value[kept] > 0.0), name
             assert np.all(kept[value > 0.05]), name
