@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from seaopt.control.tuning.frequencies import choose_prominent
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     FRICTION,
@@ -48,7 +49,6 @@ from seaopt.control.tuning.optimisation_problem import (
     LawResponse,
     Path,
     Task,
-    choose_prominent,
     use_disc,
 )
 from seaopt.records import record

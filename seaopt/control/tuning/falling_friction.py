@@ -18,14 +18,9 @@ import numpy as np
 from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.sampled_plant import sample_linear
 from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.frequencies import count_growing, place_frequencies
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import (
-    LawNumbers,
-    PlantWithFriction,
-    Task,
-    count_growing,
-    place_frequencies,
-)
+from seaopt.control.tuning.optimisation_problem import LawNumbers, PlantWithFriction, Task
 from seaopt.control.tuning.solution import solve
 
 RESOLUTION = 1.03  # ratio to which the share is found

@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
 from seaopt.control.loops.measured.loop import leave_positive
+from seaopt.control.tuning.frequencies import choose_prominent
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     DAMPING,
@@ -51,7 +52,6 @@ from seaopt.control.tuning.optimisation_problem import (
     LawResponse,
     Path,
     Task,
-    choose_prominent,
 )
 from seaopt.executors import IPOPT
 

@@ -56,7 +56,7 @@ from seaopt.control.laws.limits import (
     Scope,
 )
 from seaopt.control.laws.passivity import measure_port
-from seaopt.control.laws.spec import HIGHEST_CORNER, LOWEST_HZ, ControllerSpec
+from seaopt.control.laws.spec import HIGHEST_CORNER, ControllerSpec
 from seaopt.control.laws.structures import (
     DisturbanceObserver,
     Gains,
@@ -78,7 +78,7 @@ from seaopt.control.loops.absolute_stability import (
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.loop import GROWING, Loop, LoopFigures
+from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import PortModel, weigh_passivity
@@ -89,10 +89,6 @@ from seaopt.plants.roles import Friction
 from seaopt.records import record
 
 OBJECTIVE_HZ = 0.1  # disturbances count from here
-FREQUENCIES = 300
-SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
-MORE_FREQUENCIES = 300  # about lightly damped modes
-LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
 NO_LIMIT = 1e9
 NO_FLOOR = 1e-9
 NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
@@ -717,67 +713,3 @@ def use_disc(
 def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
     """Return the radii of the discs around a plant's responses; zeros of a model."""
     return plant.discs(f) if isinstance(plant, MeasuredPlant) else np.zeros(f.size)
-
-
-def find_light_modes(plant: DigitalPlant | MeasuredPlant) -> list[tuple[float, float]]:
-    """Return frequency (Hz) and the damping ratio's size of the modes that are lightly damped, or grow slowly.
-
-    Of a measured plant there are none: its own frequencies are looked at instead.
-    """
-    if isinstance(plant, MeasuredPlant):
-        return []
-    values = np.linalg.eigvals(plant.a).astype(complex)
-    poles = np.log(values[np.imag(values) > 0.0]) / plant.sample_time_s  # a delay's are zero
-    modes = [(abs(p) / (2 * np.pi), abs(p.real) / abs(p)) for p in poles]
-    return [(float(f), float(max(zeta, 1e-9))) for f, zeta in modes if zeta < LIGHT_DAMPING]
-
-
-def count_growing(plant: DigitalPlant | MeasuredPlant) -> int:
-    """Return how many of a plant's poles grow without control; none of a measured one, whose log is bounded."""
-    return (
-        0 if isinstance(plant, MeasuredPlant) else int(np.count_nonzero(np.abs(np.linalg.eigvals(plant.a)) > GROWING))
-    )
-
-
-def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
-    """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with f_b and all bands' ends in it.
-
-    About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
-    what falls between is found afterwards.
-    """
-    spec, nyquist = task.spec, 0.5 / task.spec.sample_time_s
-    near: list[Float[np.ndarray, " _"]] = []
-    for f, zeta in {mode for plant in task.plants for mode in find_light_modes(plant)}:
-        reach = max(4 * zeta, 0.02) * f
-        near.append(np.linspace(f - reach, f + reach, int(min(2 * reach / max(zeta * f / 4, 1e-4), 80))))
-    extra = np.sort(np.concatenate([np.zeros(0), *near]))
-    extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
-    for plant in task.plants:
-        if isinstance(plant, MeasuredPlant):
-            extra = np.concatenate([extra, plant.f[:: 1 + plant.f.size // MORE_FREQUENCIES]])
-    slow, base = (
-        np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW_FREQUENCIES),
-        np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES),
-    )
-    ends = [spec.bandwidth_hz, *(spec.passive_band_hz or ())]
-    ends += [end for name in CURVES for end in task.band_hz(name)]
-    grid = np.unique(np.concatenate([slow[:-1], base, extra, ends]))
-    return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
-
-
-def choose_prominent(usage: Float[np.ndarray, "k m"], count: int) -> Int[np.ndarray, " c"]:
-    """Return flat indices of up to `count` points that matter most: local maxima first, then the largest of others.
-
-    Of the others every third is looked at: neighbours say the same.
-    """
-    rows, m = usage.shape
-    wide = np.full((rows, m + 2), -np.inf)
-    wide[:, 1:-1] = usage
-    top = (usage >= wide[:, :-2]) & (usage >= wide[:, 2:])
-    rank = np.where(
-        top, usage + 10.0 * (usage > 0.5), -np.inf
-    )  # a maximum outranks what is none, if it is near its limit
-    rank[:, ::3] = np.maximum(rank[:, ::3], usage[:, ::3])
-    flat = rank.ravel()
-    count = min(count, int(np.count_nonzero(np.isfinite(flat))))
-    return np.argpartition(-flat, count - 1)[:count]

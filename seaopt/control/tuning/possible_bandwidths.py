@@ -15,8 +15,9 @@ import numpy as np
 
 from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_limits
 from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task
 from seaopt.control.tuning.solution import recheck
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, ignore

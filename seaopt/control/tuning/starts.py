@@ -34,6 +34,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control.laws.limits import INTEGRAL_RAD_S
 from seaopt.control.laws.spec import HIGHEST_CORNER
 from seaopt.control.laws.structures import CASCADE, LawTerms
+from seaopt.control.tuning.frequencies import count_growing, find_light_modes
 from seaopt.control.tuning.optimisation_problem import (
     K_D,
     K_I,
@@ -54,8 +55,6 @@ from seaopt.control.tuning.optimisation_problem import (
     LawNumbers,
     LawResponse,
     Task,
-    count_growing,
-    find_light_modes,
 )
 from seaopt.records import record
 

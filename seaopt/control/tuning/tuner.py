@@ -52,6 +52,7 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.easing import ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
+from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.optimisation_problem import (
     FRICTION,
     OBJECTIVE_HZ,
@@ -60,7 +61,6 @@ from seaopt.control.tuning.optimisation_problem import (
     PlantWithFriction,
     Task,
     close_plant,
-    count_growing,
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
 from seaopt.control.tuning.solution import solve

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control.tuning.convex_concave import linearise_law
-from seaopt.control.tuning.optimisation_problem import place_frequencies
+from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.starts import find_starts
 from seaopt.control.tuning.tuner import make_task
 

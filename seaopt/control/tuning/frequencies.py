@@ -1,0 +1,81 @@
+"""The frequencies that the tuner looks at: a grid that resolves light modes, and the points of it that matter most."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.control.laws.spec import LOWEST_HZ
+from seaopt.control.loops.loop import GROWING
+from seaopt.control.loops.measured.plant import MeasuredPlant
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.tuning.optimisation_problem import CURVES, OBJECTIVE_HZ, Task
+
+FREQUENCIES = 300
+SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
+MORE_FREQUENCIES = 300  # about lightly damped modes
+LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
+
+
+def find_light_modes(plant: DigitalPlant | MeasuredPlant) -> list[tuple[float, float]]:
+    """Return frequency (Hz) and the damping ratio's size of the modes that are lightly damped, or grow slowly.
+
+    Of a measured plant there are none: its own frequencies are looked at instead.
+    """
+    if isinstance(plant, MeasuredPlant):
+        return []
+    values = np.linalg.eigvals(plant.a).astype(complex)
+    poles = np.log(values[np.imag(values) > 0.0]) / plant.sample_time_s  # a delay's are zero
+    modes = [(abs(p) / (2 * np.pi), abs(p.real) / abs(p)) for p in poles]
+    return [(float(f), float(max(zeta, 1e-9))) for f, zeta in modes if zeta < LIGHT_DAMPING]
+
+
+def count_growing(plant: DigitalPlant | MeasuredPlant) -> int:
+    """Return how many of a plant's poles grow without control; none of a measured one, whose log is bounded."""
+    return (
+        0 if isinstance(plant, MeasuredPlant) else int(np.count_nonzero(np.abs(np.linalg.eigvals(plant.a)) > GROWING))
+    )
+
+
+def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
+    """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with f_b and all bands' ends in it.
+
+    About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
+    what falls between is found afterwards.
+    """
+    spec, nyquist = task.spec, 0.5 / task.spec.sample_time_s
+    near: list[Float[np.ndarray, " _"]] = []
+    for f, zeta in {mode for plant in task.plants for mode in find_light_modes(plant)}:
+        reach = max(4 * zeta, 0.02) * f
+        near.append(np.linspace(f - reach, f + reach, int(min(2 * reach / max(zeta * f / 4, 1e-4), 80))))
+    extra = np.sort(np.concatenate([np.zeros(0), *near]))
+    extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
+    for plant in task.plants:
+        if isinstance(plant, MeasuredPlant):
+            extra = np.concatenate([extra, plant.f[:: 1 + plant.f.size // MORE_FREQUENCIES]])
+    slow, base = (
+        np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW_FREQUENCIES),
+        np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES),
+    )
+    ends = [spec.bandwidth_hz, *(spec.passive_band_hz or ())]
+    ends += [end for name in CURVES for end in task.band_hz(name)]
+    grid = np.unique(np.concatenate([slow[:-1], base, extra, ends]))
+    return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
+
+
+def choose_prominent(usage: Float[np.ndarray, "k m"], count: int) -> Int[np.ndarray, " c"]:
+    """Return flat indices of up to `count` points that matter most: local maxima first, then the largest of others.
+
+    Of the others every third is looked at: neighbours say the same.
+    """
+    rows, m = usage.shape
+    wide = np.full((rows, m + 2), -np.inf)
+    wide[:, 1:-1] = usage
+    top = (usage >= wide[:, :-2]) & (usage >= wide[:, 2:])
+    rank = np.where(
+        top, usage + 10.0 * (usage > 0.5), -np.inf
+    )  # a maximum outranks what is none, if it is near its limit
+    rank[:, ::3] = np.maximum(rank[:, ::3], usage[:, ::3])
+    flat = rank.ravel()
+    count = min(count, int(np.count_nonzero(np.isfinite(flat))))
+    return np.argpartition(-flat, count - 1)[:count]
