@@ -28,9 +28,11 @@ from seaopt.control.laws.passivity import passivity
 from seaopt.simulation.native import find_compiler
 from tests.pages import blocks, list_pages, read_page, unbroken
 
-SLOW = {  # whole certificates, sweeps, searches for causes, bootstrap: 5 to 20 s of processor time each
-    "howto/choose_bandwidth.md", "howto/figures.md", "howto/friction.md", "howto/impedance.md",
-    "howto/read_certificate.md", "theory/certificate.md", "theory/diagnostics.md", "tutorial/ten_minutes.md",
+SLOW = {  # whole certificates, sweeps, searches for causes, bootstrap, reports: 1 to 20 s of processor time each
+    "howto/cascade.md", "howto/choose_bandwidth.md", "howto/compensation.md", "howto/figures.md", "howto/friction.md",
+    "howto/impedance.md", "howto/many_logs.md", "howto/measured_response.md", "howto/read_certificate.md",
+    "howto/report.md", "howto/rotary_and_encoders.md", "theory/certificate.md", "theory/diagnostics.md",
+    "theory/free_law.md", "theory/mpc.md", "theory/tuning.md", "theory/verification.md", "tutorial/ten_minutes.md",
 }  # fmt: skip
 
 
@@ -343,6 +345,7 @@ def test_the_c_of_the_docs_compiles(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_the_certificate_of_the_docs_works():
     """Its first block, quick enough for every run; the table of ranges is a problem file's."""
     found = run("theory/certificate.md", first=1)

@@ -139,6 +139,7 @@ def test_xl330_on_trajectories_not_fitted(data, tmp_path):
     xl330.check(fit)
 
 
+@pytest.mark.slow
 def test_a_simulated_drive_gives_its_soft_coupling(tmp_path):
     """As the measured one: the linear drive's misfit repeats, the load's balance names its cause."""
     twomass = script("twomass")
@@ -166,6 +167,7 @@ def test_a_simulated_pendulum_gives_its_inertia(simulated):
     assert ak80.predict(cut.parameters, log, 0.5)[0] > 98
 
 
+@pytest.mark.slow
 def test_a_simulated_flexible_link_gives_its_frequency_and_damping(simulated):
     """A rigid rod on a spring, unlike the measured beam: its damping comes out positive, and gamma as 1."""
     flexlink = script("flexlink")

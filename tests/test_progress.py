@@ -98,6 +98,7 @@ def test_a_friction_margin_that_cannot_be_had_is_told_as_it_is_raised(heard):
     heard.check("friction margin")
 
 
+@pytest.mark.slow
 def test_what_a_friction_margin_takes_is_told_before_it_is_over():
     def stop(note, share=None, /):
         if "friction margin" in note:
@@ -125,6 +126,7 @@ def test_a_certificate_tells_draws_searches_and_scenarios(heard, controller):
     assert sum("scenario" in note for note in heard.notes) > 16
 
 
+@pytest.mark.slow
 def test_rounds_of_tuning_are_told(heard):
     tune_certified(STAND, THOR, SPEC, {"swing": SWING}, ranges=RANGES, samples=40, rounds=3, progress=heard)
     heard.check("round 1, start 1 of", "round 1, swing, 40 of 40 draws", "certified after")

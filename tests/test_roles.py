@@ -140,6 +140,7 @@ def test_a_friction_margin_has_the_unit_of_the_plants_friction(pair):
     assert built_in == (strange[0], "N s/m") and strange[1] == "N m s/rad"
 
 
+@pytest.mark.slow
 def test_the_certificate_is_the_same(pair):
     certificates = [
         so.certify(
@@ -159,6 +160,7 @@ def test_the_certificate_is_the_same(pair):
         assert other.value == pytest.approx(one.value, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_scenarios_and_what_they_show_are_the_same(pair):
     first, second = (
         verify(controller, {"stand": stand, "swing": swing}, params) for controller, stand, swing, params in pair

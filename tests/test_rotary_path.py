@@ -95,6 +95,7 @@ def test_other_structures_are_the_same(paths, structure):
     assert rotary.feasible == linear.feasible and rotary.gains == pytest.approx(linear.gains, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_certificate_is_the_same(paths, controllers):
     """Draws, the worst case from below and above, and steps of several sizes."""
     first, second = (
@@ -146,6 +147,7 @@ def test_friction_at_the_motor_is_friction_at_the_screw(paths):
     check_words(*texts[len(texts) // 2 :])
 
 
+@pytest.mark.slow
 def test_port_and_environments_are_the_same(paths, controllers):
     grid = {"masses_kg": (0.01, 10.0), "stiffnesses_N_per_m": (1.0, 1e5), "dampings_N_s_per_m": (0.0, 0.1), "points": 4}
     ports, maps = [], []

@@ -50,6 +50,7 @@ def test_certify_simulates_and_looks_at_the_port(done):
     assert "34 runs passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_simulation_that_fails_exits_1_with_its_witness(folder, seaopt, design):
     """A load cell that stops at 20 N never shows the force that is asked for."""
     text = design.replace("noise_std = { F1 = 2.0 }", "saturation = { F1 = 20.0 }").replace('["swing"]', "[]")
@@ -64,6 +65,7 @@ def test_a_simulation_that_fails_exits_1_with_its_witness(folder, seaopt, design
     assert "seaopt tune clipped.toml -o out" in words
 
 
+@pytest.mark.slow
 def test_retune_tunes_until_certified(folder, seaopt, design, without_drawing, without_simulation):
     ranges = "I_p = [0.2, 0.6], delay_s = [0.0, 4e-4]"
     text = design.replace("I_p = [0.2, 0.6]", ranges) + "retune = 4\nbounds = true\n"
@@ -96,6 +98,7 @@ def test_the_fit_stage_is_the_fit_of_the_library(folder, seaopt):
             assert stored["parameters"][name]["std"] == pytest.approx(parameter.std, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_stages_one_by_one_give_the_same_files(copied, seaopt, done, without_drawing, without_simulation):
     """From the same fit.json: what a stage reads is what an earlier one would have handed on."""
     for name in ("controller.json", "robustness.json", "report.html"):
@@ -161,6 +164,7 @@ def test_an_unidentifiable_fit_exits_1_with_a_report(folder, seaopt, stand_alone
     assert not list(folder.rglob(".*"))
 
 
+@pytest.mark.slow
 def test_values_that_the_fit_does_not_identify_are_named_wherever_they_are_used(
     folder, seaopt, stand_alone, without_simulation
 ):

@@ -80,6 +80,7 @@ def acme(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(site))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("acme", "without_drawing")
 def test_a_plant_of_a_package_and_one_of_the_file_run_alike(folder, seaopt):
     results = {}

@@ -27,6 +27,7 @@ def knee(folder, text):
     return folder
 
 
+@pytest.mark.slow
 def test_tune_writes_a_schedule_that_export_takes(knee, seaopt):
     out = seaopt("tune", "knee.toml")
     assert out.returncode == 0, out.stderr

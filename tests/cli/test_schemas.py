@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import tomllib
 from pathlib import Path
@@ -16,6 +17,7 @@ PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 RESULTS = {"fit": "fit.json", "controller": "controller.json", "robustness": "robustness.json"}
 
 
+@functools.cache  # to check the schema of a problem file takes a second
 def validator(document):
     schema = json_schema(document)
     jsonschema.Draft202012Validator.check_schema(schema)

@@ -143,6 +143,7 @@ def test_a_result_counts_what_it_depends_on(write, tmp_path, text, old, new, cha
     assert moved == changed.split()
 
 
+@pytest.mark.slow
 def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, capsys, without_simulation):
     """Without experiments, so that nothing is fitted; a certificate of an old controller is refused too."""
     text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
@@ -290,6 +291,7 @@ def test_a_design_on_a_fit_that_is_not_met_says_so(write, tmp_path, capsys):
     assert not export_controller(tmp_path / "out", tmp_path / "c", json=False)
 
 
+@pytest.mark.slow
 def test_what_was_guessed_is_named_by_every_verdict_until_it_is_taken_out(write, tmp_path, capsys):
     known = BENCH.replace("[plant.stand]", "b_r = { value = 1e-4, free = true }\n[plant.stand]")
     known += '[controller]\nplant = "stand"\nmeasured = "F1"\nbandwidth_hz = 30\nsample_rate_hz = 1000\n'
@@ -341,6 +343,7 @@ def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch
     assert not capsys.readouterr().err and "write_lines" not in " ".join(thread.name for thread in enumerate_threads())
 
 
+@pytest.mark.slow
 def test_a_terminal_is_told_the_time_that_is_left(write, tmp_path, monkeypatch):
     """Of real stages, which take longer than a short while; a remark stays below the bar."""
     monkeypatch.setattr("seaopt.cli.progress.SHOWN_AFTER_S", 0.0)
@@ -358,6 +361,7 @@ def test_a_terminal_is_told_the_time_that_is_left(write, tmp_path, monkeypatch):
     assert "note: worth keeping" in shown.getvalue()
 
 
+@pytest.mark.slow
 def test_a_law_of_ones_own_is_certified_as_the_tuned_one(write, tmp_path):
     """The tuned law given back as matrices has its certificate; a controller that was tuned is not written over."""
     path = write(

@@ -99,6 +99,7 @@ def test_a_limit_that_cannot_be_met_ends_with_the_line_to_write(copied, narrow, 
     assert max(map(len, out.stdout.splitlines())) <= 90  # a command to copy is on one line
 
 
+@pytest.mark.slow
 def test_tables_of_responses_and_of_sweeps_fit_eighty_columns(copied, narrow):
     """A long name, here of a plant at a corner of a range, is broken in its cell."""
     for arguments, verdict in (
@@ -113,6 +114,7 @@ def test_tables_of_responses_and_of_sweeps_fit_eighty_columns(copied, narrow):
     assert {"worst", "limit"} <= {word for row in rows for word in row}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "quiet"),
     [

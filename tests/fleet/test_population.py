@@ -71,6 +71,7 @@ def test_posterior_and_covariances_are_those_of_brute_force() -> None:
     assert np.all(population.within == 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("runs", "within"), [(1, 0.0), (4, 1.0)])
 def test_intervals_hold_the_truth_and_values_are_closer_to_it(runs: int, within: float) -> None:
     inside, errors, own = [], [], []

@@ -60,6 +60,7 @@ def write(folder, plan, count):
     return first / count, one.written / count
 
 
+@pytest.mark.slow
 def test_a_row_costs_the_same_in_a_longer_table(tmp_path, plan):
     short, long = (write(tmp_path / str(count), plan, count) for count in (200, 1600))
     assert long[0] == pytest.approx(short[0], rel=0.1) and long[0] < 5.0

@@ -122,6 +122,7 @@ def test_fit_of_a_log_that_holds_goal_and_position_alone():
         assert abs(found.value - truth[name].value) < 4.0 * found.std < 0.3 * truth[name].value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", ["I", "duty"])
 def test_what_a_servo_commands_may_be_logged_beside_its_goal(inside):
     """Goal in, current out: integrated here, then fitted from the current alone."""

@@ -14,6 +14,7 @@ from seaopt.plants import export_fmu, modes, to_control
 from seaopt.simulation.native import find_compiler
 
 
+@pytest.mark.slow
 def test_python_control_simulates_the_same(swing, thor):
     params = thor.update(f_c=20.0, v_s=0.01, d=0.2)
     system = to_control(swing, params)

@@ -152,6 +152,7 @@ def test_a_long_sum_is_read():
 PIECES = [*"xy12.e+-*/^()<>=!, \n", "sin(", "if_else(", "max(", "\u00e9", "\x00"]
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(st.lists(st.sampled_from(PIECES), max_size=30).map("".join) | st.text())
 def test_whatever_text_is_read_or_refused(text):

@@ -95,6 +95,7 @@ def test_a_blow_is_a_strong_short_force(link2, drive, spring):
     np.testing.assert_allclose(after, braked(plant, params, x, lambda v: 0.7e7, 1e-7), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("link2", ["pendulum", "mass"])
 @pytest.mark.parametrize("drive", ["unlumped", "lumped"])
 @pytest.mark.parametrize("spring", ["link1", "link2"])

@@ -318,6 +318,7 @@ def test_delays_have_the_exact_phase_in_their_band(stand, thor):
         assert abs(np.degrees(np.angle(ratio / np.exp(-3e-3 * s)))) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("excluded", [("voltage_input", "duty_input", "inductance"), ("duty_input", "current_loop"),
                                       ("voltage_input", "current_loop")])  # fmt: skip
 def test_every_part_composes_on_every_plant(excluded):

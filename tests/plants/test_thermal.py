@@ -237,6 +237,7 @@ def test_a_plant_with_heat_pickles_and_its_held_partner_has_heat():
     assert values["T_max"].unit == "degC"
 
 
+@pytest.mark.slow
 def test_a_certificate_of_a_voltage_looks_at_the_winding_cold_and_hot():
     plant, values = make(parts=["voltage_input"])
     assert find_warm_range(PLANT, VALUES) is None  # a current is commanded
@@ -275,6 +276,7 @@ def test_the_probe_of_a_port_warms_up_too():
     assert list(attach_environment(plant).states) == list(attach_environment(without).states)
 
 
+@pytest.mark.slow
 def test_loops_of_a_commanded_current_are_those_without_heat():
     cold = so.plants.rotary(link="locked")
     spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, current_limit_A=9.0)

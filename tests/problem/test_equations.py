@@ -220,6 +220,7 @@ def test_what_is_held_and_probed_is_another_plant_of_the_file(read, thor):
     np.testing.assert_allclose(*states, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_friction_that_sticks_and_parts_around_are_those_of_the_built_in_plant(read, thor):
     text = TEXT.replace("[plant.stand]\n", '[plant.stand]\nsticks = true\nparts = ["current_loop"]\n', 1)
     own = read(text, 'held = "stand"\n', "").plants["stand"]
@@ -280,6 +281,7 @@ def both(read):
     return read(old="f_c = 12.0", new="f_c = 0.0"), read("\n".join([head, kinds, *text]))
 
 
+@pytest.mark.slow
 def test_the_fit_is_that_of_the_built_in_plant(both):
     fits = [so.fit(one.experiments(), one.parameters, **one.fit_options) for one in both]
     own, built_in = (fit.parameters["J"] for fit in fits)

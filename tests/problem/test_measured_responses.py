@@ -60,6 +60,7 @@ def test_a_response_is_read_with_the_delay_that_its_experiment_has(write):
     assert certificate.passed
 
 
+@pytest.mark.slow
 def test_without_a_model_no_fit_is_needed_and_points_are_certified(write, tmp_path):
     path = write("frf:chirp", "").rename(tmp_path / "points.toml")
     path.write_text(path.read_text().split("[robustness]")[0])
@@ -101,6 +102,7 @@ def test_a_law_that_breaks_limits_fails_on_points_and_models_are_refused(write):
         so.certify(controller, {}, params)
 
 
+@pytest.mark.slow
 def test_a_fit_in_which_nothing_is_free_is_diagnosed(write):
     problem = so.read_problem(write("frf:chirp", ""))
     assert "chirp" in repr(so.diagnose(so.fit(problem.experiments(), problem.parameters)))

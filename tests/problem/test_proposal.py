@@ -213,6 +213,7 @@ def test_the_angle_is_used_beside_the_speed(tmp_path, logs):
     assert rows["motor_pos_act"] == "theta_m" and rows["motor_vel_act"] == ""
 
 
+@pytest.mark.slow
 def test_a_fit_of_what_was_proposed_recovers_a_knee(tmp_path):
     """With the motor's own figures known; stiffness, inertias, friction and damping come from the log."""
     t, current = drive(10.0, RATE, 2.0)
@@ -250,6 +251,7 @@ def test_a_fit_of_what_was_proposed_recovers_a_screw(tmp_path):
     assert {name: fit.derived[name].value for name in truth} == pytest.approx(truth, rel=0.01)
 
 
+@pytest.mark.slow
 def test_with_nothing_known_frequencies_are_right(tmp_path, logs):
     """Whatever gear ratio and torque constant are guessed: what a held log tells is the resonance and its damping."""
     t, current = drive(10.0, RATE, 2.0)

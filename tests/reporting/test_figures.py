@@ -253,6 +253,7 @@ def test_a_sweep_is_drawn_as_its_rows_say(stand, thor):
     assert len(found.plot().axes) == 6 and "img" in found._repr_html_()
 
 
+@pytest.mark.slow
 def test_fits_that_are_compared_stand_in_one_figure(short_log, thor):
     fits = {
         drive: so.fit(

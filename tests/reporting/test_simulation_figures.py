@@ -17,6 +17,7 @@ from seaopt.robustness.verification.scenarios import Phase, Scenario
 from seaopt.robustness.verification.verification import verify
 
 
+@pytest.mark.slow
 def test_the_page_names_what_failed_and_shows_every_figure(stand, swing, thor, tmp_path):
     spec = so.ControllerSpec(bandwidth_hz=30.0, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
     controller = so.tune(stand, thor, spec)

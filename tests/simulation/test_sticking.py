@@ -101,6 +101,7 @@ def test_what_stands_still_is_held_by_the_force_that_keeps_it_so(block):
         assert np.array(read(0.0, [x, v], force, p)).ravel() == pytest.approx([x, expected], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_two_joints_that_rub_on_one_another_stand_or_slide():
     """Two blocks on a table, a spring between them; against a stiff integrator, smoothed at 1e-6."""
     mass, rub, spring = (1.0, 3.0), (2.0, 4.0), 500.0

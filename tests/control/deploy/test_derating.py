@@ -86,6 +86,7 @@ def compile_law(compiler, controller, folder, precision="double", gated=False, d
     return lambda *readings: code.law_step(ctypes.byref(law), *readings), law, code
 
 
+@pytest.mark.slow
 def test_under_full_command_for_ever_the_winding_stays_at_its_largest_temperature(controller):
     law = runnable(controller, heat=controller.heat_guard)
     commands, rises = run_law(law, 40_000, 1e6)  # six of the longer time constant

@@ -64,6 +64,7 @@ def test_a_rigid_link_needs_the_damper_of_colgate_and_schenkel(
     assert needed_damper(port, impedance) == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_map_agrees_with_eigenvalues_against_environments(controller: so.Controller) -> None:
     rng = np.random.default_rng(3)
     link = find_link(controller, FREE, KNEE)
@@ -186,6 +187,7 @@ def test_passive_gains_are_stable_by_themselves(region: ImpedanceRegion) -> None
     assert np.any(region.stable & ~region.passive)
 
 
+@pytest.mark.slow
 def test_a_map_takes_less_than_five_seconds(controller: so.Controller) -> None:
     start = time.process_time()
     region = passive_region(controller, FREE, KNEE, points=100)

@@ -153,6 +153,7 @@ def test_limits_are_never_broken(stand, thor, slew):
     assert solved == 600
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("torque", "inertia"), [(0.9, 1.0), (1.1, 1.1)])
 def test_no_offset_is_left_on_a_plant_it_was_not_made_for(stand, thor, mpc, torque, inertia):
     real = thor.update(K_tau=thor["K_tau"].value * torque, J=thor["J"].value * inertia)

@@ -70,6 +70,7 @@ def test_what_a_delay_rules_out_is_impossible(late):
     assert answers == ["optimal", "impossible"]
 
 
+@pytest.mark.slow
 def test_the_least_noise_of_an_integral_is_the_inverse_of_the_gain():
     """S is zero at 0 Hz, so that Q is 1/P there; and Q = 1/P(0) at all frequencies keeps all limits."""
     spec = so.ControllerSpec(
@@ -95,6 +96,7 @@ def measured_by(spec, controller, plant=STAND, params=THOR):
     return float(np.max(np.abs(c_y * s)) if spec.objective == "noise" else np.trapezoid(np.abs(s), np.log(f)))
 
 
+@pytest.mark.slow
 def test_no_tuned_law_is_better_than_the_bound():
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25)
     tuned = so.tune(STAND, THOR, spec)

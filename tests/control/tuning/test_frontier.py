@@ -48,6 +48,7 @@ def test_rows_are_what_a_recomputation_gives(stand, swing, thor):
     assert row.force_limit_N == pytest.approx(9.0 / controller.command.per_effort / motor, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_row_says_what_friction_costs(stand, thor):
     """Without sticking is what a plant whose friction is nothing can have: Coulomb friction does not damp in motion."""
     spec = so.ControllerSpec(structure="pd", max_sensitivity=1.6, max_noise_gain=25)

@@ -138,6 +138,7 @@ def test_the_exported_c_reads_the_link(fed, compiler, tmp_path):
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.max(np.abs(expected)))
 
 
+@pytest.mark.slow
 def test_a_sweep_places_the_path_at_every_bandwidth(stand, swing, thor):
     spec = replace(SPEC, link_feedforward=LinkFeedforward())
     frontier = sweep(stand, thor, spec, [20.0, 30.0], {"swing": swing})

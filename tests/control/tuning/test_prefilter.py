@@ -66,6 +66,7 @@ def evaluate(controller, plant, params, f):
     return p * c_r / (1 + p * c_y), 1 / (1 + p * c_y), c_y, low_pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "bandwidth_hz", "weights"), [("first_order", 20.0, "error"), ("second_order", 45.0, "tuned")]
 )

@@ -80,6 +80,7 @@ def test_what_misses_its_limits_misses_them_least(bench):
     assert max(usage[0], 1.0 + 10.0 * miss) <= 1.02 * 4.277
 
 
+@pytest.mark.slow
 def test_where_nothing_is_possible_the_least_miss_is_named(bench):
     case = bench.Case(bench.ISSUE, 25.0)
     spec = replace(case.spec, max_noise_gain=0.3, bandwidth_range_hz=(20.0, 30.0))

@@ -69,6 +69,7 @@ def test_f1_on_the_stand_cannot_tell_them_apart(thor):
     assert abs(ranking.rows[1].bic - ranking.rows[0].bic) < 1e-3
 
 
+@pytest.mark.slow
 def test_f2_on_the_stand_can_and_says_where(thor):
     """Above 7.5 Hz the lumped F2 is the motor force (7), the unlumped falls off (14): noise to 150 Hz shows it."""
     log = log_of(so.plants.high_impedance, "unlumped", PAPER_STAND, thor)

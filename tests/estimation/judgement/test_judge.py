@@ -73,11 +73,12 @@ def test_an_honest_log_is_met_and_explained_as_far_as_its_noise_allows(seed):
         (lambda c: c | {"I": c["F1"], "F1": c["I"]}, "columns of I and F1"),
         (lambda c: c | {"F1": c["F2"], "F2": c["F1"]}, "columns of F1 and F2"),
         (lambda c: c | {"I": -c["I"]}, "I has the wrong sign"),
-        (lambda c: c | {"F1": c["F1"] / 4.448}, "F1 reads 1/4.448 times"),
+        pytest.param(lambda c: c | {"F1": c["F1"] / 4.448}, "F1 reads 1/4.448 times", marks=pytest.mark.slow),
         (lambda c: c | {"I": 1e3 * c["I"]}, "I reads 1000 times"),
-        (
+        pytest.param(
             lambda c: {"I": c["I"][:-20], "F1": c["F1"][20:], "F2": c["F2"][20:]},
             r"inputs that are stamped (49\.9\d|50\S*) ms late",
+            marks=pytest.mark.slow,
         ),
         (lambda c: {"I": c["I"][2:], "F1": c["F1"][:-2], "F2": c["F2"][:-2]}, r"a delay of (4\.9\d+|5|5\.0\d+) ms"),
         (lambda c: c | {"F1": signal.lfilter([0.27], [1.0, -0.73], c["F1"])}, "F1 passed a low-pass"),

@@ -190,6 +190,7 @@ def test_what_is_computed_for_no_log_says_which_value_it_takes(fit):
     assert not warn_unidentified(params, {"k"})
 
 
+@pytest.mark.slow
 def test_another_plant_without_the_own_parameter_is_a_cause():
     """A log of the stand, fitted as one of the pendulum with a known mass, which the stand does not have."""
     stand, swing = so.plants.high_impedance(drive="lumped"), so.plants.moving_output(drive="lumped")

@@ -90,6 +90,7 @@ def test_a_wrong_known_delay_of_straight_lines_is_named():
     assert float(said.split("a delay of ")[1].split(" ms")[0]) == pytest.approx(1.3e3 / RATE, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_delay_at_its_bound_is_an_error_where_the_log_wants_it_beyond():
     delay = so.Parameter(name="delay_s", value=0.0, unit="s", free=True, min=0.0, max=1.5 / RATE)
     experiment = so.Experiment(plant=drive(), log=log_of(2.3, 1), outputs=("F1",), delay_s=delay)

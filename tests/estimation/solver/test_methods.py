@@ -45,6 +45,7 @@ def experiment(plant, log, **options):
     return so.Experiment(plant=plant, log=log, outputs=outputs, name="log", **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("case", ["stand", pytest.param("swing", marks=SLOW), "swing, friction"])
 def test_each_method_recovers_the_truth(case, method, stand, swing, thor):

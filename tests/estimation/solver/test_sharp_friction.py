@@ -48,6 +48,7 @@ def test_a_free_smoothing_speed_falls_until_the_log_resolves_no_more(bench, trut
     assert v_s.value < 1e-4 and v_s.value < 4.0 * v_s.std  # nothing tells it from the jump
 
 
+@pytest.mark.slow
 def test_what_is_told_of_smooth_friction_is_no_bound(bench, truth):
     fit = so.fit([bench], truth.update(v_s=1e-3).free(*FREE))
     (cause,) = (finding for finding in fit.findings if finding.kind == "cause")

@@ -163,6 +163,7 @@ def test_an_unstable_set_is_never_bounded_stable(name, ranges, controller, thor,
     assert "no bound" in repr(bounds)
 
 
+@pytest.mark.slow
 def test_a_budget_that_runs_out_leaves_bounds_that_hold(controller, swing, thor):
     unknown = of(swing, thor.prior(J=3.3e-7, b_r=2e-5), {"I_p": (0.3, 0.5)})
     figures = batch_figures(controller, swing, unknown.nominal, unknown.values(draws(unknown, 2000)))

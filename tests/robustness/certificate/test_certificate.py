@@ -261,6 +261,7 @@ def test_another_law_meets_other_draws(controller, stand, thor):
     assert points[0].monte_carlo != points[2].monte_carlo
 
 
+@pytest.mark.slow
 def test_failures_are_told_apart(controller, stand, swing, thor):
     """Eigenvalues and peaks of each draw, one by one, against the counts."""
     ranges = {"I_p": (0.002, 0.6), "delay_s": (0.0, 2e-3)}
@@ -387,6 +388,7 @@ def test_a_plant_with_friction_is_certified_sliding_and_stuck(stand, rubbing):
     assert again.friction == certificate.friction
 
 
+@pytest.mark.slow
 def test_stability_with_friction_is_shown_over_draws_and_may_be_required(stand, thor):
     """Viscous friction is in the sector: at every draw the loop with the least slope shown has stable eigenvalues."""
     rubbing = thor.update(f_c=50.0)

@@ -34,6 +34,7 @@ def find(certificate):
     return [row for row in certificate.requirements if row.name == "friction_compensation"]
 
 
+@pytest.mark.slow
 def test_stability_is_required_with_less_friction_than_is_compensated(controller):
     chosen = add_compensation(controller, friction=CompensateFriction(fraction=0.9, source="speed"))
     certificate = certify(chosen)

@@ -95,6 +95,7 @@ def test_it_is_in_the_json_and_read_again(certificate):
     assert read.impedance.steps == certificate.impedance.steps
 
 
+@pytest.mark.slow
 def test_draws_that_are_not_passive_fail(force):
     # A spring of 80 N m/rad passively carries no stiffness of 40 under this law: the nominal one, of 300, does.
     values = VALUES.update(d_l=0.05)
@@ -108,6 +109,7 @@ def test_draws_that_are_not_passive_fail(force):
     assert find(certificate, "impedance_damper").met  # at the nominal parameters
 
 
+@pytest.mark.slow
 def test_friction_counts_sliding_and_stuck(force):
     certificate = certify(force, 2.0, values=VALUES.update(f_c=0.005, v_s=1.0))
     assert certificate.impedance.stuck is not None

@@ -61,6 +61,7 @@ def test_a_spring_with_hysteresis_is_certified_at_its_stiffest_and_its_softest(t
     assert certificate.to_dict()["friction"]["stand"]["sector_stable"] is None
 
 
+@pytest.mark.slow
 def test_tuned_on_all_its_states_it_passes_and_says_what_is_not_shown(thor):
     stand = so.plants.high_impedance(parts=["lugre", "hysteresis"])
     params = with_own(thor, stand, f_c=30.0, k_h=6e4)

@@ -32,6 +32,7 @@ def by_differences(controller, plant, unknown, point):
     return np.array([(measure(point + step) - measure(point - step)) / (2 * STEP) for step in steps])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", [{}, {"max_complementary": 0.2}, {"max_sensitivity": None}])
 def test_slopes_are_central_differences(controller, swing, thor, limits):
     law = replace(controller, spec=replace(controller.spec, **limits))

@@ -108,6 +108,7 @@ def test_the_worst_case_is_scipys_on_one_range(controller, swing, thor, certific
     assert certificate.worst["swing"].ms == pytest.approx(best, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_worst_case_of_several_is_no_less_than_any_corner_or_draw(controller, swing, thor):
     ranges = {"I_p": (0.2, 0.6), "L_a": (0.065, 0.08), "eta": (0.9, 1.1), "delay_s": (0.0, 3e-4)}
     certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=200, simulations=False)

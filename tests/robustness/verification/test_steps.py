@@ -71,6 +71,7 @@ def test_steps_overshoot_as_the_independent_simulator_says(blind, certificate, r
     assert over.where.startswith("stand, unsaturated step") and "such runs" in over.where
 
 
+@pytest.mark.slow
 def test_what_overshoots_only_once_friction_lets_go_is_not_passed(stand, thor):
     """Smoothed as declared no step overshoots by a sixth; one that waits for the integral by two thirds."""
     params = thor.update(
