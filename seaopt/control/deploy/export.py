@@ -34,6 +34,7 @@ from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
+from seaopt.control.loops.compensation.link_feedforward import multiply_out
 from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
@@ -289,7 +290,7 @@ def _numbers(
         return ", ".join(number(float(value)) for value in values) or number(0.0)
 
     per_reference, per_measurement = law.rest()
-    transfer_functions = stored["law"].transfer_functions()
+    transfer_functions = multiply_out(stored["law"], stored["link"])
     b, d, rest = (
         np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
     )

@@ -27,7 +27,7 @@ from seaopt.control.laws.verdict import (
     shorten_blocked,
 )
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
-from seaopt.control.loops.compensation.link_feedforward import LinkPath
+from seaopt.control.loops.compensation.link_feedforward import LinkPath, multiply_out
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
@@ -376,7 +376,7 @@ class Controller:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/2)."""
-        reference, *measurements = ({"num": one.num, "den": one.den} for one in self.law.transfer_functions())
+        reference, *measurements = ({"num": one.num, "den": one.den} for one in multiply_out(self.law, self.link))
         return {
             "schema": CONTROLLER_SCHEMA,
             "structure": self.structure,
@@ -429,13 +429,15 @@ class Controller:
 
         """
         # Deferred, as pydantic takes long to import.
-        from seaopt.control.laws.stored import check_achieved, check_friction_margin, read_controller
+        from seaopt.control.laws.stored import check_achieved, check_friction_margin, check_link, read_controller
 
         stored = read_controller(content)
         if isinstance(plant, MeasuredResponse):
             return cls._on_measured(stored, content, plant, params)
         link: LinkPath | None = stored["link"]
-        plant = plant if link is None else link.see(plant)
+        if link is not None:
+            check_link(link, stored["spec"], plant)
+            plant = link.see(plant)
         measured = plant.outputs.get(stored["spec"].regulated, "")
         stored["command"] = replace(
             stored["command"], largest=find_range(plant, params),

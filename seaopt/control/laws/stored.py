@@ -38,6 +38,7 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError
 from seaopt.files import plain
+from seaopt.plants import Plant
 
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
 PREFILTER_GAINS = {PREFILTER, "prefilter_damping"}
@@ -358,6 +359,28 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "compensation": None if table.compensation is None else table.compensation.build(spec.sample_time_s),
         "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
+
+
+def check_link(link: LinkPath, spec: ControllerSpec, plant: Plant) -> None:
+    """Refuse a signal that is not the link's motion on the design plant, or of the same actuator with its link free.
+
+    Of a signal that the specification names, and neither knows, it is checked on the plants that it is closed on.
+
+    Raises
+    ------
+    FileError
+        The signal is another one, or has another unit.
+
+    """
+    port = plant.port
+    free = plant if port is None or port.motion is not None or port.probe is None else port.probe()
+    motion = None if free.sensing is None else free.sensing.link_position
+    named = spec.link_feedforward is not None and spec.link_feedforward.measured is not None
+    if motion is not None and not named and link.measured != motion:
+        raise _contradict("link_feedforward.measured", f'is "{link.measured}", and the link moves "{motion}"')
+    unit = free.outputs.get(link.measured, link.unit)
+    if unit != link.unit:
+        raise _contradict("link_feedforward.unit", f'is "{link.unit}", and {link.measured} is in {unit}')
 
 
 def _check_measured(

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control import LinkFeedforward, runnable, sweep
+from seaopt.control.deploy.export import export
 from seaopt.control.loops.loop import Loop
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
@@ -207,3 +208,46 @@ def test_a_problem_file_asks_for_it(tmp_path, line, expected):
     controller = f'[controller]\nplant = "stand"\nbandwidth_hz = 30\n{line}\n'
     (tmp_path / "problem.toml").write_text(f'schema = 1\n[plant.stand]\nkind = "high_impedance"\n{controller}')
     assert read_problem(tmp_path / "problem.toml").spec.link_feedforward == expected
+
+
+def evaluate_path(link, f):
+    """Return the path's response by its own formula, corners prewarped."""
+    s = 1j * np.tan(np.pi * f * TS)
+    w, slow = (np.tan(np.pi * hz * TS) for hz in (link.corner_hz, link.high_pass_hz))
+    rate = 2.0 / TS * s
+    return -link.fraction * (link.inertia * rate**2 + link.damping * rate) * w**2 / (
+        s**2 + np.sqrt(2.0) * w * s + w**2
+    ) * s / (s + slow)  # fmt: skip
+
+
+def test_the_path_is_printed_with_all_its_digits(fed, tmp_path):
+    """As controller.json and the MATLAB script have it, from 0.1 Hz to next to the Nyquist frequency."""
+    f = np.geomspace(0.1, 499.0, 300)
+    q, expected = np.exp(-2j * np.pi * f * TS), evaluate_path(fed.link, f)
+    export(fed, tmp_path)
+    lines = (line for path in tmp_path.rglob("*.m") for line in path.read_text().splitlines())
+    rows = dict(line.split(";")[0].split(" = ", 1) for line in lines if line.startswith("measurement_x_2_"))
+    script = [np.array(rows[f"measurement_x_2_{part}"].strip("[]").split(","), dtype=float) for part in ("num", "den")]
+    stored = json.loads(to_json(fed.to_dict()))["measurement"][-1]
+    for num, den in (script, (stored["num"], stored["den"])):
+        found = np.polynomial.polynomial.polyval(q, num) / np.polynomial.polynomial.polyval(q, den)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "value"), [("unit", "rad"), ("measured", "x_9")])
+def test_a_file_with_another_signal_of_the_link_is_refused(fed, name, value):
+    content = json.loads(to_json(fed.to_dict()))
+    content["link_feedforward"][name] = value
+    content["measured"][-1] = content["link_feedforward"]["measured"]
+    with pytest.raises(FileError, match=rf"link_feedforward\.{name}"):
+        so.Controller.from_dict(content, so.plants.high_impedance(), so.plants.thor())
+
+
+def test_a_signal_that_a_moving_plant_lacks_is_refused(fed, swing):
+    """It is not taken for zero there: only a link that is held stands still."""
+    for link, words in (
+        (replace(fed.link, measured="x_9"), "is not an output"),
+        (replace(fed.link, unit="rad"), "in m"),
+    ):
+        with pytest.raises(ControlError, match=words):
+            replace(fed, link=link).see(swing)

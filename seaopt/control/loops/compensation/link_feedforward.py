@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import linearise_sets
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -133,8 +134,34 @@ class LinkPath:
         )
 
     def see(self, plant: Plant) -> Plant:
-        """Return a plant with the signal among its outputs: it is zero where the plant holds its link."""
-        return plant if self.measured in plant.outputs else _hold_output(plant, self.measured, self.unit)
+        """Return a plant with the signal among its outputs: it is zero where the plant holds its link.
+
+        Raises
+        ------
+        ControlError
+            The plant has it in another unit, or its link moves and it has no such output.
+
+        """
+        unit = plant.outputs.get(self.measured)
+        if unit is None and plant.port is not None and plant.port.motion is not None:
+            raise ControlError(
+                f'link_feedforward.measured = "{self.measured}" is not an output of {plant.name}, whose link moves; '
+                f'give link_feedforward = {{ measured = "{plant.port.motion}" }}, or the plant an output of that name'
+            )
+        if unit not in (None, self.unit):
+            raise ControlError(
+                f'link_feedforward.unit = "{self.unit}", and {self.measured} of {plant.name} is in {unit}; tune again'
+            )
+        return plant if unit is not None else _hold_output(plant, self.measured, self.unit)
+
+
+def multiply_out(law: Law, link: LinkPath | None) -> tuple[TransferFunction, ...]:
+    """Return C_r and C_y of every signal, multiplied out; the link's, the last, with its own poles alone.
+
+    Its double zero at 0 Hz would lose all digits there beside the poles of the rest.
+    """
+    whole = law.transfer_functions()
+    return whole if link is None else (*whole[:-1], link.feedback(law.sample_time_s))
 
 
 @memo
