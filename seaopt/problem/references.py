@@ -209,19 +209,13 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
 
 
 def _check_link(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    """Refuse an impedance at a link that is held, or around a law that reads several signals."""
+    """Refuse an impedance at a link that is held."""
     if table.impedance is None:
         return
     moving = [name for name, plant in plants.items() if plant.port is not None and plant.port.motion is not None]
     if table.impedance.plant not in moving:
         known = f"write one of {', '.join(moving)}" if moving else "add a plant whose link moves"
         raise ProblemError(f'impedance.plant = "{table.impedance.plant}" holds its link; {known}')
-    if table.controller is not None and not isinstance(table.controller.measured, str):
-        measured = list(table.controller.measured)
-        raise ProblemError(
-            f"[impedance] is closed around a law that reads one signal, and controller.measured = {measured}; write "
-            f'measured = "{measured[0]}" and structure = "pid" in [controller], or leave [impedance] out'
-        )
 
 
 def _nearest(name: str, known: list[str]) -> str:

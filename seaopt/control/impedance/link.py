@@ -70,12 +70,12 @@ class Link:
         return self.law.sample_time_s
 
     def held(self) -> DigitalPlant:
-        """Return the sampled plant from motor force to the measured one with the link held."""
-        a, b, c, d = self.port.link_held()
-        parts = hold(a[None], b[None], c[:1], d[:1], self.sample_time_s, np.array([self.port.delay_s]))
+        """Return the sampled plant from motor force to what is measured with the link held."""
+        a, b, c, d = (part[None] for part in self.port.link_held())
+        a, b, c, d = (part[0] for part in hold(a, b, c, d, self.sample_time_s, np.array([self.port.delay_s])))
         return DigitalPlant(
-            a=parts[0][0], b=parts[1][0], c=parts[2][0], d=float(parts[3][0]), sample_time_s=self.sample_time_s,
-            delay_samples=self.delay_samples, static_gain=np.nan,
+            a=a, b=b, c=c[0], d=float(d[0]), sample_time_s=self.sample_time_s, delay_samples=self.delay_samples,
+            static_gain=np.nan, others=(c[1:], d[1:]),
         )  # fmt: skip
 
     def outer(self, impedance: Impedance) -> OuterLoop:
@@ -100,7 +100,8 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
     Raises
     ------
     ControlError
-        The link is held, the plant has no port, or the link is not a mass on a spring and a damper.
+        The link is held, the plant has no port, the link is not a mass on a spring and a damper, or the law feeds its
+        motion forward.
 
     """
     if plant.port is None or plant.port.motion is None:
@@ -109,13 +110,13 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
             'moves: moving_output, two_link or rotary(link="free")'
         )
     measured, per_effort = controller.spec.regulated, controller.command.per_effort
-    if len(controller.signals) > 1:
+    if controller.link is not None:
         raise ControlError(
-            f"the law reads {', '.join(controller.signals)}, and the outer loop is computed for laws that read one "
-            "signal; tune a pd, pid or pid_dob for it"
+            "the law feeds the link's motion forward, and an impedance is a law of that motion itself; leave "
+            "link_feedforward out"
         )
     sliding = take_sliding(plant, params)
-    port = port_of(sliding, params, measured, per_effort)
+    port = port_of(sliding, params, controller.signals, per_effort)
     linear, _ = linearise_sets(sliding, [sliding.complete(params)], str(plant.port.motion), per_effort)
     static = port.response(np.array([STATIC_HZ]))
     ratio = complex(static.motor_to_port[0] / static.motor_to_feedback[0])

@@ -90,40 +90,40 @@ def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -
     taken[port.place] -= share * load.stiffness
     pushed = -share * (load.inertia - port.mass) * port.motor[port.speed]
     a, b = port.a + np.outer(port.force, taken), port.motor + port.force * pushed
-    c = port.feedback[:n] + port.feedback[n + 1] * taken
-    d = port.feedback[n] + port.feedback[n + 1] * pushed
+    read = port.read
+    c = read[:, :n] + np.outer(read[:, n + 1], taken)
+    d = read[:, n] + read[:, n + 1] * pushed
     place = np.zeros(n)
     place[port.place] = 1.0
-    delay = np.array([port.delay_s])
-    big, late, read, through = (part[0] for part in hold(a[None], b[None], c[None], np.array([d]), period, delay))
-    seen = hold(a[None], b[None], place[None], np.zeros(1), period, delay)[2][0]
-    return _assemble(link, velocity_filter_s, (big, late, read, float(through), seen), law.c.size)
+    rows, direct = np.vstack([c, place]), np.append(d, 0.0)
+    sampled = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
+    return _assemble(link, velocity_filter_s, tuple(part[0] for part in sampled), law.c.size)
 
 
 def _assemble(link: Link, velocity_filter_s: float, plant: Any, order: int) -> MovingLoop:
-    """Return the loop of a sampled plant (a, b, force row, its feedthrough, position row)."""
-    big, late, read, through, seen = plant
+    """Return the loop of a sampled plant (a, b, rows of what is read and of the position, their feedthrough)."""
+    big, late, rows, direct = plant
     law, wait = link.law, link.delay_samples
     outer = link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s))
-    n = late.size
+    n, through = late.size, direct[:-1]
     size = n + wait + order + 1
     inner, speed = slice(n + wait, n + wait + order), size - 1
-    # Rows over the states (plant, commands under way, law, filter): the command that acts now, force, effort, position.
-    acts, force, place = np.zeros(size), np.zeros(size), np.zeros(size)
-    force[:n], place[:n] = read, seen
+    # Over the states (plant, commands under way, law, filter): the command that acts now, what is read, effort, place.
+    acts, read, place = np.zeros(size), np.zeros((through.size, size)), np.zeros(size)
+    read[:, :n], place[:n] = rows[:-1], rows[-1]
     effort = np.zeros(size)
     effort[inner] = law.c
     if wait:
         acts[n + wait - 1] = 1.0
-        force = force + through * acts
+        read = read + np.outer(through, acts)
         gain = 1.0
     else:
-        gain = 1.0 / (1.0 - law.d[1] * through)
-    effort = gain * (effort + law.d[1] * force)
+        gain = 1.0 / (1.0 - law.d[1:] @ through)
+    effort = gain * (effort + law.d[1:] @ read)
     per_reference = gain * law.d[0]  # of the effort
     if not wait:
         acts = effort
-        force = force + through * effort
+        read = read + np.outer(through, effort)
     matrix, drive = np.zeros((size, size)), np.zeros(size)
     matrix[:n, :n] = big
     matrix[:n] += np.outer(late, acts)
@@ -132,13 +132,13 @@ def _assemble(link: Link, velocity_filter_s: float, plant: Any, order: int) -> M
         drive[n] = per_reference
         for i in range(1, wait):
             matrix[n + i, n + i - 1] = 1.0
-        force_per_reference = 0.0
+        read_per_reference = 0.0 * through
     else:
         drive[:n] = late * per_reference
-        force_per_reference = through * per_reference
+        read_per_reference = through * per_reference
     matrix[inner, inner] = law.a
-    matrix[inner] += np.outer(law.b[:, 1], force)
-    drive[inner] = law.b[:, 0] + law.b[:, 1] * force_per_reference
+    matrix[inner] += law.b[:, 1:] @ read
+    drive[inner] = law.b[:, 0] + law.b[:, 1:] @ read_per_reference
     filtered = outer.rate * place
     filtered[speed] += 1.0
     matrix[speed] = outer.pole * filtered - outer.rate * place

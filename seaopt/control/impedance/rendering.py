@@ -255,12 +255,12 @@ def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"])
     It is the response at the frequency itself; what sampling folds onto others is left out.
     """
     response = link.port.response(f)
-    reference, measurement = link.law.responses(f)
+    reference, feedback = link.law.reference_response(f), link.law.feedback_responses(f)
     s, z = 2j * np.pi * f, np.exp(2j * np.pi * f * link.sample_time_s)
     late = hold_response(f, link.sample_time_s, link.delay_samples)
     asked = link.direction * reference * (outer.stiffness + outer.damping * outer.difference(z)) / s
-    closed = 1.0 - link.held().response(f) * measurement
-    motor = (measurement * response.motion_to_feedback - asked) * late / closed
+    closed = 1.0 + np.sum(link.held().responses(f) * feedback, axis=0)
+    motor = -(np.sum(feedback * response.motion_to_read, axis=0) + asked) * late / closed
     return response.motion_to_port + response.motor_to_port * motor
 
 

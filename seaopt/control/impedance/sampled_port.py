@@ -12,7 +12,9 @@ At :math:`\theta = \omega T` the loop couples the aliases :math:`\omega_k = (\th
 .. math::
     F_{e,k} = G_{22}(s_k) v_k + a_k \sum_l b_l v_l, \qquad
     a_k = -G_{21}(s_k) \frac{h(s_k)}{T} \frac{z^{-d}}{1 + P z^{-d} C_y}, \qquad
-    b_l = C_y G_{12}(s_l) + \frac{W}{s_l} .
+    b_l = C_y G_{12}(s_l) + \frac{W}{s_l} ,
+
+where :math:`P C_y` and :math:`C_y G_{12}` are sums over the signals that the law reads.
 
 An environment of the impedances :math:`E_k` at these frequencies, the link's own inertia in them, closes it:
 :math:`1 + \sum_k a_k b_k/(G_{22}(s_k) + E_k) = 0` is an oscillation. A passive linear environment may have any
@@ -173,14 +175,14 @@ class SampledPort:
 
         s, z = 1j * omega, np.exp(1j * theta)
         f = theta / (2 * np.pi * period)
-        reference, measurement = link.law.responses(f)
-        feedback, through = -measurement, link.held().response(f)
-        closed = z**-link.delay_samples / (1.0 + through * feedback)
+        reference, feedback = link.law.reference_response(f), link.law.feedback_responses(f)
+        closed = z**-link.delay_samples / (1.0 + np.sum(link.held().responses(f) * feedback, axis=0))
+        moved = sum(c[:, None] * at(g) for c, g in zip(feedback, response.motion_to_read, strict=True))
         drive = -at(response.motor_to_port) * (-np.expm1(-1j * theta) * closed)[:, None] / (s * period)
         outer = self.link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=self.velocity_filter_s))
         gain = link.direction * reference
         return PortResponses(
-            theta=theta, by_force=drive * feedback[:, None] * at(response.motion_to_feedback), by_place=drive / s,
+            theta=theta, by_force=drive * moved, by_place=drive / s,
             weights=np.array([gain, gain * outer.difference(z)]),
             resistance=np.maximum(np.real(at(response.motion_to_port)), 0.0), least_resistance=self._find_floor(),
         )  # fmt: skip

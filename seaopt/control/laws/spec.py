@@ -27,6 +27,7 @@ from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward
 from seaopt.control.loops.measured.plant import MeasuredPlant, sample_measured
 from seaopt.control.loops.sampled_plant import Measured, list_names
 from seaopt.errors import ControlError, suggestion
+from seaopt.formatting import join_words
 from seaopt.frequency import MeasuredResponse
 from seaopt.records import record
 
@@ -343,9 +344,15 @@ class ControllerSpec:
         Raises
         ------
         ControlError
-            The response is of another output than all that is measured, or of another input; or as `sample_measured`.
+            The law reads several outputs, or the response is of another output or input; or as `sample_measured`.
 
         """
+        if not isinstance(self.measured, str):
+            raise ControlError(
+                f"frf:{measured.name}: is of {measured.output} alone, and the law reads {join_words(self.measured)}, "
+                f'whose responses are needed together; give models of the plants, or measured = "{self.regulated}" and '
+                'structure = "pid"'
+            )
         for what, own, other in (
             ("output", measured.output, self.measured), ("input", measured.source, command.input)
         ):  # fmt: skip

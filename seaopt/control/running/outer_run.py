@@ -2,7 +2,7 @@ r"""An impedance's outer loop and the force law behind it as one law, so that wh
 
 With :math:`s` the state of the outer loop's filtered speed (`seaopt.control.loops.outer_loop`), the force law's
 reference is :math:`\sigma K_v x_0 - \sigma (K_v + D_v \rho) x - \sigma D_v s`, :math:`\rho` the filter's rate. Put into
-the force law it gives a law of the reference x_0 and of two measured signals, the force and the link's position. The
+the force law it gives a law of the reference x_0 and of the link's position beside what it measures itself. The
 integrators, the limit of the command and its anti-windup are the force law's.
 """
 
@@ -17,12 +17,12 @@ from seaopt.control.loops.outer_loop import OuterLoop
 
 
 def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
-    """Return the law of x_0, and of force and link position measured, that a force law and an outer loop make.
+    """Return the law of x_0, of what a force law measures and of the link's position, that both loops make.
 
     Parameters
     ----------
     law : RunnableLaw
-        Of one measured signal.
+        Of one measured signal or several, the link's position none of them.
     outer : OuterLoop
         Before it, at the same rate.
 
@@ -43,9 +43,9 @@ def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
     by_speed = -outer.direction * outer.damping
     a = np.zeros((n + 1, n + 1))
     a[:n, :n], a[:n, n], a[n, n] = law.a, law.b_reference * by_speed, outer.pole
-    measured = np.zeros((n + 1, 2))
-    measured[:n, 0], measured[:n, 1] = law.b_measurement, law.b_reference * by_position
-    measured[n, 1] = (1.0 - outer.pole) * outer.rate
+    measured = np.zeros((n + 1, law.measured + 1))
+    measured[:n, :-1], measured[:n, -1] = law.b_measurement.reshape(n, -1), law.b_reference * by_position
+    measured[n, -1] = (1.0 - outer.pole) * outer.rate
     by_reference = outer.direction * outer.stiffness
     added = law.compensation
     if added is not None and added.gravity is not None:  # of the force law's reference: here it moves x_0
@@ -53,6 +53,6 @@ def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
     return replace(
         law, a=a, b_measurement=measured, c=np.append(law.c, law.d_reference * by_speed),
         b_reference=np.append(law.b_reference * by_reference, 0.0), d_reference=law.d_reference * by_reference,
-        d_measurement=np.array([float(law.d_measurement), law.d_reference * by_position]),
+        d_measurement=np.append(law.d_measurement, law.d_reference * by_position),
         anti_windup=np.append(law.anti_windup, 0.0), compensation=added,
     )  # fmt: skip

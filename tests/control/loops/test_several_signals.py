@@ -14,6 +14,9 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control import Law, assess, cascade_pid, parallel_pid, passivity, read_law, realise, runnable
+from seaopt.control.impedance.link import find_link
+from seaopt.control.impedance.moving_loop import close_link
+from seaopt.control.impedance.sampled_port import SampledPort
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limit_cycles import predict_limit_cycles
@@ -148,6 +151,15 @@ def test_friction_and_port_are_the_same(one, two):
     f, size = np.geomspace(1, 50, 7), np.array([0.3, 3.0])
     gains = [predict_gain(each, STAND, VALUES, f, size) for each in (one, two)]
     np.testing.assert_allclose(gains[1], gains[0], rtol=1e-6)
+
+
+def test_an_impedance_around_them_is_the_same(one, two):
+    theta, k, d = np.geomspace(1e-3, 3.1, 60), np.array([5.0, 60.0]), np.array([0.5, 3.0])
+    links = [find_link(each, SWING, VALUES) for each in (one, two)]
+    terms = [SampledPort(link=link, velocity_filter_s=2e-3).terms(theta, 0.2) for link in links]
+    np.testing.assert_allclose(terms[1].margin(k, d), terms[0].margin(k, d), rtol=1e-6, atol=1e-9)
+    radii = [close_link(link, 2e-3).radius(k, d) for link in links]
+    np.testing.assert_allclose(radii[1], radii[0], rtol=1e-8)
 
 
 def test_simulated_it_is_the_same(one, two):

@@ -11,10 +11,17 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import seaopt as so
-from seaopt.control import Controller, cascade_pid, sweep
+from seaopt.bench import Chirp, Noise
+from seaopt.control import Controller, Impedance, add_impedance, cascade_pid, sweep
+from seaopt.control.impedance.link import find_link
+from seaopt.control.impedance.moving_loop import close_link
+from seaopt.control.impedance.rendering import apparent_impedance
+from seaopt.control.laws.realisation import runnable
 from seaopt.control.laws.structures import Gains, InnerLoop, Prefilter, SpeedLoop
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import sample
+from seaopt.control.running.closed_loop import SampledLoop, run_loop
+from seaopt.control.running.outer_run import enclose_law
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.reporting.figures.loop import step_response
@@ -263,9 +270,15 @@ def filtered() -> Controller:
     return so.tune(STAND, VALUES, replace(SPEC, prefilter=low_pass), {"swing": SWING})
 
 
-def simulate_by_hand(g: dict[str, float], reference: np.ndarray, free: bool) -> np.ndarray:
-    """Return the torque of prefilter, cascade and actuator with friction, the law sampled and the rest integrated."""
-    ts, v, w = 1e-3, {name: VALUES[name].value for name in VALUES}, np.tan(np.pi * g["prefilter_corner_hz"] * 1e-3)
+def simulate_by_hand(
+    g: dict[str, float], reference: np.ndarray, free: bool, outer: tuple[float, float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return torque and link position of prefilter, cascade and actuator with friction: the law sampled, the rest not.
+
+    With stiffness and damping of an outer loop the reference is the link's.
+    """
+    ts, v = 1e-3, {name: VALUES[name].value for name in VALUES}
+    w = np.tan(np.pi * g.get("prefilter_corner_hz", 1.0) * ts)
     k, n = v["k_s"], v["N"]
 
     def move(_: float, x: np.ndarray, effort: float) -> list[float]:
@@ -274,16 +287,20 @@ def simulate_by_hand(g: dict[str, float], reference: np.ndarray, free: bool) -> 
         link = torque - v["d_l"] * x[3] - v["m"] * 9.81 * v["L"] * np.sin(x[2])
         return [x[1], motor / v["J_m"], x[3], link / v["J_l"] if free else 0.0]
 
-    x, torques, waiting = np.zeros(4), [], 0.0
+    x, torques, places, waiting, speed_of_link, place_before = np.zeros(4), [], [], 0.0, 0.0, 0.0
     asked, passed = [0.0, 0.0, 0.0], [0.0, 0.0]  # of the prefilter: the newest last
     summed = slope = error_before = weighted_before = position_before = 0.0
-    a = 2 * g["prefilter_damping"] * w
+    a = 2 * g.get("prefilter_damping", 1.0) * w
     for wanted in reference:
         torque = k * (x[0] / n - x[2])
-        asked = [*asked[1:], wanted]
+        if outer is not None:
+            speed_of_link = 0.5 * speed_of_link + (x[2] - place_before) / (2 * ts)  # behind a filter of one sample
+            wanted = outer[0] * (wanted - x[2]) - outer[1] * speed_of_link
+        asked, place_before = [*asked[1:], wanted], x[2]
         r = w**2 * (asked[2] + 2 * asked[1] + asked[0]) - 2 * (w**2 - 1) * passed[1] - (1 - a + w**2) * passed[0]
         r /= 1 + a + w**2
         passed = [passed[1], r]
+        r = r if "prefilter_corner_hz" in g else wanted
         summed += 0.5 * ts * (r - torque + error_before)
         slope = (g["T_f"] * slope + g["c"] * r - torque - weighted_before) / (g["T_f"] + ts)
         speed = (x[0] - position_before) / ts
@@ -291,16 +308,17 @@ def simulate_by_hand(g: dict[str, float], reference: np.ndarray, free: bool) -> 
         command -= g["k_v"] * speed
         error_before, weighted_before, position_before = r - torque, g["c"] * r - torque, x[0]
         torques.append(torque)
+        places.append(x[2])
         x = solve_ivp(move, (0.0, ts), x, args=(waiting,), rtol=1e-9, atol=1e-12).y[:, -1]
         waiting = command
-    return np.array(torques)
+    return np.array(torques), np.array(places)
 
 
 @pytest.mark.parametrize("plant", [STAND, SWING])
 def test_a_certificates_step_is_the_one_integrated_here(filtered: Controller, plant: so.Plant) -> None:
     phases = (Phase(duration_s=0.02, force_N=0.0), Phase(duration_s=0.25, force_N=8.0))
     played = play(Stage(controller=filtered, plant=plant), Scenario(name="step", phases=phases), [VALUES])
-    found = simulate_by_hand(dict(filtered.gains), played.reference[0], plant is SWING)
+    found, _ = simulate_by_hand(dict(filtered.gains), played.reference[0], plant is SWING)
     assert played.reference[0, -1] == 8.0 and np.ptp(found) > 4.0
     np.testing.assert_allclose(played.outputs["tau_s"][0], found, atol=2e-4 * np.ptp(found))
 
@@ -311,6 +329,62 @@ def test_the_steps_that_a_certificate_judges_are_too(filtered: Controller, numbe
     scenario = step_scenarios(filtered, STAND)[number]
     played = play(Stage(controller=filtered, plant=STAND), scenario, [VALUES])
     count = 1500
-    found = simulate_by_hand(dict(filtered.gains), played.reference[0, :count], free=False)
+    found, _ = simulate_by_hand(dict(filtered.gains), played.reference[0, :count], free=False)
     assert np.ptp(played.reference[0, :count]) > 0.0
     np.testing.assert_allclose(played.outputs["tau_s"][0, :count], found, atol=1e-3 * np.ptp(found))
+
+
+def test_an_impedance_around_it_is_the_one_integrated_here(tuned: Controller) -> None:
+    """Stiffness and damping of the link, each sample: K (x_0 - x) less D times its filtered speed."""
+    whole = add_impedance(tuned, SWING, VALUES, Impedance(stiffness=20.0, damping=1.5))
+    assert whole.outer is not None
+    law = enclose_law(runnable(whole), whole.outer)
+    assert law.measured == 3
+    loop = SampledLoop(plant=SWING, law=law, measured=(*whole.signals, "theta_l"), delay_samples=1)
+    run = run_loop(loop, [VALUES], np.full(300, 0.2))
+    _, found = simulate_by_hand(dict(tuned.gains), np.full(300, 0.2), True, (20.0, 1.5))
+    np.testing.assert_allclose(run.outputs["theta_l"][0], found, atol=2e-4 * np.ptp(found))
+
+
+def test_what_the_link_feels_of_an_impedance_around_it_is_the_equations(tuned: Controller) -> None:
+    """Apparent impedance by frequency, and the eigenvalues by a loop written out."""
+    outer, g, f = (20.0, 1.5), dict(tuned.gains), np.geomspace(0.1, 300.0, 60)
+    link = find_link(tuned, SWING, VALUES)
+    whole = link.outer(Impedance(stiffness=outer[0], damping=outer[1]))
+    s, q = 2j * np.pi * f, np.exp(-2j * np.pi * f * 1e-3)
+    effort, _, motion = respond_plant(s, VALUES["b_r"].value)
+    hold, law = q * (1 - q) / (s * 1e-3), respond_law(g, q)
+    sampled = np.zeros((2, f.size), dtype=complex)
+    orders = 2j * np.pi * np.arange(-3000, 3001) * 1e3
+    for column, one in enumerate(s):
+        image = respond_plant(one + orders, VALUES["b_r"].value)[0] / ((one + orders) * 1e-3)
+        sampled[:, column] = np.sum(image, axis=1) * q[column] * (1 - q[column])
+    integral, rate = 5e-4 * (1 + q) / (1 - q), (1 - q) / (g["T_f"] + 1e-3 - g["T_f"] * q)
+    ahead = g["k_ff"] + g["k_r"] + g["k_i"] * integral + g["c"] * g["k_d"] * rate
+    asked = ahead * (outer[0] + outer[1] * (1 - q) / (2e-3 - 1e-3 * q))
+    command = -hold * (np.sum(law * motion, axis=0) + asked) / (1 + np.sum(law * sampled, axis=0))
+    np.testing.assert_allclose(apparent_impedance(link, whole, f), -(motion[0] + effort[0] * command) / s, rtol=1e-5)
+    moved = close_link(link, 1e-3)
+    path = moved.step(Impedance(stiffness=outer[0], damping=outer[1]), 200)
+    smooth = VALUES.update(f_c=0.0)
+    law_whole = enclose_law(runnable(add_impedance(tuned, SWING, smooth, whole.impedance)), whole)
+    loop = SampledLoop(plant=SWING, law=law_whole, measured=(*tuned.signals, "theta_l"), delay_samples=1)
+    run = run_loop(loop, [smooth], np.full(200, 1e-4))
+    np.testing.assert_allclose(path, run.outputs["theta_l"][0] * 1e4, atol=1e-4 * np.max(path))
+
+
+@pytest.mark.slow
+def test_an_impedance_around_it_is_certified(tuned: Controller) -> None:
+    whole = add_impedance(tuned, SWING, VALUES, Impedance(stiffness=20.0, damping=1.5), name="swing")
+    certificate = so.certify(whole, {"swing": SWING}, VALUES, samples=20)
+    assert certificate.impedance is not None
+    again = Controller.from_dict(json.loads(to_json(whole.to_dict())), STAND, VALUES)
+    assert again.outer == whole.outer
+
+
+def test_a_measured_response_is_of_one_signal() -> None:
+    parts = (Chirp(amplitude=2.0, f0_hz=0.1, f1_hz=100.0), Noise(std=1.0, band_hz=150.0))
+    log = so.virtual_log(STAND, VALUES, parts, duration_s=20.0, rate_hz=1000.0, seed=1)
+    response = so.measure_response(STAND, log, "tau_s")
+    with pytest.raises(ControlError, match=r"is of tau_s alone, and the law reads tau_s and thetad_m"):
+        so.tune(STAND, VALUES, SPEC, {"log": response})
