@@ -5,21 +5,34 @@ from __future__ import annotations
 import pickle
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import sweep
+from seaopt.control import (
+    CompensateFriction,
+    CompensateGravity,
+    CompensateRipple,
+    Impedance,
+    MPCSpec,
+    add_compensation,
+    add_impedance,
+    force_mpc,
+    sweep,
+    tune_schedule,
+)
 from seaopt.control.tuning import frontier
 from seaopt.estimation import bootstrap
 from seaopt.executors import Processes, Shared, _restore
 from seaopt.files import to_json
 from seaopt.progress import ignore
-from seaopt.robustness import Budget
+from seaopt.robustness import Budget, certify_mpc, certify_schedule
 from seaopt.robustness.certificate import measured_draws
 from seaopt.robustness.certificate.measured_draws import Loops, measure_draws
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
+from seaopt.robustness.verification import schedule_sweep
 
 STAND, SWING, THOR = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
@@ -74,7 +87,7 @@ def drop_clock(content):
     """Return what does not depend on the clock."""
     if isinstance(content, dict):
         return {name: drop_clock(value) for name, value in content.items() if name != "real_time_factor"}
-    return content
+    return [drop_clock(one) for one in content] if isinstance(content, list) else content
 
 
 def certify(controller, executor):
@@ -97,6 +110,69 @@ def certified(controller):
 def test_a_certificate(controller, certified, make):
     with make() as executor:
         assert certify(controller, executor) == certified
+
+
+def certify_friction(executor):
+    values = THOR.update(f_c=100.0)
+    tuned = so.tune(STAND, values, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, reserve=0.05))
+    law = add_compensation(tuned, friction=CompensateFriction(fraction=0.9, source="speed"))
+    ranges = {"f_c": (20.0, 120.0), "K_tau": (0.024, 0.027), "I_p": (0.3, 0.5)}
+    found = so.certify(
+        law, {"stand": STAND, "swing": SWING}, values, ranges=ranges, samples=5, simulations=False, executor=executor
+    )  # fmt: skip
+    assert found.friction_draws["stand"].samples == found.compensation_draws["stand"].samples == 5
+    return found
+
+
+def certify_link(executor):
+    knee, held = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
+    values = knee.defaults.update(N=50.0, k_s=300.0, J_l=0.3, d_l=0.5, m=4.0, L=0.2, f_c=0.0)
+    law = so.tune(held, values, so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6))
+    ripple = CompensateRipple(cycles=(1,), cos=(0.0,), sin=(0.5 * law.command.per_effort,), fraction=1.0)
+    law = add_compensation(law, gravity=CompensateGravity(fraction=0.8), ripple=ripple, link=(knee, values))
+    law = add_impedance(law, knee, values, Impedance(stiffness=20.0, damping=1.0), name="knee")
+    ranges = {"m": (3.0, 5.0), "k_s": (250.0, 350.0)}
+    found = so.certify(law, {"knee": knee}, values, ranges=ranges, samples=5, simulations=False, executor=executor)
+    assert found.impedance.draws.samples == 5
+    assert {"gravity_compensation", "ripple_compensation"} < {row.name for row in found.requirements}
+    return found
+
+
+def certify_points(executor):
+    spec = so.ControllerSpec(structure="pd", bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25)
+    schedule = tune_schedule(STAND, THOR, spec, "k", [5e5, 6e5])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule_sweep, "PULSE_PERIODS", 1.0)
+        found = certify_schedule(
+            schedule, {"stand": STAND}, THOR, ranges={"J": (3.2e-6, 3.4e-6)}, samples=20, executor=executor
+        )  # fmt: skip
+    assert found.places[0].worst["stand"][0] is STAND
+    assert len(found.sweeps["stand"]) > 1
+    return found
+
+
+def certify_plan(executor):
+    mpc = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
+    ranges = {"J": (2e-6, 5e-6)}
+    return certify_mpc(
+        mpc, {"stand": STAND}, THOR, ranges=ranges, samples=20, runs=3, sensor_std=1.0,
+        executor=executor,
+    )  # fmt: skip
+
+
+@cache
+def certify_here(certify_one):
+    return to_json(drop_clock(certify_one(None).to_dict()))
+
+
+OTHERS = [certify_friction, certify_link, pytest.param(certify_points, marks=pytest.mark.slow), certify_plan]
+
+
+@pytest.mark.parametrize("certify_one", OTHERS)
+@pytest.mark.parametrize("make", EXECUTORS)
+def test_other_certificates(certify_one, make):
+    with make() as executor:
+        assert to_json(drop_clock(certify_one(executor).to_dict())) == certify_here(certify_one)
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +213,8 @@ def test_draws_in_several_blocks(controller, monkeypatch, make):
     monkeypatch.setattr(measured_draws, "DRAWS_PER_BLOCK", 70)
     monkeypatch.setattr(measured_draws, "DRAW_BLOCK", 30)
     unknown = combine_uncertainty(THOR, so.ParameterSet(), {"I_p": (0.1, 2.0)}, {"swing": SWING})
-    loops = Shared(Loops(controller=controller, plants={"stand": STAND, "swing": SWING}, unknown=unknown, bounds=None))
+    plants = {"stand": STAND, "swing": SWING}
+    loops = Shared(Loops(controller=controller, models=plants, plants=plants, unknown=unknown, bounds=None))
 
     def measure(executor):
         return measure_draws(loops, 200, np.random.default_rng(1), executor, ignore)

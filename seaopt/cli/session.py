@@ -462,7 +462,7 @@ class Session:
         law, source = self._designed(), self.parameters()
         self._design_values(*plants.values())
         if isinstance(law, ScheduledController):
-            result = certify_schedule_problem(self.problem, law, source, tell)
+            result = certify_schedule_problem(self.problem, law, source, tell, self.executor)
         else:
             result = certify_problem(self.problem, law, source, tell, self.executor)
         for remark in self.problem.remarks(self.values()):

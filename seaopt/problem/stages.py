@@ -260,8 +260,9 @@ def tune_schedule_problem(
 
 
 def certify_schedule_problem(
-    problem: Problem, schedule: ScheduledController, source: Fit | ParameterSet, progress: Progress = ignore
-) -> ScheduleCertificate:
+    problem: Problem, schedule: ScheduledController, source: Fit | ParameterSet, progress: Progress = ignore,
+    executor: Executor | None = None,
+) -> ScheduleCertificate:  # fmt: skip
     """Certify a schedule on the problem's plants, simulations included, as `seaopt certify` does.
 
     Parameters
@@ -272,7 +273,7 @@ def certify_schedule_problem(
         The gains.
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
-    progress : callable, optional
+    progress, executor
         As in `seaopt.robustness.certify_schedule`.
 
     """
@@ -281,7 +282,8 @@ def certify_schedule_problem(
     return certify_schedule(
         schedule, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
         samples=table.samples, seed=table.seed, max_failure_probability=table.max_failure_probability,
-        min_rate=problem.schedule.min_rate, sensors=problem.sensors, current_step_A=table.step, progress=progress,
+        min_rate=problem.schedule.min_rate, sensors=problem.sensors, current_step_A=table.step, executor=executor,
+        progress=progress,
     )  # fmt: skip
 
 
@@ -401,7 +403,7 @@ def certify_problem(
             bounds=Budget() if table.bounds else None,
             max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
             runs=table.constrained_runs, bound_tolerance=table.bound_tolerance,
-            sensor_std=problem.sensors.noise_std.get(problem.mpc.measured, 0.0), progress=progress,
+            sensor_std=problem.sensors.noise_std.get(problem.mpc.measured, 0.0), executor=executor, progress=progress,
         )  # fmt: skip
     return certify(
         controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,

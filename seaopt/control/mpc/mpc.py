@@ -117,6 +117,9 @@ class ForceMPC:
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _design, (*self.design, self.spec, self.gate, self.warnings)  # the solver does not pickle
+
     @property
     @memo
     def loops(self) -> Mapping[str, Loop]:

@@ -199,7 +199,7 @@ def certify(
         FRICTION * len(plants), IMPEDANCE * min(samples, IMPEDANCE_DRAWS) * (controller.outer is not None),
         STEPS * len(models), SIMULATIONS * len(models) * simulations,
     )  # fmt: skip
-    loops = Shared(Loops(controller=controller, plants=plants, unknown=unknown, bounds=bounds))
+    loops = Shared(Loops(controller=controller, models=models, plants=plants, unknown=unknown, bounds=bounds))
     failures, drawn, drawn_ms = measure_draws(loops, samples, rng, executor, drawing)
     worst, brackets = search_worst(loops, drawn, executor, searching)
     monte_carlo = MonteCarlo(
@@ -209,16 +209,14 @@ def certify(
     )  # fmt: skip
     rubbing("friction at the draws", 0.0)
     friction = find_nominal_margins(controller, models, nominal)
-    friction_draws = find_margins_at_draws(
-        controller, models, unknown, friction, samples, rng, required=min_friction_margin
-    )
+    friction_draws = find_margins_at_draws(loops, friction, samples, rng, min_friction_margin, executor)
     impedance = certify_impedance(controller, models, nominal)
     if impedance is not None and impedance.safe:
-        impedance = replace(impedance, draws=draw_impedance(controller, models, unknown, samples, rng, rendering))
+        impedance = replace(impedance, draws=draw_impedance(loops, samples, rng, executor, rendering))
     compensation = find_nominal_compensation(controller, models, nominal)
-    compensation_draws = find_compensation_at_draws(controller, models, unknown, compensation, samples, rng)
-    gravity = find_gravity_cases(controller, models, unknown, samples, rng)
-    ripple = find_ripple_cases(controller, models, unknown, samples, rng)
+    compensation_draws = find_compensation_at_draws(loops, compensation, samples, rng, executor)
+    gravity = find_gravity_cases(loops, samples, rng, executor)
+    ripple = find_ripple_cases(loops, samples, rng, executor)
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),

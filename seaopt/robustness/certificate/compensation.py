@@ -19,8 +19,10 @@ elsewhere than compensated may double the slope.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,7 @@ from seaopt.control.loops.compensation.terms import GravityTerm
 from seaopt.control.loops.sampled_plant import find_rest, sample
 from seaopt.control.running.outer_run import enclose_law
 from seaopt.errors import ControlError
+from seaopt.executors import Shared
 from seaopt.formatting import format_values
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -39,7 +42,7 @@ from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import output_function
 from seaopt.records import record
 from seaopt.robustness.certificate.friction import MARGIN_DRAWS
-from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws, select_own
 from seaopt.robustness.uncertainty.worst import place_values
 
 FRICTION_COMPENSATION = "friction_compensation"
@@ -95,24 +98,31 @@ def find_nominal_compensation(
 
 
 def find_compensation_at_draws(
-    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty,
-    nominal: Mapping[str, CompensationMargin], samples: int, rng: np.random.Generator,
+    loops: Shared[Loops], nominal: Mapping[str, CompensationMargin], samples: int, rng: np.random.Generator,
+    executor: Executor | None = None,
 ) -> dict[str, CompensationDraws]:  # fmt: skip
     """Return the same over draws, of the plants for which it is shown at the nominal parameters."""
     enough, count = {name: margin for name, margin in nominal.items() if margin.shown}, min(samples, MARGIN_DRAWS)
     if not enough or not count:
         return {}
-    draws = unknown.list_draws(count, rng)
+    draws = loops.value.unknown.list_draws(count, rng)
     found: dict[str, CompensationDraws] = {}
     for name, margin in enough.items():
-        placed = [place_values(models[name], unknown.nominal, draw) for draw in draws]
-        margins = find_compensation_margins(controller, models[name], placed, first=margin.multiplier)
+        own = select_own(loops, name, draws)
+        margins = list(judge_draws(partial(_find_margins, margin.multiplier), loops, name, own, executor))
         least = int(np.argmin([one.slope for one in margins]))
         found[name] = CompensationDraws(
             samples=count, shown=sum(one.shown for one in margins), least_slope=margins[least].slope,
-            parameters={key: value for key, value in draws[least].items() if key in placed[least]},
+            parameters=own[least],
         )  # fmt: skip
     return found
+
+
+def _find_margins(first: str, loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[CompensationMargin]:
+    """Return the margins of one plant at draws, a multiplier tried first."""
+    plant, nominal = loops.value.models[name], loops.value.unknown.nominal
+    placed = [place_values(plant, nominal, draw) for draw in draws]
+    return find_compensation_margins(loops.value.controller, plant, placed, first=first)
 
 
 def describe_compensation(
@@ -148,33 +158,37 @@ class GravityCase:
 
 
 def find_gravity_cases(
-    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator
+    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
 ) -> dict[str, GravityCase]:
     """Return how fast the link of every plant runs away at most with its weight compensated; empty where none is.
 
     Parameters
     ----------
-    controller : Controller
-        Any.
-    models : mapping of name to Plant
-        Those whose link is held are left out.
-    unknown : Uncertainty
-        Of the parameters.
+    loops : Shared of Loops
+        Models whose link is held are left out.
     samples : int
         Draws; at most `GRAVITY_DRAWS` are looked at.
     rng : numpy.random.Generator
         Of the draws.
+    executor : Executor, optional
+        Where draws are looked at.
 
     """
-    term = None if controller.compensation is None else controller.compensation.gravity
+    compensation = loops.value.controller.compensation
+    term = None if compensation is None else compensation.gravity
     if term is None:
         return {}
-    draws = unknown.list_draws(min(samples, GRAVITY_DRAWS), rng)
+    draws = [{}, *loops.value.unknown.list_draws(min(samples, GRAVITY_DRAWS), rng)]
     return {
-        name: find_worst_gravity(controller, model, unknown.nominal, [{}, *draws])
-        for name, model in models.items()
+        name: _choose_worst_gravity(judge_draws(_find_gravity, loops, name, draws, executor))
+        for name, model in loops.value.models.items()
         if model.port is not None and term.reads in model.outputs
     }
+
+
+def _find_gravity(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[GravityCase]:
+    known = loops.value
+    return [_measure_gravity(known.controller, known.models[name], known.unknown.nominal, draw) for draw in draws]
 
 
 def find_worst_gravity(
@@ -194,22 +208,32 @@ def find_worst_gravity(
         Values by name.
 
     """
+    return _choose_worst_gravity(_measure_gravity(controller, plant, nominal, draw) for draw in draws)
+
+
+def _choose_worst_gravity(cases: Iterable[GravityCase]) -> GravityCase:
+    worst = max(cases, key=lambda case: case.radius)
+    return worst if worst.radius else replace(worst, radius=np.inf)  # the link falls wherever it is: nothing is shown
+
+
+def _measure_gravity(
+    controller: Controller, plant: Plant, nominal: ParameterSet, draw: Mapping[str, float]
+) -> GravityCase:
+    """Return the largest eigenvalue over angles at one draw; zero where the link falls at all of them."""
     assert controller.compensation is not None and controller.compensation.gravity is not None
     assert plant.port is not None and plant.port.coordinate is not None
     term, coordinate, unit = controller.compensation.gravity, plant.port.coordinate, plant.states[plant.port.coordinate]
     reach = INSIDE * (min(abs(term.low), abs(term.high)) if term.unit == unit else np.pi / 3)
-    worst = GravityCase(radius=0.0, angle=0.0, parameters={})
-    for draw in draws:
-        placed = place_values(plant, nominal, draw)
-        for angle in np.linspace(-reach, reach, PLACES):
-            at = placed.with_parameters(Parameter(name=coordinate, value=float(angle), unit=unit))
-            if _find_radius(controller, term, plant, at, share=0.0) > 1.0 + NEUTRAL:
-                continue  # a link that stands on its head falls by itself
-            radius = _find_radius(controller, term, plant, at)
-            if radius > worst.radius:
-                used = {name: value for name, value in draw.items() if name in placed}
-                worst = GravityCase(radius=radius, angle=float(angle), parameters=used)
-    return worst if worst.radius else replace(worst, radius=np.inf)  # the link falls wherever it is: nothing is shown
+    worst, placed = GravityCase(radius=0.0, angle=0.0, parameters={}), place_values(plant, nominal, draw)
+    for angle in np.linspace(-reach, reach, PLACES):
+        at = placed.with_parameters(Parameter(name=coordinate, value=float(angle), unit=unit))
+        if _find_radius(controller, term, plant, at, share=0.0) > 1.0 + NEUTRAL:
+            continue  # a link that stands on its head falls by itself
+        radius = _find_radius(controller, term, plant, at)
+        if radius > worst.radius:
+            used = {name: value for name, value in draw.items() if name in placed}
+            worst = GravityCase(radius=radius, angle=float(angle), parameters=used)
+    return worst
 
 
 def _find_radius(
@@ -274,22 +298,20 @@ class RippleCase:
 
 
 def find_ripple_cases(
-    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator
+    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
 ) -> dict[str, RippleCase]:
     """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without.
 
     Parameters
     ----------
-    controller : Controller
-        Any.
-    models : mapping of name to Plant
-        All on which it runs.
-    unknown : Uncertainty
-        Of the parameters.
+    loops : Shared of Loops
+        With the controller, the plants, and what is uncertain of them.
     samples : int
         Draws; at most `RIPPLE_DRAWS` are looked at.
     rng : numpy.random.Generator
         Of the draws.
+    executor : Executor, optional
+        Where draws are looked at.
 
     Raises
     ------
@@ -297,10 +319,19 @@ def find_ripple_cases(
         A plant has no output that is read.
 
     """
-    if controller.compensation is None or controller.compensation.ripple is None:
+    compensation = loops.value.controller.compensation
+    if compensation is None or compensation.ripple is None:
         return {}
-    draws = [{}, *unknown.list_draws(min(samples, RIPPLE_DRAWS), rng)]
-    return {name: find_worst_ripple(controller, model, unknown.nominal, draws) for name, model in models.items()}
+    draws = [{}, *loops.value.unknown.list_draws(min(samples, RIPPLE_DRAWS), rng)]
+    return {
+        name: max(judge_draws(_find_ripple, loops, name, draws, executor), key=lambda case: case.radius)
+        for name in loops.value.models
+    }
+
+
+def _find_ripple(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[RippleCase]:
+    known = loops.value
+    return [find_worst_ripple(known.controller, known.models[name], known.unknown.nominal, [draw]) for draw in draws]
 
 
 def find_worst_ripple(

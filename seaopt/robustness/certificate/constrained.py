@@ -13,6 +13,7 @@ Pearson's bound; nothing is claimed beyond that distribution.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -25,6 +26,7 @@ from seaopt.control import ForceMPC, ForceRun, MPCStep, close_loop
 from seaopt.control.loops.sampled_plant import DELAY, conditions
 from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.errors import SeaoptError
+from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count, format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -117,19 +119,31 @@ class ConstrainedRuns:
 
 @record(eq=False)
 class _Outcome:
-    """One run on one plant: its first fault ("" if none), and what it did."""
+    """One run on one plant: its first fault ("" if none), and what it did in so many steps."""
 
     kind: str
     text: str
     violation: float
     signal: str
-    steps: tuple[MPCStep, ...]
+    steps: int
+    unsolved: int
+    late: int
+    iterations: int
     at_limit: int
+
+
+@record(eq=False)
+class _Run:
+    """What is drawn for one run: parameters, the seed of its noise, its reference and its disturbance."""
+
+    draw: dict[str, float]
+    seed: int
+    references: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 
 
 def run_constrained(
     mpc: ForceMPC, plants: Mapping[str, Plant], unknown: Uncertainty, *, runs: int, seed: int, confidence: float,
-    tolerance: float, sensor_std: float, progress: Progress = ignore,
+    tolerance: float, sensor_std: float, executor: Executor | None = None, progress: Progress = ignore,
 ) -> ConstrainedRuns:  # fmt: skip
     """Draw and simulate runs with limits active.
 
@@ -141,36 +155,37 @@ def run_constrained(
         Each is played at every draw.
     unknown : Uncertainty
         What is drawn of the parameters.
-    runs, seed, confidence, tolerance, sensor_std, progress
+    runs, seed, confidence, tolerance, sensor_std, executor, progress
         As in `certify_mpc`.
 
     """
     rng = np.random.default_rng([seed, CONSTRAINED_STREAM])
     drawn = unknown.values(unknown.draw(runs, rng))
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name != DELAY}
+    parts = [
+        _Run(
+            draw={name: float(column[k]) for name, column in drawn.items() if name not in placed}, seed=seed + k,
+            references=_draw_references(mpc, rng),
+        )
+        for k in range(runs)
+    ]  # fmt: skip
+    shared = Shared((mpc, dict(plants), unknown.nominal, tolerance, sensor_std))
+    played = map_ordered(partial(_play_run, shared), parts, executor)
     kinds: list[str] = []
     worst, remedy, outcomes = "", "", list[_Outcome]()
     for k in count_off(range(runs), "limits active, run", progress):
-        draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
-        reference, disturbance = _draw_references(mpc, rng)
-        play = partial(
-            _play, mpc, reference=reference, disturbance=disturbance, tolerance=tolerance, sensor_std=sensor_std,
-            seed=seed + k,
-        )  # fmt: skip
-        first = ""
-        for name, plant in plants.items():
-            values = place_values(plant, unknown.nominal, draw)
-            outcome = play(plant, values)
-            outcomes.append(outcome)
-            if outcome.kind and not first:
-                first = outcome.kind
-                if not worst:
-                    drawn_here = {key: value for key, value in draw.items() if key in values}
-                    at = f"; {format_values(drawn_here)}" if drawn_here else ""
-                    worst = f"{name}, run {k}, seed {seed}: {outcome.text}{at}"
-                    remedy = _find_remedy(mpc, name, plant, unknown.nominal, drawn_here, outcome, play)
-        kinds.append(first)
-    failures, steps = sum(map(bool, kinds)), [step for one in outcomes for step in one.steps]
+        of_plants = dict(zip(plants, next(played), strict=True))
+        outcomes += of_plants.values()
+        failed = [name for name, one in of_plants.items() if one.kind]
+        kinds.append(of_plants[failed[0]].kind if failed else "")
+        if failed and not worst:
+            name, plant, draw = failed[0], plants[failed[0]], parts[k].draw
+            drawn_here = {key: draw[key] for key in draw if key in place_values(plant, unknown.nominal, draw)}
+            at = f"; {format_values(drawn_here)}" if drawn_here else ""
+            worst = f"{name}, run {k}, seed {seed}: {of_plants[name].text}{at}"
+            play = partial(_play, mpc, drawn=parts[k], tolerance=tolerance, sensor_std=sensor_std)
+            remedy = _find_remedy(mpc, name, plant, unknown.nominal, drawn_here, of_plants[name], play)
+    failures, steps = sum(map(bool, kinds)), sum(one.steps for one in outcomes)
     missing = (
         f"{name} has no {signal}: its bounds are not checked there"
         for name, plant in plants.items()
@@ -183,9 +198,9 @@ def run_constrained(
         not_settled=kinds.count(UNSETTLED), confidence=confidence,
         failure_probability_bound=failure_bound(runs, failures, confidence), bound_tolerance=tolerance,
         largest_violation=max(one.violation for one in outcomes),
-        at_limit=sum(one.at_limit for one in outcomes) / max(len(steps), 1),
-        fallback=float(np.mean([not step.solved for step in steps])) if steps else 0.0,
-        iterations=max((step.iterations for step in steps), default=0), sensor_std=sensor_std, where=worst,
+        at_limit=sum(one.at_limit for one in outcomes) / max(steps, 1),
+        fallback=sum(one.unsolved for one in outcomes) / max(steps, 1),
+        iterations=max(one.iterations for one in outcomes), sensor_std=sensor_std, where=worst,
         remedy=remedy, left_out=(*missing, *kept),
     )  # fmt: skip
 
@@ -205,12 +220,31 @@ def _phase_s(mpc: ForceMPC) -> float:
     return max(LEAST_PHASE_S, PERIODS / mpc.spec.bandwidth_hz) + mpc.spec.preview_samples * mpc.sample_time_s
 
 
+def _play_run(
+    shared: Shared[tuple[ForceMPC, dict[str, Plant], ParameterSet, float, float]], run: _Run
+) -> list[_Outcome]:
+    """Simulate one run on every plant, and judge it."""
+    mpc, plants, nominal, tolerance, sensor_std = shared.value
+    return [
+        _play(mpc, plant, place_values(plant, nominal, run.draw), run, tolerance, sensor_std)
+        for plant in plants.values()
+    ]
+
+
 def _play(
-    mpc: ForceMPC, plant: Plant, values: ParameterSet, reference: Float[np.ndarray, " n"],
-    disturbance: Float[np.ndarray, " n"], tolerance: float, sensor_std: float, seed: int,
-) -> _Outcome:  # fmt: skip
+    mpc: ForceMPC, plant: Plant, values: ParameterSet, drawn: _Run, tolerance: float, sensor_std: float
+) -> _Outcome:
     """Simulate one run on one plant, and judge it."""
     steps: list[MPCStep] = []
+    reference, disturbance = drawn.references
+
+    def report(kind: str, text: str, violation: float, signal: str, at_limit: int) -> _Outcome:
+        return _Outcome(
+            kind=kind, text=text, violation=violation, signal=signal, at_limit=at_limit, steps=len(steps),
+            unsolved=sum(not step.solved for step in steps),
+            late=sum(step.status.startswith(UNFINISHED) and not step.solved for step in steps),
+            iterations=max((step.iterations for step in steps), default=0),
+        )  # fmt: skip
 
     def law(state: Any, r: Any, y: float) -> tuple[float, Any]:
         steps.append(mpc.step(state, r, y))
@@ -220,19 +254,17 @@ def _play(
         run = close_loop(
             law, mpc.start, plant, values, reference, measured=mpc.measured, sample_time_s=mpc.sample_time_s,
             delay_samples=mpc.delay_samples, preview_samples=mpc.spec.preview_samples, sensor_std=sensor_std,
-            disturbance_A=disturbance, seed=seed,
+            disturbance_A=disturbance, seed=drawn.seed,
         )  # fmt: skip
     except SeaoptError as error:
-        return _Outcome(kind=DIVERGED, text=str(error), violation=0.0, signal="", steps=tuple(steps), at_limit=0)
+        return report(DIVERGED, str(error), 0.0, "", 0)
     violation, signal = _find_violation(mpc, plant, values, run, disturbance)
     kind, text = _judge(mpc, plant, run, np.array([step.target_N for step in steps]))
     if not kind and violation > tolerance:
         kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
     slews = np.abs(np.diff(run.current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
     at_limit = int(np.count_nonzero(slews | (np.abs(run.current) > mpc.command_limit * (1.0 - 1e-6))))
-    return _Outcome(
-        kind=kind, text=text, violation=violation, signal=signal, steps=tuple(steps), at_limit=at_limit
-    )  # fmt: skip
+    return report(kind, text, violation, signal, at_limit)
 
 
 def _find_remedy(
@@ -240,9 +272,8 @@ def _find_remedy(
     play: Callable[[Plant, ParameterSet], _Outcome],
 ) -> str:  # fmt: skip
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
-    late = sum(step.status.startswith(UNFINISHED) and not step.solved for step in failed.steps)
-    if late:
-        return f"a larger max_iterations in [mpc]: {format_count(late, 'sample')} of that run had no plan"
+    if failed.late:
+        return f"a larger max_iterations in [mpc]: {format_count(failed.late, 'sample')} of that run had no plan"
     if (own := play(*mpc.design)).kind:
         return f"{_name_obstacle(mpc, own)}: the run fails on the design plant with its own parameters too"
     room = f", or leave {failed.signal} more room by bound_tolerance" if failed.kind == OVER_BOUND else ""

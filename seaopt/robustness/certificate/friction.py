@@ -6,19 +6,22 @@ only where it shows too little: a margin of a draw is then a lower bound of what
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from functools import partial
 
 import numpy as np
 
 from seaopt.control import Controller
 from seaopt.control.laws.friction_margin import find_friction_margin, find_friction_margins
 from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.executors import Shared
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
 from seaopt.records import record
-from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws, select_own
 from seaopt.robustness.uncertainty.worst import place_values
 
 MARGIN_DRAWS = 100  # at most so many are looked at
@@ -69,24 +72,23 @@ def find_nominal_margins(
 
 
 def find_margins_at_draws(
-    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, nominal: Mapping[str, FrictionMargin],
-    samples: int, rng: np.random.Generator, required: float | None = None,
+    loops: Shared[Loops], nominal: Mapping[str, FrictionMargin], samples: int, rng: np.random.Generator,
+    required: float | None = None, executor: Executor | None = None,
 ) -> dict[str, FrictionDraws]:  # fmt: skip
     """Return margins at draws, of plants for which stability, or the slope required, is shown at nominal parameters.
 
     Those that have friction at draws alone are among them.
     """
-    count, varied = min(samples, MARGIN_DRAWS), [row.name for row in unknown.varied()]
+    unknown, count = loops.value.unknown, min(samples, MARGIN_DRAWS)
+    varied = [row.name for row in unknown.varied()]
     enough = {
-        name: nominal.get(name) for name, model in models.items()
+        name: nominal.get(name) for name, model in loops.value.models.items()
         if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
     }  # fmt: skip
     if not count or not enough:
         return {}
     draws = unknown.list_draws(count, rng)
-    return {
-        name: _count_shown(controller, models[name], unknown.nominal, draws, margin) for name, margin in enough.items()
-    }
+    return {name: _count_shown(loops, name, draws, margin, executor) for name, margin in enough.items()}
 
 
 def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool:
@@ -95,21 +97,27 @@ def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool
 
 
 def _count_shown(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draws: list[dict[str, float]],
-    known: FrictionMargin | None,
-) -> FrictionDraws:  # fmt: skip
+    loops: Shared[Loops], name: str, draws: Sequence[Draw], known: FrictionMargin | None, executor: Executor | None
+) -> FrictionDraws:
     """Return for how many draws of one plant stability is shown, and the least margin."""
-    placed = [place_values(plant, nominal, draw) for draw in draws]
-    keys = [tuple((name, each[name].value) for name in each) for each in placed]
-    distinct = dict(zip(keys, placed, strict=True))  # draws that vary what this plant does not have are one loop
-    first, least = ("", 0.0) if known is None else (known.multiplier, 1.0 if known.shown else 0.0)
-    found = find_friction_margins(controller, plant, list(distinct.values()), first, least)
+    own = select_own(loops, name, draws)
+    distinct = {tuple(draw.items()): draw for draw in own}  # draws that vary what this plant does not have are one loop
+    found = judge_draws(partial(_find_margins, known), loops, name, list(distinct.values()), executor)
     margins = dict(zip(distinct, found, strict=True))
     shown, slope, factor, place = 0, np.inf, np.inf, 0
-    for k, key in enumerate(keys):
-        margin = margins[key]
+    for k, draw in enumerate(own):
+        margin = margins[tuple(draw.items())]
         shown += margin is None or margin.shown  # without friction there is nothing to show
         if margin is not None and margin.least_slope < slope:
             slope, factor, place = margin.least_slope, margin.factor, k
-    used = {name: value for name, value in draws[place].items() if name in placed[place]}
-    return FrictionDraws(samples=len(draws), shown=shown, least_slope=slope, factor=factor, parameters=used)
+    return FrictionDraws(samples=len(draws), shown=shown, least_slope=slope, factor=factor, parameters=own[place])
+
+
+def _find_margins(
+    known: FrictionMargin | None, loops: Shared[Loops], name: str, draws: Sequence[Draw]
+) -> list[FrictionMargin | None]:
+    """Return the margins of one plant at draws, the multiplier that served at the nominal parameters tried first."""
+    first, least = ("", 0.0) if known is None else (known.multiplier, 1.0 if known.shown else 0.0)
+    plant, nominal = loops.value.models[name], loops.value.unknown.nominal
+    placed = [place_values(plant, nominal, draw) for draw in draws]
+    return find_friction_margins(loops.value.controller, plant, placed, first, least)

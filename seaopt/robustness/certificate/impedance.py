@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict
 from typing import Any
 
@@ -14,13 +15,14 @@ from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.sampled_port import SampledPort
 from seaopt.control.loops.loop import GROWING
 from seaopt.errors import ControlError, suggestion
+from seaopt.executors import Shared
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
-from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws
 from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.impedance_steps import ImpedanceStep, play_impedance_steps
 
@@ -150,28 +152,40 @@ def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
 
 
 def draw_impedance(
-    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
+    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> ImpedanceDraws | None:  # fmt: skip
     """Judge the impedance of a controller's outer loop at draws; None where it has none, or nothing is drawn."""
-    count = min(samples, IMPEDANCE_DRAWS)
-    if controller.outer is None or not count:
+    count, known = min(samples, IMPEDANCE_DRAWS), loops.value
+    if known.controller.outer is None or not count:
         return None
-    name = _find_plant(controller, models)
-    states = split_friction({name: models[name]}, unknown.nominal, [row.name for row in unknown.varied()]).values()
+    name, draws = _find_plant(known.controller, known.models), known.unknown.list_draws(count, rng)
+    cases = judge_draws(_judge_states, loops, name, draws, executor)
     stable = passive = 0
     least, worst = np.inf, dict[str, float]()
-    for draw in count_off(unknown.list_draws(count, rng), "impedance, draw", progress):
+    for draw in count_off(draws, "impedance, draw", progress):
+        rests, margin = next(cases)
+        stable += rests
+        passive += margin > 0.0
+        if margin < least:
+            least, worst = margin, {key: value for key, value in draw.items() if key in known.models[name].parameters}
+    return ImpedanceDraws(samples=count, stable=stable, passive=passive, margin=float(least), parameters=worst)
+
+
+def _judge_states(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[tuple[bool, float]]:
+    """Return whether the link rests by itself, sliding and stuck, and the least margin, at every draw."""
+    controller, unknown = loops.value.controller, loops.value.unknown
+    assert controller.outer is not None
+    varied = [row.name for row in unknown.varied()]
+    states = split_friction({name: loops.value.models[name]}, unknown.nominal, varied).values()
+    found: list[tuple[bool, float]] = []
+    for draw in draws:
         judged = [
             _judge(controller, state, place_values(state, unknown.nominal, draw), controller.outer.impedance)
             for state in states
         ]
-        stable += all(rests for rests, _ in judged)
-        margin = min(margin for _, margin in judged)
-        passive += margin > 0.0
-        if margin < least:
-            least, worst = margin, {key: value for key, value in draw.items() if key in models[name].parameters}
-    return ImpedanceDraws(samples=count, stable=stable, passive=passive, margin=float(least), parameters=worst)
+        found.append((all(rests for rests, _ in judged), min(margin for _, margin in judged)))
+    return found
 
 
 def _judge(controller: Controller, plant: Plant, params: ParameterSet, impedance: Impedance) -> tuple[bool, float]:

@@ -7,10 +7,11 @@ of them is the same, as nothing is cut or drawn by it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,11 +27,15 @@ from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures, join_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty
 from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
-from seaopt.robustness.uncertainty.worst import Worst, combine_worst, find_worst, measure_worst
+from seaopt.robustness.uncertainty.worst import Worst, combine_worst, find_worst, measure_worst, place_values
 
 DRAWS_PER_BLOCK = 50_000
 DRAWS_KEPT = 5000  # of which Ms is kept, to be drawn
 WORST_KEPT = 64  # worst draws kept of each plant
+DRAWS_PER_PART = 4  # of those that are judged one by one
+
+Draw = Mapping[str, float]
+Case = TypeVar("Case")
 
 
 @record(eq=False)
@@ -40,6 +45,8 @@ class Loops:
     Parameters
     ----------
     controller : Controller
+    models : mapping of name to Plant
+        As they are, with their friction.
     plants : mapping of name to Plant
         Without friction that sticks: sliding or stuck.
     unknown : Uncertainty
@@ -49,6 +56,7 @@ class Loops:
     """
 
     controller: Controller
+    models: Mapping[str, Plant]
     plants: Mapping[str, Plant]
     unknown: Uncertainty
     bounds: Budget | None
@@ -173,3 +181,35 @@ def _search_plant(loops: Shared[Loops], part: tuple[str, Float[np.ndarray, "n k"
     if bounded.parameters:
         worst = combine_worst([worst, measure_worst(controller, plant, unknown.nominal, bounded.parameters)])
     return worst, bounded
+
+
+def select_own(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[dict[str, float]]:
+    """Return of draws what the model of a name has of them."""
+    model, nominal = loops.value.models[name], loops.value.unknown.nominal
+    own = [key for key in draws[0] if key in place_values(model, nominal, draws[0])] if draws else []
+    return [{key: draw[key] for key in own} for draw in draws]
+
+
+def judge_draws(
+    judge: Callable[[Shared[Loops], str, Sequence[Draw]], Sequence[Case]], loops: Shared[Loops], name: str,
+    draws: Sequence[Draw], executor: Executor | None,
+) -> Iterator[Case]:  # fmt: skip
+    """Yield what a judgement makes of every draw on the plant of a name, in order.
+
+    Parameters
+    ----------
+    judge : callable
+        Of these loops, the name and some draws; it returns a case for each.
+    loops : Shared of Loops
+        What the judgement takes.
+    name : str
+        Among the models.
+    draws : sequence of mapping
+        Values by name.
+    executor : Executor or None
+        Where it is made; here, if None.
+
+    """
+    parts = (draws[k : k + DRAWS_PER_PART] for k in range(0, len(draws), DRAWS_PER_PART))
+    for cases in map_ordered(partial(judge, loops, name), parts, executor):
+        yield from cases

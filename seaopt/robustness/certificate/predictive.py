@@ -8,6 +8,7 @@ there is no such law: `constrained` simulates that.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
@@ -78,6 +79,7 @@ def certify_mpc(
     max_failure_probability: float | None = None,
     bound_tolerance: float = 0.1,
     sensor_std: float = 0.0,
+    executor: Executor | None = None,
     progress: Progress = ignore,
     **linear: Any,
 ) -> Certificate:
@@ -99,8 +101,8 @@ def certify_mpc(
         make the estimate of it wrong.
     sensor_std : float
         White noise of the measured output in the runs.
-    progress : callable, optional
-        As in `certify`.
+    executor, progress
+        As in `certify`; runs are parts, too.
     **linear
         Further keywords of `certify`: samples, min_friction_margin, bounds, measured.
 
@@ -135,13 +137,15 @@ def certify_mpc(
     linearly, simulating = divide(progress, LINEAR_RUN, CONSTRAINED_RUN * runs * max(len(plants), 1))
     certificate = certify(
         linear_controller(mpc), plants, parameters, ranges=ranges, others=others, seed=seed, confidence=confidence,
-        max_failure_probability=max_failure_probability, simulations=False, progress=linearly, **linear,
+        max_failure_probability=max_failure_probability, simulations=False, executor=executor, progress=linearly,
+        **linear,
     )  # fmt: skip
     models, (_, values), known = certificate.models, mpc.design, others or ParameterSet()
     known = known.with_parameters(*(values[name] for name in values if name not in known))
     constrained = run_constrained(
         mpc, models, combine_uncertainty(parameters, known, dict(ranges or {}), models), runs=runs, seed=seed,
-        confidence=confidence, tolerance=bound_tolerance, sensor_std=sensor_std, progress=simulating,
+        confidence=confidence, tolerance=bound_tolerance, sensor_std=sensor_std, executor=executor,
+        progress=simulating,
     )  # fmt: skip
     requirements = (*certificate.requirements, *_require_runs(constrained, max_failure_probability))
     return replace(

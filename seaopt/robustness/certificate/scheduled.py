@@ -17,12 +17,16 @@ What is said, and how it is known:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import fields, replace
+from functools import partial
 from hashlib import sha256
 from itertools import pairwise
+from types import NoneType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control import LoopFigures, ScheduledController
@@ -31,6 +35,7 @@ from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
+from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count, html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -88,6 +93,10 @@ class PlaceCertificate:
     over_mt: int
     requirements: tuple[Requirement, ...]
     simulated: Certificate | None = None
+
+    def on(self, plants: Mapping[str, Plant]) -> PlaceCertificate:
+        """Return the same of plants that equal its own (`Worst.on`)."""
+        return replace(self, worst={name: case.on(plants[name]) for name, case in self.worst.items()})
 
     @property
     def ms(self) -> float:
@@ -271,6 +280,7 @@ def certify_schedule(
     simulations: bool = True,
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
+    executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> ScheduleCertificate:
     """Check a schedule against plants, with its variable standing still and in sweeps.
@@ -289,6 +299,9 @@ def certify_schedule(
         rate is stated, not required.
     simulations : bool
         Simulate the points on the plants that hold the variable, and the sweeps.
+    executor : concurrent.futures.Executor, optional
+        Where values, stretches and sweeps are worked on (`seaopt.executors`); here, if left out. The result is the
+        same, bit for bit.
     progress : callable, optional
         Called with what is done and the share of it that is done.
 
@@ -312,6 +325,7 @@ def certify_schedule(
     """
     require_type(schedule, ScheduledController, "schedule", "give a ScheduledController", ControlError)
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
+    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", ControlError)
     if min_rate is not None and not require_number(min_rate, "min_rate", ControlError) > 0.0:
         raise ControlError(f"min_rate = {min_rate:g} is not positive; give a rate in {schedule.unit}/s")
     ranges, others = dict(ranges or {}), others or ParameterSet()
@@ -323,30 +337,30 @@ def certify_schedule(
     )
     count = -(-samples // len(values))
     rng = np.random.default_rng([seed, *_digest(schedule)])
+    sources = [_place_source(schedule, parameters, others, value) for value in values]
+    unknowns = [combine_uncertainty(source, rest, ranges, models) for source, rest in sources]
+    drawn = [unknown.draw(count if unknown.size else 0, rng) for unknown in unknowns]
+    shared, nominal = Shared((schedule, models)), unknowns[-1].nominal
+    standing_at = map_ordered(partial(_certify_place, shared), zip(values, unknowns, drawn, strict=True), executor)
+    held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
     places: list[PlaceCertificate] = []
-    nominal = ParameterSet()
-    for value in count_off(values, f"value of {schedule.over}", standing):
-        source, rest = _place_source(schedule, parameters, others, value)
-        unknown = combine_uncertainty(source, rest, ranges, models)
-        nominal = unknown.nominal
-        place = _certify_place(schedule, models, unknown, value, count, rng)
-        held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
+    for number, value in enumerate(count_off(values, f"value of {schedule.over}", standing)):
+        place, (source, rest) = next(standing_at).on(_split(models, unknowns[number])), sources[number]
         if place.point and schedule.design[0] in held.values():
             # Where a plant moves the variable, a law that is frozen there is not what runs.
             simulated = certify(
                 schedule.at(value), held, source, ranges=_choose_ranges(ranges, held), others=rest, samples=count,
                 seed=seed, simulations=simulations, sensors=sensors if simulations else None,
-                current_step_A=current_step_A if simulations else 0.0,
+                current_step_A=current_step_A if simulations else 0.0, executor=executor,
             )  # fmt: skip
             place = _add_simulations(schedule, place, simulated)
         places.append(place)
-    stretches = [
-        bound for low, high in count_off(list(pairwise(values)), "stretch", proving)
-        for bound in _bound_plants(schedule, models, nominal, low, high)
-    ]  # fmt: skip
+    pairs = list(pairwise(values))
+    bounds = map_ordered(partial(_bound_plants, shared, nominal), pairs, executor)
+    stretches = [bound for _ in count_off(pairs, "stretch", proving) for bound in next(bounds)]
     sweeps: dict[str, tuple[Sweep, ...]] = {}
     for name in count_off(list(models), "sweeps, plant", sweeping) if simulations else ():
-        found = sweep_schedule(schedule, name, models[name], nominal)
+        found = sweep_schedule(schedule, name, models[name], nominal, executor=executor)
         sweeps |= {name: found} if found else {}
     draws = _count_draws(places, seed, confidence)
     certificate = ScheduleCertificate(
@@ -400,17 +414,22 @@ def _place_source(
     return parameters, others.with_parameters(here)
 
 
+_Scheduled = tuple[ScheduledController, dict[str, Plant]]
+
+
+def _split(models: Mapping[str, Plant], unknown: Uncertainty) -> dict[str, Plant]:
+    """Return the plants whose loops are measured: one with friction is there sliding and stuck."""
+    return split_friction(models, unknown.nominal, [row.name for row in unknown.varied()])
+
+
 def _certify_place(
-    schedule: ScheduledController, models: Mapping[str, Plant], unknown: Uncertainty, value: float, count: int,
-    rng: np.random.Generator,
-) -> PlaceCertificate:  # fmt: skip
+    shared: Shared[_Scheduled], part: tuple[float, Uncertainty, Float[np.ndarray, "n k"]]
+) -> PlaceCertificate:
     """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case."""
-    controller, point = schedule.at(value), value in schedule.points
-    plants = split_friction(models, unknown.nominal, [row.name for row in unknown.varied()])
+    (schedule, models), (value, unknown, points) = shared.value, part
+    controller, point, plants = schedule.at(value), value in schedule.points, _split(models, unknown)
     figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
-    count = count if unknown.size else 0
-    points = unknown.draw(count, rng)
-    drawn = unknown.values(points)
+    count, drawn = len(points), unknown.values(points)
     unstable, over_ms, over_mt = (np.zeros(count, dtype=bool) for _ in range(3))
     ms, mt = limits(controller)
     for plant in plants.values() if count else ():
@@ -459,9 +478,10 @@ def _add_simulations(
 
 
 def _bound_plants(
-    schedule: ScheduledController, models: Mapping[str, Plant], nominal: ParameterSet, low: float, high: float
+    shared: Shared[_Scheduled], nominal: ParameterSet, stretch: tuple[float, float]
 ) -> list[StretchBound]:
     """Return what is proved of every plant on the stretch between two neighbouring values."""
+    (schedule, models), (low, high) = shared.value, stretch
     middle = schedule.at(0.5 * (low + high))
     out: list[StretchBound] = []
     for name, plant in split_friction(models, nominal).items():

@@ -21,6 +21,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,6 +35,7 @@ from seaopt.control.running.force_run import close_loop
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
 from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
 from seaopt.errors import ControlError, SimulationError
+from seaopt.executors import Shared, map_ordered
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
@@ -91,8 +94,9 @@ class _Pulses:
 
 
 def sweep_schedule(
-    schedule: ScheduledController, name: str, plant: Plant, params: ParameterSet, progress: Progress = ignore
-) -> tuple[Sweep, ...]:
+    schedule: ScheduledController, name: str, plant: Plant, params: ParameterSet, progress: Progress = ignore,
+    executor: Executor | None = None,
+) -> tuple[Sweep, ...]:  # fmt: skip
     """Sweep a plant's scheduling variable at growing rates, up to the first that does not keep the judgement.
 
     Parameters
@@ -105,6 +109,8 @@ def sweep_schedule(
         Which has the variable, as a parameter or as a state.
     progress : callable, optional
         Called before each sweep.
+    executor : concurrent.futures.Executor, optional
+        Where sweeps are simulated, some of them beyond the first that does not keep the judgement; here, if left out.
 
     Returns
     -------
@@ -119,13 +125,13 @@ def sweep_schedule(
     """
     if schedule.over not in plant.parameters and schedule.over not in plant.states:
         return ()
-    law, least = schedule.runnable(), min(schedule.bandwidths_hz)
-    pulses = _choose_pulses(schedule, plant, params)
+    least, pulses = min(schedule.bandwidths_hz), _choose_pulses(schedule, plant, params)
     sweeps: list[Sweep] = []
     frequencies = [least * share for share in _list_shares()]
+    runs = map_ordered(partial(_run_sweep, Shared((schedule, name, plant, params, pulses))), frequencies, executor)
     for number, frequency in enumerate(frequencies):
         progress(f"sweep at {frequency:.3g} Hz", number / len(frequencies))
-        sweeps.append(_run_sweep(schedule, law, name, plant, params, pulses, frequency))
+        sweeps.append(next(runs))
         if sweeps[-1].fault:
             break
     return tuple(sweeps)
@@ -177,11 +183,11 @@ def find_least_effort(schedule: ScheduledController) -> float:
 
 
 def _run_sweep(
-    schedule: ScheduledController, law: RunnableSchedule, name: str, plant: Plant, params: ParameterSet,
-    pulses: _Pulses, frequency_hz: float,
-) -> Sweep:  # fmt: skip
+    shared: Shared[tuple[ScheduledController, str, Plant, ParameterSet, _Pulses]], frequency_hz: float
+) -> Sweep:
     """Simulate one sweep with pulses and without, and judge the difference."""
-    low, high, ts = schedule.points[0], schedule.points[-1], schedule.spec.sample_time_s
+    schedule, name, plant, params, pulses = shared.value
+    law, low, high, ts = schedule.runnable(), schedule.points[0], schedule.points[-1], schedule.spec.sample_time_s
     omega = 2.0 * math.pi * frequency_hz
     count = max(LEAST_PULSES, math.ceil(1.0 / frequency_hz / (2 * pulses.samples * ts)))
     pulse = np.tile(np.repeat([1.0, 0.0], pulses.samples), count)
