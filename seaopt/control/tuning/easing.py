@@ -38,7 +38,7 @@ def ease_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop], progress: 
         Called before each solution.
 
     """
-    best, factors = (x, loops), dict[str, float]()
+    best, factors = (x, loops), dict(task.eased)
     for number in range(ROUNDS):
         missed = _measure_missed(task, best[1])
         left = {name: used for name, used in missed.items() if _can_ease(name) and name not in factors}

@@ -49,7 +49,7 @@ from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DigitalPlant, find_signals, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.control.tuning.easing import ease_limits
+from seaopt.control.tuning.easing import ROOM, ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.frequencies import count_growing
@@ -163,13 +163,18 @@ def tune(
         check_delay(spec, task.plants[0])
     command = command_of(model, values, spec.regulated)
     check_current(spec, task.k_ff, command, {} if model is not plant else find_dry_friction(model, values))
+    at_rest, allowed = _find_rest_gain(task), spec.level("max_noise_gain")
+    if at_rest is not None and allowed is not None:  # no law keeps it, at any bandwidth: the others are looked after
+        task = replace(task, eased={"max_noise_gain": ROOM * at_rest / allowed})
     first = SOLUTION * (8.0 if task.asks_margin else 1.0)
     solving, seeking, again, easing = divide(progress, first, BANDWIDTHS, SOLUTION, EASING)
     x, loops = solve(task, progress=solving)
     task, x, loops = lower_fraction(task, x, loops)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
     if broken - {FRICTION}:  # of a margin alone it is known what can be had
-        possible, near = _find_possible(task, x, seeking, stable="stability" not in broken)
+        near: list[LawNumbers] = []
+        if not task.eased:
+            possible, near = _find_possible(task, x, seeking, stable="stability" not in broken)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
             x, loops = solve(task, (x, *near), again)
@@ -526,14 +531,20 @@ def describe_law(
     return replace(controller, friction=find_friction_margin(controller, plant, params))
 
 
-def _explain_rest(task: Task, text: str) -> str:
-    """Return what is said of a broken limit; of a noise gain that no integral keeps on a plant that sticks, that, too.
+def _find_rest_gain(task: Task) -> float | None:
+    """Return the noise gain of the stuck plant that any integral has at rest; None where the limit allows it.
 
     An integral holds the reading at rest: it makes 1/P(0) there, which is far above 1 where bristles hold the motor.
     """
     allowed = task.spec.level("max_noise_gain")
     at_rest = max((1.0 / abs(plant.static_gain) for plant in task.plants[1 : task.design_states]), default=0.0)
-    if not text.startswith("max_noise_gain") or allowed is None or task.spec.structure == "pd" or at_rest <= allowed:
+    return None if allowed is None or task.spec.structure == "pd" or at_rest <= allowed else at_rest
+
+
+def _explain_rest(task: Task, text: str) -> str:
+    """Return what is said of a broken limit; of a noise gain that no integral keeps, that, too."""
+    at_rest = _find_rest_gain(task) if text.startswith("max_noise_gain") else None
+    if at_rest is None:
         return text
     return f"{text}, where any integral makes {at_rest:.4g}: give max_noise_gain = {math.ceil(1.01 * at_rest)}"
 

@@ -114,6 +114,7 @@ def test_beside_a_limit_that_nothing_keeps_the_others_are_kept():
     (blocked,) = controller.blocked_by
     assert blocked.startswith(f"max_noise_gain {at_rest:.4g} of 25 (design plant stuck), where any integral makes")
     assert f"give max_noise_gain = {np.ceil(1.01 * at_rest):.0f}" in blocked
+    assert controller.possible is None  # at no bandwidth would it be kept
     eased = so.tune(plant, values, replace(spec, max_noise_gain=np.ceil(1.01 * at_rest)))
     assert eased.feasible
     for one in (controller, eased):
