@@ -12,10 +12,12 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import LinkFeedforward, runnable, sweep
 from seaopt.control.deploy.export import export
+from seaopt.control.impedance.link import find_link
 from seaopt.control.loops.loop import Loop
-from seaopt.errors import ControlError, FileError
+from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.files import to_json
 from seaopt.problem import read_problem
+from seaopt.robustness.certificate.certify import Budget
 from tests.c_code import CompiledLaw
 
 TS, DELAY = 1e-3, 1
@@ -251,3 +253,37 @@ def test_a_signal_that_a_moving_plant_lacks_is_refused(fed, swing):
     ):
         with pytest.raises(ControlError, match=words):
             replace(fed, link=link).see(swing)
+
+
+@pytest.mark.slow
+def test_the_worst_case_is_bounded(fed, swing, thor):
+    """Ms by hand over the range of I_p: below the bound from above, and the worst case is the worst of them."""
+    lax = replace(fed, spec=replace(fed.spec, max_sensitivity=1.7))
+    certificate = so.certify(
+        lax, {"swing": swing}, thor.prior(J=1e-12), ranges={"I_p": (0.33, 0.4)}, samples=40, bounds=Budget(),
+        simulations=False,
+    )  # fmt: skip
+    r, bracket = 2e-3 / (2 * np.pi * 3), certificate.brackets["swing"]
+    f = np.unique(np.r_[np.geomspace(0.05, 499.0, 4000), np.linspace(0.5, 60.0, 4000)])
+    by_hand = [
+        np.max(np.abs(close_by_hand(fed, f, -3.31e-6 / r**2, -1.31e-4 / r**2, I_p=I_p)[1]))
+        for I_p in np.linspace(0.33, 0.4, 8)
+    ]
+    assert bracket.bounded_stable and max(by_hand) <= bracket.ms_upper <= 1.02 * max(by_hand)
+    assert bracket.ms_lower == pytest.approx(max(by_hand), rel=1e-3)
+    assert certificate.worst["swing"].parameters["I_p"] == pytest.approx(0.33)
+
+
+def test_an_impedance_around_it_is_refused(fed, swing, thor):
+    """It is a law of the link's motion itself."""
+    with pytest.raises(ControlError, match="leave link_feedforward out"):
+        find_link(fed, swing, thor)
+
+
+def test_a_schedule_of_it_is_refused(tmp_path):
+    plants = '[plant.stand]\nkind = "high_impedance"\n[plant.swing]\nkind = "moving_output"\n'
+    asked = '[controller]\nplant = "stand"\nrobust_to = ["swing"]\nbandwidth_hz = 30\nlink_feedforward = true\n'
+    schedule = '[controller.schedule]\nover = "I_p"\npoints = [0.3, 0.5]\n'
+    (tmp_path / "problem.toml").write_text(f"schema = 1\n{plants}{asked}{schedule}")
+    with pytest.raises(SeaoptError, match="leave one of them out"):
+        read_problem(tmp_path / "problem.toml")
