@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -14,11 +15,11 @@ import polars as pl
 
 from seaopt.errors import LogError, SeaoptError, require_number, require_type
 from seaopt.executors import Processes
-from seaopt.files import check_folder, write_json
+from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.fleet.dispatch import Dispatcher
 from seaopt.fleet.logs import FleetLog, find_logs
 from seaopt.fleet.plan import list_columns, make_plan
-from seaopt.fleet.result import Fleet
+from seaopt.fleet.result import FLEET_SCHEMA, Fleet
 from seaopt.fleet.table import Table, find_done, make_schema
 from seaopt.fleet.worker import FAILED, MET, NOT_MET, UNCHANGED, name_process
 from seaopt.problem import Problem, read_problem
@@ -130,9 +131,17 @@ def fit_fleet(
             free=columns.free,
         )  # fmt: skip
         if folder is not None:
-            made_from = {"problem_sha256": plan.digest, "version": plan.version}
-            write_json(place / "fleet.json", result.to_dict() | made_from)
+            content = result.to_dict() | {"problem_sha256": plan.digest, "version": plan.version}
+            write_json(place / "fleet.json", _keep_summary(place / "fleet.json", content, result) | content)
     return result
+
+
+def _keep_summary(path: Path, content: dict[str, Any], fleet: Fleet) -> dict[str, Any]:
+    """Return what fleet.json has besides, drift and population, where it is of the same results."""
+    if fleet.unchanged < len(fleet.rows) or not path.exists():
+        return {}
+    before, now = read_json(path, FLEET_SCHEMA, remedy="delete it"), json.loads(to_json(content))
+    return before if all(before.get(key) == value for key, value in now.items()) else {}
 
 
 def _choose_logs(logs: Sequence[str | Path | FleetLog], identity: str | None) -> tuple[FleetLog, ...]:

@@ -92,6 +92,16 @@ def test_a_second_run_fits_what_is_new_failed_or_changed(stand, threads):
     assert len(pl.read_parquet(out / "fleet")) == LOGS + 1
 
 
+def test_drift_stays_in_fleet_json_until_a_log_changes(stand, threads):
+    so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_*.csv"], stand / "out", executor=threads)
+    path = stand / "out" / "fleet.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"drift": {"alarms": []}}))
+    so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_*.csv"], stand / "out", executor=threads)
+    assert json.loads(path.read_text())["drift"] == {"alarms": []}
+    so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_j0.csv"], stand / "out", executor=threads)
+    assert "drift" not in json.loads(path.read_text())
+
+
 def test_other_logs_of_the_table_stay_and_identities_are_renewed(stand, threads):
     problem, logs, out = stand / "stand.toml", stand / "logs", stand / "out"
     so.fit_fleet(problem, [logs / "r0_*.csv"], out, executor=threads)

@@ -118,7 +118,7 @@ class ForceMPC:
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _design, (*self.design, self.spec, self.gate, self.warnings)  # the solver does not pickle
+        return _design, (*self.design, self.spec, self.gate, self.warnings)  # what it remembers does not pickle
 
     @property
     @memo
