@@ -165,7 +165,8 @@ def certify_here(certify_one):
     return to_json(drop_clock(certify_one(None).to_dict()))
 
 
-OTHERS = [certify_friction, certify_link, pytest.param(certify_points, marks=pytest.mark.slow), certify_plan]
+SLOW = (certify_link, certify_points)
+OTHERS = [certify_friction, certify_plan, *(pytest.param(one, marks=pytest.mark.slow) for one in SLOW)]
 
 
 @pytest.mark.parametrize("certify_one", OTHERS)
