@@ -351,14 +351,18 @@ def guess_remarks(
     fixed = [one for one in unknown if one.std is None and one.prior_std is None]
     if not fixed:
         return []
-    wide = ", ".join(
-        f"{one.name} = [{max(0.5 * one.value, one.min):.3g}, {min(2.0 * one.value, one.max):.3g}]" for one in fixed
-    )
+    wide = ", ".join(filter(None, map(_propose_range, fixed)))
     names, are = join_words([one.name for one in fixed]), "is a guess" if len(fixed) == 1 else "are guesses"
     return [
-        f"nothing is drawn of {names}, which {are}: give each a range that holds the truth, in [robustness]: "
-        f"parameters = {{ {wide} }}"
+        f"nothing is drawn of {names}, which {are}: give each a range that holds the truth, in [robustness]"
+        + (f": parameters = {{ {wide} }}" if wide else "")
     ]
+
+
+def _propose_range(guess: Parameter) -> str:
+    """Return a range from half a guess to its double, as a file has it; empty for 0, which says nothing of its size."""
+    low, high = sorted((0.5 * guess.value, 2.0 * guess.value))
+    return f"{guess.name} = [{max(low, guess.min):.3g}, {min(high, guess.max):.3g}]" if guess.value else ""
 
 
 def _mode_outside(name: str, ends_hz: tuple[float, float], plants: Mapping[str, Plant], nominal: ParameterSet) -> bool:

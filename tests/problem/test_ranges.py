@@ -38,3 +38,11 @@ def test_guesses_of_which_nothing_is_drawn_are_named_with_ranges(stand, thor):
         in text
     )
     assert not guess_remarks(["unit of F1", "J"], {}, {"stand": stand}, known)
+
+
+def test_a_guess_of_nothing_is_named_without_a_range_and_one_below_zero_with_its_ends_in_order(stand, thor):
+    plant = so.plants.moving_output()
+    (text,) = guess_remarks(["b_r"], {}, {"stand": stand}, thor.update(b_r=0.0))
+    assert text.startswith("nothing is drawn of b_r, which is a guess") and "parameters" not in text
+    (text,) = guess_remarks(["b_r", "g"], {}, {"swing": plant}, thor.update(b_r=0.0, g=-10.0))
+    assert "nothing is drawn of b_r and g" in text and text.endswith("parameters = { g = [-20, -5] }")
