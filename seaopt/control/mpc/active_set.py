@@ -13,7 +13,9 @@ Rows with negative multipliers are let go, so that the distance to :math:`y_0` i
 Then the row that is broken most is taken in. On the way there the multipliers change by :math:`-t r`, with r the row's
 share in the held ones; one that would become negative is let go first. Each full step increases the distance, so that
 no set comes back, and the method ends: at the solution, or with a row that no step brings closer, which proves that the
-bounds contradict each other. In most samples of a controller nothing changes, and the answer is one product.
+bounds contradict each other. A row counts as such where 1e-6 of its length or less is left besides the held ones: rows
+that nearly depend on each other can be said to contradict although a point keeps them. In most samples of a controller
+nothing changes, and the answer is one product.
 
 `c/active_set.c` takes the same steps, and updates Q and R where this module makes them anew.
 
@@ -132,7 +134,7 @@ def find_nearest(
     normals : array, shape (m, n)
         Rows of length 1.
     low, high : arrays, shape (m,)
-        Their bounds.
+        Their bounds, low <= high: of a row that is held at one end the other is not looked at.
     sides : array of int, shape (m,)
         Where rows are held to begin with, as `Nearest.sides`; the held ones are linearly independent.
     max_iterations : int
