@@ -214,7 +214,7 @@ def run_inspect(folder, *arguments, **options):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+@pytest.mark.parametrize("encoding", ["ascii", pytest.param("latin-1", marks=pytest.mark.slow)])
 def test_a_terminal_of_few_characters_gets_the_others_as_escapes(folder, encoding):
     write_csv(folder / "u.csv", ["time [s]", "Kraft µ Ω [N]"])
     done = run_inspect(folder, "u.csv", env=os.environ | {"PYTHONIOENCODING": encoding}, stdout=subprocess.PIPE)
@@ -223,7 +223,7 @@ def test_a_terminal_of_few_characters_gets_the_others_as_escapes(folder, encodin
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")  # noqa: PTH110
-@pytest.mark.parametrize("options", [(), ("--json",)])
+@pytest.mark.parametrize("options", [(), pytest.param(("--json",), marks=pytest.mark.slow)])
 def test_a_full_disk_under_stdout_is_one_line(folder, options):
     write_csv(folder / "ok.csv", ["time [s]", "F1 [N]"])
     with open("/dev/full", "wb") as full:  # noqa: PTH123

@@ -291,8 +291,7 @@ def test_a_design_on_a_fit_that_is_not_met_says_so(write, tmp_path, capsys):
     assert not export_controller(tmp_path / "out", tmp_path / "c", json=False)
 
 
-@pytest.mark.slow
-def test_what_was_guessed_is_named_by_every_verdict_until_it_is_taken_out(write, tmp_path, capsys):
+def test_what_was_guessed_is_named_by_every_verdict_until_it_is_taken_out(write, tmp_path, capsys, without_drawing):
     known = BENCH.replace("[plant.stand]", "b_r = { value = 1e-4, free = true }\n[plant.stand]")
     known += '[controller]\nplant = "stand"\nmeasured = "F1"\nbandwidth_hz = 30\nsample_rate_hz = 1000\n'
     guessed = known.replace("schema = 1\n", 'schema = 1\nguessed = ["N_p", "unit of F1, F2"]\n')

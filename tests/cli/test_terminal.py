@@ -99,8 +99,7 @@ def test_a_limit_that_cannot_be_met_ends_with_the_line_to_write(copied, narrow, 
     assert max(map(len, out.stdout.splitlines())) <= 90  # a command to copy is on one line
 
 
-@pytest.mark.slow
-def test_tables_of_responses_and_of_sweeps_fit_eighty_columns(copied, narrow):
+def test_tables_of_responses_and_of_sweeps_fit_eighty_columns(copied, narrow, without_drawing):
     """A long name, here of a plant at a corner of a range, is broken in its cell."""
     for arguments, verdict in (
         (("frf", "short.toml"), "met      chirp: every response is coherent"),
@@ -124,7 +123,7 @@ def test_tables_of_responses_and_of_sweeps_fit_eighty_columns(copied, narrow):
         (("export", "all", "--c", "firmware"), "wrote "),
     ],
 )
-def test_every_command_says_less_or_more(copied, narrow, arguments, quiet):
+def test_every_command_says_less_or_more(copied, narrow, without_drawing, arguments, quiet):
     rows = [f"{t / 400},{t % 7},{t % 11}" for t in range(400)]
     (copied / "log.csv").write_text("\n".join(["time [s],I [A],F1 [N]", *rows]), encoding="utf-8")
     little, usual, much = (narrow(*arguments, *option).stdout for option in (["--quiet"], [], ["--verbose"]))
