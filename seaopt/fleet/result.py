@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from seaopt.estimation.result.findings import GUESS
 from seaopt.fleet.worker import FAILED, MET, NOT_MET
 from seaopt.formatting import format_count, format_number, format_table, html_text
+from seaopt.problem.problem import name_after
 from seaopt.records import record
 
 FLEET_SCHEMA = "seaopt/fleet/1"
@@ -61,6 +63,8 @@ class Fleet:
         Which of the units' columns a fit estimates: free parameters, delay and gains; the others follow from these.
     free : tuple of str
         The parameters among them, whose errors' correlations have columns, too.
+    drift, population : mapping or None
+        What fleet.json says of them, of `read_fleet`; the objects are those of `find_drift`, `estimate_population`.
 
     """
 
@@ -70,6 +74,8 @@ class Fleet:
     unchanged: int = 0
     fitted: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
+    drift: Mapping[str, Any] | None = None
+    population: Mapping[str, Any] | None = None
 
     @property
     def counts(self) -> dict[str, int]:
@@ -118,6 +124,7 @@ class Fleet:
             "counts": self.counts,
             "reasons": [{"reason": text, "logs": count, "example": log} for text, count, log in self.reasons],
             "units": dict(self.units), "identity": list(self.identity),
+            "fitted": list(self.fitted), "free": list(self.free),
             "spreads": {
                 one.name: {
                     "unit": one.unit, "logs": one.logs, "median": one.median, "p10": one.low, "p90": one.high,
@@ -161,8 +168,9 @@ def count_reasons(
     counts, examples = Counter[str](), dict[str, tuple[str, str]]()
     for log, reason, findings in rows:
         errors = [one for one in findings or () if one["severity"] == "error"]
-        text = (reason or "").replace(log, "LOG")
-        kind = f"{errors[0]['kind']} {errors[0]['where']}" if errors else text
+        text, own = (reason or "").replace(log, "LOG"), name_after(PurePath(log).stem)
+        text = text.replace(f"experiment {own}", "experiment LOG")
+        kind = f"{errors[0]['kind']} {errors[0]['where'].removeprefix(own)}" if errors else text
         counts[kind] += 1
         examples.setdefault(kind, (text, log))
     return tuple((examples[kind][0], count, examples[kind][1]) for kind, count in counts.most_common())

@@ -13,14 +13,14 @@ from typing import Any
 
 import polars as pl
 
-from seaopt.errors import LogError, SeaoptError, require_number, require_type
+from seaopt.errors import FileError, LogError, SeaoptError, require_number, require_type
 from seaopt.executors import Processes
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.fleet.dispatch import Dispatcher
 from seaopt.fleet.logs import FleetLog, find_logs
 from seaopt.fleet.plan import list_columns, make_plan
 from seaopt.fleet.result import FLEET_SCHEMA, Fleet
-from seaopt.fleet.table import Table, find_done, make_schema
+from seaopt.fleet.table import Table, find_done, make_schema, note_short_logs, read_rows
 from seaopt.fleet.worker import FAILED, MET, NOT_MET, UNCHANGED, name_process
 from seaopt.problem import Problem, read_problem
 from seaopt.progress import Progress, ignore
@@ -125,15 +125,60 @@ def fit_fleet(
             stack.callback(executor.shutdown, cancel_futures=True)
         table.relabel(names, chosen)
         unchanged = _fit_all(table, executor, chosen, progress)
-        rows = table.read().filter(pl.col("log").is_in([log.path for log in chosen])).select(*schema)
+        named = pl.col("log").is_in([log.path for log in chosen])
+        table.put(note_short_logs(table.read().filter(named)))
+        content = table.read()
+        rows = content.filter(named).select(*schema)
         result = Fleet(
             rows=rows, units=columns.units, identity=tuple(names), unchanged=unchanged, fitted=columns.fitted,
             free=columns.free,
         )  # fmt: skip
         if folder is not None:
-            content = result.to_dict() | {"problem_sha256": plan.digest, "version": plan.version}
-            write_json(place / "fleet.json", _keep_summary(place / "fleet.json", content, result) | content)
+            summary = result.to_dict() | {"problem_sha256": plan.digest, "version": plan.version}
+            summary["other_logs"] = content.filter(~named)["log"].to_list()
+            write_json(place / "fleet.json", _keep_summary(place / "fleet.json", summary, result) | summary)
     return result
+
+
+def read_fleet(folder: Path | str) -> Fleet:
+    """Return what the last `fit_fleet`, or `seaopt fleet`, left in a folder; nothing is fitted.
+
+    Parameters
+    ----------
+    folder : Path or str
+        That of the results, with fleet.json.
+
+    Returns
+    -------
+    Fleet
+        Of the logs that were named last, with what fleet.json says of drift and population; all logs are `unchanged`.
+
+    Raises
+    ------
+    FileError
+        A file is missing or damaged, is of an older seaopt, or a later run was stopped.
+
+    Examples
+    --------
+    >>> read_fleet("no_such_folder")
+    Traceback (most recent call last):
+    seaopt.errors.FileError: no_such_folder/fleet.json: ...
+
+    """
+    place, remedy = Path(folder), "type the command of the fleet again"
+    content = read_json(place / "fleet.json", FLEET_SCHEMA, remedy=remedy)
+    missing = [name for name in ("fitted", "free", "other_logs") if name not in content]
+    if missing:
+        raise FileError(f"{place / 'fleet.json'}: has no {missing[0]}, as of an older seaopt; {remedy}")
+    rows = read_rows(place).filter(~pl.col("log").is_in(content["other_logs"]))
+    fleet = Fleet(
+        rows=rows, units=content["units"], identity=tuple(content["identity"]), unchanged=len(rows),
+        fitted=tuple(content["fitted"]), free=tuple(content["free"]), drift=content.get("drift"),
+        population=content.get("population"),
+    )  # fmt: skip
+    if fleet.counts != content["counts"]:
+        raise FileError(f"{place}: its table has changed since fleet.json, as where a run was stopped; {remedy}")
+    return fleet
 
 
 def _keep_summary(path: Path, content: dict[str, Any], fleet: Fleet) -> dict[str, Any]:

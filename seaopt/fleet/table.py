@@ -38,6 +38,7 @@ PART_S, PART_ROWS = 2.0, 5000  # a part is written after so long, or so many row
 WRITING = 0.1  # of the time, at most, goes into writing
 MOST_PARTS = 64  # new ones, until the small ones are merged
 LARGE = 50_000  # rows of a file that is merged no more
+SHORT, SHORT_SHARE = "short", 0.25  # kind of finding of a log with less than this share of the median's samples
 SHARE = 0.25  # of the table's rows, that newer ones are when they replace them
 WORK = ".fleet"  # the folder of work: readers of a folder of Parquet files want no others in it
 MERGED = "merged-"  # begins the name of a file there that is whole; of its parts, some may be gone
@@ -170,7 +171,12 @@ class Table:
         labelled = rows.drop(names).join(now, on="log").select(rows.columns)
         before = rows.join(now.select("log"), on="log", how="semi")
         if not labelled.select("log", *names).equals(before.select("log", *names)):
-            self._write(labelled, f"{NEWER}{_name_part()}")
+            self.put(labelled)
+
+    def put(self, rows: pl.DataFrame) -> None:
+        """Write rows in the place of those of the same logs, at once."""
+        if len(rows):
+            self._write(rows, f"{NEWER}{_name_part()}")
             self._replace_older()
 
     def _merge_small(self) -> None:
@@ -247,6 +253,38 @@ def _put(rows: pl.DataFrame, newer: pl.DataFrame) -> pl.DataFrame:
 
 def _count_rows(path: Path) -> int:
     return int(pl.scan_parquet(path).select(pl.len()).collect().item())
+
+
+def read_rows(folder: Path) -> pl.DataFrame:
+    """Return the rows of a table that nobody writes, in order of their logs.
+
+    Raises
+    ------
+    FileError
+        There is none, or a file of it is damaged.
+
+    """
+    parts = [_read(path) for path in sorted((folder / "fleet").glob("part-*.parquet"))]
+    if not parts:
+        raise FileError(f"{folder / 'fleet'}: has no table; type the command of the fleet again")
+    return pl.concat(parts, how="diagonal_relaxed").sort("log")
+
+
+def note_short_logs(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return those rows whose finding "short" comes, goes or changes: of logs much shorter than their siblings."""
+    median = pl.Series(rows["samples"].drop_nulls()).cast(pl.Float64).median() or 0.0
+    short = (pl.col("samples") < SHORT_SHARE * float(str(median))).fill_null(value=False)
+    kinds = pl.col("findings").list.eval(pl.element().struct.field("kind"))
+    picked = rows.filter(short | kinds.list.contains(SHORT).fill_null(value=False))
+    findings: list[list[dict[str, Any]]] = []
+    for row, is_short in zip(picked.iter_rows(named=True), picked.select(short).to_series(), strict=True):
+        text = f"{row['samples']} samples, where half the logs have {median:g} or more: cut off, or another test?"
+        note = {"severity": "warning", "kind": SHORT, "where": "", "text": text}
+        others = [one for one in row["findings"] or [] if one["kind"] != SHORT]
+        findings.append([*others, note] if is_short else others)
+    changed = [now != before for now, before in zip(findings, picked["findings"].to_list(), strict=True)]
+    noted = picked.with_columns(pl.Series("findings", findings, dtype=pl.List(_FINDING)))
+    return noted.filter(pl.Series(changed, dtype=pl.Boolean))
 
 
 def find_done(rows: pl.DataFrame, plan: Plan) -> dict[str, str]:

@@ -279,13 +279,12 @@ class Problem:
             There is no such experiment, or the log cannot be read as it would read it.
 
         """
-        name = re.sub(r"[^A-Za-z0-9_-]", "_", log.stem)
-        name = name if name[:1].isalpha() else f"log_{name}"
-        table = self.choose_template(like).model_copy(update={"name": name, "log": str(log.resolve()), "slice_s": None})
+        own = {"name": name_after(log.stem), "log": str(log.resolve()), "slice_s": None}
+        table = self.choose_template(like).model_copy(update=own)
         return self._make_experiment(table, anywhere=True)
 
     def repeat_experiment(self, log: Path, like: str | None = None) -> Experiment:
-        """Return another log of the same test as an experiment: its name, and its slice, too.
+        """Return another log of the same test as an experiment, which is named after its file and keeps the slice.
 
         Raises
         ------
@@ -293,7 +292,7 @@ class Problem:
             As `experiment_like`.
 
         """
-        table = self.choose_template(like).model_copy(update={"log": str(log.resolve())})
+        table = self.choose_template(like).model_copy(update={"name": name_after(log.stem), "log": str(log.resolve())})
         return self._make_experiment(table, anywhere=True)
 
     def choose_template(self, like: str | None = None) -> ExperimentTable:
@@ -398,6 +397,19 @@ class Problem:
             plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
             seed=table.seed, sensors=_make_sensors(table),
         )  # fmt: skip
+
+
+def name_after(stem: str) -> str:
+    """Return the name of an experiment that is named after a log file.
+
+    Examples
+    --------
+    >>> name_after("knee left.2"), name_after("7")
+    ('knee_left_2', 'log_7')
+
+    """
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", stem)
+    return name if name[:1].isalpha() else f"log_{name}"
 
 
 def _compute_speeds(log: Log, table: ExperimentTable) -> Log:

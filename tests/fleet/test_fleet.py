@@ -10,7 +10,7 @@ import pytest
 
 import seaopt as so
 from seaopt.errors import FileError, LogError, ProblemError, SeaoptError
-from seaopt.fleet import FleetLog, read_manifest
+from seaopt.fleet import FleetLog, read_fleet, read_manifest
 from seaopt.fleet.plan import make_plan
 from seaopt.fleet.table import Table
 from tests.fleet.conftest import LOGS, PROBLEM, compare, write_log
@@ -219,3 +219,28 @@ def test_a_damaged_part_is_named(stand, threads):
     part.write_bytes(part.read_bytes()[:-20])
     with pytest.raises(FileError, match=part.name):
         so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_j0.csv"], stand / "out", executor=threads)
+
+
+def test_a_folder_is_read_back(stand, threads):
+    problem, logs, out = stand / "stand.toml", stand / "logs", stand / "out"
+    so.fit_fleet(problem, [logs / "r0_j0.csv"], out, executor=threads, identity=IDENTITY)
+    fleet = so.fit_fleet(problem, [logs / "r1_j[01].csv"], out, executor=threads, identity=IDENTITY)
+    path = out / "fleet.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"drift": {"alarms": []}}))
+    again = read_fleet(out)
+    assert again.rows.equals(fleet.rows) and again.to_dict() == fleet.to_dict() and again.drift == {"alarms": []}
+    assert (again.fitted, again.free, again.identity) == (fleet.fitted, fleet.free, fleet.identity)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_logs": []}))
+    with pytest.raises(FileError, match="has changed"):
+        read_fleet(out)
+
+
+def test_a_log_much_shorter_than_its_siblings_has_a_finding(stand, threads):
+    problem, logs, out = stand / "stand.toml", stand / "logs", stand / "out"
+    write_log(logs / "r0_j0.csv", 0, n=190)
+    write_log(logs / "r0_j1.csv", 1, n=210)
+    fleet = so.fit_fleet(problem, [logs / "r0_*.csv", logs / "r1_*.csv"], out, executor=threads)
+    short = [any(one["kind"] == "short" for one in found) for found in fleet.rows["findings"]]
+    assert short == [True] + 7 * [False] and pl.read_parquet(out / "fleet").equals(fleet.rows)
+    fleet = so.fit_fleet(problem, [logs / "r0_j0.csv"], out, executor=threads)  # no siblings: it goes again
+    assert fleet.unchanged == 1 and "short" not in {one["kind"] for one in fleet.rows["findings"][0]}
