@@ -6,6 +6,7 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
+from seaopt.executors import Shared
 from seaopt.plants.plant import output_function
 from seaopt.robustness.verification.schedule_sweep import (
     SWEEP,
@@ -48,7 +49,7 @@ def test_a_sweep_is_what_an_exact_simulation_of_the_stand_shows():
     schedule, (stand, _, values) = tune_knee(), read_knee()
     law, frequency = schedule.runnable(), 2.0
     pulses = _choose_pulses(schedule, stand, values)
-    sweep = _run_sweep(schedule, law, "stand", stand, values, pulses, frequency)
+    sweep = _run_sweep(Shared((schedule, "stand", stand, values, pulses)), frequency)
     block = np.zeros((3, 3))
     block[:2] = [[0.0, 1.0, 0.0], [-K / MASS, -B / MASS, FORCE / MASS]]
     step = expm(block * 1e-3)[:2]
@@ -68,7 +69,7 @@ def test_a_sweep_is_what_an_exact_simulation_of_the_stand_shows():
 def test_a_sweep_that_is_too_fast_does_not_keep_the_judgement():
     schedule, (_, swing, values) = tune_knee(), read_knee()
     pulses = _choose_pulses(schedule, swing, values)
-    fast = _run_sweep(schedule, schedule.runnable(), "swing", swing, values, pulses, 15.0)
+    fast = _run_sweep(Shared((schedule, "swing", swing, values, pulses)), 15.0)
     assert fast.fault and find_fastest([fast]) == 0.0
 
 
