@@ -134,6 +134,9 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
     reasons = tuple(Reason(what=f"{text} ({log})", where="", count=count) for text, count, log in fleet.reasons)
     verdict = StageVerdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=_advise(fleet))
     show_verdicts(console, [verdict], verbose=verbose)
+    if fleet.short:
+        count = format_count(len(fleet.short), "log")
+        console.wrap(printable(f"much shorter than the others: {count} ({fleet.short[0]})"), indent=9)
     if drift.left_out:
         total = format_count(len(fleet.rows), "log")
         console.wrap(f"left out of drift, of {total}: {drift.describe_left_out()}", indent=9)

@@ -22,7 +22,7 @@ from seaopt.errors import SeaoptError, suggestion
 from seaopt.fleet.cusum import ALLOWANCE, Charts, alarm_probabilities, chart_runs, choose_threshold, find_change
 from seaopt.fleet.history import LABEL, TIME, History, format_time, order_runs, parse_time
 from seaopt.fleet.result import Fleet
-from seaopt.fleet.worker import MET
+from seaopt.fleet.worker import FAILED, MET
 from seaopt.formatting import format_count, format_number, format_table, html_text, join_words
 from seaopt.records import record
 
@@ -354,7 +354,9 @@ def _select_rows(history: History, since: str | float | None) -> tuple[pl.DataFr
     """Return the logs that charts have, and how many are left out for which reason."""
     rows = history.rows.with_row_index(_PLACE)
     left_out: dict[str, int] = {}
-    conditions = [("not met", pl.col("status") == MET), ("without a time", pl.col(TIME).is_not_null())]
+    status = pl.col("status")
+    conditions = [("failed", status != FAILED), ("not met", status == MET)]
+    conditions.append(("without a time", pl.col(TIME).is_not_null()))
     if since is not None:
         conditions.append((f"before {since}", pl.col(TIME) >= parse_time(since, history)))
     for reason, condition in conditions:

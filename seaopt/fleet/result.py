@@ -18,6 +18,7 @@ from seaopt.problem.problem import name_after
 from seaopt.records import record
 
 FLEET_SCHEMA = "seaopt/fleet/1"
+SHORT = "short"  # kind of finding of a log that is much shorter than its siblings
 
 
 @record
@@ -103,6 +104,12 @@ class Fleet:
         """What to say of the guesses that its fits rest on, "on 2 guesses: N_p, l"; empty where there are none."""
         findings = (one for found in self.rows["findings"].drop_nulls() for one in found)
         return next((one["where"] for one in findings if one["kind"] == GUESS), "")
+
+    @property
+    def short(self) -> tuple[str, ...]:
+        """The logs that are much shorter than their siblings."""
+        kinds = pl.col("findings").list.eval(pl.element().struct.field("kind"))
+        return tuple(self.rows.filter(kinds.list.contains(SHORT))["log"])
 
     @property
     def reasons(self) -> tuple[tuple[str, int, str], ...]:

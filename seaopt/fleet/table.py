@@ -32,13 +32,14 @@ from seaopt.errors import FileError
 from seaopt.files import describe_os_error, write_bytes
 from seaopt.fleet.logs import FleetLog
 from seaopt.fleet.plan import Columns, Plan, name_correlation
+from seaopt.fleet.result import SHORT
 from seaopt.fleet.worker import FAILED, Row
 
 PART_S, PART_ROWS = 2.0, 5000  # a part is written after so long, or so many rows
 WRITING = 0.1  # of the time, at most, goes into writing
 MOST_PARTS = 64  # new ones, until the small ones are merged
 LARGE = 50_000  # rows of a file that is merged no more
-SHORT, SHORT_SHARE = "short", 0.25  # kind of finding of a log with less than this share of the median's samples
+SHORT_SHARE = 0.25  # of the median's samples, under which a log has a finding
 SHARE = 0.25  # of the table's rows, that newer ones are when they replace them
 WORK = ".fleet"  # the folder of work: readers of a folder of Parquet files want no others in it
 MERGED = "merged-"  # begins the name of a file there that is whole; of its parts, some may be gone

@@ -241,6 +241,7 @@ def test_a_log_much_shorter_than_its_siblings_has_a_finding(stand, threads):
     write_log(logs / "r0_j1.csv", 1, n=210)
     fleet = so.fit_fleet(problem, [logs / "r0_*.csv", logs / "r1_*.csv"], out, executor=threads)
     short = [any(one["kind"] == "short" for one in found) for found in fleet.rows["findings"]]
+    assert fleet.short == (str(logs / "r0_j0.csv"),)
     assert short == [True] + 7 * [False] and pl.read_parquet(out / "fleet").equals(fleet.rows)
     fleet = so.fit_fleet(problem, [logs / "r0_j0.csv"], out, executor=threads)  # no siblings: it goes again
     assert fleet.unchanged == 1 and "short" not in {one["kind"] for one in fleet.rows["findings"][0]}
