@@ -432,7 +432,7 @@ class Certificate:
     def _ideal_notes(self) -> tuple[str, ...]:
         """Say that friction that sticks was simulated with a sensor without noise, where nothing else was."""
         noisy = self.simulated is not None and any(self.simulated.sensors.noise_std.values())
-        if noisy or self.runs is None:
+        if noisy or self.runs is None or self.constrained is not None:  # which says so itself
             return ()
         if not any(each.friction == "sticking" for chosen in self.runs.scenarios.values() for each in chosen):
             return ()

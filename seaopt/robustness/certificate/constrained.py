@@ -113,6 +113,8 @@ class ConstrainedRuns:
         """What a certificate remarks of these runs."""
         return (
             "margins, worst cases and draws are of the linear region, in which no limit of the plan is active",
+            "steps are simulated with ideal sensors, runs with limits active with noise of what is measured alone; "
+            "offset, quantisation and saturation of sensors, and steps of the command, are in neither",
             str(self), *self.left_out,
         )  # fmt: skip
 

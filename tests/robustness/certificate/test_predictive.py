@@ -52,6 +52,7 @@ def test_the_linear_region_is_certified_as_a_law(certificate, mpc, thor):
     assert certificate.monte_carlo.samples == 200 and certificate.monte_carlo.failures == 0
     assert linear_controller(mpc).feasible == mpc.feasible
     assert any("linear region" in note for note in certificate.notes)
+    assert any("quantisation" in note and "in neither" in note for note in certificate.notes)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
@@ -113,6 +114,14 @@ def test_iterations_are_named_where_a_run_has_no_plan(stand, thor):
     )  # fmt: skip
     runs = certify_mpc(force_mpc(stand, thor, spec), {"stand": stand}, thor, ranges=HERE, samples=1, runs=2).constrained
     assert runs.failures and runs.remedy.startswith("a larger max_iterations in [mpc]: ")
+
+
+@pytest.mark.slow
+def test_of_friction_no_sensors_are_asked_for_that_no_step_would_have(stand, thor):
+    rubbing = thor.update(f_c=20.0)
+    law = force_mpc(stand, rubbing, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
+    found = certify_mpc(law, {"stand": stand}, rubbing, ranges=HERE, samples=1, runs=1, sensor_std=2.0)
+    assert not any("give certify(sensors" in note for note in found.notes)
 
 
 def test_it_comes_back_from_its_file(certificate, mpc, stand, thor):
