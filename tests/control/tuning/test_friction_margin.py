@@ -23,7 +23,8 @@ RUBBING = {
 SPEC = so.ControllerSpec(bandwidth_hz=20, delay_samples=lifted.DELAY, max_sensitivity=1.6, max_noise_gain=25)
 ASKED = 2e5  # N s/m; the best law without has 2.5e4, and the friction's own slope is 6.3e3
 # A slope at which scipy's differential evolution finds a law that keeps all limits, without any reserve, by the
-# equations of benchmarks/bench_friction_margin.py (Popov, 2 ms, 150 generations of 64 laws, seed 1).
+# equations of benchmarks/bench_friction_margin.py (Popov, 2 ms, 150 generations of 64 laws, seed 1). It may leave more
+# of a step to a slow integral than the tuner, which came to 2.23e5 before it had that limit, and comes to 2.14e5 now.
 SEARCHED = 2.6e5
 
 
@@ -68,13 +69,13 @@ def test_what_is_asked_costs_disturbance_rejection_and_no_other_limit(designed):
 
 @pytest.mark.slow
 def test_a_margin_that_cannot_be_had_is_answered_with_the_largest(stand, rubbing):
-    """The other limits are kept, with the tuner's reserve; a global search without any finds a seventh more."""
+    """The others are kept, with the tuner's reserve; a search without it, and with slower integrals, finds more."""
     controller = so.tune(stand, rubbing, replace(SPEC, min_friction_margin=1e7))
     slope = find_friction_margin(controller, stand, rubbing).slopes[0]
     assert not controller.feasible
     assert controller.active_constraints == ("min_friction_margin (design plant sliding)",)
     assert f"{slope:.4g} of 1e+07" in controller.explanation
-    assert slope > 0.85 * SEARCHED
+    assert slope > 0.82 * SEARCHED
 
 
 def test_a_margin_is_asked_of_plants_in_robust_to_and_at_draws(stand, rubbing):
