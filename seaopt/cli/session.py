@@ -304,10 +304,10 @@ class Session:
         asked, path = self._spec().to_dict(), self._path("tune")
         given = OF_THE_LAW if stored.structure == CUSTOM else ()
         for name, value in stored.to_dict().items():
-            if name not in given and value != asked[name]:
+            if name not in given and value != asked.get(name):
                 raise ProblemError(
                     f"{path}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
-                    f"{asked[name]}; correct one of them, or run {self._spell('tune')} again"
+                    f"{asked.get(name)}; correct one of them, or run {self._spell('tune')} again"
                 )
 
     def fit_met(self) -> bool:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any, Literal
 
 from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, SHOULDER, SHOULDER_FALL, STABLE, LoopFigures
@@ -429,5 +430,12 @@ LIMITS = (
 BY_NAME = {limit.name: limit for limit in LIMITS}
 BY_REQUIREMENT = {limit.requirement or limit.name: limit for limit in LIMITS}
 FIELDS = tuple(limit for limit in LIMITS if limit.has_field)
-# A law that is given, not tuned, may have more bandwidth than is asked.
-GIVEN_LAW_LIMITS = tuple(replace(row, sense="at least") if row.sense == "equal to" else row for row in LIMITS)
+
+
+@cache
+def list_given_limits(bandwidth_tolerance: float) -> tuple[Limit, ...]:
+    """Return the limits of a law that is given, not tuned: it may have more bandwidth, and less by this share."""
+    return tuple(
+        replace(row, sense="at least", tolerance=bandwidth_tolerance) if row.name == "bandwidth_hz" else row
+        for row in LIMITS
+    )

@@ -8,7 +8,7 @@ from dataclasses import asdict, fields
 from typing import Any, Literal
 
 from seaopt.control.laws.command import Command
-from seaopt.control.laws.limits import BY_NAME, FIELDS, GIVEN_LAW_LIMITS, LIMITS, Limit
+from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, FIELDS, LIMITS, Limit, list_given_limits
 from seaopt.control.laws.structures import (
     CASCADE,
     CUSTOM,
@@ -109,6 +109,8 @@ class ControllerSpec:
     reserve : float
         Fraction by which Ms, Mt and the other limits are met with room to spare, so that parameters as uncertain as a
         fit leaves them do not break them.
+    bandwidth_tolerance : float
+        Share of bandwidth_hz by which a law that is given, not tuned (`seaopt.control.assess`), may fall short of it.
 
     Raises
     ------
@@ -144,6 +146,7 @@ class ControllerSpec:
     command_limit: float | None = None
     step_N: float | None = None
     reserve: float = 0.005
+    bandwidth_tolerance: float = BANDWIDTH_TOLERANCE
 
     def __post_init__(self) -> None:
         self._check_measured()
@@ -205,7 +208,7 @@ class ControllerSpec:
             raise ControlError(
                 f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give delay_samples = 1"
             )
-        for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *OPTIONAL):
+        for name in ("bandwidth_hz", "sample_rate_hz", "reserve", "bandwidth_tolerance", *OPTIONAL):
             value = getattr(self, name)
             if value is None and name in OPTIONAL:
                 continue
@@ -226,6 +229,10 @@ class ControllerSpec:
         check_command_limits(self.current_limit_A, self.command_limit)
         if not 0.0 <= self.reserve < 0.5:
             raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")
+        if not 0.0 <= self.bandwidth_tolerance < 0.5:
+            raise ControlError(
+                f"bandwidth_tolerance = {self.bandwidth_tolerance:g} is not a small fraction; give 0 to 0.5"
+            )
 
     def _check_band(self) -> None:
         if self.passive_band_hz is None:
@@ -313,7 +320,7 @@ class ControllerSpec:
     @property
     def limits(self) -> tuple[Limit, ...]:
         """The rows that a loop is judged by."""
-        return GIVEN_LAW_LIMITS if self.structure == CUSTOM else LIMITS
+        return list_given_limits(self.bandwidth_tolerance) if self.structure == CUSTOM else LIMITS
 
     @property
     def sample_time_s(self) -> float:
@@ -370,6 +377,8 @@ class ControllerSpec:
             "notch": self.notch, "prefilter": self.reference_filter, "link_feedforward": self.link_feedforward
         }  # fmt: skip
         stated = {name: None if one is None else asdict(one) for name, one in filters.items()}
+        if self.bandwidth_tolerance == BANDWIDTH_TOLERANCE:
+            del values["bandwidth_tolerance"]  # stands in no file of a law that was tuned
         return values | stated | {"delay_samples": self.loop_delay_samples}
 
 

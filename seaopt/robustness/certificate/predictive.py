@@ -58,11 +58,11 @@ def linear_spec(spec: MPCSpec) -> ControllerSpec:
         for limit in MPC_LIMITS
         if limit.has_field and limit.name != "bandwidth_hz"
     }
-    bandwidth = spec.bandwidth_hz * (1.0 - MPC_BANDWIDTH_TOLERANCE)
     return ControllerSpec(
-        structure=CUSTOM, measured=spec.measured, bandwidth_hz=bandwidth, sample_rate_hz=spec.sample_rate_hz,
-        bandwidth_range_hz=(min(15.0, bandwidth), max(60.0, bandwidth)), delay_samples=spec.delay_samples,
-        min_filter_samples=False, **levels,
+        structure=CUSTOM, measured=spec.measured, bandwidth_hz=spec.bandwidth_hz,
+        bandwidth_range_hz=(min(15.0, spec.bandwidth_hz), max(60.0, spec.bandwidth_hz)),
+        sample_rate_hz=spec.sample_rate_hz, delay_samples=spec.delay_samples, min_filter_samples=False,
+        bandwidth_tolerance=MPC_BANDWIDTH_TOLERANCE, **levels,
     )  # fmt: skip
 
 

@@ -50,7 +50,8 @@ def test_the_linear_region_is_certified_as_a_law(certificate, mpc, thor):
     ends = [find_ms(mpc, thor, inertia) for inertia in HERE["J"]]
     assert certificate.worst["stand"].ms == pytest.approx(max(ends), rel=2e-3)
     assert certificate.monte_carlo.samples == 200 and certificate.monte_carlo.failures == 0
-    assert linear_controller(mpc).feasible == mpc.feasible
+    linear = linear_controller(mpc)
+    assert linear.feasible == mpc.feasible and linear.spec.bandwidth_hz == mpc.spec.bandwidth_hz
     assert any("linear region" in note for note in certificate.notes)
     assert any("quantisation" in note and "in neither" in note for note in certificate.notes)
 
