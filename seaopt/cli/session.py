@@ -29,6 +29,7 @@ from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
+from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentified
 from seaopt.estimation.result.findings import state_guesses
@@ -44,7 +45,7 @@ from seaopt.problem.stages import (
     can_design,
     certify_problem,
     certify_schedule_problem,
-    describe_mpc,
+    check_mpc_file,
     design_mpc,
     fit_problem,
     list_plants,
@@ -68,7 +69,7 @@ from seaopt.reporting.verdict import (
     judge_schedule_certificate,
     name_guesses,
 )
-from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate
+from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate, linear_controller
 from seaopt.testing.expectations import list_expectations
 
 SCHEMAS = {
@@ -259,20 +260,26 @@ class Session:
     def take_law(self, path: Path) -> None:
         """Take a law of the user's own in place of a tuned one, and write it as the folder's controller.
 
-        A controller that was tuned there is kept: the law then needs another folder.
+        A controller that was tuned there is kept: the law then needs another folder. Of predictive control it is the
+        controller.json of the problem's own.
         """
         if self.problem.mpc is not None:
-            raise ProblemError(
-                f'{self.problem.source}: [controller] has structure = "mpc", and a law of one\'s own is no plan; write '
-                'structure = "pid" for its limits'
-            )
+            check_mpc_file(self.problem, self.plan(), path, f"run {self._spell('tune')}, and certify that")
+            self._keep(linear_controller(self.plan()))
+            return
         given = read_law(path)
         controller = assess_problem(self.problem, given, self.parameters())
         target = self.folder / FILES["tune"]
-        if target.exists() and read_json(target, SCHEMAS["tune"]).get("structure") != CUSTOM:
+        before = read_json(target, SCHEMAS["tune"]) if target.exists() else {"structure": CUSTOM}
+        if before.get("structure") != CUSTOM or "mpc" in before:
             raise ProblemError(f"{target}: is a controller that was tuned; give the law another folder: -o DIR")
+        self._keep(controller)
+
+    def _keep(self, controller: Controller | ScheduledController) -> None:
+        """Write what was tuned, or given, as the folder's controller; of predictive control with its plan."""
+        plan = {} if self.problem.mpc is None else {"mpc": describe_mpc(self.plan())}
         self.results["tune"] = controller
-        self._write("tune", controller.to_dict())
+        self._write("tune", controller.to_dict() | plan)
 
     def schedule(self) -> ScheduledController:
         """Return the schedule of this run or of the folder; one for other limits than the problem's is refused."""
@@ -420,14 +427,9 @@ class Session:
             result = tune_schedule_problem(self.problem, self.parameters(), tell)
         else:
             result = tune_problem(self.problem, self.parameters(), tell, self.executor)
-        if self.problem.mpc is not None and isinstance(result, Controller):
-            self.results["tune"] = result
-            self._write("tune", result.to_dict() | {"mpc": describe_mpc(self.plan())})
-            return
         if isinstance(result, JointTuning):
             self.results["joint"], result = result, result.controller
-        self.results["tune"] = result
-        self._write("tune", result.to_dict())
+        self._keep(result)
 
     def _sweep(self, tell: Progress) -> None:
         if self.problem.mpc is not None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,10 +32,11 @@ from seaopt.control import (
 )
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.loops.sampled_plant import list_names
-from seaopt.control.mpc.export import collect_code
+from seaopt.control.mpc.stored import check_described
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
+from seaopt.files import parse_file
 from seaopt.frequency import MeasuredResponse
 from seaopt.logs import Log
 from seaopt.parameters import Parameter, ParameterSet
@@ -153,9 +156,34 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
     return force_mpc(problem.design_plant, source, problem.mpc)
 
 
-def describe_mpc(mpc: ForceMPC) -> dict[str, Any]:
-    """Return what controller.json says of a plan beside its linear law: its specification, and its C code's numbers."""
-    return {"spec": asdict(mpc.spec), "code": collect_code(mpc).to_dict()}
+def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:
+    """Refuse a file that is not the controller.json of the predictive controller that a problem asks for.
+
+    Parameters
+    ----------
+    problem : Problem
+        With `mpc`.
+    mpc : ForceMPC
+        What `design_mpc` returned.
+    path : Path
+        The file.
+    remedy : str
+        What to do, for messages.
+
+    Raises
+    ------
+    SeaoptError
+        The file cannot be read, or is of something else.
+
+    """
+    is_json = path.suffix.lower() == ".json"
+    content = parse_file(path, json.loads, "JSON", remedy="give a controller.json") if is_json else None
+    if not isinstance(content, dict) or "mpc" not in content:
+        raise ProblemError(
+            f'{problem.source}: [controller] has structure = "mpc", and a law of one\'s own is no plan; write '
+            'structure = "pid" for its limits'
+        )
+    check_described(content["mpc"], mpc, source=str(path), problem=problem.source, remedy=remedy)
 
 
 def tune_problem(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
 import seaopt as so
 from seaopt.control import export_mpc
+from seaopt.control.mpc.stored import describe_mpc
+from seaopt.files import to_json
 from seaopt.problem.stages import design_mpc
 
 PLANNED = """
@@ -89,6 +92,39 @@ def test_what_cannot_be_is_refused(planned, seaopt, old, new, said):
     (planned / "plan.toml").write_text(PLANNED.replace(old, new), encoding="utf-8")
     out = seaopt("tune", "plan.toml", "-o", "out")
     assert out.returncode == 2 and said in out.stderr
+
+
+def test_its_own_controller_is_certified_as_that_plan(planned, seaopt):
+    assert seaopt("tune", "plan.toml", "-o", "out").returncode == 0
+    kept = planned / "kept.json"
+    (planned / "out" / "controller.json").rename(kept)
+    out = seaopt("certify", "plan.toml", "-o", "other", "--controller", "kept.json")
+    assert out.returncode == 0, out.stderr
+    robustness = json.loads((planned / "other" / "robustness.json").read_text(encoding="utf-8"))
+    assert robustness["passed"] and robustness["constrained"]["runs"] == 1
+    own = json.loads(kept.read_text(encoding="utf-8"))
+    written = json.loads((planned / "other" / "controller.json").read_text(encoding="utf-8"))
+    assert all(written[name] == own[name] for name in ("law", "spec", "mpc"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("bandwidth_hz = 20", "bandwidth_hz = 25", "kept.json: mpc.spec.bandwidth_hz is 20.0, and plan.toml asks for"),
+        ("[plant.stand]", "[parameters]\nk = 500000\n[plant.stand]", "mpc.code is not what plan.toml makes"),
+        ('structure = "mpc"', 'structure = "pid"', "kept.json: is of predictive control"),
+    ],
+)  # fmt: skip
+def test_a_controller_of_another_plan_is_refused(planned, seaopt, old, new, said):
+    problem = so.read_problem(planned / "plan.toml")
+    content = {"mpc": describe_mpc(design_mpc(problem, problem.parameters))}
+    (planned / "kept.json").write_text(to_json(content), encoding="utf-8")
+    text = PLANNED.replace(old, new)
+    if "pid" in new:
+        text = re.sub(r"\[mpc\].*\n(?=\[robustness\])", "", text, flags=re.DOTALL).replace("constrained_runs = 1", "")
+    (planned / "plan.toml").write_text(text, encoding="utf-8")
+    out = seaopt("certify", "plan.toml", "-o", "out", "--controller", "kept.json")
+    assert out.returncode == 2 and said in " ".join(out.stderr.split())
 
 
 @pytest.mark.parametrize(

@@ -240,6 +240,11 @@ def read_law(path: Path | str) -> GivenLaw:
     source = Path(path)
     parse, form = (json.loads, "JSON") if source.suffix.lower() == ".json" else (tomllib.loads, "TOML")
     content = parse_file(source, parse, form, remedy=f"give the law's file: {LAW_EXAMPLE}")
+    if isinstance(content, dict) and "mpc" in content:
+        raise FileError(
+            f"{source}: is of predictive control, which plans and is no law; certify it with the problem file that it "
+            'was made from, whose [controller] has structure = "mpc"'
+        )
     return check_table(LawFile, content, str(source)).build(str(source))
 
 
