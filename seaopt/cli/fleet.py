@@ -46,12 +46,16 @@ def run_fleet(
         os.environ.setdefault(name, "1")
     from seaopt.executors import Processes, connect_dask
     from seaopt.fleet import find_logs, fit_fleet, read_manifest
+    from seaopt.problem import read_problem
 
     if (manifest is None) == (not names):
         raise LogError("give the logs either as LOGS, files or patterns in quotes, or as --manifest FILE")
     errors = Terminal(stderr=True)
     logs = find_logs(names, identity) if manifest is None else read_manifest(manifest)
     _check_options(logs, drift)
+    read = read_problem(problem, design=False)
+    if read.refused:
+        errors.say(f"warning: {read.refused}; a design refuses this")
     with ExitStack() as stack:
         if scheduler is not None:
             executor = stack.enter_context(connect_dask(scheduler))
@@ -61,7 +65,7 @@ def run_fleet(
         try:
             with show_progress(errors, "fitting the fleet", errors.say) as tell:
                 fleet = fit_fleet(
-                    problem, logs, folder, executor=executor, like=like, time_limit_s=time_limit_s, progress=tell
+                    read, logs, folder, executor=executor, like=like, time_limit_s=time_limit_s, progress=tell
                 )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"what was finished is in {folder}; the same command goes on from there") from None

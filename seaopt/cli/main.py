@@ -148,7 +148,7 @@ def simulate(
     """Simulate every experiment with the file's values; write one CSV each, and the logs of virtual ones."""
     from seaopt.cli.session import Session
 
-    session = Session(problem, output)
+    session = Session(problem, output, design=False)
     session.run("simulate")
     _finish(session, json, ["simulate"], quiet, verbose)
 
@@ -168,7 +168,7 @@ def frf(
     """Estimate frequency responses (H1, coherence, second-order fit); write frf.json and figure."""
     from seaopt.cli.session import Session
 
-    session = Session(problem, output, stretch_s=stretch)
+    session = Session(problem, output, stretch_s=stretch, design=False)
     session.run("frf")
     _finish(session, json, ["frf"], quiet, verbose)
 
@@ -285,7 +285,7 @@ def validate(
     """Score the fit in DIR on another log, from its own initial state and offsets."""
     from seaopt.cli.session import Session
 
-    Session(problem, output).validate(log, like, json, _choose_amount(quiet, verbose))
+    Session(problem, output, design=False).validate(log, like, json, _choose_amount(quiet, verbose))
 
 
 def _make_command(name: str, text: str) -> Callable[..., None]:
@@ -295,7 +295,7 @@ def _make_command(name: str, text: str) -> Callable[..., None]:
     ) -> None:  # fmt: skip
         from seaopt.cli.session import Session
 
-        session = Session(problem, output)
+        session = Session(problem, output, design=name != "fit")
         session.run(name)
         _finish(session, json, [name], quiet, verbose)
 

@@ -113,9 +113,10 @@ class Session:
         *,
         free_law: bool = False,
         workers: int | None = None,
+        design: bool = True,
     ) -> None:
         check_folder(folder)
-        self.problem: Problem = read_problem(problem)
+        self.problem: Problem = read_problem(problem, design=design)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -131,6 +132,7 @@ class Session:
         self._experiments: tuple[Experiment, ...] | None = None
         self._warned: set[str] = set()
         self._console = Terminal(stderr=True)
+        self._warn([f"{self.problem.refused}; a design refuses this"] if self.problem.refused else [])
         for note in self.problem.notes:
             self._note(note)
 

@@ -76,6 +76,8 @@ class Problem:
         What is asked of the controller; of predictive control while no limit of its plan is active.
     mpc : MPCSpec or None
         What is asked of predictive control, with structure = "mpc".
+    refused : str
+        What is wrong in the tables of a design, where the file was read without them: `read_problem(design=False)`.
 
     """
 
@@ -87,6 +89,7 @@ class Problem:
     table: ProblemTable
     spec: ControllerSpec | None
     mpc: MPCSpec | None = None
+    refused: str = ""
 
     @property
     def fit_options(self) -> dict[str, Any]:
@@ -100,7 +103,9 @@ class Problem:
         }
 
     def _ask_for_controller(self) -> str:
-        """Return what to say where the file has no controller: the least table of one."""
+        """Return what to say where the file has no controller: what is wrong in it, or the least table of one."""
+        if self.refused:
+            return self.refused
         table = f'controller = {{ plant = "{next(iter(self.plants), "stand")}", bandwidth_hz = 30 }}'
         return f"{self.source}: has no [controller]; add one to tune or certify: {table}"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -22,14 +23,24 @@ from seaopt.problem.references import check_references
 from seaopt.problem.schema import AnyPlant, EquationsTable, PlantTable, PrefilterTable, ProblemTable
 from seaopt.robustness.certificate.predictive import linear_spec
 
+OF_DESIGN = ("controller", "impedance", "mpc", "robustness", "expect")  # tables that a fit does not read
+
 
 def demo_path() -> Path:
     """Return the path of the THOR problem that comes with the package."""
     return Path(str(files("seaopt.problem").joinpath("thor.toml")))
 
 
-def read_problem(path: Path | str) -> Problem:
+def read_problem(path: Path | str, *, design: bool = True) -> Problem:
     """Read and check a problem file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    design : bool
+        False: of a file in which only what a design needs is wrong ([controller], [impedance], [mpc], [robustness],
+        [expect]), read the rest, which a fit needs; `Problem.refused` then says what is wrong.
 
     Raises
     ------
@@ -49,7 +60,20 @@ def read_problem(path: Path | str) -> Problem:
     """
     require_type(path, (str, Path), "path", "give the path of a problem file", ProblemError)
     source = Path(path)
-    return make_problem(_read_table(source), str(path), source.parent)
+    content = _read_toml(source)
+    try:
+        return _make(content, str(path))
+    except SeaoptError as error:
+        if design:
+            raise
+        refused = str(error)
+    fitted = {key: value for key, value in content.items() if key not in OF_DESIGN}
+    return replace(_make(fitted, str(path)), refused=refused)
+
+
+def _make(content: Mapping[str, Any], source: str) -> Problem:
+    table = check_table(ProblemTable, content, source, error=ProblemError)
+    return make_problem(table, source, Path(source).parent)
 
 
 def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
@@ -128,18 +152,6 @@ def _make_spec(table: ProblemTable) -> ControllerSpec | None:
         designed, certified = fields["min_friction_margin"], table.robustness.min_friction_margin
         fields["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
     return ControllerSpec(**fields, notch=tuned, prefilter=prefilter, link_feedforward=link)
-
-
-def _read_table(source: Path) -> ProblemTable:
-    """Return a problem file's table.
-
-    Raises
-    ------
-    ProblemError
-        The file is missing or not TOML, a key is unknown or missing, or a value is out of range.
-
-    """
-    return check_table(ProblemTable, _read_toml(source), str(source), error=ProblemError)
 
 
 def _exists(path: Path) -> bool:

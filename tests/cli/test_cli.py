@@ -153,6 +153,17 @@ def test_a_controller_of_another_fit_is_not_exported(copied, seaopt):
 OPEN = ("[plant.stand]", "K_tau = { value = 0.0255, free = true }\n[plant.stand]", 1)  # only eta K_tau is seen
 
 
+def test_a_wrong_controller_keeps_no_fit_from_its_logs(folder, seaopt, stand_alone):
+    problem, said = folder / "stand.toml", "bandwidth_hz = 3 is outside 15 to 60"
+    problem.write_text(stand_alone.replace("bandwidth_hz = 30", "bandwidth_hz = 3"), encoding="utf-8")
+    out = seaopt("fit", "stand.toml")
+    assert out.returncode == 0 and f"warning: stand.toml: {said}" in out.stderr
+    out = seaopt("tune", "stand.toml")
+    assert out.returncode == 2 and said in out.stderr
+    problem.write_text(stand_alone, encoding="utf-8")  # mended, its fit still counts
+    assert seaopt("tune", "stand.toml").returncode == 0
+
+
 def test_an_unidentifiable_fit_exits_1_with_a_report(folder, seaopt, stand_alone, without_drawing):
     (folder / "open.toml").write_text(stand_alone.replace(*OPEN), encoding="utf-8")
     out = seaopt("run", "open.toml", "-o", "open")

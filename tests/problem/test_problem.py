@@ -27,6 +27,31 @@ def test_the_packaged_problem_is_the_one_in_problems():
     assert (ROOT / "problems" / "thor.toml").read_text(encoding="utf-8") == TEXT
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [("bandwidth_hz = 30", "bandwidth_hz = 3", "bandwidth_hz = 3 is outside 15 to 60"),
+     ("[controller]", "[controller]\nstep = 3", "controller.step: unknown key"),
+     ('[controller]\nplant = "stand"', '[controller]\nplant = "bench"', 'controller.plant = "bench" is not a [plant]')],
+)  # fmt: skip
+def test_what_only_a_design_needs_keeps_no_fit_from_the_file(write, old, new, said):
+    assert TEXT.count(old) == 1
+    path = write(TEXT.replace(old, new))
+    with pytest.raises(so.SeaoptError, match=re.escape(said)):
+        so.read_problem(path)
+    problem, good = so.read_problem(path, design=False), so.read_problem(so.demo_path(), design=False)
+    assert said in problem.refused and not good.refused and good.spec is not None
+    assert problem.parameters == good.parameters and problem.fit_options == good.fit_options
+    with pytest.raises(so.SeaoptError, match=re.escape(said)):
+        _ = problem.design_plant
+
+
+def test_what_a_fit_needs_is_refused_without_a_design_too(write):
+    with pytest.raises(so.SeaoptError, match="holdout"):
+        so.read_problem(
+            write(TEXT.replace("[fit]", "[fit]\nholdout = 3").replace("bandwidth_hz = 30", "")), design=False
+        )
+
+
 def test_a_multisine_in_a_problem_file_drives_the_virtual_log(write):
     """One line of 2 A at 8 Hz for 2 s at 400 Hz: 16 whole periods, an rms of sqrt(2) A."""
     lines = "multisine = { amplitudes = [2.0], frequencies_hz = [8.0] }"
