@@ -30,7 +30,7 @@ def test_the_packaged_problem_is_the_one_in_problems():
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [("bandwidth_hz = 30", "bandwidth_hz = 3", "bandwidth_hz = 3 is outside 15 to 60"),
-     ("[controller]", "[controller]\nstep = 3", "controller.step: unknown key"),
+     ("[controller]", "[controller]\nstep = 3", "unknown key controller.step"),
      ('[controller]\nplant = "stand"', '[controller]\nplant = "bench"', 'controller.plant = "bench" is not a [plant]')],
 )  # fmt: skip
 def test_what_only_a_design_needs_keeps_no_fit_from_the_file(write, old, new, said):
@@ -46,10 +46,9 @@ def test_what_only_a_design_needs_keeps_no_fit_from_the_file(write, old, new, sa
 
 
 def test_what_a_fit_needs_is_refused_without_a_design_too(write):
+    wrong = TEXT.replace("holdout = 0.2", "holdout = 3").replace("bandwidth_hz = 30", "")
     with pytest.raises(so.SeaoptError, match="holdout"):
-        so.read_problem(
-            write(TEXT.replace("[fit]", "[fit]\nholdout = 3").replace("bandwidth_hz = 30", "")), design=False
-        )
+        so.read_problem(write(wrong), design=False)
 
 
 def test_a_multisine_in_a_problem_file_drives_the_virtual_log(write):
