@@ -52,6 +52,14 @@ class Sensors:
             out = np.clip(out, -limit, limit)
         return step * np.round(out / step) if step else out
 
+    def convert(self, name: str, value: float) -> float:
+        """Return one reading of a value that has its noise: offset added, clipped, rounded to the nearest step."""
+        limit, step = self.saturation.get(name), self.quantisation.get(name)
+        reading = value + self.offset.get(name, 0.0)
+        if limit is not None:
+            reading = min(max(reading, -limit), limit)
+        return step * math.floor(reading / step + 0.5) if step else reading
+
     def combine_errors(self, plant: Plant, params: CompletedParameters, name: str) -> tuple[float, float]:
         """Return noise (std) and rounding (step) of an output, of those encoders included that it is computed from.
 

@@ -431,7 +431,7 @@ def certify_problem(
             bounds=Budget() if table.bounds else None,
             max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
             runs=table.constrained_runs, bound_tolerance=table.bound_tolerance,
-            sensor_std=problem.sensors.noise_std.get(problem.mpc.measured, 0.0), executor=executor, progress=progress,
+            sensors=problem.sensors, current_step_A=table.step, executor=executor, progress=progress,
         )  # fmt: skip
     return certify(
         controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,

@@ -8,6 +8,7 @@ steps and the same error: each sample is integrated with n and with 2n of them, 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,15 +18,17 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.bench import Sensors
 from seaopt.control.loops.sampled_plant import DELAY, read_conditions
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
-from seaopt.control.running.sampled_loop import whole_samples
+from seaopt.control.running.sampled_loop import largest_current, whole_samples
 from seaopt.errors import ControlError, SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import name_input, output_function
+from seaopt.plants.sensors.deflection import evaluate_weights
 from seaopt.records import record
 from seaopt.units import LINEAR, mechanics_of, name_command, unit_after
 
@@ -40,8 +43,8 @@ class ForceRun:
     Parameters
     ----------
     time, reference, force, current, law_time_s : arrays, shape (n,)
-        Seconds; N; N at the samples, without the sensor's noise; A as commanded; and the time (s) that each step of the
-        law took.
+        Seconds; N; N at the samples, without the sensor's errors; A as the amplifier makes it; and the time (s) that
+        each step of the law took.
     state : array, shape (n, nx)
         Of the plant.
     error : float
@@ -103,7 +106,9 @@ def close_loop(
     sample_time_s: float = 1e-3,
     delay_samples: int = 1,
     preview_samples: int = 0,
-    sensor_std: float = 0.0,
+    sensors: Sensors | None = None,
+    current_step_A: float = 0.0,
+    current_limit_A: float = np.inf,
     disturbance_A: float | Float[np.ndarray, " n"] = 0.0,
     seed: int = 0,
     start_state: Float[np.ndarray, " nx"] | None = None,
@@ -134,8 +139,13 @@ def close_loop(
     preview_samples : int
         How many references beyond the present one the law is given: it is called with an array of them all, the present
         one first, fewer at the end; with 0, with the present one as a number.
-    sensor_std : float
-        White noise on the measurement.
+    sensors : Sensors, optional
+        Noise, offset, range and quantisation of the measured output, and of the encoders that it is computed from;
+        ideal if left out.
+    current_step_A : float
+        What the amplifier rounds the command to, in its unit; 0 for not at all.
+    current_limit_A : float
+        The amplifier's; with a step the largest is the last whole one within it.
     disturbance_A : float or array, shape (n,)
         Added to the current inside the plant.
     seed : int
@@ -165,8 +175,12 @@ def close_loop(
         raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, ca.DM(values.vector)
     output, integrator = output_function(plant), _Integrator(plant=plant, rtol=rtol)
-    row, others = list(plant.outputs).index(measured), [0.0] * (len(plant.inputs) - 1)
-    noise = sensor_std * np.random.default_rng(seed).normal(size=n)
+    others = [0.0] * (len(plant.inputs) - 1)
+    reading = _place_sensor(sensors or Sensors(), plant, values, measured)
+    noise = reading.noise_std * np.random.default_rng(seed).normal(size=n)
+    if not current_step_A >= 0.0:
+        raise ControlError(f"current_step_A = {current_step_A:g} is negative; give the amplifier's step, 0 for none")
+    most = largest_current(current_limit_A, current_step_A)
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
     x = np.zeros(len(plant.states)) if start_state is None else start_state
     if place is not None and place not in plant.states:
@@ -180,11 +194,13 @@ def close_loop(
 
     for k in range(n):
         older = k - newer - (rest_s > 0.0)
-        force[k] = float(output(time_s[k], x, inputs(k, min(older, k - 1)), p)[row])
+        outputs = np.array(output(time_s[k], x, inputs(k, min(older, k - 1)), p)).ravel()
+        force[k] = outputs[reading.row]
         call_start_s = time.perf_counter()
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
-        current[k], law = step(law, coming, float(force[k] + noise[k]), *x[seen].tolist())
+        command, law = step(law, coming, reading.read(outputs, float(noise[k])), *x[seen].tolist())
         law_time_s[k] = time.perf_counter() - call_start_s
+        current[k] = _convert_command(command, current_step_A, most)
         states[k] = x
         if rest_s > 0.0:
             x = integrator.advance(time_s[k], x, inputs(k, older), p, rest_s)
@@ -193,6 +209,47 @@ def close_loop(
         time=time_s, reference=reference, force=force, current=current, law_time_s=law_time_s, state=states,
         error=integrator.error, substeps=2 * integrator.substeps, unit=plant.outputs[measured],
         command=name_input(plant),
+    )  # fmt: skip
+
+
+def _convert_command(command: float, step_A: float, most_A: float) -> float:
+    """Return what an amplifier makes of a command: the nearest step, within its limit."""
+    rounded = step_A * math.floor(command / step_A + 0.5) if step_A else command
+    return min(max(rounded, -most_A), most_A)
+
+
+@record(eq=False)
+class _Reading:
+    """A sensor with what it reads: rows among the outputs, its noise, and the encoders that err with their weights."""
+
+    sensors: Sensors
+    name: str
+    row: int
+    noise_std: float
+    encoders: tuple[tuple[str, int, float], ...]
+
+    def read(self, outputs: Float[np.ndarray, " ny"], noise: float) -> float:
+        """Return the reading of a sample's outputs."""
+        value = float(outputs[self.row]) + noise
+        for name, row, weight in self.encoders:
+            true = float(outputs[row])
+            value += weight * (self.sensors.convert(name, true) - true)
+        return self.sensors.convert(self.name, value)
+
+
+def _place_sensor(sensors: Sensors, plant: Plant, values: CompletedParameters, measured: str) -> _Reading:
+    """Return the sensor of an output, with the encoders that it is computed from."""
+    for what in ("noise_std", "quantisation", "saturation"):
+        for name, value in getattr(sensors, what).items():
+            if not value >= 0.0:
+                raise ControlError(f"sensors: {what} of {name} = {value:g} is negative; give zero or more")
+    names = list(plant.outputs)
+    erring = {*sensors.offset, *sensors.saturation, *sensors.quantisation} & plant.outputs.keys()
+    weights = evaluate_weights(plant, values, measured)
+    return _Reading(
+        sensors=sensors, name=measured, row=names.index(measured),
+        noise_std=sensors.combine_errors(plant, values, measured)[0],
+        encoders=tuple((name, names.index(name), weights[name]) for name in weights if name in erring),
     )  # fmt: skip
 
 

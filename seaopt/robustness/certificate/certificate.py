@@ -216,20 +216,29 @@ class Certificate:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
         simulations = self._simulate(sensors, current_step_A, seed, executor, progress)
         runs = simulations.verification or simulations.left_out["simulation"]
-        others = (row for row in self.requirements if row.name not in (SIMULATION_FAILURES, *NAMED_FAULTS.values()))
-        requirements = (*others, *_require_runs(runs))
+        requirements = (*self._drop_runs(), *_require_runs(runs))
         passed = all(row.met for row in requirements)
         return replace(self, simulated=simulations, requirements=requirements, passed=passed)
 
-    def with_steps(self, progress: Progress = ignore, executor: Executor | None = None) -> Certificate:
+    def with_steps(
+        self, progress: Progress = ignore, executor: Executor | None = None, *, sensors: Sensors | None = None,
+        current_step_A: float = 0.0, seed: int = 1,
+    ) -> Certificate:  # fmt: skip
         """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
 
         Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
-        reference; nothing may oscillate. `certify` always does this; `with_simulation` plays all other scenarios too.
+        reference; nothing may oscillate. `certify` always does this, on ideal sensors; `with_simulation` plays all
+        other scenarios too.
         """
-        played = self.play_steps(progress, executor)
-        requirements = (*self.requirements, *played._require_cycles(), *_require_runs(played.steps or ""))
+        played = self.play_steps(progress, executor, sensors=sensors, current_step_A=current_step_A, seed=seed)
+        others = (row for row in self._drop_runs() if row.name != LIMIT_CYCLE)
+        requirements = (*others, *played._require_cycles(), *_require_runs(played.steps or ""))
         return replace(played, requirements=requirements, passed=all(row.met for row in requirements))
+
+    def _drop_runs(self) -> tuple[Requirement, ...]:
+        """Return what is required besides simulated runs, which are played again."""
+        played = (SIMULATION_FAILURES, *NAMED_FAULTS.values())
+        return tuple(row for row in self.requirements if row.name not in played)
 
     @property
     def draws(self) -> str:
@@ -243,11 +252,24 @@ class Certificate:
             return self.simulated.verification
         return self.steps if isinstance(self.steps, Verification) else None
 
-    def play_steps(self, progress: Progress = ignore, executor: Executor | None = None) -> Certificate:
+    def play_steps(
+        self, progress: Progress = ignore, executor: Executor | None = None, *, sensors: Sensors | None = None,
+        current_step_A: float = 0.0, seed: int = 1,
+    ) -> Certificate:  # fmt: skip
         """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
         if not self.models:
             return replace(self, steps=NO_MODEL)
-        steps = simulate_steps(self.controller, self.models, self.parameters, self._draws(), executor, progress)
+        steps = simulate_steps(
+            self.controller,
+            self.models,
+            self.parameters,
+            self._draws(),
+            executor,
+            progress,
+            sensors=sensors,
+            current_step_A=current_step_A,
+            seed=seed,
+        )
         shown_of = {name: name not in self.friction or self.friction[name].shown for name in self.models}
         seek = partial(_seek_cycles, Shared((self.controller, self.models, self.parameters)))
         cycles: dict[str, tuple[FoundCycle, ...]] = {}
@@ -363,7 +385,12 @@ class Certificate:
                 constrained=stored.read_constrained(),
                 remarks=tuple(stored.remarks),
             )
-            certificate = certificate.play_steps()
+            runs = certificate.constrained
+            certificate = (
+                certificate.play_steps()
+                if runs is None
+                else certificate.play_steps(sensors=runs.sensors, current_step_A=runs.current_step_A, seed=runs.seed)
+            )
             played = stored.simulation
             if played is None:
                 return certificate
@@ -431,8 +458,7 @@ class Certificate:
 
     def _ideal_notes(self) -> tuple[str, ...]:
         """Say that friction that sticks was simulated with a sensor without noise, where nothing else was."""
-        noisy = self.simulated is not None and any(self.simulated.sensors.noise_std.values())
-        if noisy or self.runs is None or self.constrained is not None:  # which says so itself
+        if self.runs is None or any(any(stage.sensors.noise_std.values()) for stage in self.runs.stages.values()):
             return ()
         if not any(each.friction == "sticking" for chosen in self.runs.scenarios.values() for each in chosen):
             return ()

@@ -4,17 +4,19 @@ Each run is the law as it runs, solver and fallback included, on the nonlinear p
 
     rest, a step, the step reversed, the disturbance with the reference held.
 
-Sizes and signs are drawn, from steps that stay within the limits to those that take all that the command holds. A run
-fails where it diverges or grows, breaks a bound of an output by more than a tolerance, or, on a plant whose link does
-not move, does not settle. With n runs and f failures the probability that a run drawn so fails is below Clopper's and
-Pearson's bound; nothing is claimed beyond that distribution.
+Sizes and signs are drawn, from steps that stay within the limits to those that take all that the command holds. What
+the law reads is what the sensors make of the output, and what acts is its command as the amplifier rounds it. A run
+fails where it diverges or grows, breaks a bound of an output by more than a tolerance, rings in the last phase above
+what noise and rounding make in the linear loop, or, on a plant whose link does not move, does not settle. With n runs
+and f failures the probability that a run drawn so fails is below Clopper's and Pearson's bound; nothing is claimed
+beyond that distribution.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict
+from dataclasses import asdict, field, replace
 from functools import partial
 from typing import Any
 
@@ -22,7 +24,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control import ForceMPC, ForceRun, MPCStep, close_loop
+from seaopt.bench import Sensors
+from seaopt.control import Controller, ForceMPC, ForceRun, MPCStep, close_loop
 from seaopt.control.loops.sampled_plant import DELAY, conditions
 from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.errors import SeaoptError
@@ -36,14 +39,21 @@ from seaopt.records import record
 from seaopt.robustness.uncertainty.draws import Uncertainty
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
+from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_floor
+from seaopt.robustness.verification.linear import view_loop
+from seaopt.robustness.verification.oscillation import measure_swing
+from seaopt.robustness.verification.playback import Stage
+from seaopt.units import LINEAR
 
 CONSTRAINED_STREAM = 0x3C  # the runs' own stream of random numbers, whatever the seed
 STEP_SHARES = (0.3, 1.0)  # of the force that the limits hold, of the steps
 DISTURBANCE_SHARE = 0.1  # of the limit of the command, at most
 PERIODS, LEAST_PHASE_S, REST_S = 3.0, 0.1, 0.02  # of the bandwidth that a phase lasts besides a preview; before it
+JUDGED_PERIODS = 8.0  # of the bandwidth that the last phase lasts besides, in which a ring would last
+SLOWEST = 0.5  # of the bandwidth: slower rings, of the linear law, are looked for in its own simulations
 LAST_SHARE, SETTLED = 0.2, 0.1  # of a phase, over which the force is off by at most this share of the step
 RUNAWAY, GROWTH = 3.0, 1.5  # times what the limits hold; second half of the last phase over its first
-DIVERGED, OVER_BOUND, UNSETTLED = "diverged", "over a bound", "not settled"
+DIVERGED, OVER_BOUND, UNSETTLED, RINGS = "diverged", "over a bound", "not settled", "ringing"
 
 
 @record
@@ -54,18 +64,22 @@ class ConstrainedRuns:
     ----------
     runs, failures, seed : int
         A run is one draw on every plant; it fails if it fails on one.
-    diverged, over_bound, not_settled : int
+    diverged, over_bound, not_settled, ringing : int
         The failures by their first reason.
     confidence, failure_probability_bound : float
         With that confidence the probability of failure is below the bound.
     bound_tolerance, largest_violation : float
         By how much a bounded signal may leave its bounds, and did, as a share of half their width.
+    largest_ring : float
+        Amplitude of what still swings at the end of a run, of noise and rounding too, in the regulated output's unit.
     at_limit, fallback : float
         Share of the samples with the command at its limit or its slew limit, and without a plan that keeps the limits.
     iterations : int
         The most of any step.
-    sensor_std : float
-        Noise of the measurement.
+    sensors, current_step_A
+        What the law reads with, and what its command is rounded to.
+    unit : str
+        Of the ring: N, or N m of a torque.
     where : str
         The first run that failed, with its parameters; "" where none did.
     remedy : str
@@ -88,7 +102,11 @@ class ConstrainedRuns:
     at_limit: float
     fallback: float
     iterations: int
-    sensor_std: float
+    ringing: int = 0
+    largest_ring: float = 0.0
+    sensors: Sensors = field(default_factory=Sensors)
+    current_step_A: float = 0.0
+    unit: str = LINEAR.unit
     where: str = ""
     remedy: str = ""
     left_out: tuple[str, ...] = ()
@@ -98,14 +116,18 @@ class ConstrainedRuns:
         return asdict(self) | {"left_out": list(self.left_out)}
 
     def __str__(self) -> str:
-        kinds = ((self.diverged, DIVERGED), (self.over_bound, OVER_BOUND), (self.not_settled, UNSETTLED))
+        kinds = (
+            (self.diverged, DIVERGED), (self.over_bound, OVER_BOUND), (self.not_settled, UNSETTLED),
+            (self.ringing, RINGS),
+        )  # fmt: skip
         counts = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
+        ring = f"; what swings at the end has up to {self.largest_ring:.3g} {self.unit}" if self.largest_ring else ""
         failures, runs = format_count(self.failures, "failure"), format_count(self.runs, "simulated run")
         return (
             f"with limits active: {failures} in {runs}{f' ({counts})' if counts else ''}, failure probability below "
             f"{self.failure_probability_bound:.2g} at a confidence of {100 * self.confidence:.6g} %; the command at a "
             f"limit in {self.at_limit:.0%} of the samples, no new plan in {self.fallback:.2%}, {self.iterations} "
-            "iterations at most"
+            f"iterations at most{ring}"
         )
 
     @property
@@ -113,20 +135,19 @@ class ConstrainedRuns:
         """What a certificate remarks of these runs."""
         return (
             "margins, worst cases and draws are of the linear region, in which no limit of the plan is active",
-            "steps are simulated with ideal sensors, runs with limits active with noise of what is measured alone; "
-            "offset, quantisation and saturation of sensors, and steps of the command, are in neither",
             str(self), *self.left_out,
         )  # fmt: skip
 
 
 @record(eq=False)
 class _Outcome:
-    """One run on one plant: its first fault ("" if none), and what it did in so many steps."""
+    """One run on one plant: its first fault ("" if none), its ring's amplitude, and what it did in so many steps."""
 
     kind: str
     text: str
     violation: float
     signal: str
+    ring: float
     steps: int
     unsolved: int
     late: int
@@ -143,9 +164,21 @@ class _Run:
     references: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 
 
+@record(eq=False)
+class _Bench:
+    """What every run has: the law, the same in its linear region, sensors, amplifier and the tolerance of bounds."""
+
+    mpc: ForceMPC
+    law: Controller
+    tolerance: float
+    sensors: Sensors
+    current_step_A: float
+
+
 def run_constrained(
-    mpc: ForceMPC, plants: Mapping[str, Plant], unknown: Uncertainty, *, runs: int, seed: int, confidence: float,
-    tolerance: float, sensor_std: float, executor: Executor | None = None, progress: Progress = ignore,
+    mpc: ForceMPC, law: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, *, runs: int, seed: int,
+    confidence: float, tolerance: float, sensors: Sensors, current_step_A: float, executor: Executor | None = None,
+    progress: Progress = ignore,
 ) -> ConstrainedRuns:  # fmt: skip
     """Draw and simulate runs with limits active.
 
@@ -153,11 +186,13 @@ def run_constrained(
     ----------
     mpc : ForceMPC
         The law.
+    law : Controller
+        The same in its linear region.
     plants : mapping of name to Plant
         Each is played at every draw.
     unknown : Uncertainty
         What is drawn of the parameters.
-    runs, seed, confidence, tolerance, sensor_std, executor, progress
+    runs, seed, confidence, tolerance, sensors, current_step_A, executor, progress
         As in `certify_mpc`.
 
     """
@@ -171,8 +206,8 @@ def run_constrained(
         )
         for k in range(runs)
     ]  # fmt: skip
-    shared = Shared((mpc, dict(plants), unknown.nominal, tolerance, sensor_std))
-    played = map_ordered(partial(_play_run, shared), parts, executor)
+    bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, current_step_A=current_step_A)
+    played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, executor)
     kinds: list[str] = []
     worst, remedy, outcomes = "", "", list[_Outcome]()
     for k in count_off(range(runs), "limits active, run", progress):
@@ -185,8 +220,7 @@ def run_constrained(
             drawn_here = {key: draw[key] for key in draw if key in place_values(plant, unknown.nominal, draw)}
             at = f"; {format_values(drawn_here)}" if drawn_here else ""
             worst = f"{name}, run {k}, seed {seed}: {of_plants[name].text}{at}"
-            play = partial(_play, mpc, drawn=parts[k], tolerance=tolerance, sensor_std=sensor_std)
-            remedy = _find_remedy(mpc, name, plant, unknown.nominal, drawn_here, of_plants[name], play)
+            remedy = _find_remedy(bench, name, plant, unknown.nominal, drawn_here, of_plants[name], parts[k])
     failures, steps = sum(map(bool, kinds)), sum(one.steps for one in outcomes)
     missing = (
         f"{name} has no {signal}: its bounds are not checked there"
@@ -197,52 +231,52 @@ def run_constrained(
     kept = (f"runs with limits active start at rest at zero: {name} is not drawn there" for name in placed & {*drawn})
     return ConstrainedRuns(
         runs=runs, failures=failures, seed=seed, diverged=kinds.count(DIVERGED), over_bound=kinds.count(OVER_BOUND),
-        not_settled=kinds.count(UNSETTLED), confidence=confidence,
+        not_settled=kinds.count(UNSETTLED), ringing=kinds.count(RINGS), confidence=confidence,
         failure_probability_bound=failure_bound(runs, failures, confidence), bound_tolerance=tolerance,
-        largest_violation=max(one.violation for one in outcomes),
+        largest_violation=max(one.violation for one in outcomes), largest_ring=max(one.ring for one in outcomes),
         at_limit=sum(one.at_limit for one in outcomes) / max(steps, 1),
         fallback=sum(one.unsolved for one in outcomes) / max(steps, 1),
-        iterations=max(one.iterations for one in outcomes), sensor_std=sensor_std, where=worst,
-        remedy=remedy, left_out=(*missing, *kept),
+        iterations=max(one.iterations for one in outcomes), sensors=sensors,
+        current_step_A=current_step_A, unit=law.command.reference_unit, where=worst, remedy=remedy,
+        left_out=(*missing, *kept),
     )  # fmt: skip
 
 
 def _draw_references(
     mpc: ForceMPC, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:  # fmt: skip
-    """Return the reference of a run, and the disturbance of its command: each of its phases is as long."""
-    rest, phase = (round(seconds * mpc.spec.sample_rate_hz) for seconds in (REST_S, _phase_s(mpc)))
+    """Return the reference of a run, and the disturbance of its command, which lasts a phase and what is judged."""
+    rest, phase, last = _count_samples(mpc)
     force = rng.choice([-1.0, 1.0]) * rng.uniform(*STEP_SHARES) * abs(mpc.static_gain) * mpc.command_limit
     disturbance = rng.uniform(-1.0, 1.0) * DISTURBANCE_SHARE * mpc.command_limit
-    reference = np.concatenate([np.zeros(rest), np.full(phase, force), np.full(2 * phase, -force)])
-    return reference, np.concatenate([np.zeros(rest + 2 * phase), np.full(phase, disturbance)])
+    reference = np.concatenate([np.zeros(rest), np.full(phase, force), np.full(phase + last, -force)])
+    return reference, np.concatenate([np.zeros(rest + 2 * phase), np.full(last, disturbance)])
 
 
-def _phase_s(mpc: ForceMPC) -> float:
-    return max(LEAST_PHASE_S, PERIODS / mpc.spec.bandwidth_hz) + mpc.spec.preview_samples * mpc.sample_time_s
+def _count_samples(mpc: ForceMPC) -> tuple[int, int, int]:
+    """Return how many samples a run is at rest, in a phase, and in its last phase."""
+    rate, band = mpc.spec.sample_rate_hz, mpc.spec.bandwidth_hz
+    phase_s = max(LEAST_PHASE_S, PERIODS / band) + mpc.spec.preview_samples * mpc.sample_time_s
+    return round(REST_S * rate), round(phase_s * rate), round((phase_s + JUDGED_PERIODS / band) * rate)
 
 
-def _play_run(
-    shared: Shared[tuple[ForceMPC, dict[str, Plant], ParameterSet, float, float]], run: _Run
-) -> list[_Outcome]:
+def _play_run(shared: Shared[tuple[_Bench, dict[str, Plant], ParameterSet]], run: _Run) -> list[_Outcome]:
     """Simulate one run on every plant, and judge it."""
-    mpc, plants, nominal, tolerance, sensor_std = shared.value
-    return [
-        _play(mpc, plant, place_values(plant, nominal, run.draw), run, tolerance, sensor_std)
-        for plant in plants.values()
-    ]
+    bench, plants, nominal = shared.value
+    return [_play(bench, plant, place_values(plant, nominal, run.draw), run) for plant in plants.values()]
 
 
-def _play(
-    mpc: ForceMPC, plant: Plant, values: ParameterSet, drawn: _Run, tolerance: float, sensor_std: float
-) -> _Outcome:
+def _play(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run) -> _Outcome:
     """Simulate one run on one plant, and judge it."""
+    mpc = bench.mpc
     steps: list[MPCStep] = []
     reference, disturbance = drawn.references
 
-    def report(kind: str, text: str, violation: float, signal: str, at_limit: int) -> _Outcome:
+    def report(
+        kind: str, text: str, violation: float = 0.0, signal: str = "", at_limit: int = 0, ring: float = 0.0
+    ) -> _Outcome:
         return _Outcome(
-            kind=kind, text=text, violation=violation, signal=signal, at_limit=at_limit, steps=len(steps),
+            kind=kind, text=text, violation=violation, signal=signal, at_limit=at_limit, ring=ring, steps=len(steps),
             unsolved=sum(not step.solved for step in steps),
             late=sum(step.status.startswith(UNFINISHED) and not step.solved for step in steps),
             iterations=max((step.iterations for step in steps), default=0),
@@ -255,27 +289,36 @@ def _play(
     try:
         run = close_loop(
             law, mpc.start, plant, values, reference, measured=mpc.measured, sample_time_s=mpc.sample_time_s,
-            delay_samples=mpc.delay_samples, preview_samples=mpc.spec.preview_samples, sensor_std=sensor_std,
-            disturbance_A=disturbance, seed=drawn.seed,
+            delay_samples=mpc.delay_samples, preview_samples=mpc.spec.preview_samples, sensors=bench.sensors,
+            current_step_A=bench.current_step_A, current_limit_A=mpc.command_limit, disturbance_A=disturbance,
+            seed=drawn.seed,
         )  # fmt: skip
     except SeaoptError as error:
-        return report(DIVERGED, str(error), 0.0, "", 0)
+        return report(DIVERGED, str(error))
     violation, signal = _find_violation(mpc, plant, values, run, disturbance)
     kind, text = _judge(mpc, plant, run, np.array([step.target_N for step in steps]))
-    if not kind and violation > tolerance:
+    if not kind and violation > bench.tolerance:
         kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
-    slews = np.abs(np.diff(run.current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
-    at_limit = int(np.count_nonzero(slews | (np.abs(run.current) > mpc.command_limit * (1.0 - 1e-6))))
-    return report(kind, text, violation, signal, at_limit)
+    ring, lasting = _find_ring(bench, plant, values, run)
+    if not kind and lasting:
+        kind, text = RINGS, lasting
+    current = np.array([step.current_A for step in steps])  # before the amplifier rounds it
+    slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
+    at_limit = int(np.count_nonzero(slews | (np.abs(current) > mpc.command_limit * (1.0 - 1e-6))))
+    return report(kind, text, violation, signal, at_limit, ring)
 
 
 def _find_remedy(
-    mpc: ForceMPC, name: str, plant: Plant, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome,
-    play: Callable[[Plant, ParameterSet], _Outcome],
+    bench: _Bench, name: str, plant: Plant, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome,
+    drawn: _Run,
 ) -> str:  # fmt: skip
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
+    mpc, play = bench.mpc, partial(_play, bench, drawn=drawn)
     if failed.late:
         return f"a larger max_iterations in [mpc]: {format_count(failed.late, 'sample')} of that run had no plan"
+    ideal = replace(bench, sensors=Sensors(), current_step_A=0.0)
+    if failed.kind == RINGS and not _play(ideal, plant, place_values(plant, nominal, draw), drawn).kind:
+        return "finer sensors and a finer current_step_A, or a lower bandwidth_hz: with ideal ones that run passes"
     if (own := play(*mpc.design)).kind:
         return f"{_name_obstacle(mpc, own)}: the run fails on the design plant with its own parameters too"
     room = f", or leave {failed.signal} more room by bound_tolerance" if failed.kind == OVER_BOUND else ""
@@ -298,23 +341,43 @@ def _name_obstacle(mpc: ForceMPC, failed: _Outcome) -> str:
 
 def _judge(mpc: ForceMPC, plant: Plant, run: ForceRun, target: Float[np.ndarray, " n"]) -> tuple[str, str]:
     """Return what is wrong with the force of a run, a kind and a sentence; "" twice where nothing is."""
-    held, phase = abs(mpc.static_gain) * mpc.command_limit, round(_phase_s(mpc) * mpc.spec.sample_rate_hz)
+    held = abs(mpc.static_gain) * mpc.command_limit
+    _, phase, lasting = _count_samples(mpc)
     peak = float(np.max(np.abs(run.force)))
     if not peak < RUNAWAY * held:
         return DIVERGED, f"{peak:.4g} {run.unit}, and the limits hold {held:.4g} {run.unit}"
     off = np.abs(run.force - target)
-    first, second = np.max(off[-phase : -phase // 2]), np.max(off[-phase // 2 :])
+    first, second = np.max(off[-lasting : -lasting // 2]), np.max(off[-lasting // 2 :])
     if second > GROWTH * first + SETTLED * held:
         return DIVERGED, f"the error grows to {second:.4g} {run.unit} over the last phase"
     if plant.moves:
         return "", ""
     last = max(round(LAST_SHARE * phase), 1)
     known = mpc.spec.preview_samples  # before the end of a phase the next one is known
-    for end in (run.time.size, run.time.size - phase - known, run.time.size - 2 * phase - known):
+    for end in (run.time.size, run.time.size - lasting - known, run.time.size - lasting - phase - known):
         error = float(np.mean(off[end - last : end]))
         if error > SETTLED * abs(run.reference[-1]):
             return UNSETTLED, f"{error:.4g} {run.unit} off {end / run.time.size:.0%} into the run"
     return "", ""
+
+
+def _find_ring(bench: _Bench, plant: Plant, values: ParameterSet, run: ForceRun) -> tuple[float, str]:
+    """Return the amplitude of what swings at the end of a run, 0 for nothing, and a sentence where it is a fault."""
+    mpc = bench.mpc
+    slowest, window = SLOWEST * mpc.spec.bandwidth_hz, run.force[-_count_samples(mpc)[2] :]
+    window = window[-round(JUDGED_PERIODS / mpc.spec.bandwidth_hz * mpc.spec.sample_rate_hz) :]
+    swing = measure_swing(window, mpc.sample_time_s, lowest_hz=slowest)
+    if not (swing.sustained or swing.growing):
+        return 0.0, ""
+    stage = Stage(controller=bench.law, plant=plant, sensors=bench.sensors, current_step_A=bench.current_step_A)
+    view = view_loop(stage, plant, values)
+    floor = find_noise_floor(stage, float(np.max(np.abs(run.force))))
+    if not view.instability:
+        floor = max(floor, LINE_SIGMAS * view.force_std(slowest))
+    if swing.amplitude <= floor:
+        return swing.amplitude, ""
+    what = f"an oscillation of {swing.amplitude:.3g} {run.unit}, at {swing.frequency_hz:.3g} Hz most, does not die out"
+    return swing.amplitude, f"{what}; noise and rounding explain {floor:.3g} {run.unit}"
 
 
 def _has(plant: Plant, name: str) -> bool:

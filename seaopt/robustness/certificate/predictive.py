@@ -10,10 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
+from types import NoneType
 from typing import Any
 
 import numpy as np
 
+from seaopt.bench import Sensors
 from seaopt.control import Controller, ControllerSpec, ForceMPC, Law, MPCSpec, assess
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
@@ -23,12 +25,12 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
 from seaopt.robustness.certificate.certificate import Certificate, Requirement
-from seaopt.robustness.certificate.certify import CONFIDENCE, certify
+from seaopt.robustness.certificate.certify import CONFIDENCE, STEPS, certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, run_constrained
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
 
 CONSTRAINED_FAILURES, CONSTRAINED_PROBABILITY = "constrained_failures", "constrained_failure_probability"
-LINEAR_RUN, CONSTRAINED_RUN = 8.0, 0.2  # seconds that a part takes as a rule: all of the linear region, one run
+LINEAR_RUN, CONSTRAINED_RUN = 8.0, 0.35  # seconds that a part takes as a rule: all of the linear region, one run
 
 
 def linear_controller(mpc: ForceMPC) -> Controller:
@@ -78,7 +80,8 @@ def certify_mpc(
     confidence: float = CONFIDENCE,
     max_failure_probability: float | None = None,
     bound_tolerance: float = 0.1,
-    sensor_std: float = 0.0,
+    sensors: Sensors | None = None,
+    current_step_A: float = 0.0,
     executor: Executor | None = None,
     progress: Progress = ignore,
     **linear: Any,
@@ -93,14 +96,14 @@ def certify_mpc(
         As in `certify`. The design plant is certified too.
     runs : int
         Draws with limits active, each on every plant: 100 without a failure bound the probability of one by 13 % at
-        the confidence of 1 - 1e-6 (4.5 % at 0.99). One takes about a fifth of a second on each plant.
+        the confidence of 1 - 1e-6 (4.5 % at 0.99). One takes about a third of a second on each plant.
     max_failure_probability : float, optional
         Required of the bounds of both, so that too few draws or runs do not pass.
     bound_tolerance : float
         By how much a bounded signal may leave its bounds, as a share of half their width: a wrong model, and noise,
         make the estimate of it wrong.
-    sensor_std : float
-        White noise of the measured output in the runs.
+    sensors, current_step_A
+        As in `certify`: of the runs, and of steps that are simulated in the linear region.
     executor, progress
         As in `certify`; runs are parts, too.
     **linear
@@ -130,22 +133,31 @@ def certify_mpc(
     require_type(mpc, ForceMPC, "mpc", "give a ForceMPC", ControlError)
     if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
         raise ControlError(f"runs = {runs!r} is not a number of runs; give a whole number, 1 or more")
-    for name, value in (("bound_tolerance", bound_tolerance), ("sensor_std", sensor_std)):
+    require_type(sensors, (Sensors, NoneType), "sensors", "give Sensors", ControlError)
+    for name, value in (("bound_tolerance", bound_tolerance), ("current_step_A", current_step_A)):
         require_number(value, name, ControlError)
         if not 0.0 <= value < np.inf:
             raise ControlError(f"{name} = {value!r} is negative or not finite; give zero or more")
-    linearly, simulating = divide(progress, LINEAR_RUN, CONSTRAINED_RUN * runs * max(len(plants), 1))
+    real = sensors not in (None, Sensors()) or current_step_A > 0.0
+    linearly, stepping, simulating = divide(
+        progress, LINEAR_RUN, STEPS * real, CONSTRAINED_RUN * runs * max(len(plants), 1)
+    )
+    law = linear_controller(mpc)
     certificate = certify(
-        linear_controller(mpc), plants, parameters, ranges=ranges, others=others, seed=seed, confidence=confidence,
+        law, plants, parameters, ranges=ranges, others=others, seed=seed, confidence=confidence,
         max_failure_probability=max_failure_probability, simulations=False, executor=executor, progress=linearly,
         **linear,
     )  # fmt: skip
+    if real:
+        certificate = certificate.with_steps(
+            sensors=sensors, current_step_A=current_step_A, seed=seed, executor=executor, progress=stepping
+        )
     models, (_, values), known = certificate.models, mpc.design, others or ParameterSet()
     known = known.with_parameters(*(values[name] for name in values if name not in known))
     constrained = run_constrained(
-        mpc, models, combine_uncertainty(parameters, known, dict(ranges or {}), models), runs=runs, seed=seed,
-        confidence=confidence, tolerance=bound_tolerance, sensor_std=sensor_std, executor=executor,
-        progress=simulating,
+        mpc, law, models, combine_uncertainty(parameters, known, dict(ranges or {}), models), runs=runs, seed=seed,
+        confidence=confidence, tolerance=bound_tolerance, sensors=sensors or Sensors(),
+        current_step_A=current_step_A, executor=executor, progress=simulating,
     )  # fmt: skip
     requirements = (*certificate.requirements, *_require_runs(constrained, max_failure_probability))
     return replace(

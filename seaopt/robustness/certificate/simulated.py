@@ -219,12 +219,17 @@ def simulate_steps(
     draws: Mapping[str, Sequence[ParameterSet]],
     executor: Executor | None = None,
     progress: Progress = ignore,
+    *,
+    sensors: Sensors | None = None,
+    current_step_A: float = 0.0,
+    seed: int = 1,
 ) -> Verification | str:
-    """Play the steps of `step_scenarios` on every plant, on ideal devices; return why not where that cannot be done."""
+    """Play the steps of `step_scenarios` on every plant; return why not where that cannot be done."""
     try:
         return verify(
-            controller, plants, parameters, scenarios=step_scenarios, draws=draws, executor=executor, progress=progress
-        )
+            controller, plants, parameters, scenarios=step_scenarios, draws=draws, executor=executor,
+            progress=progress, sensors=sensors, current_step_A=current_step_A, seed=seed,
+        )  # fmt: skip
     except SeaoptError as error:
         return str(error)
 

@@ -9,9 +9,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from seaopt.bench import Sensors
 from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
 from seaopt.files import plain
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
+from seaopt.units import LINEAR
 
 CERTIFY_AGAIN = "certify again"
 
@@ -166,7 +168,11 @@ class StoredConstrained(ResultTable):
     at_limit: Number
     fallback: Number
     iterations: Whole
-    sensor_std: Number
+    ringing: Whole = 0
+    largest_ring: Number = 0.0
+    sensors: StoredSensors = StoredSensors()
+    current_step_A: Number = 0.0
+    unit: str = LINEAR.unit
     where: str
     remedy: str = ""
     left_out: tuple[str, ...]
@@ -188,7 +194,10 @@ class StoredCertificate(ResultTable):
 
     def read_constrained(self) -> ConstrainedRuns | None:
         """Return the runs with limits active, of a certificate of predictive control."""
-        return None if self.constrained is None else ConstrainedRuns(**self.constrained.model_dump())
+        if self.constrained is None:
+            return None
+        sensors = Sensors(**self.constrained.sensors.model_dump())
+        return ConstrainedRuns(**self.constrained.model_dump(exclude={"sensors"}), sensors=sensors)
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:

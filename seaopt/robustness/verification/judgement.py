@@ -282,7 +282,7 @@ def _judge_oscillation(
     for window in _find_windows(stage, trace):
         lasting = period * (window.stop - window.start)
         lowest = max(spec.bandwidth_hz / SLOWEST, LINE_PERIODS / lasting) if free else STILL_PERIODS / lasting
-        floor = _noise_floor(stage, trace, run)
+        floor = find_noise_floor(stage, float(trace.peaks[spec.regulated][run]))
         if scenario.settling_s is not None:  # what creeps against friction is no pure exponential
             floor = max(floor, VISIBLE * abs(scenario.phases[-1].force_N))
         if not view.instability:
@@ -322,12 +322,12 @@ def _find_windows(stage: Stage, trace: Playback) -> tuple[slice, slice]:
     return long, short
 
 
-def _noise_floor(stage: Stage, trace: Playback, run: int) -> float:
-    """Return the amplitude (N) that noise, quantisation and rounding make without an oscillation."""
+def find_noise_floor(stage: Stage, peak: float) -> float:
+    """Return the amplitude (N) that noise, quantisation and rounding make without an oscillation in a run's peak."""
     rounding = 0.5 * stage.current_step_A / stage.controller.command.per_effort
     std, step = stage.reading_errors
     noise = 2.0 * std + 1.5 * step
-    return max(noise + rounding, 1e-3 * float(trace.peaks[stage.controller.spec.regulated][run]))
+    return max(noise + rounding, 1e-3 * peak)
 
 
 def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bool:

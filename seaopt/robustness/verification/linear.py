@@ -16,6 +16,7 @@ import numpy as np
 
 from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.verification.playback import Stage, apply_load
 from seaopt.robustness.verification.scenarios import Scenario
@@ -95,11 +96,17 @@ def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) 
     ('', True)
 
     """
-    controller, last = stage.controller, scenario.phases[-1]
+    last = scenario.phases[-1]
     plant = stage.partner if last.held and stage.partner is not None else stage.plant
     params = drawn.with_parameters(*plant.complete(drawn).values())
     for phase in scenario.phases:
         params = apply_load(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
+    return view_loop(stage, plant, params)
+
+
+def view_loop(stage: Stage, plant: Plant, params: ParameterSet) -> LinearView:
+    """Return the linear loop on a plant at rest, with the noise of a stage's devices."""
+    controller = stage.controller
     return LinearView(
         loop=Loop(plant=controller.plant(plant, params), law=controller.law),
         noise=tuple(_combine_std(*stage.find_errors(name)) for name in controller.signals),

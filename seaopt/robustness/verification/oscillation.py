@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -87,6 +88,34 @@ def find_oscillation(
     if last <= floor / size or last**2 < LINE_SHARE * power:
         return None
     return Oscillation(frequency_hz=f, amplitude=size * last, growth=last / max(first, 1e-300))
+
+
+def measure_swing(signal: Float[np.ndarray, " n"], sample_time_s: float, *, lowest_hz: float) -> Oscillation:
+    """Return what swings in a window, whether it is a line or wanders as rounding makes it.
+
+    Its amplitude is that of a sine of the same power in the window's second half, its frequency that of the largest
+    line.
+
+    Parameters
+    ----------
+    signal, sample_time_s, lowest_hz
+        As in `find_oscillation`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(400) * 1e-3
+    >>> swing = measure_swing(100 * t + 3.0 * np.sin(2 * np.pi * 40 * t), 1e-3, lowest_hz=10.0)
+    >>> round(swing.frequency_hz), round(swing.amplitude, 1), swing.sustained
+    (40, 3.0, True)
+
+    """
+    fast = _remove_slow(signal, sample_time_s, lowest_hz)
+    first, last = (math.sqrt(2.0 * float(np.mean(half**2))) for half in np.array_split(fast, 2))
+    return Oscillation(
+        frequency_hz=_find_frequency(fast, sample_time_s) if last else 0.0, amplitude=last,
+        growth=last / max(first, 1e-300),
+    )  # fmt: skip
 
 
 def _remove_slow(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: float) -> Float[np.ndarray, " n"]:

@@ -17,6 +17,8 @@ from seaopt.control.mpc.quadratic_program import QuadraticProgram, Solution
 from seaopt.errors import ControlError
 from tests.c_code import CompiledMPC
 
+SENSOR = so.Sensors(noise_std={"F1": 2.0})
+
 TS = 1e-3
 
 
@@ -171,7 +173,7 @@ def test_designed_on_the_stand_it_holds_on_the_swing(swing, thor, mpc):
     """In the nonlinear simulation too; the pendulum swings to an angle that holds the force."""
     figures = mpc.close(swing, thor).figures()
     assert figures.stable and figures.ms < 2.0
-    run = close_loop(mpc.command, mpc.start, swing, thor, np.full(3000, 60.0), sensor_std=2.0)
+    run = close_loop(mpc.command, mpc.start, swing, thor, np.full(3000, 60.0), sensors=SENSOR)
     assert np.mean(run.force[-500:]) == pytest.approx(60.0, abs=10.0)
     assert np.std(run.force[-500:]) < 5.0
     assert np.degrees(np.max(np.abs(run.state[:, 2]))) > 10.0
@@ -223,7 +225,7 @@ def test_the_c_code_does_the_same(compiler, stand, thor, mpc, tmp_path, single, 
         return mpc.command(state, reference, measurements[-1])
 
     reference = np.repeat([0.0, 2000.0, -2000.0, 500.0], 150)
-    run = close_loop(watched, mpc.start, stand, thor, reference, sensor_std=2.0)
+    run = close_loop(watched, mpc.start, stand, thor, reference, sensors=SENSOR)
     rows = CompiledMPC(compiler, tmp_path / "code", mpc, single_precision=single).run(reference, measurements)
     assert np.max(np.abs(run.current)) == 9.0
     assert rows[:, 0] == pytest.approx(run.current, abs=error_A)

@@ -15,6 +15,8 @@ from seaopt.control.mpc.quadratic_program import QuadraticProgram, Solution
 from seaopt.errors import ControlError
 from tests.c_code import CompiledMPC
 
+SENSOR = so.Sensors(noise_std={"F1": 2.0})
+
 TS, SPEED, FORCE = 1e-3, 0.05, 800.0
 SPEED_LIMIT = {"qd": (-SPEED, SPEED)}
 
@@ -141,7 +143,7 @@ def test_a_speed_that_is_there_already_is_broken_as_little_as_can_be(stand, thor
 def test_noise_and_jumps_leave_the_command_within_limits_and_the_speed_near_its_own(stand, thor):
     mpc = made(stand, thor, bounds=SPEED_LIMIT)
     rng = np.random.default_rng(3)
-    run, steps = run_on(mpc, stand, thor, np.repeat(rng.uniform(-1500, 1500, 5), 50), sensor_std=2.0)
+    run, steps = run_on(mpc, stand, thor, np.repeat(rng.uniform(-1500, 1500, 5), 50), sensors=SENSOR)
     assert np.max(np.abs(run.state[:, 1])) < 1.25 * SPEED
     assert np.max(np.abs(run.current)) <= 9.0
     assert np.max(np.abs(np.diff(run.current, prepend=0.0))) <= 2.0 + 1e-9
@@ -209,7 +211,7 @@ def test_the_c_code_does_the_same_with_bounds_and_preview_and_where_iterations_d
         steps.append(mpc.step(state, r, y))
         return steps[-1].current_A, steps[-1].state
 
-    run = close_loop(law, mpc.start, stand, thor, reference, preview_samples=ahead, sensor_std=2.0)
+    run = close_loop(law, mpc.start, stand, thor, reference, preview_samples=ahead, sensors=SENSOR)
     padded = np.append(reference, np.full(ahead, reference[-1]))
     rows = CompiledMPC(compiler, tmp_path / "code", mpc).run(
         [padded[k : k + ahead + 1] for k in range(reference.size)], measurements

@@ -53,6 +53,38 @@ def test_the_exported_law_runs_here_as_there(swing, thor, delay_s):
     assert np.max(np.abs(one.current)) == 3.0
 
 
+def test_sensors_and_amplifier_err_here_as_there(thor):
+    """The torque computed from two encoders, of which the motor's counts, clips and is off."""
+    knee = so.plants.rotary(parts=["deflection_sensor"])
+    params = knee.complete(so.ParameterSet.of(k_n=(300.0, "N m/rad")))
+    sensors = so.Sensors(
+        quantisation={"theta_m": 2e-3, "tau_d": 0.05}, offset={"theta_m": 1e-3, "theta_l": 2e-4},
+        saturation={"tau_d": 4.0},
+    )  # fmt: skip
+    runnable = law(4.3, per_effort=0.4)
+    reference = np.where(np.arange(120) < 60, 6.0, -2.0)
+    one = close_loop(
+        runnable.step, runnable.reset(), knee, params, reference, measured="tau_d", sensors=sensors,
+        current_step_A=0.4, current_limit_A=4.3,
+    )  # fmt: skip
+    loop = SampledLoop(plant=knee, law=runnable, measured="tau_d", delay_samples=1, sensors=sensors, current_step_A=0.4)
+    other = run_loop(loop, [params], reference)
+    np.testing.assert_allclose(one.force, other.outputs["tau_d"][0], atol=1e-6)
+    assert np.max(np.abs(one.current)) == pytest.approx(4.0)  # the last whole step within the limit
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"current_step_A": -1.0}, "current_step_A"),
+        ({"sensors": so.Sensors(noise_std={"F1": -1.0})}, "noise_std of F1"),
+    ],
+)
+def test_negative_errors_are_refused(swing, thor, options, named):
+    with pytest.raises(ControlError, match=named):
+        close_loop(lambda s, r, y: (0.0, s), None, swing, thor, np.zeros(5), **options)
+
+
 def test_time_goes_on(thor):
     """x' = a (I + 3 t): x = a (I t + 3 t^2/2)."""
     plant = so.Plant(

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import MPCSpec, close_loop, force_mpc, runnable
+from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, runnable
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.reporting.verdict import judge_certificate
@@ -53,7 +53,6 @@ def test_the_linear_region_is_certified_as_a_law(certificate, mpc, thor):
     linear = linear_controller(mpc)
     assert linear.feasible == mpc.feasible and linear.spec.bandwidth_hz == mpc.spec.bandwidth_hz
     assert any("linear region" in note for note in certificate.notes)
-    assert any("quantisation" in note and "in neither" in note for note in certificate.notes)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
@@ -102,7 +101,9 @@ def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, 
 def test_a_bound_that_noise_breaks_on_the_design_plant_itself_is_named_with_the_room_it_needs(stand, thor):
     spec = MPCSpec(current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, bounds={"qd": (-0.05, 0.05)})
     tight = force_mpc(stand, thor, spec)
-    runs = certify_mpc(tight, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, sensor_std=3.0).constrained
+    runs = certify_mpc(
+        tight, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, sensors=so.Sensors(noise_std={"F1": 3.0})
+    ).constrained
     assert runs.over_bound == 1 and "on the design plant with its own parameters too" in runs.remedy
     low, high = (float(end) for end in runs.remedy.split("[")[1].split("]")[0].split(","))
     assert -high == pytest.approx(low) and high == pytest.approx(0.05 * (1 + runs.largest_violation), rel=0.2)
@@ -117,11 +118,59 @@ def test_iterations_are_named_where_a_run_has_no_plan(stand, thor):
     assert runs.failures and runs.remedy.startswith("a larger max_iterations in [mpc]: ")
 
 
+def simulate_rounded(mpc, params, force, quantum, seconds=1.0):
+    """Return the force under a constant reference, its reading rounded, by the exact response of the stand."""
+    v = {name: params[name].value for name in params}
+    r = v["l"] / (2 * np.pi * v["N_p"])
+    mass, b = v["J"] / r**2 + v["m_l"], v["b_r"] / r**2
+    per_ampere = mpc.static_gain  # N at rest, of the spring: k q = gain I
+    a = np.array([[0.0, 1.0], [-v["k"] / mass, -b / mass]])
+    step, push = cont2discrete((a, np.array([[0.0], [per_ampere / mass]]), np.eye(2), np.zeros((2, 1))), TS)[:2]
+    x, state, waiting, out = np.zeros(2), mpc.start, 0.0, []
+    for _ in range(round(seconds / TS)):
+        out.append(v["k"] * x[0])
+        command, state = mpc.command(state, force, quantum * np.floor(out[-1] / quantum + 0.5) if quantum else out[-1])
+        x, waiting = step @ x + push[:, 0] * waiting, command
+    return np.array(out)
+
+
+def test_a_law_reads_what_its_sensor_rounds(mpc, stand, thor):
+    coarse = so.Sensors(quantisation={"F1": 5.0})
+    run = close_loop(mpc.command, mpc.start, stand, thor, np.full(300, 777.0), sensors=coarse)
+    np.testing.assert_allclose(run.force, simulate_rounded(mpc, thor, 777.0, 5.0, 0.3), atol=0.01)
+
+
+def test_a_law_whose_estimate_trusts_a_coarse_reading_rings_and_is_not_met(stand, thor):
+    noise = NoiseModel(sensor_std={"F1": 0.002}, input_noise={"I": 0.05}, input_drift={"I": 0.05})
+    spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=50, noise=noise, max_sensitivity=False, max_complementary=False)
+    mpc = force_mpc(stand, thor, spec)
+    swings = {q: [np.ptp(simulate_rounded(mpc, thor, r, q)[-160:]) / 2 for r in (777.0, 1234.5)] for q in (0.0, 5.0)}
+    assert max(swings[0.0]) < 0.01 and max(swings[5.0]) > 50.0
+    coarse, options = so.Sensors(quantisation={"F1": 5.0}), {"ranges": HERE, "samples": 1, "runs": 6}
+    found = certify_mpc(mpc, {"stand": stand}, thor, sensors=coarse, **options)
+    runs = found.constrained
+    assert not found.passed and 0 < runs.ringing <= runs.failures
+    assert runs.largest_ring > 7.5 and f"{runs.largest_ring:.3g} N" in str(runs)
+    assert runs.remedy.startswith("finer sensors") and "does not die out" in runs.where
+    again = so.Certificate.from_dict(json.loads(to_json(found.to_dict())), found.controller, {"stand": stand}, thor)
+    assert again.constrained == runs and again.runs.rows == found.runs.rows
+    ideal = certify_mpc(mpc, {"stand": stand}, thor, **options)
+    assert ideal.passed and ideal.constrained.largest_ring < 0.01
+
+
+def test_what_an_amplifier_rounds_reaches_the_steps_of_the_linear_region_too(mpc, stand, thor):
+    rough = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=2, current_step_A=2.0)
+    assert all(stage.current_step_A == 2.0 for stage in rough.runs.stages.values())
+    assert 0.0 < rough.constrained.largest_ring < 0.5 * 2.0 * abs(mpc.static_gain)
+
+
 @pytest.mark.slow
 def test_of_friction_no_sensors_are_asked_for_that_no_step_would_have(stand, thor):
     rubbing = thor.update(f_c=20.0)
     law = force_mpc(stand, rubbing, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
-    found = certify_mpc(law, {"stand": stand}, rubbing, ranges=HERE, samples=1, runs=1, sensor_std=2.0)
+    found = certify_mpc(
+        law, {"stand": stand}, rubbing, ranges=HERE, samples=1, runs=1, sensors=so.Sensors(noise_std={"F1": 2.0})
+    )
     assert not any("give certify(sensors" in note for note in found.notes)
 
 
