@@ -139,18 +139,24 @@ def _print_columns(console: Terminal, proposal: Proposal) -> None:
         console.tabulate(rows, COLUMN_HEAD)
 
 
+def _describe_guesses(proposal: Proposal) -> list[tuple[str, str, str]]:
+    """Return a row for each of the guesses that results rest on: what it is, what was taken, and why."""
+    rows = {one.entry: (one.label, one.guess, one.why) for one in proposal.questions}
+    rows |= {f"role of {one.column}": (f'Column "{one.column}"', one.role, one.doubt) for one in proposal.columns}
+    return [rows.get(name, (name.capitalize(), "", "see its line in the file")) for name in proposal.guessed]
+
+
 def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
     """Print what was written, what of it is a guess, and the command to type next."""
-    guesses = [(one.label, one.guess, one.why) for one in proposal.guesses if one.key != "roles"]
-    if any(one.key == "roles" for one in proposal.guesses):
-        guesses += [(f'Column "{one.column}"', one.role, one.doubt) for one in proposal.columns if one.doubt]
     console.say(f"wrote {target}", soft_wrap=True)
-    if guesses:
-        are = "is a guess" if len(guesses) == 1 else "are guesses"
-        console.say(f"{len(guesses)} of its values {are}, marked in it:")
-        console.tabulate(guesses)
     if proposal.guessed:
-        console.wrap('Verdicts name those that they rest on, until they are out of "guessed" in the file.')
+        count = len(proposal.guessed)
+        are = "is a guess" if count == 1 else "are guesses"
+        console.wrap(f'{count} of its values {are}, which verdicts name until they are out of "guessed":')
+        console.tabulate(_describe_guesses(proposal))
+    if proposal.open:
+        console.say("Left to the fit, or for you to choose:")
+        console.tabulate([(one.label, one.guess, one.why) for one in proposal.open])
     for note in proposal.notes:
         console.wrap(f"note: {note}")
     out = shlex.quote(str(target.with_suffix("")))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shlex
 
 import pytest
@@ -75,6 +76,14 @@ def test_json_has_the_columns_and_the_guesses(folder, seaopt, held):
         "t [s]": "time", "I [A]": "input", "tau_s [N m]": "tau_s",
     }  # fmt: skip
     assert float(content["guesses"]["N"]) > 0
+
+
+def test_as_many_guesses_are_printed_as_the_file_names(folder, seaopt, held):
+    out = seaopt("new", "knee.csv", "--yes").stdout
+    guessed = so.read_problem(folder / "knee.toml").table.guessed
+    printed, rest = out.split("Left to the fit")
+    head, rows = re.search(r"\n(\d+) of its values are guesses, .*\n((?:  .*\n)+)$", printed).groups()
+    assert int(head) == len(guessed) == len(rows.splitlines()) and "Bandwidth of the controller" in rest
 
 
 def test_several_logs_are_several_experiments(folder, seaopt, held):

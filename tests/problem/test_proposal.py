@@ -374,6 +374,22 @@ def test_a_column_that_is_another_but_for_a_factor_is_no_second_sensor(tmp_path,
     assert rows["LoadCell_raw"].description == "not used: 3.226 times LoadCell_N"
 
 
+def test_a_column_that_is_not_used_says_why(tmp_path, logs):
+    free, noise = logs["free"], np.random.default_rng(1).normal(size=logs["t"].size)
+    columns = {
+        "t [s]": logs["t"], "I [A]": free["I"], "I_meas [A]": free["I"] + noise, "tau_s [N m]": free["tau_s"],
+        "theta_m [rad]": free["theta_m"], "motor_enc_counts": steps(free["theta_m"] + noise), "F [N]": 9.0 * noise,
+        "speed [rad/s]": np.gradient(free["theta_m"], logs["t"]), "temp": 20.0 + noise, "aux": noise**2,
+    }  # fmt: skip
+    path = write_csv(tmp_path / "a.csv", columns)
+    rows = {row.column: row for row in propose([path], {"actuator": "rotary"}, tmp_path).columns}
+    assert {name: row.description.removeprefix("not used: ") for name, row in rows.items() if not row.role} == {
+        "I_meas [A]": "the input is I [A]", "motor_enc_counts": "theta_m [rad] is that already",
+        "F [N]": "no output of an actuator with a gear", "speed [rad/s]": "a speed, which a fit takes from a position",
+        "temp": "not a signal of the actuator", "aux": "its name does not say what it is",
+    }  # fmt: skip
+
+
 def test_wrong_roles_can_be_put_right(tmp_path, logs):
     held = logs["held"]
     path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "a": held["theta_m"], "b": held["I"], "c": held["tau_s"]})

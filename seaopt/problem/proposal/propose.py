@@ -85,6 +85,11 @@ class Proposal:
     guessed: tuple[str, ...]
     notes: tuple[str, ...]
 
+    @property
+    def open(self) -> tuple[Question, ...]:
+        """The guesses that no result rests on: what a fit finds, and what is chosen, as the bandwidth is."""
+        return tuple(one for one in self.guesses if one.entry not in self.guessed and one.key != "roles")
+
 
 @np.errstate(over="ignore", invalid="ignore")  # of a column with numbers near the largest float
 def propose(
@@ -350,7 +355,7 @@ def _list_columns(log: DescribedLog) -> list[ProposedColumn]:
             unit=column.header.unit or log.units[role], description=DESCRIPTIONS[role],
             doubt=log.roles.doubts.get(column.name, ""),
         ))  # fmt: skip
-    for name, why in {**dict.fromkeys((one.name for one in log.roles.unused), ""), **survey.left_out}.items():
-        text = f"not used: {why}" if why else "not used"
+    for name, why in {**log.roles.unused, **survey.left_out}.items():
+        text = f"not used: {why}"
         rows.append(ProposedColumn(log=survey.name, column=name, role="", unit="", description=text, doubt=""))
     return rows

@@ -52,6 +52,11 @@ class Question:
         first, *rest = re.split(r" \(|, |\?$", self.text)
         return f"{rest[0]} in {first.removeprefix('In ')}" if first.startswith("In ") and rest else first
 
+    @property
+    def entry(self) -> str:
+        """What it is called in the file's `guessed`."""
+        return name_entry(self.key)
+
     def read(self, answer: str) -> str:
         """Return an answer as it counts.
 
@@ -134,4 +139,16 @@ class Interview:
             for one in self.questions
             if one.key not in self.answers and one.guess != UNKNOWN and one.key not in WISHES
         ]
-        return list(dict.fromkeys(key.replace(":", " of ", 1) for key in (*open_keys, *self.assumed)))
+        return list(dict.fromkeys(name_entry(key) for key in (*open_keys, *self.assumed)))
+
+
+def name_entry(key: str) -> str:
+    """Return what a question's key is called in the file's `guessed`.
+
+    Examples
+    --------
+    >>> name_entry("unit:F1"), name_entry("N")
+    ('unit of F1', 'N')
+
+    """
+    return key.replace(":", " of ", 1)

@@ -45,7 +45,8 @@ class Assignment:
         One of `INPUTS`.
     columns : mapping of role to SurveyedColumn
         The input's and the outputs'.
-    unused : tuple of SurveyedColumn
+    unused : mapping of column to str
+        Why other columns are not used.
     doubts : mapping of column to str
         What of it is a guess, in a sentence.
 
@@ -54,7 +55,7 @@ class Assignment:
     rotary: bool
     input: str
     columns: Mapping[str, SurveyedColumn]
-    unused: tuple[SurveyedColumn, ...]
+    unused: Mapping[str, str]
     doubts: Mapping[str, str]
 
     @property
@@ -94,8 +95,31 @@ def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignm
     used = {one.name for one in columns.values()}
     return Assignment(
         rotary=rotary, input=role, columns=columns, doubts=doubts,
-        unused=tuple(one for one in survey.columns if one.name not in used),
+        unused={
+            one.name: "as answered" if one.name in given else _explain_unused(one, role, columns, rotary=rotary)
+            for one in survey.columns
+            if one.name not in used
+        },
     )  # fmt: skip
+
+
+def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, SurveyedColumn], *, rotary: bool) -> str:
+    """Return why a column has no role; `source` is the input's."""
+    header = column.header
+    if header.quantity in ("", "other", "time"):
+        return "not a signal of the actuator" if header.quantity else "its name does not say what it is"
+    if header.quantity == "speed":
+        return "a speed, which a fit takes from a position"
+    if header.commanded or header.quantity in ("current", "voltage", "duty"):
+        return f"the input is {roles[source].name}"
+    angles = ("theta_m", "theta_l") if rotary else ("screw", "phi")
+    of_side = {"motor": angles[:1], "link": angles[1:]}.get(header.side, angles)
+    own = {"torque": ("tau_s",)} if rotary else {"force": ("F1", "F2"), "length": ("q",) * (header.side != "link")}
+    places = ("deflection",) if rotary and header.deflection else of_side
+    taken = [roles[role].name for role in (own | {"angle": places}).get(header.quantity, ()) if role in roles]
+    if taken:
+        return f"{join_words(taken)} {'is' if len(taken) == 1 else 'are'} that already"
+    return f"no output of an actuator with a {'gear' if rotary else 'screw'}"
 
 
 def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str, SurveyedColumn, str]:
