@@ -31,9 +31,13 @@ def find_crossings(
 
 
 def add_minima(
-    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: Float[np.ndarray, " m"]
-) -> Float[np.ndarray, " k"]:
+    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: Float[np.ndarray, " m"],
+    shallow: float = np.inf,
+) -> Float[np.ndarray, " k"]:  # fmt: skip
     """Return f with every local minimum of the curve on that grid, refined by thirds, ascending.
+
+    Who looks for crossings of zero can leave out minima that do not reach it: on the grid they are above zero by more
+    than `shallow` times what they are below their neighbours.
 
     Examples
     --------
@@ -44,6 +48,8 @@ def add_minima(
     distinct = f[np.concatenate([[True], np.diff(f) > ROUNDING_DISTANCE * np.abs(f[1:])])]
     values = curve(distinct)
     inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
+    depth = np.maximum(values[inner - 1], values[inner + 1]) - values[inner]
+    inner = inner[values[inner] / shallow <= depth]
     low, high = distinct[inner - 1], distinct[inner + 1]
     for _ in range(60 if inner.size else 0):
         left, right = low + (high - low) / 3, high - (high - low) / 3

@@ -81,15 +81,7 @@ class Law:
     @property
     def integrators(self) -> int:
         """How many of the first states are the chain of accumulators."""
-        n, m = self.c.size, 0
-        for length in range(1, n + 1):
-            if self.a[length - 1, length - 1] != 1.0:
-                break
-            rows = np.eye(length, n) + np.eye(length, n, k=1) * (np.arange(n) < length)
-            alone = np.array_equal(self.a[:length], rows) and not np.any(self.a[length:, :length])
-            if alone and np.array_equal(self.c[:length], np.eye(1, length)[0]):
-                m = length
-        return m
+        return _count_integrators(self)
 
     @property
     def rest(self) -> tuple[Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]:
@@ -351,6 +343,21 @@ def _in_delay(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " m"]) -> Tra
         raise ControlError("law has a higher power of z in its numerator than in its denominator; delay it")
     num = np.concatenate([np.zeros(den.size - num.size), num])
     return TransferFunction(num=num / den[0], den=den / den[0])
+
+
+@lru_cache(maxsize=32)
+def _count_integrators(law: Law) -> int:
+    """Return the length of the longest chain of accumulators that the first states are, once for a law."""
+    a, c = law.a, law.c
+    n, m = c.size, 0
+    for length in range(1, n + 1):
+        if a[length - 1, length - 1] != 1.0:
+            break
+        rows = np.eye(length, n) + np.eye(length, n, k=1) * (np.arange(n) < length)
+        alone = np.array_equal(a[:length], rows) and not np.any(a[length:, :length])
+        if alone and np.array_equal(c[:length], np.eye(1, length)[0]):
+            m = length
+    return m
 
 
 @lru_cache(maxsize=32)

@@ -31,6 +31,7 @@ DROOP_BAND = 1.0 / 3.0  # of the bandwidth
 FALLEN_ABOVE = 1.03  # of the bandwidth: from here abs(F/F_ref) must be below -3 dB,
 SHOULDER = 3.0  # up to here it must not come back,
 SHOULDER_FALL = 0.25  # and be below by more and more, by this power of frequency, so that it does not linger there
+SHALLOW = 30.0  # times what a minimum on a grid is below its neighbours: further from zero it does not reach it
 # A spectral radius from STABLE to GROWING is 1 to rounding. A loop there is not stable: it has no margins. What has
 # nothing to damp it (an actuator or an environment without friction) is there too, and does not grow: growth by e
 # takes longer than 11 days at 1 kHz.
@@ -187,9 +188,12 @@ class Loop:
 
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
+        return self._make_grid(self.eigenvalues())
+
+    def _make_grid(self, poles: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        """Return the grid, of the closed loop's eigenvalues."""
         base = np.geomspace(GRID_LOWEST_HZ, self.plant.nyquist_hz, 1200)
-        poles = np.concatenate([np.linalg.eigvals(self.plant.a), self.eigenvalues()])
-        return np.union1d(base, self.about(poles))
+        return np.union1d(base, self.about(np.concatenate([np.linalg.eigvals(self.plant.a), poles])))
 
     def about(self, poles: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve poles, up to the Nyquist frequency, unsorted."""
@@ -231,7 +235,7 @@ class Loop:
             ms_hz=float(ms_at) / per_hz,
             reference_peak=float(reference) / extremes.static if extremes.static else np.inf,
             droop_db=_droop_db(least, extremes.static),
-            return_hz=self._find_return(float(below[0]) / per_hz, extremes.static) if below.size else None,
+            return_hz=self._find_return(system, float(below[0]) / per_hz, extremes.static) if below.size else None,
             gain_margin_db=_least(extremes.gains_db),
             phase_margin_deg=_least(extremes.lags_deg),
             delay_margin_s=_least(extremes.delays * self.plant.sample_time_s),
@@ -240,7 +244,7 @@ class Loop:
             other_noise_gains=tuple(map(float, others)),
         )
 
-    def _find_return(self, bandwidth_hz: float, static: float) -> float | None:
+    def _find_return(self, system: ClosedLoop, bandwidth_hz: float, static: float) -> float | None:
         """Return where abs(F/F_ref) comes back, or lingers, above its bandwidth."""
         low, high = FALLEN_ABOVE * bandwidth_hz, min(SHOULDER * bandwidth_hz, self.plant.nyquist_hz)
         if low >= high:
@@ -249,10 +253,12 @@ class Loop:
         def room(f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
             return HALF_POWER * static * (bandwidth_hz / f) ** SHOULDER_FALL - np.abs(self.tracking(f))
 
-        grid = self.grid()
-        f = add_minima(room, np.concatenate([[low], grid[(grid > low) & (grid < high)], [high]]))
-        crossings = [low] if room(f[:1])[0] < 0.0 else find_crossings(room, f)
-        return float(crossings[0]) if len(crossings) else None
+        if room(np.array([low]))[0] < 0.0:
+            return low
+        grid = self._make_grid(system.poles)
+        f = add_minima(room, np.concatenate([[low], grid[(grid > low) & (grid < high)], [high]]), SHALLOW)
+        crossings = find_crossings(room, f)
+        return float(crossings[0]) if crossings.size else None
 
 
 def _droop_db(least: float, static: float) -> float:

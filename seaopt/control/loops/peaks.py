@@ -9,7 +9,7 @@ are bracketed by the arcs of their own level sets.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control.loops.response import ClosedLoop, Indices, find_arcs, find_sign_changes, find_zeros
 from seaopt.errors import ControlError
@@ -20,6 +20,7 @@ PROOF = 1e-7
 COARSE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 49)])
 SENSITIVITY, TRACKING = 0, 4
 REFINED_PER_CURVE = 3  # local maxima of each curve that are refined before the proof
+NEARLY_HIGHEST = 0.99  # of a curve's largest value
 MAX_PROOF_ROUNDS = 20
 # Nearer to a pole of L on the circle -1/L is that pole's: a double one is known to the root of rounding.
 POLE_DISTANCE = 1e-5
@@ -138,7 +139,7 @@ def find_least(system: ClosedLoop, curve: int, until: float) -> float:
         high = edges[1:][values < least]
 
         def fall(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
-            return system.slopes(theta)[curve]
+            return system.differentiate(theta, np.full(theta.size, curve))[1]
 
         at_low, at_high = fall(low, np.arange(low.size)), fall(high, np.arange(low.size))
         inside = (at_low < 0.0) & (at_high > 0.0)
@@ -175,8 +176,9 @@ def _gain_factors(
         factors = -np.real(system.sensitivity(turns) / system.curves(turns)[1])
     poles = system.opened
     beside = np.abs(np.exp(1j * turns)[:, None] - poles) < POLE_DISTANCE
-    if np.any(beside):
-        beside &= np.abs(np.abs(poles) - 1.0) <= system.resolution()
+    off_circle = np.abs(np.abs(poles) - 1.0)
+    if np.any(beside & (off_circle > 0.0)):
+        beside &= off_circle <= system.resolution()
     infinite = np.any(beside, axis=1)
     crossing = (factors > SMALLEST_FACTOR) & (factors < 1.0 / SMALLEST_FACTOR) & ~infinite
     return factors[crossing], turns[crossing]
@@ -186,7 +188,8 @@ def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " c"], Float
     """Return the largest values on a coarse grid and at the poles, the best of each curve refined."""
     modes = np.abs(np.angle(system.poles))
     theta = np.unique(np.concatenate([COARSE_ANGLES, modes[modes > 1e-9]]))
-    values, slopes = np.abs(system.curves(theta)), system.slopes(theta)
+    values, slopes = system.differentiate(theta)
+    values = np.abs(values)
     best = np.argmax(values, axis=1)
     peaks, at = values[np.arange(best.size), best], theta[best]
     curve, cell = np.nonzero((slopes[:, :-1] > 0.0) & (slopes[:, 1:] < 0.0))
@@ -194,22 +197,28 @@ def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " c"], Float
     order = np.lexsort((-height, curve))
     rank = np.arange(curve.size) - np.searchsorted(curve[order], curve[order])
     kept = order[rank < REFINED_PER_CURVE]
-    return _climb(system, peaks, at, curve[kept], theta[cell[kept]], theta[cell[kept] + 1])
+    # Curves are even: the slope at angle 0 is rounding, which may look like a maximum beside it. Such a one is not
+    # worth the many steps to it where the curve is higher elsewhere; if it is one after all, the proof finds it.
+    wanted = (cell[kept] > 0) | (height[kept] > NEARLY_HIGHEST * peaks[curve[kept]])
+    return _climb(system, peaks, at, curve[kept], theta[cell[kept]], theta[cell[kept] + 1], wanted)
 
 
 def _climb(
     system: ClosedLoop, peaks: Float[np.ndarray, " c"], at: Float[np.ndarray, " c"], curve: Indices,
-    low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
+    low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"], wanted: Bool[np.ndarray, " m"] | None = None,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:  # fmt: skip
-    """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in."""
+    """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in.
+
+    Maxima that are not `wanted` are followed for as long as others are.
+    """
     if not curve.size:
         return peaks, at
 
     def slope(theta: Float[np.ndarray, " m"], which: Indices) -> Float[np.ndarray, " m"]:
-        return system.slopes(theta)[curve[which], np.arange(theta.size)]
+        return system.differentiate(theta, curve[which])[1]
 
     every = np.arange(curve.size)
-    top = find_zeros(slope, low, high, slope(low, every), slope(high, every), 1e-8)
+    top = find_zeros(slope, low, high, slope(low, every), slope(high, every), 1e-8, wanted)
     value = np.abs(system.curves(top)[curve, every])
     peaks, at = peaks.copy(), at.copy()
     for k in range(peaks.size):
@@ -244,8 +253,7 @@ def _prove(
         for k, value, theta in zip(own, values[above], middle[above], strict=True):
             if value > peaks[k]:
                 peaks[k], at[k] = value, theta
-        every = np.arange(own.size)
-        rising = (system.slopes(low)[own, every] > 0.0) & (system.slopes(high)[own, every] < 0.0)
+        rising = (system.differentiate(low, own)[1] > 0.0) & (system.differentiate(high, own)[1] < 0.0)
         peaks, at = _climb(system, peaks, at, own[rising], low[rising], high[rising])
         curves = np.unique(own)
         edges = find_arcs([system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, curves)])

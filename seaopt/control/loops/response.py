@@ -33,10 +33,11 @@ Control Signals Systems 2, 1989; Bruinsma, Steinbuch, Systems & Control Letters 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import StateSpace
@@ -54,31 +55,33 @@ Indices = Int[np.ndarray, " m"]
 Indexed = Callable[[Float[np.ndarray, " m"], Indices], Float[np.ndarray, " m"]]
 
 
-@record
-class Curve:
-    """A transfer function that a loop is judged by: factor G + offset, G from one input to one output."""
+@record(eq=False)
+class Curves:
+    """Transfer functions that a loop is judged by: each is factor G + offset, G from one input to one output."""
 
-    output: int
-    input: int
-    factor: float = 1.0
-    offset: float = 0.0
-
-
-# S, T, S - T, C_y S and F/F_ref, of the inputs noise and reference and the outputs measured and effort.
-CURVES_OF_ONE = (Curve(output=0, input=0), Curve(output=0, input=0, factor=-1.0, offset=1.0),
-                 Curve(output=0, input=0, factor=2.0, offset=-1.0), Curve(output=1, input=0, factor=-1.0),
-                 Curve(output=0, input=1))  # fmt: skip
+    outputs: Int[np.ndarray, " k"]
+    inputs: Int[np.ndarray, " k"]
+    factors: Float[np.ndarray, " k"]
+    offsets: Float[np.ndarray, " k"]
 
 
-def list_curves(measured: int) -> tuple[Curve, ...]:
+@cache
+def list_curves(measured: int) -> Curves:
     """Return S, T, S - T, C_y S and F/F_ref, and of further measured signals C_y S each.
 
-    Of several signals the inputs are w, reference and one noise each; the outputs command, effort and regulated force.
+    Of one signal the inputs are noise and reference, the outputs measured and effort. Of several the inputs are w,
+    reference and one noise each; the outputs command, effort and regulated force.
     """
     if measured == 1:
-        return CURVES_OF_ONE
-    noise = [Curve(output=1, input=2 + number, factor=-1.0) for number in range(measured)]
-    return (*CURVES_OF_ONE[:3], noise[0], Curve(output=2, input=1), *noise[1:])
+        noises, regulated = [0], 0
+    else:
+        noises, regulated = [*range(2, 2 + measured)], 2
+    more = len(noises) - 1
+    return Curves(
+        outputs=np.array([0, 0, 0, 1, regulated] + [1] * more), inputs=np.array([0, 0, 0, noises[0], 1, *noises[1:]]),
+        factors=np.array([1.0, -1.0, 2.0, -1.0, 1.0] + [-1.0] * more),
+        offsets=np.array([0.0, 1.0, -1.0, 0.0, 0.0] + [0.0] * more),
+    )  # fmt: skip
 
 
 @record(eq=False)
@@ -97,6 +100,8 @@ class ClosedLoop:
         The matrices of plant and law whose eigenvalues those are, but for the law's integrators.
     table
         Its curves.
+    through
+        Their direct terms.
 
     """
 
@@ -109,16 +114,17 @@ class ClosedLoop:
     left: Complex[np.ndarray, "o n"]
     opened: Complex[np.ndarray, " n"]
     blocks: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
-    table: tuple[Curve, ...] = CURVES_OF_ONE
+    table: Curves
+    through: Float[np.ndarray, " k"]
 
     @property
     def poles(self) -> Complex[np.ndarray, " n"]:
         """The eigenvalues of `a`."""
-        return np.diag(self.triangle)
+        return self.triangle.diagonal()
 
     def curves(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
         """Return S, T, S - T, C_y S, F/F_ref and what else is in the table at angles (rad) on the unit circle."""
-        return self._combine(self._solve(np.exp(1j * theta), self.right[:, :, None]), direct=True)
+        return self._combine(self._solve(self._from_poles(np.exp(1j * theta)), self.right[:, :, None]))
 
     def sensitivity(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
@@ -134,43 +140,56 @@ class ClosedLoop:
         plant, rest = (_resolution(block) for block in self.blocks)
         return np.concatenate([plant, np.zeros(self.opened.size - plant.size - rest.size), rest])
 
-    def slopes(self, theta: Float[np.ndarray, " m"]) -> Float[np.ndarray, "k m"]:
-        """Return half the derivative of -1/abs(curve)^2 along the angle.
+    def differentiate(
+        self, theta: Float[np.ndarray, " m"], which: Indices | None = None
+    ) -> tuple[Complex[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
+        """Return the curves and half the derivatives of -1/abs(curve)^2 along the angle.
 
-        It has the sign of the curve's own slope, and about a resonance it is close to a straight line.
+        These have the sign of the curve's own slope, and about a resonance they are close to a straight line. Of all
+        curves, shape (k, m), or of the curve number `which` of each angle, shape (m,).
         """
         z = np.exp(1j * theta)
-        x = self._solve(z, self.right[:, :, None])
-        values: Any = self._combine(x, direct=True)
-        turned: Any = self._combine(self._solve(z, x), direct=False) * (-1j * z)
+        distance = self._from_poles(z)
+        x = self._solve(distance, self.right[:, :, None])
+        values: Any = self._combine(x, which)
+        turned: Any = self._combine(self._solve(distance, x), which, direct=False) * (-1j * z)
         size = np.maximum(values.real**2 + values.imag**2, 1e-150)
-        return (values.real * turned.real + values.imag * turned.imag) / size**2
+        return values, (values.real * turned.real + values.imag * turned.imag) / size**2
 
-    def _solve(self, z: Complex[np.ndarray, " m"], rhs: Complex[np.ndarray, "n i k"]) -> Complex[np.ndarray, "n i m"]:
-        """Return (zI - A)^-1 rhs in the Schur basis, by back substitution."""
-        n, inputs = self.right.shape
-        x = np.zeros((n, inputs, z.size), dtype=complex)
-        flat = x.reshape(n, inputs * z.size)
+    def _from_poles(self, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, "n m"]:
+        return z - self.poles[:, None]
+
+    def _solve(
+        self, distance: Complex[np.ndarray, "n m"], rhs: Complex[np.ndarray, "n i k"]
+    ) -> Complex[np.ndarray, "n i m"]:
+        """Return (zI - A)^-1 rhs in the Schur basis, by back substitution, of the distances of z from the poles."""
+        (n, count), inputs = distance.shape, self.right.shape[1]
+        x = np.zeros((n, inputs, count), dtype=complex)
+        flat = x.reshape(n, inputs * count)
         for i in range(n - 1, -1, -1):
             known = self.triangle[i, i + 1 :] @ flat[i + 1 :]
-            x[i] = (rhs[i] + known.reshape(inputs, -1)) / (z - self.triangle[i, i])
+            x[i] = (rhs[i] + known.reshape(inputs, -1)) / distance[i]
         return x
 
-    def _combine(self, x: Complex[np.ndarray, "n i m"], direct: bool) -> Complex[np.ndarray, "k m"]:
-        """Return the transfer functions of a state, with or without their direct terms."""
+    def _combine(
+        self, x: Complex[np.ndarray, "n i m"], which: Indices | None = None, direct: bool = True
+    ) -> Complex[np.ndarray, "*k m"]:
+        """Return the transfer functions of a state, or of each angle's state one, with or without direct terms."""
         n, inputs, count = x.shape
+        table, through = self.table, self.through
         out = (self.left @ x.reshape(n, inputs * count)).reshape(self.left.shape[0], inputs, count)
-        through = [self.d[one.output, one.input] * one.factor + one.offset if direct else 0.0 for one in self.table]
-        return np.array([
-            one.factor * out[one.output, one.input] + more for one, more in zip(self.table, through, strict=True)
-        ])  # fmt: skip
+        if which is None:
+            values = table.factors[:, None] * out[table.outputs, table.inputs]
+            return values + through[:, None] if direct else values
+        values = table.factors[which] * out[table.outputs[which], table.inputs[which], np.arange(count)]
+        return values + through[which] if direct else values
 
     def modulus(self, curve: int, level: float) -> Pencil:
         """Return the pencil whose eigenvalues on the circle are where abs(curve) = level."""
-        one = self.table[curve]
-        c = self.c[one.output] * (one.factor / level)
-        d = (self.d[one.output, one.input] * one.factor + one.offset) / level
-        return self._pencil(self.b[:, one.input], (np.outer(c, c), c * d), (d * c, 1.0, d * d - 1.0))
+        table = self.table
+        c = self.c[table.outputs[curve]] * (table.factors[curve] / level)
+        d = float(self.through[curve]) / level
+        return self._pencil(self.b[:, table.inputs[curve]], (np.outer(c, c), c * d), (d * c, 1.0, d * d - 1.0))
 
     def equal(self) -> Pencil:
         """Return the pencil whose eigenvalues on the circle are where abs(L) = 1, that is 2 Re S = 1."""
@@ -224,6 +243,7 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
     else:
         c, d = np.stack([c_u, c_u, c_m[0]]), np.stack([d_u + to_command, d_u, d_m[0]])
     table = list_curves(measured)
+    through = d[table.outputs, table.inputs] * table.factors + table.offsets
     opened = np.full(n + m, np.inf + 0j)
     side = max(b.shape[1], c.shape[0])
     whole = np.zeros((n + m + side, n + m + side))
@@ -232,7 +252,7 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
         gone = np.diag(opened)
         return ClosedLoop(
             a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, law.rest[0]),
-            table=table,
+            table=table, through=through,
         )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
         scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
@@ -244,7 +264,7 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
     opened = np.concatenate([np.linalg.eigvals(ap), law.poles]).astype(complex)
     return ClosedLoop(
         a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened,
-        blocks=(ap, law.rest[0]), table=table,
+        blocks=(ap, law.rest[0]), table=table, through=through,
     )  # fmt: skip
 
 
@@ -313,12 +333,13 @@ def find_sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]
 
 def find_zeros(
     function: Indexed, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"], at_low: Float[np.ndarray, " m"],
-    at_high: Float[np.ndarray, " m"], tolerance: float,
+    at_high: Float[np.ndarray, " m"], tolerance: float, wanted: Bool[np.ndarray, " m"] | None = None,
 ) -> Float[np.ndarray, " m"]:  # fmt: skip
     """Return a zero in every bracket (Chandrupatla, Advances in Engineering Software 28, 1997).
 
     `function(x, i)` is evaluated at x for the brackets number i only. A bracket is done when it, or the function
-    in it, is smaller than `tolerance` as a fraction of where it is, or of what it was.
+    in it, is smaller than `tolerance` as a fraction of where it is, or of what it was; and all are when those `wanted`
+    are.
     """
     # scipy's elementwise.find_root gives the same zeros; its overhead would make `margins` of a loop 70 % slower.
     a, b, c = high.copy(), low.copy(), high.copy()  # b is the newest, a across the zero from it, c the one before
@@ -326,7 +347,7 @@ def find_zeros(
     fraction, small = np.full(a.size, 0.5), tolerance * np.minimum(np.abs(at_low), np.abs(at_high))
     live = np.arange(a.size)
     for _ in range(MAX_ZERO_STEPS):
-        if not live.size:
+        if not live.size or not (wanted is None or np.any(wanted[live])):
             break
         x = b[live] + fraction[live] * (a[live] - b[live])
         fx = function(x, live)

@@ -78,7 +78,7 @@ def step_response(
     """Return what is measured, and the effort, at the samples after a step of the reference, linear."""
     system = loop.system()
     x, out = np.zeros(system.a.shape[0]), np.empty((samples, 2))
-    rows = [system.table[TRACKING].output, 1]  # what is measured, and the effort
+    rows = [system.table.outputs[TRACKING], 1]  # what is measured, and the effort
     drive, through, c = size * system.b[:, 1], size * system.d[rows, 1], system.c[rows]
     for k in range(samples):
         out[k] = c @ x + through
