@@ -108,8 +108,9 @@ def show_fit(console: Terminal, fit: Fit, scores: Iterable[ModelledOutputs] = ()
         for one in fit.parameters.values()
         if one.free
     ]
-    for name, figure in fit.derived.items():
-        rows.append((name, f"{figure.value:.5g}", _spread(figure.std), unit_after(figure.unit).strip(), "derived"))
+    for what, figures in (("", fit.own_unknowns), ("derived", fit.derived)):
+        for name, figure in figures.items():
+            rows.append((name, f"{figure.value:.5g}", _spread(figure.std), unit_after(figure.unit).strip(), what))
     heading(console, "Fit", f"{fit.samples} samples, {format_count(fit.iterations, 'iteration')}, {fit.wall_s:.1f} s")
     _tabulate(console, rows, ("parameter", "value", "std", "unit", ""), "<>><<")
     outputs = [

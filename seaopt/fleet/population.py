@@ -39,7 +39,7 @@ from seaopt.errors import SeaoptError, suggestion
 from seaopt.fleet.history import LABEL, order_runs
 from seaopt.fleet.plan import name_correlation
 from seaopt.fleet.result import Fleet
-from seaopt.fleet.worker import MET
+from seaopt.fleet.worker import FAILED, MET
 from seaopt.formatting import format_count, format_number, format_table, html_text
 from seaopt.records import record
 
@@ -153,7 +153,7 @@ def estimate_population(
 ) -> Population:
     """Return how actuators differ, and each one's parameters, for which a short log borrows from its siblings.
 
-    Logs that are not met, or that leave a parameter or covariance open, are left out, and counted.
+    Logs that failed, that are not met, or that leave a parameter or covariance open, are left out, and counted.
 
     Parameters
     ----------
@@ -233,6 +233,7 @@ def _select_rows(rows: pl.DataFrame, names: Sequence[str]) -> tuple[pl.DataFrame
     pairs = [name_correlation(*pair) for pair in combinations(names, 2)]
     needed = [name for name in (*names, *(f"{name}_std" for name in names), *pairs) if name in rows.columns]
     conditions = {
+        "failed": pl.col("status") != FAILED,
         "not met": pl.col("status") == MET,
         "not identified": pl.all_horizontal(pl.col(name).is_not_null() & pl.col(name).is_finite() for name in needed),
         "certain": pl.all_horizontal(pl.col(f"{name}_std") > 0.0 for name in names),

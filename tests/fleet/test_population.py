@@ -101,14 +101,18 @@ def test_positive_parameters_are_taken_by_their_logarithms_where_they_are_known(
     assert value == pytest.approx(np.sqrt(low * high), rel=1e-9) and np.all(low > 0)
 
 
-def test_logs_that_are_not_met_or_tell_nothing_are_left_out() -> None:
+def test_logs_that_failed_are_not_met_or_tell_nothing_are_left_out() -> None:
     fleet, _ = make_fleet(5, 20)
     rows = fleet.rows.with_row_index("k").with_columns(
-        status=pl.when(pl.col("k") == 3).then(pl.lit("failed")).otherwise("status"),
+        status=pl.when(pl.col("k") == 3)
+        .then(pl.lit("not met"))
+        .when(pl.col("k").is_in([4, 5]))
+        .then(pl.lit("failed"))
+        .otherwise("status"),
         J_std=pl.when(pl.col("k") == 7).then(float("inf")).otherwise("J_std"),
     )
     population = estimate_population(Fleet(rows=rows, units=fleet.units, identity=("unit",), free=NAMES))
-    assert population.left_out == {"not met": 1, "not identified": 1} and len(population.table) == 18
+    assert population.left_out == {"failed": 2, "not met": 1, "not identified": 1} and len(population.table) == 16
 
 
 @pytest.mark.parametrize("options", [{"parameters": ["m_k"]}, {"actuator": ["robot"]}])

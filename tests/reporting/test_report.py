@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.cli.show import show_fit
+from seaopt.cli.terminal import Terminal
 from seaopt.estimation.result.findings import FitFinding
+from seaopt.estimation.result.fit_result import format_fit
 from seaopt.reporting import judge_results
 from seaopt.reporting.figures.panel import Panel
 from seaopt.reporting.page.chart import make_chart, make_id
@@ -44,6 +47,20 @@ def test_the_page_says_how_the_papers_form_compares_with_the_fit(stand, stand_lo
     assert mass == pytest.approx(0.646 + 3.31e-6 / (0.002 / (6 * 3.141592653589793)) ** 2, rel=5e-4)  # (1), (2)
     assert "not of second order" not in said
     assert (tmp_path / "figures" / "response_chirp.svg").exists()
+
+
+def test_a_fitted_delay_is_a_row_of_every_table_of_the_fit(fitted, tmp_path, capsys, without_drawing):
+    own = replace(fitted.nuisance["chirp"], delay_s=0.00312, std={"delay_s": 2.5e-5})
+    fit = replace(fitted, nuisance=dict(fitted.nuisance) | {"chirp": own})
+    page = so.write_report([fit], tmp_path / "r.html").read_text(encoding="utf-8")
+    for text in (page, format_fit(fit)):
+        (row,) = re.findall(r"<tr><td>chirp\.delay_s</td>.*?</tr>", text)
+        assert [html.unescape(cell) for cell in re.findall(r">([^<>]+)<", row)] == [
+            "chirp.delay_s", *(["of one log"] if text is page else []), "0.00312", "2.5e-05",
+            *(["0.003071 to 0.003169"] if text is page else []), "s",
+        ]  # fmt: skip
+    show_fit(Terminal(), fit)
+    assert re.search(r"chirp\.delay_s +0\.00312 +± 2\.5e-05 +s", capsys.readouterr().out)
 
 
 def test_a_heading_holds_nothing_that_a_reader_does_not_see(controller, tmp_path, without_drawing):

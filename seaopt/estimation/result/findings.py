@@ -116,6 +116,20 @@ class OutputFit:
 
 
 @record
+class DerivedFigure:
+    """A figure that follows from the parameters, or is an experiment's own, with its std from the covariance."""
+
+    value: float
+    unit: str
+    std: float
+
+    @property
+    def ci95(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
+
+
+@record
 class Nuisance:
     """An experiment's own unknowns as estimated: delay, gain and offset per output, initial state per segment.
 
@@ -134,24 +148,15 @@ class Nuisance:
     std: dict[str, float] = field(default_factory=dict[str, float])
     plant: str = ""
 
+    @property
+    def fitted(self) -> dict[str, DerivedFigure]:
+        """What was estimated of delay and gains, as `delay_s` and `gain.F1`, with its standard deviation."""
+        values = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (gain, "-") for name, gain in self.gain.items()}
+        return {key: DerivedFigure(value=values[key][0], unit=values[key][1], std=std) for key, std in self.std.items()}
+
     def describe(self) -> list[str]:
         """Return what was estimated of delay and gains, in words."""
-        values = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (gain, "") for name, gain in self.gain.items()}
-        return [f"{key} = {values[key][0]:.5g} ± {std:.2g} {values[key][1]}".rstrip() for key, std in self.std.items()]
-
-
-@record
-class DerivedFigure:
-    """A figure that follows from the parameters, with its standard deviation from the covariance."""
-
-    value: float
-    unit: str
-    std: float
-
-    @property
-    def ci95(self) -> tuple[float, float]:
-        """The 95 % interval."""
-        return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
+        return [f"{key} = {one.value:.5g} ± {one.std:.2g}{unit_after(one.unit)}" for key, one in self.fitted.items()]
 
 
 @record(eq=False, repr=False)

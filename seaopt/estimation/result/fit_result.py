@@ -172,6 +172,11 @@ class Fit:
         known = max(KNOWN_DELAY_S, BETTER * min(stds, default=0.0))
         return max((one.delay_s for one in own if one.std.get("delay_s", 0.0) <= known), default=0.0)
 
+    @property
+    def own_unknowns(self) -> dict[str, DerivedFigure]:
+        """Delays and gains that were fitted, each of one experiment: `chirp.delay_s`, `chirp.gain.F1`."""
+        return {f"{name}.{key}": one for name, own in self.nuisance.items() for key, one in own.fitted.items()}
+
     def require_minimum(self, what: str) -> Minimum:
         """Return the minimum, for `what` needs it.
 
@@ -346,9 +351,9 @@ def format_fit(fit: Fit) -> str:
         for one in fit.parameters.values()
         if one.free
     ]
-    derived = [
+    others = [
         (name, format_number(one.value, 6), format_number(one.std, 2), unit_after(one.unit).strip())
-        for name, one in fit.derived.items()
+        for name, one in (fit.own_unknowns | fit.derived).items()
     ]
     outputs = [
         (name, output, *(format_figure(value, "%") for value in (one.fit_percent, one.holdout_fit_percent)),
@@ -360,7 +365,7 @@ def format_fit(fit: Fit) -> str:
         html_paragraph(f"Fit: {'met' if fit.met else 'NOT MET'}, {fit.status} ({fit.message})")
         + html_list(findings)
         + (html_paragraph(fit.caveat) if fit.caveat else "")
-        + html_table(("parameter", "value", "std", "unit"), [*fitted, *derived])
+        + html_table(("parameter", "value", "std", "unit"), [*fitted, *others])
         + html_table(("experiment", "output", "fit", "held out", "rms residual"), outputs)
         + html_list(fit.notes)
     )
