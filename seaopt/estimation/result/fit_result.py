@@ -353,7 +353,7 @@ def format_fit(fit: Fit) -> str:
     ]
     others = [
         (name, format_number(one.value, 6), format_number(one.std, 2), unit_after(one.unit).strip())
-        for name, one in (fit.own_unknowns | fit.derived).items()
+        for name, one in {**fit.own_unknowns, **fit.derived}.items()
     ]
     outputs = [
         (name, output, *(format_figure(value, "%") for value in (one.fit_percent, one.holdout_fit_percent)),
