@@ -100,8 +100,7 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
     Raises
     ------
     ControlError
-        The link is held, the plant has no port, the link is not a mass on a spring and a damper, or the law feeds its
-        motion forward.
+        The link is held, the plant has no port, or the link is not a mass on a spring and a damper.
 
     """
     if plant.port is None or plant.port.motion is None:
@@ -110,11 +109,6 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
             'moves: moving_output, two_link or rotary(link="free")'
         )
     measured, per_effort = controller.spec.regulated, controller.command.per_effort
-    if controller.link is not None:
-        raise ControlError(
-            "the law feeds the link's motion forward, and an impedance is a law of that motion itself; leave "
-            "link_feedforward out"
-        )
     sliding = take_sliding(plant, params)
     port = port_of(sliding, params, controller.signals, per_effort)
     linear, _ = linearise_sets(sliding, [sliding.complete(params)], str(plant.port.motion), per_effort)

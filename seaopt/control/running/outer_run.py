@@ -12,19 +12,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.loops.outer_loop import OuterLoop
 
 
-def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
+def enclose_law(law: RunnableLaw, outer: OuterLoop, place: int | None = None) -> RunnableLaw:
     """Return the law of x_0, of what a force law measures and of the link's position, that both loops make.
 
     Parameters
     ----------
     law : RunnableLaw
-        Of one measured signal or several, the link's position none of them.
+        Of one measured signal or several.
     outer : OuterLoop
         Before it, at the same rate.
+    place : int, optional
+        Which of the measured signals is the link's position; it is one more, the last, where none of them is.
 
     Examples
     --------
@@ -43,9 +46,12 @@ def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
     by_speed = -outer.direction * outer.damping
     a = np.zeros((n + 1, n + 1))
     a[:n, :n], a[:n, n], a[n, n] = law.a, law.b_reference * by_speed, outer.pole
-    measured = np.zeros((n + 1, law.measured + 1))
-    measured[:n, :-1], measured[:n, -1] = law.b_measurement.reshape(n, -1), law.b_reference * by_position
-    measured[n, -1] = (1.0 - outer.pole) * outer.rate
+    at, read = (law.measured, law.measured + 1) if place is None else (place, law.measured)
+    measured, direct = np.zeros((n + 1, read)), np.zeros(read)
+    measured[:n, : law.measured], direct[: law.measured] = law.b_measurement.reshape(n, -1), law.d_measurement
+    measured[:n, at] += law.b_reference * by_position
+    measured[n, at] = (1.0 - outer.pole) * outer.rate
+    direct[at] += law.d_reference * by_position
     by_reference = outer.direction * outer.stiffness
     added = law.compensation
     if added is not None and added.gravity is not None:  # of the force law's reference: here it moves x_0
@@ -53,6 +59,23 @@ def enclose_law(law: RunnableLaw, outer: OuterLoop) -> RunnableLaw:
     return replace(
         law, a=a, b_measurement=measured, c=np.append(law.c, law.d_reference * by_speed),
         b_reference=np.append(law.b_reference * by_reference, 0.0), d_reference=law.d_reference * by_reference,
-        d_measurement=np.append(law.d_measurement, law.d_reference * by_position),
-        anti_windup=np.append(law.anti_windup, 0.0), compensation=added,
+        d_measurement=direct, anti_windup=np.append(law.anti_windup, 0.0), compensation=added,
     )  # fmt: skip
+
+
+def enclose_controller(controller: Controller, position: str) -> tuple[RunnableLaw, tuple[str, ...]]:
+    """Return the law of a controller with its outer loop, and the outputs that it reads.
+
+    Parameters
+    ----------
+    controller : Controller
+        With an outer loop; its law may read the link's position itself.
+    position : str
+        The output that is the link's position.
+
+    """
+    assert controller.outer is not None
+    signals = controller.signals
+    place = signals.index(position) if position in signals else None
+    law = enclose_law(runnable(controller), controller.outer, place)
+    return law, signals if place is not None else (*signals, position)

@@ -143,7 +143,12 @@ def tune_schedule(
 
 
 def _check_structure(spec: ControllerSpec) -> None:
-    parts = {"a notch": spec.notch, "a prefilter": spec.prefilter, "link_feedforward": spec.link_feedforward}
+    if spec.link_feedforward is not None:
+        raise ControlError(
+            "link_feedforward reads the link's motion, and a scheduled law one signal, the one that is regulated; leave "
+            "link_feedforward out, or tune one law for all points: so.tune(..., draws=[{name: value}, ...])"
+        )
+    parts = {"a notch": spec.notch, "a prefilter": spec.prefilter}
     if spec.structure not in STRUCTURES or any(part is not None for part in parts.values()):
         what = next((name for name, part in parts.items() if part is not None), f'structure = "{spec.structure}"')
         raise ControlError(

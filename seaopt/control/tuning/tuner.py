@@ -56,7 +56,6 @@ from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.optimisation_problem import (
     FRICTION,
     OBJECTIVE_HZ,
-    PASSIVE,
     LawNumbers,
     PlantWithFriction,
     Task,
@@ -333,13 +332,12 @@ def _find_link(
     Raises
     ------
     ControlError
-        No plant has such a signal, or one is a measured response; or a limit is asked that such a law has not.
+        No plant has such a signal, or one is a measured response.
 
     """
     asked = spec.link_feedforward
     if asked is None:
         return None
-    _refuse_limits(spec, "link_feedforward", "leave link_feedforward out")
     if sees_responses:
         raise ControlError(
             "link_feedforward reads the link's motion, which a measured response does not have; leave the measured "
@@ -390,28 +388,26 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
     """Return task, numbers and loops with as large a fraction of the link's feedforward as keeps the limits.
 
     It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is zero, as
-    nothing shows then which one misses them least.
+    nothing shows then which one misses them least. A friction margin that alone is missed does: it is lowered only as
+    long as that makes it larger.
     """
     asked, link = task.spec.link_feedforward, task.link
     if asked is None or asked.fraction is not None or link is None:
         return task, x, loops
+    best, largest = (task, x, loops), -np.inf
     for power in range(LOWER_FRACTIONS + 1):
-        if not list_broken_limits(task.spec, loops, task.design_states):
+        broken = list_broken_limits(task.spec, loops, task.design_states)
+        if not broken:
             break
+        if broken == {FRICTION}:
+            margin = min(loop.friction_slope for loop in loops)
+            if margin <= largest:
+                return best
+            best, largest = (task, x, loops), margin
         share = 0.8 ** (power + 1) if power < LOWER_FRACTIONS else 0.0
         task = feed_link(task, replace(link, fraction=round(share * link.fraction, 3)))
         x, loops = solve(task)
     return task, x, loops
-
-
-def _refuse_limits(spec: ControllerSpec, what: str, remedy: str) -> None:
-    """Refuse the limits that are not yet those of a law which reads further signals."""
-    for limit in (PASSIVE, FRICTION):
-        if getattr(spec, limit) not in (None, False):
-            raise ControlError(
-                f"{limit} is not yet a limit of {what}; leave it out and read what the certificate says of it, or "
-                f"{remedy}"
-            )
 
 
 def _check_measured_design(spec: ControllerSpec) -> None:

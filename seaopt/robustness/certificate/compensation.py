@@ -32,7 +32,7 @@ from seaopt.control.compensation.compensate import ENOUGH, find_compensation_mar
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.compensation.terms import GravityTerm
 from seaopt.control.loops.sampled_plant import find_rest, sample
-from seaopt.control.running.outer_run import enclose_law
+from seaopt.control.running.outer_run import enclose_controller
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
 from seaopt.formatting import format_values
@@ -256,8 +256,8 @@ def _find_largest_eigenvalue(controller: Controller, plant: Plant, params: Param
     """Return the largest eigenvalue of the sampled loop, sliding, with further feedback."""
     law, signals, per_reference = runnable(controller), list(controller.signals), 1.0
     if controller.outer is not None and plant.port is not None and plant.port.motion in plant.outputs:
-        law = enclose_law(law, controller.outer)
-        signals.append(str(plant.port.motion))
+        law, read = enclose_controller(controller, str(plant.port.motion))
+        signals = list(read)
         per_reference = controller.outer.direction * controller.outer.stiffness
     n = law.c.size
     b, d = np.reshape(law.b_measurement, (n, -1)).copy(), np.ravel(law.d_measurement).copy()

@@ -15,9 +15,8 @@ from jaxtyping import Float
 from seaopt.control import Controller
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
-from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.outer_run import enclose_law
+from seaopt.control.running.outer_run import enclose_controller
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_dry_friction
@@ -89,11 +88,10 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
     if not outer.stiffness > 0.0:
         return ()
     motion, completed = str(plant.port.motion), plant.complete(params)
-    law, sticks = enclose_law(runnable(controller), outer), can_stick(plant)
+    law, measured = enclose_controller(controller, motion)
     loop = SampledLoop(
-        plant=plant, law=law, measured=(*controller.signals, motion), delay_samples=controller.delay_samples,
-        sticks=sticks,
-    )  # fmt: skip
+        plant=plant, law=law, measured=measured, delay_samples=controller.delay_samples, sticks=can_stick(plant)
+    )
     samples = _count_samples(controller, plant, completed)
     steps: list[ImpedanceStep] = []
     for effort in _size_efforts(controller, find_dry_friction(plant, completed)):

@@ -12,7 +12,6 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import LinkFeedforward, runnable, sweep
 from seaopt.control.deploy.export import export
-from seaopt.control.impedance.link import find_link
 from seaopt.control.loops.loop import Loop
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.files import to_json
@@ -272,12 +271,6 @@ def test_the_worst_case_is_bounded(fed, swing, thor):
     assert bracket.bounded_stable and max(by_hand) <= bracket.ms_upper <= 1.02 * max(by_hand)
     assert bracket.ms_lower == pytest.approx(max(by_hand), rel=1e-3)
     assert certificate.worst["swing"].parameters["I_p"] == pytest.approx(0.33)
-
-
-def test_an_impedance_around_it_is_refused(fed, swing, thor):
-    """It is a law of the link's motion itself."""
-    with pytest.raises(ControlError, match="leave link_feedforward out"):
-        find_link(fed, swing, thor)
 
 
 def test_a_schedule_of_it_is_refused(tmp_path):

@@ -20,6 +20,24 @@ by Tustin's rule, each corner prewarped.
 P, all effort moves the drive and none the spring: :math:`(M s^2 + b s) P_x = 1`, :math:`P C_y` is nothing, and
 :math:`S = 1/B = 1/(1 - \lambda)` without a high-pass: Ms of 1.6 leaves a fraction of 0.37. That zero is at a hertz or
 so, below what is followed, and there the high-pass takes the path away.
+
+**Where friction sticks.** The path is that of the drive as it slides, of the damping b. Friction of the slope
+:math:`\beta` makes another loop: P and P_x are of :math:`b + \beta`, and where the link swings freely
+:math:`(M s^2 + (b + \beta) s) P_x = 1`, so that
+
+.. math:: B = 1 - \lambda\, \frac{M s + b}{M s + b + \beta} \cdots .
+
+The steeper the friction, the less the path does: a drive that stands feeds nothing back, B is 1. So what bounds
+:math:`\lambda` is the sliding loop, with the flattest slope, and a loop may be stable as it sticks and not as it
+slides. Between the two :math:`K G_y` of `seaopt.control.loops.absolute_stability` has the path among its sum.
+
+**At the port** (`seaopt.control.laws.passivity`) x is what the world imposes: with :math:`C_x` of u = - C_x x, delayed
+and held, P_x is nothing and
+
+.. math:: Z = \frac{G_{22} + \Delta\, C' - G_{21} C_x'/s}{1 + G_{11} C'} ,
+
+of the actuators here :math:`1 - \lambda H` times what it is under the same feedback without the path, H its filters
+with delay and hold. Sampled, :math:`C_x/s_l` stands beside :math:`W/s_l` in `seaopt.control.impedance.sampled_port`.
 """
 
 from __future__ import annotations
