@@ -387,27 +387,24 @@ def aim_task(task: Task, spec: ControllerSpec) -> Task:
 def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tuple[Task, LawNumbers, list[MeasuredLoop]]:
     """Return task, numbers and loops with as large a fraction of the link's feedforward as keeps the limits.
 
-    It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is zero, as
-    nothing shows then which one misses them least. A friction margin that alone is missed does: it is lowered only as
-    long as that makes it larger.
+    It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is that
+    which shows most of a friction margin that alone is missed, else zero, as nothing shows then which one misses least.
     """
     asked, link = task.spec.link_feedforward, task.link
     if asked is None or asked.fraction is not None or link is None:
         return task, x, loops
-    best, largest = (task, x, loops), -np.inf
-    for power in range(LOWER_FRACTIONS + 1):
+    missing: list[tuple[float, tuple[Task, LawNumbers, list[MeasuredLoop]]]] = []
+    for power in range(LOWER_FRACTIONS + 2):
         broken = list_broken_limits(task.spec, loops, task.design_states)
         if not broken:
-            break
+            return task, x, loops
         if broken == {FRICTION}:
-            margin = min(loop.friction_slope for loop in loops)
-            if margin <= largest:
-                return best
-            best, largest = (task, x, loops), margin
-        share = 0.8 ** (power + 1) if power < LOWER_FRACTIONS else 0.0
-        task = feed_link(task, replace(link, fraction=round(share * link.fraction, 3)))
-        x, loops = solve(task)
-    return task, x, loops
+            missing.append((min(loop.friction_slope for loop in loops), (task, x, loops)))
+        if power <= LOWER_FRACTIONS:
+            share = 0.8 ** (power + 1) if power < LOWER_FRACTIONS else 0.0
+            task = feed_link(task, replace(link, fraction=round(share * link.fraction, 3)))
+            x, loops = solve(task)
+    return max(missing, key=lambda found: found[0])[1] if missing else (task, x, loops)
 
 
 def _check_measured_design(spec: ControllerSpec) -> None:
