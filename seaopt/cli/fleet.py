@@ -141,6 +141,9 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
     if fleet.short:
         count = format_count(len(fleet.short), "log")
         console.wrap(printable(f"much shorter than the others: {count} ({fleet.short[0]})"), indent=9)
+    if fleet.gaps:
+        log, text = fleet.gaps[0]
+        console.wrap(printable(f"with gaps: {format_count(len(fleet.gaps), 'log')} ({log}: {text})"), indent=9)
     if drift.left_out:
         total = format_count(len(fleet.rows), "log")
         console.wrap(f"left out of drift, of {total}: {drift.describe_left_out()}", indent=9)

@@ -12,7 +12,7 @@ import polars as pl
 from jaxtyping import Float
 
 from seaopt.estimation.result.findings import GUESS
-from seaopt.fleet.worker import FAILED, MET, NOT_MET
+from seaopt.fleet.worker import FAILED, GAP, MET, NOT_MET
 from seaopt.formatting import format_count, format_number, format_table, html_text
 from seaopt.problem.problem import name_after
 from seaopt.records import record
@@ -108,8 +108,17 @@ class Fleet:
     @property
     def short(self) -> tuple[str, ...]:
         """The logs that are much shorter than their siblings."""
-        kinds = pl.col("findings").list.eval(pl.element().struct.field("kind"))
-        return tuple(self.rows.filter(kinds.list.contains(SHORT))["log"])
+        return tuple(log for log, _ in self._list_findings(SHORT))
+
+    @property
+    def gaps(self) -> tuple[tuple[str, str], ...]:
+        """The logs with gaps, and how many samples each lost, in words."""
+        return self._list_findings(GAP)
+
+    def _list_findings(self, kind: str) -> tuple[tuple[str, str], ...]:
+        """Return the logs with a finding of a kind, and its text."""
+        rows = self.rows.select("log", "findings").drop_nulls().iter_rows()
+        return tuple((log, one["text"]) for log, findings in rows for one in findings if one["kind"] == kind)
 
     @property
     def reasons(self) -> tuple[tuple[str, int, str], ...]:

@@ -24,13 +24,16 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation import Fit
+from seaopt.estimation import Experiment, Fit
 from seaopt.fleet.logs import FleetLog, open_local
 from seaopt.fleet.plan import VERSION, Plan, name_correlation
+from seaopt.logs.quality.clock import assess_clock
+from seaopt.logs.quality.findings import find_clock_faults
 from seaopt.problem import Problem, fit_problem
 
 Row = dict[str, Any]
 MET, NOT_MET, FAILED, UNCHANGED = "met", "not met", "failed", "unchanged"
+GAP = "gap"  # kind of finding of a log with gaps
 GRACE_S = 5.0  # after the time limit, until the process is ended
 ENDED = 1  # its exit code
 
@@ -112,7 +115,18 @@ def _describe_fit(plan: Plan, log: FleetLog, known: str | None) -> Row:
             fitted = fit_problem(problem, [experiment])
         except SeaoptError as error:
             return row | {"status": FAILED, "reason": str(error)}
-    return row | describe(fitted, experiment.name)
+    row |= describe(fitted, experiment.name)
+    return row | {"findings": [*row["findings"], *_find_gaps(experiment)]}
+
+
+def _find_gaps(experiment: Experiment) -> list[dict[str, str]]:
+    """Return the finding of a log with gaps, in the words of `seaopt inspect`; a fit alone bears them."""
+    log = experiment.log
+    return [
+        {"severity": one.severity, "kind": one.kind, "where": experiment.name, "text": one.sentence}
+        for one in find_clock_faults(assess_clock(log.time, log.source), log.time)
+        if one.kind == GAP
+    ]
 
 
 def describe(fitted: Fit, name: str) -> Row:

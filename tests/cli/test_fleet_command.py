@@ -33,6 +33,14 @@ def test_the_verdict_comes_first_and_a_second_run_has_nothing_to_do(fleet, folde
     }
 
 
+def test_a_log_with_a_gap_is_named(fleet, folder):
+    lines = (folder / "r0_j0.csv").read_text().splitlines()
+    (folder / "r0_j0.csv").write_text("\n".join(lines[:401] + lines[520:]))
+    done = fleet("r0_j?.csv", "-o", "out")
+    said = " ".join(done.stdout.split())
+    assert done.returncode == 0 and "with gaps: 1 log (" in said and "r0_j0.csv: 1 gap, 119 samples lost" in said
+
+
 def test_a_log_that_is_not_met_exits_1_with_its_reason(fleet, folder):
     (folder / "bad.csv").write_text("junk\n", encoding="utf-8")
     (folder / "list.csv").write_text("log,unit\nbad.csv,a\nr0_j0.csv,b\n", encoding="utf-8")

@@ -13,6 +13,7 @@ from seaopt.errors import FileError, LogError, ProblemError, SeaoptError
 from seaopt.fleet import FleetLog, read_fleet, read_manifest
 from seaopt.fleet.plan import make_plan
 from seaopt.fleet.table import Table
+from seaopt.logs import assess_quality, read_table
 from tests.fleet.conftest import LOGS, PROBLEM, compare, write_log
 
 IDENTITY = "{robot}_{joint}.csv"
@@ -233,6 +234,16 @@ def test_a_folder_is_read_back(stand, threads):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"other_logs": []}))
     with pytest.raises(FileError, match="has changed"):
         read_fleet(out)
+
+
+def test_a_log_with_a_gap_is_met_and_has_the_finding_of_inspect(stand, threads):
+    """0.3 s at 400 Hz are 120 steps, of which 119 samples lie inside."""
+    log = stand / "logs" / "r0_j0.csv"
+    lines = log.read_text().splitlines()
+    log.write_text("\n".join(lines[:401] + lines[520:]))
+    fleet = so.fit_fleet(stand / "stand.toml", [stand / "logs" / "r0_*.csv"], executor=threads)
+    (said,) = [one.sentence for one in assess_quality(read_table(log)).findings if one.kind == "gap"]
+    assert fleet.met and fleet.gaps == ((str(log), said),) and said.startswith("1 gap, 119 samples lost")
 
 
 def test_a_log_much_shorter_than_its_siblings_has_a_finding(stand, threads):
