@@ -351,7 +351,8 @@ class ControllerSpec:
         Raises
         ------
         ControlError
-            The law reads several outputs, or the response is of another output or input; or as `sample_measured`.
+            The law reads several outputs, or the motion of a link that the response's plant does not hold; the response
+            is of another output or input; or as `sample_measured`.
 
         """
         if not isinstance(self.measured, str):
@@ -359,6 +360,11 @@ class ControllerSpec:
                 f"frf:{measured.name}: is of {measured.output} alone, and the law reads {join_words(self.measured)}, "
                 f'whose responses are needed together; give models of the plants, or measured = "{self.regulated}" and '
                 'structure = "pid"'
+            )
+        if self.link_feedforward is not None and measured.plant.moves:
+            raise ControlError(
+                f"frf:{measured.name}: is of {measured.output} alone, and of a plant whose link moves, which "
+                "link_feedforward reads; give a model of that plant, and responses of one that holds its link"
             )
         for what, own, other in (
             ("output", measured.output, self.measured), ("input", measured.source, command.input)

@@ -239,6 +239,7 @@ def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Int[np.ndar
     """Return the derivative of a limit's usage by the gains at points in discs, by central differences."""
     curve, column = CURVES[name], index % grid.f.size
     p, discs, level = grid.p.ravel()[index], grid.discs.ravel()[index], grid.levels[name][column]
+    rest = law.law.rest.ravel()[index]
     slope = np.zeros((index.size, len(law.by_y)))
     for k in range(len(law.by_y)):
         by_y, by_r = law.by_y[k, column], law.by_r[k, column]
@@ -247,7 +248,7 @@ def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Int[np.ndar
         ends: list[Float[np.ndarray, " c"]] = []
         for sign in (1.0, -1.0):
             c_y, c_r = (c[column] + sign * step * by for c, by in ((law.law.c_y, by_y), (law.law.c_r, by_r)))
-            ends.append(use_disc(curve, level, p, discs, c_y, c_r))
+            ends.append(use_disc(curve, level, p, discs, c_y, c_r, rest))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     return slope
 

@@ -254,7 +254,7 @@ def _build_program(
             continue
         curve = CURVES[kind]
         if discs:
-            size = _bound_disc(curve, p, data["discs"], c_y, c_r)[where]
+            size = _bound_disc(curve, p, open_loop, data["discs"], c_y, c_r)[where]
             usage[kind] = data["ln_level"][where] - size if curve.floor else size - data["ln_level"][where]
             continue
         value = curve.numerator(p, c_y, c_r, open_loop, c_v)
@@ -288,9 +288,8 @@ def _build_program(
     return ca.nlpsol("polish", "ipopt", nlp, options), list(data)
 
 
-def _bound_disc(curve: LimitCurve, p: _Complex, r: Any, c_y: _Complex, c_r: _Complex) -> Any:
+def _bound_disc(curve: LimitCurve, p: _Complex, open_loop: _Complex, r: Any, c_y: _Complex, c_r: _Complex) -> Any:
     """Return the logarithm of the largest (of a floor the least) X/(1 + L) of discs: `disc_loop.bound_disc`."""
-    open_loop = p * c_y
     a, reach = open_loop + 1.0, r * ca.sqrt(c_y.square() + SMOOTHING)
     size, back = a.square() + SMOOTHING, a.conjugate()
     room = size * leave_positive(1.0 - reach * reach / size, ca.fmin, ca.fmax)
@@ -304,7 +303,7 @@ def _bound_disc(curve: LimitCurve, p: _Complex, r: Any, c_y: _Complex, c_r: _Com
         case "C_y":
             centre, radius = c_y * back, reach * ca.sqrt(c_y.square() + SMOOTHING)
         case "C_v":
-            raise AssertionError("a measured response is of one signal, and has no speed loop")
+            raise AssertionError("a measured response has no speed loop")
         case "P C_r":
             centre = c_r * (p * back - c_y.conjugate() * (r * r))
             radius = r * ca.sqrt(c_r.square() + SMOOTHING)

@@ -483,9 +483,8 @@ class Task:
     ) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
         """Return P, B without a speed loop, and the speed per command as the law has it, of one plant."""
         plant, fixed, speed = self.plants[row], np.ones(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
-        if not self.further:
+        if not self.further or isinstance(plant, MeasuredPlant):  # whose link is held: what is read besides is zero
             return plant.response(f), fixed, speed
-        assert isinstance(plant, DigitalPlant), "a measured response is of one signal"
         p, *others = plant.responses(f)
         for one, response in zip(self.further, others, strict=True):
             if isinstance(one, SpeedLoop):
@@ -557,7 +556,7 @@ class Task:
         for name in filter(grid.levels.__contains__, names):
             curve, level = CURVES[name], grid.levels[name]
             if measured:
-                out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r)
+                out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r, rest)
                 continue
             size = np.abs(curve.numerator(p, law.c_y, law.c_r, open_loop, law.c_v))
             out[name] = level * distance / np.maximum(size, 1e-12) if curve.floor else size / (level * distance)
@@ -703,10 +702,10 @@ def close_plant(plant: DigitalPlant | MeasuredPlant, law: Law) -> Loop | DiscLoo
 
 def use_disc(
     curve: LimitCurve, level: Float[np.ndarray, "..."], p: Complex[np.ndarray, "..."], discs: Float[np.ndarray, "..."],
-    c_y: Complex[np.ndarray, "..."], c_r: Complex[np.ndarray, "..."],
+    c_y: Complex[np.ndarray, "..."], c_r: Complex[np.ndarray, "..."], rest: Complex[np.ndarray, "..."],
 ) -> Float[np.ndarray, "..."]:  # fmt: skip
     """Return the usage of a limit by the worst of the responses in discs."""
-    least, most = bound_disc(curve.of, p, discs, c_y, c_r)
+    least, most = bound_disc(curve.of, p, discs, c_y, c_r, rest)
     return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level
 
 

@@ -259,7 +259,7 @@ def make_task(
     else:
         named["design plant"] = (plant, values)
     named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in models_given.items()}
-    link = _find_link(spec, named, bool(first or seen), gain)
+    link = _find_link(spec, named, bool(first), gain)
     if link is not None:
         named = {name: (link.see(model), given) for name, (model, given) in named.items()}
         design, signals = link.see(design), (*signals, link.measured)
@@ -325,23 +325,23 @@ def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
 
 
 def _find_link(
-    spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], sees_responses: bool, per_effort: float
+    spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], on_response: bool, per_effort: float
 ) -> LinkPath | None:
     """Return the path from the link's motion, of the first plant whose link moves; None where none is asked.
 
     Raises
     ------
     ControlError
-        No plant has such a signal, or one is a measured response.
+        No plant has such a signal, or the design plant is a measured response.
 
     """
     asked = spec.link_feedforward
     if asked is None:
         return None
-    if sees_responses:
+    if on_response:
         raise ControlError(
-            "link_feedforward reads the link's motion, which a measured response does not have; leave the measured "
-            "responses out, or link_feedforward"
+            "link_feedforward takes a model of the design plant, as a law of a measured response is certified on such "
+            "responses alone, whose links stand still; design on a model, and name the response in robust_to"
         )
     for model, values in named.values():
         if name_link_signal(asked, model) is not None:

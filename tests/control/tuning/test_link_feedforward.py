@@ -13,11 +13,14 @@ import seaopt as so
 from seaopt.control import LinkFeedforward, runnable, sweep
 from seaopt.control.deploy.export import export
 from seaopt.control.loops.loop import Loop
+from seaopt.control.tuning.frequencies import place_frequencies
+from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.files import to_json
 from seaopt.problem import read_problem
 from seaopt.robustness.certificate.certify import Budget
 from tests.c_code import CompiledLaw
+from tests.control.tuning import test_measured
 
 TS, DELAY = 1e-3, 1
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, min_sensitivity_bandwidth_hz=6)
@@ -271,6 +274,60 @@ def test_the_worst_case_is_bounded(fed, swing, thor):
     assert bracket.bounded_stable and max(by_hand) <= bracket.ms_upper <= 1.02 * max(by_hand)
     assert bracket.ms_lower == pytest.approx(max(by_hand), rel=1e-3)
     assert certificate.worst["swing"].parameters["I_p"] == pytest.approx(0.33)
+
+
+@pytest.fixture(scope="module")
+def beside_discs():
+    """Return a controller tuned on the swing and on the stand's response, known to 3 % at every frequency."""
+    response = test_measured.exact(TS, relative=0.03)
+    spec = replace(SPEC, link_feedforward=LinkFeedforward())
+    robust_to = {"swing": so.plants.moving_output(), "log": response}
+    return so.tune(so.plants.high_impedance(), so.plants.thor(), spec, robust_to), response
+
+
+def test_the_response_of_a_held_link_is_kept_beside_it(beside_discs, stand, swing, thor):
+    """By hand: the swing, and random responses in the discs, which the path does not reach."""
+    controller, response = beside_discs
+    assert controller.feasible and controller.link.fraction > 0.5
+    r, f = 2e-3 / (2 * np.pi * 3), np.geomspace(0.05, 499.0, 20_000)
+    tracking, s = close_by_hand(controller, f, -3.31e-6 / r**2, -1.31e-4 / r**2)
+    assert np.max(np.abs(s)) <= 1.6 and find_band(f, tracking)[0] < 3.5
+    (found,) = controller.measured
+    rng, f, g = np.random.default_rng(1), response.frequency_hz, controller.gains
+    q = np.exp(-2j * np.pi * f * TS)
+    c_y = g["k_p"] + g["k_i"] * TS / 2 * (1 + q) / (1 - q) + g["k_d"] * (1 - q) / (g["T_f"] + TS - q * g["T_f"])
+    disc = response.radius * np.sqrt(rng.uniform(size=(2000, f.size))) * np.exp(2j * np.pi * rng.uniform(size=f.size))
+    s = 1 / (1 + (response.response + disc) * controller.command.per_effort * q * c_y)
+    assert found.stable and 0.99 * found.ms < np.max(np.abs(s)) <= found.ms <= 1.6
+    certificate = so.certify(controller, {"swing": swing}, thor, measured={"log": response}, simulations=False)
+    assert certificate.passed and any("log" in str(row) for row in certificate.requirements)
+
+
+def test_curves_beside_discs_are_those_of_the_loops(beside_discs, stand, swing, thor):
+    """Of models, which have no disc, what the tuner uses of Ms is the loop's own."""
+    controller, response = beside_discs
+    task = make_task(stand, thor, controller.spec, {"swing": swing, "log": response})
+    grid, x = (
+        task.grid(place_frequencies(task)),
+        np.array([4.0, 2.0, 0.03, 0.5, 0.01, 0, 2e-3, 1, 0, 0.1, 0.5, 1, 1, 1]),
+    )
+    used = task.usage(grid, task.respond(grid, x))["max_sensitivity"] * grid.levels["max_sensitivity"]
+    for row, plant in enumerate(task.plants[:2]):
+        np.testing.assert_allclose(
+            used[row], np.abs(Loop(plant=plant, law=task.law_of(x)).sensitivity(grid.f)), rtol=1e-6
+        )
+
+
+def test_a_response_of_a_moving_link_is_refused(beside_discs, stand, swing, thor):
+    """It does not tell the motion that the law reads; nor may the law be certified on such responses alone."""
+    controller, response = beside_discs
+    moving = replace(response, plant=swing)
+    with pytest.raises(ControlError, match="whose link moves"):
+        so.tune(stand, thor, controller.spec, {"swing": swing, "log": moving})
+    with pytest.raises(ControlError, match="whose link moves"):
+        so.certify(controller, {"swing": swing}, thor, measured={"log": moving})
+    with pytest.raises(ControlError, match="model of the design plant"):
+        so.tune(response, thor, controller.spec, {"swing": swing})
 
 
 def test_a_schedule_of_it_is_refused(tmp_path):

@@ -1,6 +1,6 @@
 r"""The loop of a law and a measured plant: the worst that any response in its discs does, and whether it is stable.
 
-With P in the disc of centre :math:`P_0` and radius r, :math:`a = 1 + P_0 C_y`, :math:`\rho = r |C_y|` and
+With P in the disc of centre :math:`P_0` and radius r, :math:`a = 1 + L_0`, :math:`\rho = r |C_y|` and
 :math:`D = |a|^2 - \rho^2 > 0`, every figure is a Moebius map of P, whose image is again a disc:
 
 .. math:: \frac{X}{1 + P C_y} \in \frac{1}{D}\Big(X_0 \bar a + s,\; R\Big), \qquad
@@ -62,7 +62,7 @@ def leave_positive(left: Any, least: Any = np.minimum, most: Any = np.maximum) -
 
 @record(eq=False)
 class DiscLoop:
-    """A measured plant closed by a law."""
+    """A measured plant closed by a law; what this reads besides the regulated output, such as a held link, is zero."""
 
     plant: MeasuredPlant
     law: Law
@@ -133,7 +133,7 @@ class DiscLoop:
             )  # fmt: skip
         f = self.grid()
         p, r = self.plant.response(f), self.plant.discs(f)
-        reference, negative = self.law.responses(f)
+        reference, negative = self.law.responses(f)[:2]
         sizes = {
             name: bound_disc(name, p, r, -negative, reference) for name in ("1", "L", "1 - L", "C_y", "P C_r")
         }  # fmt: skip
@@ -163,7 +163,7 @@ class DiscLoop:
     def bandwidths_hz(self) -> tuple[float | None, float | None]:
         """Return the least and the largest bandwidth of the responses in the discs."""
         f = self.grid()
-        reference, negative = self.law.responses(f)
+        reference, negative = self.law.responses(f)[:2]
         low, high = bound_disc("P C_r", self.plant.response(f), self.plant.discs(f), -negative, reference)
         static = 1.0 if self.law.integrators else float(low[0])
         return _first(f, HALF_POWER * static - low), _first(f, HALF_POWER * static - high)
@@ -182,10 +182,13 @@ class DiscLoop:
 
 
 def bound_disc(
-    of: str, p: Any, r: Any, c_y: Any, c_r: Any
+    of: str, p: Any, r: Any, c_y: Any, c_r: Any, rest: Any = 1.0
 ) -> tuple[Float[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
-    """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table."""
-    open_loop = p * c_y
+    """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table.
+
+    1 + L is `rest` + P C_y: of a model, without a disc, what the law reads besides is in the rest.
+    """
+    open_loop = rest - 1.0 + p * c_y
     a, reach = 1.0 + open_loop, r * np.abs(c_y)
     size = np.abs(a) ** 2
     room = size * leave_positive(1.0 - reach**2 / np.maximum(size, 1e-300))
