@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.cli.progress import LEAST_SHARE, TimeLeft
 from seaopt.control import sweep
+from seaopt.estimation.judgement.fit import SCALED
 from seaopt.logs import assess_quality
 from seaopt.problem.proposal import propose
 from seaopt.progress import divide
@@ -71,6 +73,22 @@ def test_a_fit_that_is_not_met_tells_the_causes_that_it_tries(heard):
     wrong = THOR.update(k=2.0 * THOR["k"].value)
     assert not so.fit([make_experiment(THOR)], wrong.free("J"), progress=heard).met
     heard.check("trying cause 1 of", "trying cause 2 of")
+
+
+def test_no_time_left_is_told_of_a_fit_until_its_causes_are_a_scale():
+    now, told = 0.0, {}
+    left = TimeLeft(lambda: now, told_from=SCALED + LEAST_SHARE)
+
+    def hear(note, share=None, /):
+        nonlocal now
+        now += 3.0 if "cause" in note else 0.1
+        if share is not None:
+            left.move(share)
+            told[note] = left.tell()
+
+    so.fit([make_experiment(THOR)], THOR.update(k=2.0 * THOR["k"].value).free("J"), progress=hear)
+    scaled = [note for note in told if "cause" in note][1:]
+    assert scaled and all(bool(text) == (note in scaled or note == [*told][-1]) for note, text in told.items()), told
 
 
 def test_a_tune_tells_its_starts(heard):

@@ -43,6 +43,8 @@ class TimeLeft:
     ----------
     clock : callable
         Returns seconds.
+    told_from : float
+        The share from which it can be told: what comes before has no scale.
 
     Examples
     --------
@@ -54,8 +56,8 @@ class TimeLeft:
 
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self, clock: Callable[[], float] = time.monotonic, told_from: float = LEAST_SHARE) -> None:
+        self._clock, self._told_from = clock, told_from
         self._marks = [(clock(), 0.0)]
 
     def move(self, share: float) -> None:
@@ -68,7 +70,7 @@ class TimeLeft:
         (started, _), (last, share) = marks[0], marks[-1]
         part = max(RECENT * (now - started), LEAST_RECENT_S)
         since, before = next((mark for mark in reversed(marks) if mark[0] <= last - part), marks[0])
-        if share < LEAST_SHARE or share <= before:
+        if share < self._told_from or share <= before:
             return ""
         slowness = max((last - started) / share, (last - since) / (share - before))
         silent = now - last  # what is silent for longer than was told takes longer
@@ -89,21 +91,22 @@ def shorten_note(text: str) -> str:
 
 @contextmanager
 def show_progress(
-    console: Terminal, label: str, note: Callable[[str], None], *, brief: bool = False
+    console: Terminal, label: str, note: Callable[[str], None], *, brief: bool = False, told_from: float = LEAST_SHARE
 ) -> Generator[Progress]:
     """Show a stage's progress on a terminal, with the time left; elsewhere write lines. Remarks go to `note`, and stay.
 
     A stage that ends in an error is not done. Of a `brief` one nothing is written where it ends before the first line.
+    The time left is told from the share `told_from`.
     """
     if not console.is_terminal:
-        with _write_progress(console, label, note, brief=brief) as tell:
+        with _write_progress(console, label, note, brief=brief, told_from=told_from) as tell:
             yield tell
         return
     columns = (
         SpinnerColumn(), TextColumn("{task.description:<22}"), BarColumn(bar_width=12), TimeElapsedColumn(),
         _Left(), TextColumn("{task.fields[note]}", style="dim"),
     )  # fmt: skip
-    left = TimeLeft()
+    left = TimeLeft(told_from=told_from)
     with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task(label, total=1.0, note="", left=left, visible=False)
 
@@ -124,9 +127,11 @@ def show_progress(
 
 
 @contextmanager
-def _write_progress(console: Terminal, label: str, note: Callable[[str], None], *, brief: bool) -> Generator[Progress]:
+def _write_progress(
+    console: Terminal, label: str, note: Callable[[str], None], *, brief: bool, told_from: float
+) -> Generator[Progress]:
     """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
-    latest, ended, started, left = "", Event(), time.monotonic(), TimeLeft()
+    latest, ended, started, left = "", Event(), time.monotonic(), TimeLeft(told_from=told_from)
 
     def say(text: str) -> None:
         console.print(text, highlight=False, markup=False, soft_wrap=True)

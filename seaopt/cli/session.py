@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt import __version__
-from seaopt.cli.progress import show_progress
+from seaopt.cli.progress import LEAST_SHARE, show_progress
 from seaopt.cli.provenance import (
     FILES,
     ROBUSTNESS,
@@ -32,6 +32,7 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentified
+from seaopt.estimation.judgement.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.executors import Processes
 from seaopt.files import check_folder, read_json, to_json, write_json
@@ -177,7 +178,7 @@ class Session:
             "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
         try:
-            with self._progress(LABELS[stage]) as tell, self._start_workers(stage):
+            with self._progress(stage) as tell, self._start_workers(stage):
                 stages[stage](tell)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
@@ -195,8 +196,9 @@ class Session:
             self.executor.shutdown(cancel_futures=True)
             self.executor = None
 
-    def _progress(self, label: str) -> AbstractContextManager[Progress]:
-        return show_progress(self._console, label, self._note)
+    def _progress(self, stage: str) -> AbstractContextManager[Progress]:
+        told_from = READING + (1.0 - READING) * SCALED if stage == "fit" else 0.0
+        return show_progress(self._console, LABELS[stage], self._note, told_from=told_from + LEAST_SHARE)
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Return the problem's experiments, read or made once."""

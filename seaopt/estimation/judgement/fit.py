@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import EstimationError, require_type
-from seaopt.estimation.judgement.judge import judge
+from seaopt.estimation.judgement.judge import CAUSES, TESTS, judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS
 from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
@@ -33,6 +33,8 @@ from seaopt.simulation.simulate import input_samples
 from seaopt.units import unit_after
 
 SEARCH, JUDGEMENT = 0.25, 0.75  # of the time of a fit that goes wrong; one that does not ends early
+# Nobody knows how many iterations follow, nor what causes take; from here those that are left are a scale.
+SCALED = SEARCH + JUDGEMENT * TESTS / (TESTS + CAUSES)
 USUAL_ITERATIONS = 10  # of a whole fit
 SLOW_STEPS, SLOW = 2.0, 1e5  # steps in a sample, and in a pass, from which smoothed friction is said to be slow
 
