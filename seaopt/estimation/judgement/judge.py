@@ -18,7 +18,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.estimation.judgement.causes import Cause, find_causes, free_delay
+from seaopt.estimation.judgement.candidates import free_delay
+from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
 from seaopt.estimation.problem.fit_experiment import FitExperiment

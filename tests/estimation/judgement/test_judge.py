@@ -11,7 +11,8 @@ import pytest
 from scipy import signal
 
 import seaopt as so
-from seaopt.estimation.judgement.causes import find_causes, find_clipping
+from seaopt.estimation.judgement.candidates import find_clipping
+from seaopt.estimation.judgement.causes import find_causes
 from seaopt.estimation.judgement.coherence import measure_coherence
 from seaopt.estimation.judgement.judge import _find_unexplained
 
