@@ -249,7 +249,7 @@ class Task:
     What it reads besides the regulated one has an entry each in `further`: the filter C that feeds it back, which is
     given, or the `SpeedLoop` that is tuned. `link` is what the last of them is made of, where that feeds the motion of
     the link forward. `eased` are factors by which more of a limit may be used while a law is looked for, by its name
-    (`seaopt.control.tuning.easing`).
+    (`seaopt.control.tuning.easing`); and unless it `settles`, any part of a step may be left to the integral.
     """
 
     spec: ControllerSpec
@@ -264,6 +264,7 @@ class Task:
     further: tuple[TransferFunction | SpeedLoop, ...] = ()
     link: LinkPath | None = None
     eased: Mapping[str, float] = field(default_factory=dict[str, float])
+    settles: bool = True
 
     @property
     def speed_loop(self) -> SpeedLoop | None:
@@ -304,7 +305,7 @@ class Task:
         if self.integrates(x):
             x[K_I] = max(x[K_I], least)
         x[W_R] = min(x[W_R], max(self.k_ff + x[K_P], 0.0))
-        if self.integrates(x) and x[SPEED_RATE] == 0.0:
+        if self.settles and self.integrates(x) and x[SPEED_RATE] == 0.0:
             x[W_R] = min(x[W_R], self.most_left_to_integral(x[K_P], x[K_I]))
         x[W_C] = x[K_D] if self.spec.reference_weights == "measurement" else min(x[W_C], x[K_D])
         return x
@@ -319,7 +320,7 @@ class Task:
         """
         rate = least_integral_rate(x) if self.integrates(x) else 0.0
         weighed = self.integrates(x) and x[SPEED_RATE] == 0.0 and self.spec.reference_weights != "error"
-        left = STEADY if weighed else 0.0
+        left = STEADY if self.settles and weighed else 0.0
         matrix = np.zeros((LINEAR_LIMITS, self.gains_tuned.stop))
         matrix[:, :K_V] = [
             [-rate, 1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, -1.0, 0.0, 1.0],

@@ -306,7 +306,7 @@ def _scan_free_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.nd
     with np.errstate(invalid="ignore"):
         gains[:, W_R] = np.real(whole) + np.resize([-1.0, 1.0], chosen.size) * np.sqrt(size**2 - np.imag(whole) ** 2)
     most = scan.task.k_ff + gains[:, K_P]
-    if not scan.shape[SPEED_RATE - K_V]:
+    if scan.task.settles and not scan.shape[SPEED_RATE - K_V]:
         most = np.minimum(most, scan.task.most_left_to_integral(gains[:, K_P], gains[:, K_I]))
     keep = (gains[:, W_R] >= 0.0) & (gains[:, W_R] <= most)
     gains, c_y, merit = gains[keep], c_y[keep], merit[keep]
