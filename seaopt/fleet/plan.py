@@ -11,9 +11,10 @@ from typing import Any
 
 from seaopt.errors import ProblemError
 from seaopt.problem import Problem
+from seaopt.problem.bench_tables import UnknownTable
 from seaopt.problem.columns import list_log_files
 from seaopt.problem.reading import make_problem
-from seaopt.problem.schema import ProblemTable, UnknownTable
+from seaopt.problem.schema import ProblemTable
 from seaopt.records import record
 
 VERSION = version("seaopt")

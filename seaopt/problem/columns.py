@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from seaopt.errors import ProblemError
 from seaopt.logs import Column, Hold, Linear, Nearest
-from seaopt.problem.schema import AlignTable, ClockTable, ColumnTable, ExperimentTable
+from seaopt.problem.bench_tables import AlignTable, ClockTable, ColumnTable, ExperimentTable
 
 
 def list_log_files(table: ExperimentTable) -> list[str]:

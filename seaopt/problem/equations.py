@@ -19,7 +19,7 @@ from seaopt.parameters import Parameter
 from seaopt.plants import Actuation, Friction, Mode, Plant, Port, Sensing, SeriesSpring, wrapped
 from seaopt.plants.equations.expressions import MAX_LENGTH, RESERVED, list_names, parse
 from seaopt.plants.equations.stored_equations import StoredFunction, store_function
-from seaopt.problem.schema import AnyPlant, EquationsTable, Formula, FrictionTable, PortTable
+from seaopt.problem.bench_tables import AnyPlant, EquationsTable, Formula, FrictionTable, PortTable
 from seaopt.records import record
 from seaopt.units import factor, si_unit
 

@@ -11,10 +11,8 @@ from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters
 from seaopt.plants.motor.thermal import list_guessed_heat
-from seaopt.problem.schema import (
-    ParameterTable,
-    ProblemTable,
-)
+from seaopt.problem.bench_tables import ParameterTable
+from seaopt.problem.schema import ProblemTable
 from seaopt.units import ROTARY, factor, unit_after
 
 

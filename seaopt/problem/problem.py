@@ -30,21 +30,19 @@ from seaopt.frequency import MeasuredResponse, measure_response
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Difference, Plant
-from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
-from seaopt.problem.equations import list_partners, list_unused, order_plants
-from seaopt.problem.references import RESPONSE, guess_remarks, range_remarks
-from seaopt.problem.schema import (
+from seaopt.problem.bench_tables import (
     ColumnTable,
     EquationsTable,
     ExperimentTable,
     FitTable,
-    ProblemTable,
-    RobustnessTable,
-    ScheduleTable,
     SensorsTable,
     UnknownTable,
     VirtualTable,
 )
+from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
+from seaopt.problem.equations import list_partners, list_unused, order_plants
+from seaopt.problem.references import RESPONSE, guess_remarks, range_remarks
+from seaopt.problem.schema import ProblemTable, RobustnessTable, ScheduleTable
 from seaopt.records import record
 from seaopt.robustness import place_value
 from seaopt.signals import Signal

@@ -15,12 +15,13 @@ from seaopt.documents import check_table
 from seaopt.errors import FileError, ProblemError, SeaoptError, require_type
 from seaopt.files import check_regular, parse_file
 from seaopt.plants import Plant, plant_of_kind
+from seaopt.problem.bench_tables import AnyPlant, EquationsTable, PlantTable
 from seaopt.problem.equations import make_plant, order_plants
 from seaopt.problem.parameters import make_parameters, name_guesses
 from seaopt.problem.predictive import make_mpc_spec
 from seaopt.problem.problem import Problem
 from seaopt.problem.references import check_references
-from seaopt.problem.schema import AnyPlant, EquationsTable, PlantTable, PrefilterTable, ProblemTable
+from seaopt.problem.schema import PrefilterTable, ProblemTable
 from seaopt.robustness.certificate.predictive import linear_spec
 
 OF_DESIGN = ("controller", "impedance", "mpc", "robustness", "expect")  # tables that a fit does not read

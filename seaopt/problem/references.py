@@ -16,9 +16,10 @@ from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.motor.thermal import PARAMETERS as HEAT
+from seaopt.problem.bench_tables import ExperimentTable, SensorsTable
 from seaopt.problem.columns import check_inside
 from seaopt.problem.proposal.vocabulary import read_header
-from seaopt.problem.schema import ControllerTable, ExpectTable, ExperimentTable, ProblemTable, RangeTable, SensorsTable
+from seaopt.problem.schema import ControllerTable, ExpectTable, ProblemTable, RangeTable
 from seaopt.robustness import check_ranges, place_value
 from seaopt.robustness.uncertainty.draws import find_modes
 from seaopt.units import factor, unit_after

@@ -1,4 +1,7 @@
-"""The problem file's schema (TOML, validated with pydantic): what may be written, and nothing else."""
+"""The problem file's schema (TOML, validated with pydantic): what may be written, and nothing else.
+
+Here is what is asked of a design, and expected of results; `bench_tables` has plants, logs and the fit.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     ConfigDict,
     Discriminator,
     Field,
-    Strict,
     StringConstraints,
     Tag,
     model_validator,
@@ -21,361 +22,21 @@ from seaopt.control.laws.limits import BY_NAME
 from seaopt.control.loops.compensation.ripple_term import MOST_CYCLES, RIPPLE_FRACTION
 from seaopt.control.loops.compensation.terms import DEFAULT_FRACTION, FrictionSource
 from seaopt.documents import Flag, Number, Whole
+from seaopt.problem.bench_tables import (
+    AnyPlant,
+    ExperimentTable,
+    FitTable,
+    Name,
+    NotNegative,
+    ParameterTable,
+    PlantOrResponse,
+    SensorsTable,
+    StrictTable,
+)
 from seaopt.problem.key_descriptions import KEYS
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
-
-
-NotNegative = Annotated[Number, Field(ge=0)]
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=64)]
-PlantOrResponse = Annotated[str, StringConstraints(pattern=r"^(frf:)?[A-Za-z][A-Za-z0-9_-]*$", max_length=68)]
-
-
-class ParameterTable(_Strict):
-    """A value with its unit, and what a fit may do with it."""
-
-    value: Number
-    unit: str | None = None
-    free: Flag | None = None
-    min: Number | None = None
-    max: Number | None = None
-    prior_std: Number | None = None
-
-
-class PlantTable(BaseModel):
-    """A kind of plant; further keys are the kind's own options."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
-
-    kind: str
-
-
-Formula = Annotated[
-    Annotated[str, Strict()] | Number,
-    Field(description="Numbers, names, + - * / ^, brackets, sin, cos, tan, tanh, exp, log, sqrt, abs, min, max, atan2, "
-          "if_else(a > b, then, else), pi."),
-]  # fmt: skip
-
-
-class DefaultTable(_Strict):
-    """A parameter of a plant of the user's own, with what it is where [parameters] does not say."""
-
-    unit: str
-    value: Number
-    min: Number | None = None
-    max: Number | None = None
-    description: str = ""
-
-
-class DerivedTable(_Strict):
-    """A figure that follows from the parameters."""
-
-    value: Formula
-    unit: str
-
-
-class ActuationTable(_Strict):
-    """What a controller commands, and the effort that one unit of it makes, of the parameters."""
-
-    input: str
-    effort: Formula
-    unit: str = "N"
-    efficiency: str | None = None
-    speed: Formula | None = None
-    largest: Formula | None = None
-
-
-class SensingTable(_Strict):
-    """Regulated and sensed signals: names of outputs, or of states."""
-
-    regulated: list[str] = []
-    motor_position: str | None = None
-    motor_speed: str | None = None
-    link_position: str | None = None
-    from_encoders: list[str] = []
-
-
-class SpringTable(_Strict):
-    """The elastic element; its deflection is of states and parameters."""
-
-    deflection: Formula
-    unit: str
-    stiffness: str | None = None
-    mass: str | None = None
-    damping: str | None = None
-
-
-class PortTable(_Strict):
-    """Where the world touches the plant; `held` and `probe` are other plants of the file."""
-
-    motion: str | None = None
-    coordinate: str | None = None
-    rate: str | None = None
-    effort: str | None = None
-    payload: list[str] = []
-    drive: str | None = None
-    ratio: Formula = 1.0
-    held: Name | None = None
-    probe: Name | None = None
-
-
-class FrictionTable(_Strict):
-    """A dissipative force: of v, the velocity that it opposes, of the parameters, and of loads that it grows with."""
-
-    velocity: Formula
-    force: Formula
-    unit: str = "N"
-    effort: Formula = 1.0
-    slopes: tuple[Formula, Formula] | None = None
-    jump: Formula | None = None
-    smoothing: str | None = None
-    loads: dict[str, Formula] = {}
-    rated: dict[str, Number] = {}
-
-
-class ModeTable(_Strict):
-    """A mode whose frequency one parameter sets."""
-
-    name: str
-    parameter: str
-    state: str
-
-
-class EquationsTable(_Strict):
-    """A plant of the user's own: names with their SI units, equations as text, roles."""
-
-    states: dict[str, str]
-    inputs: dict[str, str] = {}
-    outputs: dict[str, str]
-    parameters: dict[str, str | DefaultTable] = {}
-    optional_inputs: list[str] = []
-    definitions: dict[str, Formula] = {}
-    f: dict[str, Formula]
-    h: dict[str, Formula]
-    derived: dict[str, DerivedTable] = {}
-    energy: Formula | None = None
-    actuation: ActuationTable | None = None
-    sensing: SensingTable | None = None
-    spring: SpringTable | None = None
-    ports: list[PortTable] = []
-    friction: dict[str, FrictionTable] = {}
-    mode: ModeTable | None = None
-    sticks: Flag = False
-    parts: list[str] = []
-
-
-def _choose_plant(table: Any) -> str:
-    """Return which table a plant is: one of equations where it has any, and no kind."""
-    own = (
-        isinstance(table, Mapping) and "kind" not in table and not table.keys().isdisjoint(EquationsTable.model_fields)
-    )
-    return EquationsTable.__name__ if own or isinstance(table, EquationsTable) else PlantTable.__name__
-
-
-AnyPlant = Annotated[
-    Annotated[PlantTable, Tag(PlantTable.__name__)] | Annotated[EquationsTable, Tag(EquationsTable.__name__)],
-    Discriminator(_choose_plant),
-]
-
-
-class HoldTable(_Strict):
-    """The last sample at or before each instant."""
-
-    max_age_s: Annotated[Number, Field(gt=0)] | None = None
-
-
-class LinearTable(_Strict):
-    """The straight line between the samples on either side."""
-
-    max_gap_s: Annotated[Number, Field(gt=0)] | None = None
-
-
-class NearestTable(_Strict):
-    """The nearest sample."""
-
-    tolerance_s: Annotated[Number, Field(gt=0)]
-
-
-class AlignTable(_Strict):
-    """How a channel of another clock comes to the log's: exactly one of these."""
-
-    hold: HoldTable | None = None
-    linear: LinearTable | None = None
-    nearest: NearestTable | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> AlignTable:
-        if sum(rule is not None for rule in (self.hold, self.linear, self.nearest)) != 1:
-            raise ValueError("give exactly one of hold, linear and nearest")
-        return self
-
-
-Header = Annotated[str, Strict()] | Annotated[Whole, Field(ge=1)]  # or the column's number
-
-
-class ClockTable(_Strict):
-    """A time column."""
-
-    column: Header
-    unit: str | None = None
-    file: str | None = None
-    clock_offset_s: Number = 0.0
-    where: dict[str, Annotated[str, Strict()] | Number] | None = None
-
-
-class ColumnTable(_Strict):
-    """A column of a log, the way from its numbers to its unit, and for an output its noise."""
-
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, strict=False, populate_by_name=True
-    )  # fmt: skip
-
-    column: Header
-    unit: str | None = None
-    scale: Number = 1.0
-    offset: Number = 0.0
-    wrap_bits: Annotated[Whole, Field(ge=2, le=53)] | None = None
-    file: str | None = None
-    time: Header | ClockTable | None = None
-    clock_offset_s: Number = 0.0
-    align: AlignTable | None = None
-    where: dict[str, Annotated[str, Strict()] | Number] | None = None
-    source: Annotated[Literal["header"] | None, Field(alias="from")] = None
-    shared: Flag = False
-    sigma: Number | None = None
-
-
-class CounterTable(_Strict):
-    """A column that counts samples; where it skips, gaps are opened."""
-
-    column: str
-    samples_per_count: Annotated[Whole, Field(ge=1)] = 1
-
-
-class DifferenceTable(_Strict):
-    """A measured speed that a device computed from a position, sample by sample."""
-
-    of: str
-    samples: Annotated[Whole, Field(ge=1, le=100)] = 1
-    lag_hz: Annotated[Number, Field(gt=0)] | None = None
-
-
-class UnknownTable(_Strict):
-    """A value of an experiment that may be estimated."""
-
-    value: Number
-    free: Flag | None = None
-    min: Number | None = None
-    max: Number | None = None
-    prior_std: Number | None = None
-
-
-class ChirpTable(_Strict):
-    """A logarithmic chirp over the whole duration."""
-
-    amplitude: Number
-    f0_hz: Number
-    f1_hz: Number
-
-
-class NoiseTable(_Strict):
-    """Band-limited Gaussian noise."""
-
-    std: Number
-    band_hz: Number
-
-
-class MultisineTable(_Strict):
-    """A sum of sines; phases are zero where left out."""
-
-    amplitudes: list[Number]
-    frequencies_hz: list[Number]
-    phases_rad: list[Number] = []
-
-
-class ExcitationTable(_Strict):
-    """What drives a virtual experiment; the parts are summed."""
-
-    chirp: ChirpTable | None = None
-    noise: NoiseTable | None = None
-    multisine: MultisineTable | None = None
-
-
-class SensorsTable(_Strict):
-    """What sensors do to outputs, by name."""
-
-    noise_std: dict[str, NotNegative] = {}
-    offset: dict[str, Number] = {}
-    quantisation: dict[str, NotNegative] = {}
-    saturation: dict[str, NotNegative] = {}
-
-
-class VirtualTable(SensorsTable):
-    """A virtual experiment in place of a log."""
-
-    seed: Whole
-    duration_s: Annotated[Number, Field(gt=0, le=1e6)]
-    rate_hz: Annotated[Number, Field(gt=0, le=1e6)]
-    truth: dict[str, Number] = {}
-    excitation: ExcitationTable
-    outputs: list[str] = []
-
-
-class ResampleTable(_Strict):
-    """A uniform clock that a log is interpolated to, by lines where no rule is given."""
-
-    rate_hz: Annotated[Number, Field(gt=0, le=1e9)]
-    rule: AlignTable | Literal["restamp"] | None = None
-    bridge_s: Annotated[Number, Field(gt=0)] | None = None
-
-
-class ExperimentTable(_Strict):
-    """One log, or one virtual experiment, of one plant."""
-
-    name: Name
-    plant: Name
-    use: Literal["fit", "validate"] = "fit"
-    log: str | list[str] | None = None
-    virtual: VirtualTable | None = None
-    time: Header | ClockTable | None = None
-    rate_hz: Annotated[Number, Field(gt=0, le=1e9)] | None = None
-    inputs: dict[str, Header | ColumnTable] = {}
-    outputs: dict[str, Header | ColumnTable] = {}
-    differences: dict[str, DifferenceTable] = {}
-    align: AlignTable | None = None
-    window_s: tuple[Number, Number] | None = None
-    counter: CounterTable | None = None
-    duplicates: Literal["first", "mean"] | None = None
-    sigma: dict[str, Number] = {}
-    initial_state: Literal["estimate", "rest"] | dict[str, Number] = "estimate"
-    offset: Flag | dict[str, Number] = True
-    parameters: dict[str, Number | UnknownTable | ColumnTable] = {}
-    delay_s: Number | UnknownTable = 0.0
-    gain: dict[str, Number | UnknownTable] = {}
-    hold: Literal["zero", "first"] = "zero"
-    drift: Annotated[Whole, Field(ge=0, le=5)] = 0
-    shots: Annotated[Whole, Field(ge=1, le=100_000)] = 1
-    slice_s: tuple[Number, Number] | None = None
-    resample: Literal["restamp"] | ResampleTable | None = None
-    decimate: Annotated[Whole, Field(ge=1, le=10_000)] = 1
-    saturation: dict[str, tuple[Number, Number]] = {}
-    mask: Literal["auto", "declared", "none"] = "auto"
-    gaps: Literal["split", "error"] = "split"
-
-
-class FitTable(_Strict):
-    """How the fit is made."""
-
-    method: Literal["output_error", "multiple_shooting", "prediction_error"] = "output_error"
-    segments: Annotated[Whole, Field(ge=1, le=100_000)] | None = None
-    loss: Literal["linear", "huber", "soft_l1"] = "linear"
-    band_hz: tuple[Number, Number] | None = None
-    holdout: Annotated[Number, Field(ge=0, lt=1)] = 0.0
-
-
-class NotchTable(_Strict):
+class NotchTable(StrictTable):
     """A notch in series; what is left out is tuned."""
 
     frequency_hz: Number | None = None
@@ -383,7 +44,7 @@ class NotchTable(_Strict):
     depth: Number | None = None
 
 
-class PrefilterTable(_Strict):
+class PrefilterTable(StrictTable):
     """A low-pass of the reference alone; what is left out is tuned."""
 
     order: Literal["first_order", "second_order"]
@@ -391,7 +52,7 @@ class PrefilterTable(_Strict):
     damping: Number | None = None
 
 
-class LinkFeedforwardTable(_Strict):
+class LinkFeedforwardTable(StrictTable):
     """The effort that the link's measured motion needs."""
 
     measured: str | None = None
@@ -409,7 +70,7 @@ Level = Number | Literal[False] | None  # of a limit: false lifts it
 MPC = "mpc"  # the structure that plans
 
 
-class FrictionCompensationTable(_Strict):
+class FrictionCompensationTable(StrictTable):
     """Compensation of friction."""
 
     fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = DEFAULT_FRACTION
@@ -417,14 +78,14 @@ class FrictionCompensationTable(_Strict):
     speed: Annotated[Number, Field(gt=0.0)] | None = None
 
 
-class GravityCompensationTable(_Strict):
+class GravityCompensationTable(StrictTable):
     """Compensation of gravity."""
 
     fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = 1.0
     plant: Name | None = None
 
 
-class RippleCompensationTable(_Strict):
+class RippleCompensationTable(StrictTable):
     """Compensation of torque ripple and cogging."""
 
     cycles: Annotated[
@@ -442,7 +103,7 @@ class RippleCompensationTable(_Strict):
         return self
 
 
-class CompensationTable(_Strict):
+class CompensationTable(StrictTable):
     """What is compensated, and how much of it."""
 
     friction: FrictionCompensationTable | None = None
@@ -465,7 +126,7 @@ Compensated = Annotated[
 ]
 
 
-class ScheduleTable(_Strict):
+class ScheduleTable(StrictTable):
     """Gains over a state that is measured, or over a parameter that is known as the law runs."""
 
     over: Name
@@ -474,7 +135,7 @@ class ScheduleTable(_Strict):
     min_rate: Annotated[Number, Field(gt=0)] | None = None
 
 
-class ControllerTable(_Strict):
+class ControllerTable(StrictTable):
     """What is asked of the controller."""
 
     plant: PlantOrResponse
@@ -522,7 +183,7 @@ class ControllerTable(_Strict):
         )
 
 
-class NoiseModelTable(_Strict):
+class NoiseModelTable(StrictTable):
     """What the Kalman filter of predictive control counts on, by name of output and input."""
 
     sensor_std: dict[str, NotNegative]
@@ -531,7 +192,7 @@ class NoiseModelTable(_Strict):
     offset: dict[str, Number] = {}
 
 
-class MPCTable(_Strict):
+class MPCTable(StrictTable):
     """What only predictive control has; the rest is in [controller]."""
 
     current_slew_A_per_s: Number | None = None
@@ -545,7 +206,7 @@ class MPCTable(_Strict):
     noise: NoiseModelTable | None = None
 
 
-class ImpedanceTable(_Strict):
+class ImpedanceTable(StrictTable):
     """Stiffness and damping at the link, around the force loop."""
 
     plant: Name
@@ -554,7 +215,7 @@ class ImpedanceTable(_Strict):
     velocity_filter_s: NotNegative | None = None
 
 
-class RobustnessTable(_Strict):
+class RobustnessTable(StrictTable):
     """What the controller must survive."""
 
     plants: list[Name] = []
@@ -593,7 +254,7 @@ Range = Annotated[tuple[Number, Number], AfterValidator(_check_ends)]
 Bound = Range | Number  # a number is the end on the bad side of the figure: an Ms at most, a margin at least
 
 
-class RangeTable(_Strict):
+class RangeTable(StrictTable):
     """The ends of a range, either of which may be left out, in a unit of one's own."""
 
     min: Number | None = Field(None, description="The low end.")
@@ -609,7 +270,7 @@ class RangeTable(_Strict):
         return self
 
 
-class FiguresTable(_Strict):
+class FiguresTable(StrictTable):
     """Figures of a loop: a number is the limit on the bad side, [low, high] a range."""
 
     bandwidth_hz: Bound | None = Field(None, description="At least, where a number.")
@@ -640,7 +301,7 @@ class ExpectedPlantTable(FiguresTable):
     worst_mt: Bound | None = Field(None, description="Mt at the worst case found; at most, where a number.")
 
 
-class ExpectedCertificateTable(_Strict):
+class ExpectedCertificateTable(StrictTable):
     """What the certificate is to say."""
 
     passed: Flag = Field(True, description="Every requirement is met.")
@@ -648,7 +309,7 @@ class ExpectedCertificateTable(_Strict):
     plants: dict[Name, ExpectedPlantTable] = Field({}, description="Figures of a certified plant's loop, by its name.")
 
 
-class ExpectTable(_Strict):
+class ExpectTable(StrictTable):
     """What `seaopt run` and the pytest plugin check of the results."""
 
     fit_met: Flag = Field(True, description="The fit is met; where there are experiments.")
@@ -662,7 +323,7 @@ class ExpectTable(_Strict):
     certificate: ExpectedCertificateTable | None = Field(None, description="The certificate.")
 
 
-class ProblemTable(_Strict):
+class ProblemTable(StrictTable):
     """A problem file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
