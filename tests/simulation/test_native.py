@@ -279,6 +279,16 @@ def test_processes_that_want_one_kernel_compile_it_once(kernels, make_compiler, 
     assert {file.suffix for file in kernels.iterdir()} == {".so", ".sha256"}
 
 
+@needs_compiler
+@pytest.mark.parametrize("unknown", ["-fipa*", "-m*", "-fipa* | -m*"])
+def test_a_compiler_that_refuses_options_compiles_without_them(kernels, make_compiler, unknown):
+    """As clang and zig, whose error for an option of gcc alone left no kernel at all."""
+    make_compiler(
+        f'for option; do case "$option" in {unknown}) exit 1;; esac; done; exec {native.shutil.which("cc")} "$@"'
+    )
+    assert native.load_library(ANSWER % unknown) is not None
+
+
 def test_a_compiler_that_fails_leaves_nothing(kernels, make_compiler):
     make_compiler("exit 1")
     assert native.load_library(ANSWER % "fails") is None
