@@ -33,8 +33,10 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     pointer, whole, real = np.uint64, np.int64, np.float64
     return np.dtype([
         ("from", whole), ("to", whole), ("length", whole), ("lead", whole), ("u", pointer, (nu,)),
-        ("y", pointer, (ny,)), ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("lag_c", whole),
-        ("settle", whole), ("start", whole), ("output_rows", whole), ("t0", real), ("tau0", real), ("dtau", real),
+        ("y", pointer, (ny,)), ("keep", pointer, (ny,)),
+        ("shared", whole), ("drift_terms", whole), ("z_columns", whole), ("v_columns", whole),
+        ("lag_a", whole), ("lag_b", whole), ("lag_c", whole), ("settle", whole), ("start", whole),
+        ("output_rows", whole), ("t0", real), ("tau0", real), ("dtau", real),
         ("model", pointer), ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer),
         ("drift", pointer),
         ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
@@ -63,18 +65,17 @@ def _count_delayed(model: Model, point: Point) -> int:
 def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
     """Return the C source of the passes of a model, over data with measured outputs or of simulations alone."""
     constants = {
-        "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": layout.shared, "NQ": model.np, "ND": layout.drift_terms,
-        "LINEAR": int(model.linear), "STEPPED": int(model.sticks), "CORRECT": int(layout.corrected), "DELAYED": delayed,
-        "MEASURED": int(measured),
+        "NX": model.nx, "NU": model.nu, "NY": model.ny, "NJP": _pad_to_vectors(layout.states),
+        "NCP": _pad_to_vectors(layout.columns), "LINEAR": int(model.linear), "STEPPED": int(model.sticks),
+        "CORRECT": int(layout.corrected), "DELAYED": delayed, "MEASURED": int(measured),
     }  # fmt: skip
     generated = _write_sampling(model)
-    if model.linear:
-        constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
-    elif model.sticks:
+    constants |= {"NI": model.nu * (1 + delayed) + _has_constant(model)} if model.linear else {"NQ": model.np}
+    if model.sticks:
         step, output = step_function(model), output_function(model)
         plain = [_drop_derivatives(step, "seaopt_plain_step"), _drop_derivatives(output, "seaopt_plain_output")]
         generated += generate_code(step, output, *plain)
-    else:
+    elif not model.linear:
         rates = rate_functions(model, moving=delayed == 2)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
         constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
@@ -217,6 +218,8 @@ class Program:
         base["u"] = [memory.constant(channel) + 8 * segment.lead for channel in segment.u]
         base["y"] = [memory.constant(channel) for channel in segment.y] if segment.y else 0
         base["keep"] = [memory.address(np.ascontiguousarray(mask)) for mask in segment.keep] if segment.keep else 0
+        base["shared"], base["drift_terms"] = layout.shared, layout.drift_terms
+        base["z_columns"], base["v_columns"] = layout.states, layout.columns
         base["lag_a"], base["lag_b"], base["lag_c"] = (*point.clock.lags, 0)[:3]
         base["settle"], base["t0"] = weights.settle, segment.start_s
         base["tau0"], base["dtau"] = segment.drift_span

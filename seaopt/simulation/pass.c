@@ -5,8 +5,8 @@
    Every array that is summed over derivatives has them last and padded to whole vectors: Z[i][0] is the state x_i and
    Z[i][j] its derivative to unknown j, so that one loop over j advances all.
 
-   Columns of v, for each output: residual, shared (NP), initial state (NX), then the output's own: offset, drift
-   (ND), gain. With a correction the own columns of every output act on the state: then v holds those of all. */
+   Columns of v, for each output: residual, shared, initial state (NX), then the output's own: offset, drift, gain. With
+   a correction the own columns of every output act on the state: then v holds those of all. */
 #include <string.h>
 #if defined(__SSE2__)
 #include <xmmintrin.h>
@@ -17,8 +17,12 @@ typedef struct {
     long length;                   /* rows: inputs are clamped to them */
     long lead;                     /* rows of inputs that go before row 0 */
     const double *u[NU];
-    const double *y[NY];           /* y[0] NULL: simulate only */
+    const double *y[NY];           /* of MEASURED */
     const unsigned char *keep[NY]; /* NULL: all kept */
+    long shared;                   /* derivatives that all outputs share: parameters (NQ), then a free delay, then what only
+                                      the correction gain depends on */
+    long drift_terms;              /* per output */
+    long z_columns, v_columns;     /* of Z and v; NJP and NCP are the room for them */
     long lag_a, lag_b, lag_c;      /* rows of u in force: u[k - lag_a], and so on; clamped to the log */
     long settle;                   /* rows from `start` that are left out while the filter settles */
     long start;                    /* first row of the stretch; later than `from` is not allowed */
@@ -29,18 +33,18 @@ typedef struct {
     const double *correction;      /* CORRECT: NX x NY x NJP, gain and its derivatives */
     const double *x0;
     const double *offset, *gain;   /* NY */
-    const double *drift;           /* NY x ND */
+    const double *drift;           /* NY x drift_terms */
     const double *sos;             /* sections x 5: b0 b1 b2 a1 a2 */
     long sections;
     long loss;                     /* 0 squares, 1 Huber, 2 soft l1 */
     const double *knee;            /* NY: where a robust loss leaves the square */
-    double *gram;                  /* NY x NC x NC, added to, or NULL: no sums are made */
+    double *gram;                  /* NY x v_columns x v_columns, added to, or NULL: no sums are made */
     double *rho;                   /* NY: sum of losses, added to; unless gram is NULL */
     double *count;                 /* NY: samples counted, added to; unless gram is NULL */
     double *outputs;               /* output_rows x NY or NULL */
-    double *columns;               /* (to - from) x NY x NC or NULL */
+    double *columns;               /* (to - from) x NY x v_columns or NULL */
     double *states;                /* (to - from) x NX or NULL */
-    double *last;                  /* NX x NJ: Z one step after the last row, or NULL; without sums, columns and influences
+    double *last;                  /* NX x z_columns: Z one step after the last row, or NULL; without sums, columns and influences
                                       its derivatives are not made */
     double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
     influences into;               /* of estimates, into.into NULL: none */
@@ -314,20 +318,20 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
 INLINE void residual(const seaopt_pass_args *a, int o, const double *restrict y, double measured, double tau, double *restrict v,
                      int wide) {
     const double gain = a->gain[o];
-    double basis[ND + 1], older = 1.0, value = gain * y[0] + a->offset[o] - measured;
-    for (int d = 0; d < ND; d++) { /* Legendre's recurrence */
+    double basis[NCP], older = 1.0, value = gain * y[0] + a->offset[o] - measured;
+    for (long d = 0; d < a->drift_terms; d++) { /* Legendre's recurrence */
         basis[d] = d == 0 ? tau : ((2 * d + 1) * tau * basis[d - 1] - d * older) / (d + 1);
         if (d > 0) older = basis[d - 1];
-        value += a->drift[o * ND + d] * basis[d];
+        value += a->drift[o * a->drift_terms + d] * basis[d];
     }
     for (int j = 0; j < wide; j++) ((vec *)v)[j] = gain * ((const vec *)y)[j];
     v[0] = value;
     if (wide < ALL) return;
     for (int j = NJP; j < NCP; j++) v[j] = 0.0;
-    double *own = v + NS + (CORRECT ? o * OWN : 0);
+    double *own = v + 1 + a->shared + NX + (CORRECT ? o * (2 + a->drift_terms) : 0);
     own[0] += 1.0;
-    for (int d = 0; d < ND; d++) own[1 + d] += basis[d];
-    own[1 + ND] += y[0];
+    for (long d = 0; d < a->drift_terms; d++) own[1 + d] += basis[d];
+    own[1 + a->drift_terms] += y[0];
 }
 
 ONCE void filtered(const seaopt_pass_args *a, double *restrict v, double (*restrict z)[2][NCP]) {
@@ -412,7 +416,7 @@ ONCE void begin(hot *q, const seaopt_pass_args *a) {
         memcpy(q->filter, before->filter, sizeof q->filter);
         return;
     }
-    for (int i = 0; i < NX; i++) { q->z[i][0] = a->x0[i]; q->z[i][1 + NP + i] = 1.0; }
+    for (int i = 0; i < NX; i++) { q->z[i][0] = a->x0[i]; q->z[i][1 + a->shared + i] = 1.0; }
 }
 
 ONCE void deliver(hot *q, const seaopt_pass_args *a) {
@@ -423,15 +427,16 @@ ONCE void deliver(hot *q, const seaopt_pass_args *a) {
         memcpy(after->filter, q->filter, sizeof q->filter);
     }
     if (a->last)
-        for (int i = 0; i < NX; i++) memcpy(a->last + i * NJ, q->z[i], NJ * sizeof(double));
+        for (int i = 0; i < NX; i++) memcpy(a->last + i * a->z_columns, q->z[i], a->z_columns * sizeof(double));
     for (int o = 0; a->gram && o < NY; o++) {
         a->rho[o] += q->rho[o];
         a->count[o] += q->count[o];
-        sums->add_gram(q->sum[o][0], NCP, a->gram + o * NC * NC, NC);
+        sums->add_gram(q->sum[o][0], NCP, a->gram + o * a->v_columns * a->v_columns, a->v_columns);
     }
 }
 
 INLINE void one_pass(const seaopt_pass_args *a, int wide) {
+    const int summed = MEASURED && wide == ALL, compared = summed || (MEASURED && CORRECT);
     hot here, *const q = &here;
     long slot = 0; /* of the ring of influences */
     begin(q, a);
@@ -443,7 +448,7 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
         if (a->outputs && k - a->from < a->output_rows)
             for (int o = 0; o < NY; o++) a->outputs[(k - a->from) * NY + o] = q->y[o][0];
         double *v[NY];
-        for (int o = 0; a->y[0] && o < NY; o++) {
+        for (int o = 0; compared && o < NY; o++) {
             const double measured = a->y[o][k];
             v[o] = q->v[o][q->waiting[o]];
             present[o] = isfinite(measured) && !(a->keep[o] && !a->keep[o][k]);
@@ -453,20 +458,20 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
         advance(q, a, k, wide);
 #if CORRECT
         for (int o = 0; o < NY; o++)
-            if (a->y[0] && present[o])
+            if (MEASURED && present[o])
                 for (int i = 0; i < NX; i++) {
                     const double *g = a->correction + (i * NY + o) * NJP;
                     for (int j = 1; j < 4 * wide; j++) q->z[i][j] -= g[0] * v[o][j] + g[j] * v[o][0];
                     q->z[i][0] -= g[0] * v[o][0];
                 }
 #endif
-        for (int o = 0; a->y[0] && wide == ALL && o < NY; o++) {
+        for (int o = 0; summed && o < NY; o++) {
             if (a->sections) filtered(a, v[o], q->filter[o]);
-            if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, v[o], NC * sizeof(double));
+            if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * a->v_columns, v[o], a->v_columns * sizeof(double));
             present[o] = present[o] && k >= a->start + a->settle;
             if (a->gram && present[o] && k >= a->from + a->warm) accumulate(a, q, o);
         }
-        if (a->into.into && wide == ALL) {
+        if (summed && a->into.into) {
             sums->add_influence(&a->into, v, present, slot, k >= a->from + a->warm);
             slot = slot < a->into.lags ? slot + 1 : 0;
         }

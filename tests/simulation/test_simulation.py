@@ -341,6 +341,17 @@ def test_other_parameter_values_need_no_other_code(swing, thor):
     assert a == b
 
 
+def test_other_unknowns_of_a_linear_plant_need_no_other_code(stand, thor):
+    """Their count, and that of drift terms, are data, in the room of whole vectors."""
+    from seaopt.simulation.compiled import kernel_source
+
+    def source(free, drift_terms):
+        layout = Layout(shared=len(free), nx=2, ny=2, drift_terms=drift_terms, corrected=False)
+        return kernel_source(make_model(stand, thor, free), layout, 0, measured=True)
+
+    assert source(("J", "b_r"), 0) == source(("J", "b_r"), 1) == source(("k", "eta", "b_r"), 0)
+
+
 def test_too_many_filter_sections_are_refused():
     with pytest.raises(SimulationError, match="9 filter sections"):
         Weights(sections=np.zeros((9, 5)), settle=0, knee=np.ones(1))
