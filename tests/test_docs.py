@@ -347,7 +347,7 @@ def test_the_c_of_the_docs_compiles(tmp_path):
 
 @pytest.mark.slow
 def test_the_certificate_of_the_docs_works():
-    """Its first block, quick enough for every run; the table of ranges is a problem file's."""
+    """Its first block; the table of ranges is a problem file's."""
     found = run("theory/certificate.md", first=1)
     assert found["worst"].verify(found["controller"])
     (table,) = blocks("theory/certificate.md", "toml")

@@ -186,6 +186,28 @@ class Loop:
         samples = max(round(seconds / self.plant.sample_time_s), 0)
         return float(c @ np.linalg.matrix_power(a, samples) @ np.linalg.solve(np.eye(b.size) - a, b))
 
+    def simulate(self, reference: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return what is measured, and the effort, at each sample of a reference, from rest; linear.
+
+        Examples
+        --------
+        >>> import seaopt as so
+        >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+        >>> loop = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).close(stand, thor)
+        >>> force, effort = loop.simulate(np.ones(1000))
+        >>> print(f"{force[-1]:.2f} N of {effort[-1]:.2f} N")
+        1.00 N of 1.00 N
+
+        """
+        system = self.system()
+        rows = [int(system.table.outputs[TRACKING]), 1]  # what is measured, and the effort
+        drive, through, c = system.b[:, 1], system.d[rows, 1], system.c[rows]
+        x, out = np.zeros(len(system.a)), np.empty((reference.size, 2))
+        for k, r in enumerate(reference):
+            out[k] = c @ x + r * through
+            x = system.a @ x + r * drive
+        return out[:, 0], out[:, 1]
+
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
         return self._make_grid(self.eigenvalues())

@@ -14,6 +14,7 @@ from seaopt.control.laws.command import Command, name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
@@ -207,6 +208,10 @@ class ScheduledController:
         if value in self.points:
             return self.controllers[self.points.index(value)]
         return freeze(self.table, value, self._ask(value), self.design, self.others)
+
+    def close_points(self, plant: Plant, params: ParameterSet) -> tuple[Loop, ...]:
+        """Return a plant's loop at each point, with the variable standing still there."""
+        return tuple(one.close(plant, place_variable(plant, params, self.over, point)) for point, one in self._pairs)
 
     def _ask(self, value: float) -> ControllerSpec:
         return replace(self.spec, bandwidth_hz=self.asked_hz(value))

@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from seaopt.control import Controller, Loop
 from seaopt.control.loops.loop import STABLE
-from seaopt.control.loops.peaks import TRACKING
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -72,20 +71,6 @@ def _decibel(values: Any) -> Any:
     return 20 * np.log10(np.maximum(np.abs(values), 1e-12))
 
 
-def step_response(
-    loop: Loop, samples: int, size: float = 1.0
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return what is measured, and the effort, at the samples after a step of the reference, linear."""
-    system = loop.system()
-    x, out = np.zeros(system.a.shape[0]), np.empty((samples, 2))
-    rows = [system.table.outputs[TRACKING], 1]  # what is measured, and the effort
-    drive, through, c = size * system.b[:, 1], size * system.d[rows, 1], system.c[rows]
-    for k in range(samples):
-        out[k] = c @ x + through
-        x = system.a @ x + drive
-    return out[:, 0], out[:, 1]
-
-
 def step_panel(
     controller: Controller, plants: Plants | None = None, *, size: float = 1.0, duration_s: float | None = None
 ) -> Panel:
@@ -95,7 +80,7 @@ def step_panel(
         most = round(MOST_S / period)
         least = LEAST_PERIODS / controller.spec.bandwidth_hz
         first = next(iter(loops.values()))
-        settled = _settling(step_response(first, most)[0]) * period if _is_stable(first) else 0.0
+        settled = _settling(first.simulate(np.ones(most))[0]) * period if _is_stable(first) else 0.0
         duration_s = min(max(least, SPARE * settled), MOST_S)
     samples = max(round(duration_s / period), 2)
     command, measured = controller.command, controller.spec.regulated
@@ -107,7 +92,7 @@ def step_panel(
         time = np.arange(samples) * period
         upper.plot([0.0, time[-1]], [size, size], color=LIMIT, linestyle=":", linewidth=1.0, label="reference")
         for name, loop, look in _looks(loops):
-            force, effort = step_response(loop, samples, size)
+            force, effort = loop.simulate(np.full(samples, size))
             if not _is_stable(loop):
                 look["label"] = f"{name} (unstable)"
                 gone = np.flatnonzero(np.abs(force) > RUNAWAY * abs(size))

@@ -380,7 +380,7 @@ def certify_schedule(
         certificate, motions=motions,
         requirements=(
             *certificate.requirements, *_require_rate(certificate, min_rate),
-            *(_require_motion(motion, schedule) for motion in motions.values()),
+            *(_require_motion(motion, schedule, min_rate) for motion in motions.values()),
         ),
     )  # fmt: skip
 
@@ -539,10 +539,18 @@ def _require_rate(certificate: ScheduleCertificate, least: float | None) -> list
     return rows
 
 
-def _require_motion(motion: Motion, schedule: ScheduledController) -> Requirement:
+def _require_motion(motion: Motion, schedule: ScheduledController, least: float | None) -> Requirement:
+    """Return that a plant that moves the variable keeps its judgement: at the rate reached at all, or as asked.
+
+    What keeps its judgement at less than was asked is not met: nothing is known of the rate that was.
+    """
+    asked = motion.rate if least is None else least
+    short = not motion.fault and motion.rate < asked
+    remedy = "; ask a smaller min_rate, or give the command a higher limit" if short else ""
     return Requirement(
-        name="schedule_motion", limit=0.0, value=float(bool(motion.fault)), met=not motion.fault,
-        where=describe_motion(motion, schedule.over, schedule.unit),
+        name="min_motion_rate", limit=asked, value=0.0 if motion.fault else motion.rate,
+        met=not motion.fault and not short,
+        where=f"{describe_motion(motion, schedule.over, schedule.unit)}{remedy}",
     )  # fmt: skip
 
 

@@ -9,7 +9,9 @@ sweeps contain. Here nothing is imposed. From rest in the middle of the table th
 so that a link which nothing holds comes back; from one push to the next in a period of the bandwidth, since a jump
 would take the command to its limit. Each push lasts as long as the variable takes from the middle of the table to its
 end at the rate that is stated, and A is as large as makes it move at that rate, or as table and limit of the command
-allow.
+allow. Where the rate is not reached, pushes of another length are tried: of a mass A moves it by :math:`A T^2` at the
+rate :math:`A T`, so that it is fastest where a push takes it to the end of the table and the command to its limit. What
+is judged is then the rate that is reached, and the result says which.
 
 Two things are judged over the last two periods of the bandwidth in every push: how far the output is from its
 reference, so that a loop that departs is found, and what remains of that beside the best parabola, which is what rings:
@@ -21,13 +23,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.loops.loop import Loop
 from seaopt.control.running.force_run import ForceRun, close_loop
-from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
+from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, SimulationError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -40,6 +42,7 @@ PUSHES, ROUNDS = (1.0, -1.0, -1.0, 1.0), 3
 LEAST_PERIODS, MOST_PERIODS, JUDGED_PERIODS = 5, 20, 2  # of the least bandwidth: of a push, and of its end
 FIRST_SHARE = 1e-3  # of the effort that the command's limit leaves: the first push that is tried
 NEAR, AIM, TRIES = 0.97, 0.985, 12  # shares of what is allowed that a push takes: enough, sought; pushes that are tried
+LEAST_ROOM = 1e-6  # share of it: a variable that moves by less is not moved
 LOST_SHARE = 4.0  # of what is allowed, that a push is taken to take which is lost
 
 
@@ -51,8 +54,9 @@ class Motion:
     ----------
     plant : str
         Its name.
-    rate, low, high : float
-        The largest rate of the variable, in its unit per second, and the ends of its motion.
+    asked, rate, low, high : float
+        The rate of the variable that was to be reached, in its unit per second, the largest that was, and the ends of
+        its motion.
     size : float
         A, in the output's unit.
     left, ringing : float
@@ -63,6 +67,7 @@ class Motion:
     """
 
     plant: str
+    asked: float
     rate: float
     low: float
     high: float
@@ -70,6 +75,17 @@ class Motion:
     left: float
     ringing: float
     fault: str
+
+
+@record(eq=False)
+class _Push:
+    """A run under pushes of a size: the rate reached, and the shares taken of the room and of the command's limit."""
+
+    size: float
+    run: ForceRun
+    rate: float
+    room: float
+    command: float
 
 
 @record(eq=False)
@@ -83,7 +99,7 @@ class _Pushing:
     room: float
     pushes: Float[np.ndarray, " n"]
     lasting: int
-    judged: int
+    period: int
 
     def run(self, size: float) -> ForceRun:
         """Return the loop under pushes of a size."""
@@ -99,23 +115,22 @@ class _Pushing:
         """Return the variable at each sample."""
         return run.state[:, list(self.plant.states).index(self.schedule.over)]
 
-    def measure_rate(self, run: ForceRun) -> float:
-        """Return the variable's largest rate."""
-        return float(np.max(np.abs(np.diff(self.follow(run))))) / self.schedule.spec.sample_time_s
-
-    def find_size(self, rate: float, first: float) -> float | None:
+    def find_push(self, rate: float, first: float) -> _Push | None:
         """Return the push that moves the variable at a rate, or as fast as it may; None where even small ones fail."""
         size, kept, limit = first, None, self.schedule.runnable().limit
         for _ in range(TRIES):
             try:
                 run = self.run(size)
-                away = float(np.max(np.abs(self.follow(run) - self.middle)))
-                share = max(
-                    self.measure_rate(run) / rate, away / self.room, float(np.max(np.abs(run.current))) / limit
+                place = self.follow(run)
+                push = _Push(
+                    size=size, run=run, rate=float(np.max(np.abs(np.diff(place)))) / self.schedule.spec.sample_time_s,
+                    room=float(np.max(np.abs(place - self.middle))) / self.room,
+                    command=float(np.max(np.abs(run.current))) / limit,
                 )  # fmt: skip
+                share = max(NEAR * push.rate / rate, push.room, push.command)
+                kept = push if share <= 1.0 else kept
             except (ControlError, SimulationError):
                 share = LOST_SHARE
-            kept = size if share <= 1.0 else kept
             if NEAR <= share <= 1.0:
                 break
             size *= AIM / max(share, AIM / LOST_SHARE)
@@ -123,20 +138,11 @@ class _Pushing:
 
     def measure(self, error: Float[np.ndarray, " n"]) -> tuple[float, float]:
         """Return how large an error is at the ends of pushes, over their step, and its fast part."""
-        ends = np.arange(self.lasting, self.pushes.size + 1, self.lasting)
-        windows = np.array([error[end - self.judged : end] for end in ends])
-        slow = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, self.judged), 3))[0]
+        ends, judged = np.arange(self.lasting, self.pushes.size + 1, self.lasting), JUDGED_PERIODS * self.period
+        windows = np.array([error[end - judged : end] for end in ends])
+        slow = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, judged), 3))[0]
         fast = windows - windows @ slow @ slow.T
         return 0.5 * float(np.max(np.abs(windows))), 0.5 * float(np.max(np.abs(fast)))
-
-    def respond(self, loop: Loop) -> Float[np.ndarray, " n"]:
-        """Return the error of a loop whose variable stands still, under pushes of one."""
-        system, error = loop.system(), np.zeros(self.pushes.size)
-        x = np.zeros(len(system.a))
-        for k, r in enumerate(self.pushes):
-            error[k] = system.c[0] @ x + system.d[0, 1] * r - r
-            x = system.a @ x + system.b[:, 1] * r
-        return error
 
 
 def move_schedule(
@@ -164,19 +170,20 @@ def move_schedule(
     if schedule.over not in plant.states:
         return None
     pushing = _make_pushing(schedule, plant, params, rate)
-    size = pushing.find_size(rate, FIRST_SHARE * find_least_effort(schedule))
-    if size is None:
+    push = pushing.find_push(rate, FIRST_SHARE * find_least_effort(schedule))
+    if push is None:
         return Motion(
-            plant=name, rate=0.0, low=pushing.middle, high=pushing.middle, size=0.0, left=math.inf, ringing=math.inf,
-            fault="is lost under any push, small ones too",
+            plant=name, asked=rate, rate=0.0, low=pushing.middle, high=pushing.middle, size=0.0, left=math.inf,
+            ringing=math.inf, fault="is lost under any push, small ones too",
         )  # fmt: skip
-    run = pushing.run(size)
-    place, (left, ringing) = pushing.follow(run), pushing.measure((run.force - run.reference) / size)
-    loops = [
-        one.close(plant, place_variable(plant, params, schedule.over, point))
-        for point, one in zip(schedule.points, schedule.controllers, strict=True)
-    ]
-    still = [(0.0, 0.0), *(pushing.measure(pushing.respond(loop)) for loop in loops if loop.is_stable())]
+    if push.rate < rate:
+        pushing, push = _change_length(pushing, push, rate)
+    place, size = pushing.follow(push.run), push.size
+    left, ringing = pushing.measure((push.run.force - push.run.reference) / size)
+    still = [(0.0, 0.0)]
+    for loop in schedule.close_points(plant, params):
+        if loop.is_stable():
+            still.append(pushing.measure(loop.simulate(pushing.pushes)[0] - pushing.pushes))
     most, most_ringing = (max(SETTLED, 2.0 * max(values)) for values in zip(*still, strict=True))
     fault = ""
     if not ringing <= most_ringing:
@@ -184,9 +191,19 @@ def move_schedule(
     elif not left <= most:
         fault = f"departs: a push is still {100 * left:.3g} % off at its end, {100 * most:.3g} % allowed"
     return Motion(
-        plant=name, rate=pushing.measure_rate(run), low=float(np.min(place)), high=float(np.max(place)), size=size,
+        plant=name, asked=rate, rate=push.rate, low=float(np.min(place)), high=float(np.max(place)), size=size,
         left=left, ringing=ringing, fault=fault,
     )  # fmt: skip
+
+
+def _change_length(pushing: _Pushing, push: _Push, rate: float) -> tuple[_Pushing, _Push]:
+    """Return pushes of the length that takes both room and command to their limits, where these are faster."""
+    lasting = _limit_length(pushing.lasting * math.sqrt(push.command / max(push.room, LEAST_ROOM)), pushing.period)
+    if lasting == pushing.lasting:
+        return pushing, push
+    other = replace(pushing, pushes=_make_pushes(lasting, pushing.period), lasting=lasting)
+    faster = other.find_push(rate, push.size)
+    return (pushing, push) if faster is None or faster.rate <= push.rate else (other, faster)
 
 
 def _make_pushing(schedule: ScheduledController, plant: Plant, params: ParameterSet, rate: float) -> _Pushing:
@@ -194,14 +211,22 @@ def _make_pushing(schedule: ScheduledController, plant: Plant, params: Parameter
     low, high, ts = schedule.points[0], schedule.points[-1], schedule.spec.sample_time_s
     middle, room = 0.5 * (low + high), 0.5 * (high - low)
     period = math.ceil(1.0 / min(schedule.bandwidths_hz) / ts)
-    lasting = int(np.clip(round(room / rate / ts), LEAST_PERIODS * period, MOST_PERIODS * period))
-    edge = np.hanning(period + 2)
-    steps = np.repeat([*(PUSHES * ROUNDS), 0.0, 0.0], lasting)
+    lasting = _limit_length(room / rate / ts, period)
     return _Pushing(
         schedule=schedule, plant=plant, start=RestStart.at_rest(schedule, plant, params, middle), middle=middle,
-        room=room, pushes=np.convolve(steps, edge / np.sum(edge))[: steps.size], lasting=lasting,
-        judged=JUDGED_PERIODS * period,
+        room=room, pushes=_make_pushes(lasting, period), lasting=lasting, period=period,
     )  # fmt: skip
+
+
+def _limit_length(samples: float, period: int) -> int:
+    return int(np.clip(round(samples), LEAST_PERIODS * period, MOST_PERIODS * period))
+
+
+def _make_pushes(lasting: int, period: int) -> Float[np.ndarray, " n"]:
+    """Return pushes of one that last so many samples."""
+    edge = np.hanning(period + 2)
+    steps = np.repeat([*(PUSHES * ROUNDS), 0.0, 0.0], lasting)
+    return np.convolve(steps, edge / np.sum(edge))[: steps.size]
 
 
 def move_plants(
@@ -216,4 +241,7 @@ def describe_motion(motion: Motion, over: str, unit: str) -> str:
     """Return what was found where a plant moves the variable, in one line."""
     per, ends = f"{unit_after(unit).strip()}/s", f"{motion.low:.3g} and {motion.high:.3g}"
     head = f"{motion.plant} moves {over} by itself between {ends} at up to {motion.rate:.3g} {per}"
-    return f"{head}, pushed to and fro, and {motion.fault or 'neither rings nor departs'}"
+    found = f"{head}, pushed to and fro, and {motion.fault or 'neither rings nor departs'}"
+    if motion.rate >= motion.asked:
+        return found
+    return f"{found}; {motion.asked:.3g} {per} is not reached within the table and the command's limit"

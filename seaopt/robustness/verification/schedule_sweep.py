@@ -164,8 +164,7 @@ def _choose_pulses(schedule: ScheduledController, plant: Plant, params: Paramete
     samples = math.ceil(PULSE_PERIODS / min(schedule.bandwidths_hz) / ts)
     left = max(
         abs(loop.measure_step_left(JUDGED_FROM * samples * ts)) / max(abs(loop.tracking(np.zeros(1))[0]), 1e-9)
-        for point, one in zip(schedule.points, schedule.controllers, strict=True)
-        for loop in [one.close(plant, place_variable(plant, params, schedule.over, point))]
+        for loop in schedule.close_points(plant, params)
     )
     return _Pulses(
         size=STEP_SHARE * find_least_effort(schedule), samples=samples,

@@ -24,7 +24,6 @@ from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.running.outer_run import enclose_law
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
-from seaopt.reporting.figures.loop import step_response
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, step_scenarios
 
@@ -78,7 +77,7 @@ def test_the_law_is_the_drive_that_its_gains_describe(T_v: float) -> None:
     inner = InnerLoop(k_v=0.4, T_v=T_v, k_ff=1.0, speed=SpeedLoop(differenced=True))
     gains = Gains(k_p=8.0, k_i=20.0, k_d=0.02, T_f=2e-3, k_r=7.0, c=0.5, inner=inner)
     plant = sample(STAND, VALUES.update(f_c=0.0), ("tau_s", "theta_m"), 1.0 / (0.7 * 0.0369 * 100.0), 1e-3, 1)
-    torque, _ = step_response(Loop(plant=plant, law=gains.law("cascade", 1e-3).balanced()), 400)
+    torque, _ = Loop(plant=plant, law=gains.law("cascade", 1e-3).balanced()).simulate(np.ones(400))
     assert abs(torque[-1] - 1.0) < 0.1
     np.testing.assert_allclose(torque, step_by_hand(gains.by_name(), 400), atol=1e-9)
 

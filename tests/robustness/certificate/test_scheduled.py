@@ -11,7 +11,8 @@ from seaopt.control import tune_schedule
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.robustness import certify_schedule
-from seaopt.robustness.certificate.scheduled import _require_rate
+from seaopt.robustness.certificate.scheduled import _require_motion, _require_rate
+from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
 from tests.schedules import POINTS, read_knee, tune_knee
 
@@ -83,6 +84,22 @@ def test_a_rate_is_required_where_it_is_asked_and_the_slowest_sweep_always(certi
     assert not _require_rate(some, 3.0)[0].met and not _require_rate(none, None)[0].met
 
 
+def test_a_motion_slower_than_the_rate_asked_is_not_met():
+    schedule = tune_knee()
+    slow = Motion(
+        plant="swing", asked=3.0, rate=1.5, low=0.1, high=0.5, size=4.5, left=0.3, ringing=0.01, fault="",
+    )  # fmt: skip
+    short = _require_motion(slow, schedule, 3.0)
+    assert (short.met, short.limit, short.value, short.sense) == (False, 3.0, 1.5, "≥")
+    assert "3 rad/s is not reached within the table and the command's limit; ask a smaller min_rate" in short.where
+    assert _require_motion(slow, schedule, 1.5).met
+    tried = _require_motion(slow, schedule, None)  # nothing was asked: what is shown is stated
+    assert tried.met and tried.limit == tried.value == 1.5 and "is not reached" in tried.where
+    for least in (None, 1.0):
+        rings = _require_motion(replace(slow, fault="rings"), schedule, least)
+        assert not rings.met and rings.value == 0.0
+
+
 def test_a_range_of_what_it_is_over_is_refused():
     stand, _, values = read_knee()
     with pytest.raises(ControlError, match="range of phi"):
@@ -104,6 +121,6 @@ def test_with_simulations_it_states_how_fast_the_variable_may_move():
     assert found.passed, found
     assert 0.5 < found.fastest < np.inf and set(found.sweeps) == {"stand", "swing"}
     assert set(found.motions) == {"swing"} and found.motions["swing"].rate == pytest.approx(0.5, rel=0.05)
-    (row,) = (row for row in found.requirements if row.name == "schedule_motion")
+    (row,) = (row for row in found.requirements if row.name == "min_motion_rate")
     assert row.met and "moves phi by itself" in row.where and row.where in found.notes
     assert all(place.simulated is not None for place in found.places if place.point)

@@ -56,7 +56,7 @@ def simulate(table, reference, middle):
 def test_the_shank_under_the_schedule_moves_as_an_own_simulation_says():
     schedule, (_, swing, values) = tune_knee(), read_knee()
     motion = move_schedule(schedule, "swing", swing, values, RATE)
-    assert not motion.fault and motion.rate == pytest.approx(RATE, rel=0.05)
+    assert not motion.fault and RATE <= motion.rate < 1.05 * RATE
     middle, room = 0.5 * schedule.points[-1], 0.5 * schedule.points[-1]
     period = int(np.ceil(1.0 / 30.0 / TS))
     lasting = int(np.clip(round(room / RATE / TS), 5 * period, 20 * period))
@@ -79,6 +79,18 @@ def test_a_loop_that_rings_while_it_moves_is_found():
     motion = move_schedule(schedule, "swing", swing, values.update(K_f=6 * FORCE), RATE)
     assert motion.fault.startswith("rings")
     assert "rings" in describe_motion(motion, "phi", "rad")
+
+
+def test_a_link_too_heavy_for_the_rate_asked_shows_less():
+    """A push of 5 A turns 20 kg m^2 by at most F L_a t/I_p in its 20 periods of the bandwidth: 2.9 rad/s."""
+    schedule, (_, swing, values) = tune_knee(), read_knee()
+    inertia, asked = 20.0, 8.0
+    bound = 5.0 * FORCE * L_A * (20.0 / 30.0) / inertia
+    motion = move_schedule(schedule, "swing", swing, values.update(I_p=inertia), asked)
+    assert bound < asked == motion.asked
+    assert 0.5 < motion.rate < bound and not motion.fault
+    assert "8 rad/s is not reached within" in describe_motion(motion, "phi", "rad")
+    assert schedule.points[0] < motion.low < motion.high < schedule.points[-1]
 
 
 def test_a_plant_that_holds_the_variable_is_not_pushed():
