@@ -127,7 +127,7 @@ def run_loop(
     seed: int = 0,
     start_s: float = 0.0,
     rtol: float | None = None,
-    standing: float | Float[np.ndarray, " runs"] = 0.0,
+    standing: float | Float[np.ndarray, "..."] = 0.0,
 ) -> LoopRun:
     """Run a loop, once for each set of parameters.
 
@@ -149,8 +149,8 @@ def run_loop(
         Time of the first sample.
     rtol : float, optional
         Of the integration, see the module's docstring.
-    standing : float or array, shape (runs,)
-        Where the link stands of a plant that holds it, as the law's compensation of gravity reads it.
+    standing : float or array, shape (runs,) or (runs, k)
+        Where the link stands of a plant that holds it, as the law reads it: the k signals of `SampledLoop.standing`.
 
     Returns
     -------
@@ -283,17 +283,20 @@ def _noise(
     params: Sequence[CompletedParameters],
     n: int,
     seed: int,
-    standing: float | Float[np.ndarray, " runs"],
+    standing: float | Float[np.ndarray, "..."],
 ) -> Float[np.ndarray, "runs n y"]:
     """Return the noise of every reading, that of further ones drawn after the first; where a held link stands too."""
 
     def find_std(values: CompletedParameters, name: str) -> float:
-        return 0.0 if name in loop.standing else loop.sensors.combine_errors(loop.plant, values, name)[0]
+        if name in loop.standing:
+            return loop.sensors.noise_std.get(name, 0.0) if name == loop.link else 0.0
+        return loop.sensors.combine_errors(loop.plant, values, name)[0]
 
     std = np.array([[find_std(values, name) for name in loop.signals] for values in params])
     noise = np.zeros((len(params), n, len(loop.signals)))
-    for name in loop.standing:
-        noise[:, :, loop.signals.index(name)] = np.broadcast_to(standing, len(params))[:, None]
+    places = np.reshape(standing, (-1, 1)) if np.ndim(standing) < 2 else standing
+    for name, place in zip(loop.standing, np.broadcast_to(places, (len(params), len(loop.standing))).T, strict=True):
+        noise[:, :, loop.signals.index(name)] = place[:, None]
     if not np.any(std):
         return noise
     rng = np.random.default_rng(seed)

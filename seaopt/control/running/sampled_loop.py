@@ -46,6 +46,8 @@ class SampledLoop:
     sticks : bool
         Dry friction jumps at rest, so that what sticks stands still (`seaopt.simulation.sticking`), in place of the
         smoothed curve.
+    link : str, optional
+        Of what is measured the link's motion: a plant that holds its link need not have it, and it stands still there.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class SampledLoop:
     current_step_A: float = 0.0
     longest_delay_s: float = 0.0
     sticks: bool = False
+    link: str | None = None
 
     def __post_init__(self) -> None:
         plant = self.plant
@@ -116,11 +119,12 @@ class SampledLoop:
 
     @property
     def standing(self) -> tuple[str, ...]:
-        """The link's position, where gravity is compensated by it and the plant holds its link."""
+        """What is read of a link that the plant holds: what the law is fed, and by which gravity is compensated."""
         gravity = None if self.law.compensation is None else self.law.compensation.gravity
-        if gravity is None or gravity.reads in self.plant.outputs or self.plant.moves:
+        named = dict.fromkeys((self.link, None if gravity is None else gravity.reads))
+        if self.plant.moves:
             return ()
-        return (gravity.reads,)
+        return tuple(name for name in named if name is not None and name not in self.plant.outputs)
 
     @property
     def law_states(self) -> int:

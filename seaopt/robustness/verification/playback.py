@@ -11,7 +11,7 @@ from jaxtyping import Float
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
-from seaopt.control.loops.sampled_plant import read_conditions
+from seaopt.control.loops.sampled_plant import find_rows, read_conditions
 from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.control.running.sampled_loop import channel_names
@@ -67,6 +67,7 @@ class Stage:
             current_step_A=self.current_step_A,
             longest_delay_s=longest_delay_s,
             sticks=sticks and can_stick(plant),  # bristles hold by themselves
+            link=None if self.controller.link is None else self.controller.link.measured,
         )
 
     @property
@@ -276,15 +277,13 @@ def _catch(
 
 def _read_standing(
     stage: Stage, values: Sequence[CompletedParameters], grip: Sequence[Mapping[str, float]], names: tuple[str, ...]
-) -> Float[np.ndarray, " runs"]:
-    """Return where held links stand, as their position is read."""
-    if not names:
-        return np.zeros(len(values))
+) -> Float[np.ndarray, "runs k"]:
+    """Return where held links stand, as each of the outputs that are read of them."""
     plant = stage.plant
-    observe, row, still = output_function(plant), list(plant.outputs).index(names[0]), np.zeros(len(plant.inputs))
+    observe, rows, still = output_function(plant), find_rows(plant, names), np.zeros(len(plant.inputs))
     places = [fill_vector("state", plant.states, at) for at in grip]
     return np.array([
-        float(observe(0.0, x, still, each.vector)[row]) for x, each in zip(places, values, strict=True)
+        np.array(observe(0.0, x, still, each.vector)).ravel()[rows] for x, each in zip(places, values, strict=True)
     ])  # fmt: skip
 
 

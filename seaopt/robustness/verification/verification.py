@@ -384,9 +384,10 @@ def _partner(controller: Controller, plant: Plant, partner: Plant | None) -> Pla
     if partner is not None:
         check_held(plant, partner)
         return partner
-    if controller.link is not None:  # a link that is gripped stands elsewhere than at zero, where a held plant has it
-        return None
-    return plant.port.held() if plant.port is not None and plant.port.held is not None else None
+    held = plant.port.held() if plant.port is not None and plant.port.held is not None else None
+    if held is not None and held.moves and controller.link is not None and controller.link.measured not in held.outputs:
+        return None  # where another link moves on, nothing says where this one stands
+    return held
 
 
 def _to_plain(value: Any) -> Any:

@@ -21,6 +21,9 @@ from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.running.outer_run import enclose_controller
 from seaopt.errors import ControlError
+from seaopt.robustness.verification.playback import play
+from seaopt.robustness.verification.scenarios import Phase, Scenario
+from seaopt.robustness.verification.verification import verify
 
 TS = 1e-3
 STAND, SWING = so.plants.high_impedance(), so.plants.moving_output()
@@ -300,6 +303,50 @@ def test_it_makes_an_impedance_come_nearer_to_what_was_asked(rendering: Controll
     ]
     assert bands[0] is not None and bands[1] is not None
     assert bands[0][1] > 3.0 * bands[1][1]
+
+
+def grip_by_hand(controller: Controller, samples: tuple[int, int, int], force: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return force and command while the linear swing moves, is gripped where it is, and is let go: step by step.
+
+    The link stops at once; the drive keeps what the sprung mass does not give it.
+    """
+    params = so.plants.thor()
+    simulator, (mass, b, k, sprung) = Simulator(controller, params, 0.0), drive_numbers(params)
+    arm = params["L_a"].value
+    a = np.zeros((5, 5))  # of q, its rate, the command and the lever's place, which stands
+    a[0, 1], a[1] = 1.0, np.array([-k, -b, 1.0, -k, 0.0]) / (mass + sprung)
+    held = expm(TS * a)
+    state, forces, commands = np.zeros(simulator.size), [], []
+    for phase, count in enumerate(samples):
+        if phase == 1:
+            state[2] += sprung * arm / (mass + sprung) * state[3]
+            state[3] = 0.0
+        for _ in range(count):
+            forces.append(float(simulator.rows[0] @ state[:4]))
+            commands.append(float(state[4]))
+            after = simulator.step(state, force)
+            if phase == 1:
+                moved = held @ np.array([state[0], state[2], state[4], arm * state[1], 0.0])
+                after[:4] = moved[0], state[1], moved[1], 0.0
+            state = after
+    return np.array(forces), np.array(commands)
+
+
+def test_a_gripped_link_stands_where_it_was_gripped(fed: Controller) -> None:
+    """Off zero, where nothing happens to what the law reads; the linear loop is the pendulum's at a small force."""
+    smooth, force = so.plants.thor(), 1e-3
+    verification = verify(fed, {"swing": SWING}, smooth)
+    assert "contact" in {row.scenario for row in verification.rows}
+    phases = [
+        Phase(duration_s=n * TS, force_N=force, held=held) for n, held in ((300, False), (200, True), (300, False))
+    ]
+    stage = verification.stages["swing"]
+    played = play(stage, Scenario(name="grip", phases=tuple(phases)), [smooth])
+    expected, command = grip_by_hand(fed, (300, 200, 300), force)
+    assert np.max(np.abs(expected)) > 0.5 * force
+    np.testing.assert_allclose(played.outputs["F1"][0], expected, atol=1e-4 * np.max(np.abs(expected)))
+    applied = played.current[0] / fed.command.per_effort
+    np.testing.assert_allclose(applied, command, atol=1e-4 * np.max(np.abs(command)))
 
 
 @pytest.mark.slow
