@@ -47,7 +47,7 @@ class SampledLoop:
         Dry friction jumps at rest, so that what sticks stands still (`seaopt.simulation.sticking`), in place of the
         smoothed curve.
     link : str, optional
-        Of what is measured the link's motion: a plant that holds its link need not have it, and it stands still there.
+        Of what is measured the link's motion: a plant without that output holds this link, which stands still there.
 
     Raises
     ------
@@ -121,9 +121,8 @@ class SampledLoop:
     def standing(self) -> tuple[str, ...]:
         """What is read of a link that the plant holds: what the law is fed, and by which gravity is compensated."""
         gravity = None if self.law.compensation is None else self.law.compensation.gravity
-        named = dict.fromkeys((self.link, None if gravity is None else gravity.reads))
-        if self.plant.moves:
-            return ()
+        weighed = None if gravity is None or self.plant.moves else gravity.reads
+        named = dict.fromkeys((self.link, weighed))
         return tuple(name for name in named if name is not None and name not in self.plant.outputs)
 
     @property

@@ -265,7 +265,7 @@ def verify(
     plants = {name: controller.see(plant) for name, plant in plants.items()}
     stages = {
         name: Stage(
-            controller=controller, plant=plant, partner=_partner(controller, plant, (partners or {}).get(name)),
+            controller=controller, plant=plant, partner=_partner(plant, (partners or {}).get(name)),
             sensors=sensors or Sensors(), current_step_A=current_step_A,
         )
         for name, plant in plants.items()
@@ -379,15 +379,12 @@ def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners
                 raise ControlError(f'{argument} = {{"{name}": ...}} is none of the plants; {suggestion(name, plants)}')
 
 
-def _partner(controller: Controller, plant: Plant, partner: Plant | None) -> Plant | None:
+def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
     """Return the plant with the port held: as given, else as the port makes it; None where it makes none."""
     if partner is not None:
         check_held(plant, partner)
         return partner
-    held = plant.port.held() if plant.port is not None and plant.port.held is not None else None
-    if held is not None and held.moves and controller.link is not None and controller.link.measured not in held.outputs:
-        return None  # where another link moves on, nothing says where this one stands
-    return held
+    return plant.port.held() if plant.port is not None and plant.port.held is not None else None
 
 
 def _to_plain(value: Any) -> Any:
