@@ -223,6 +223,10 @@ def test_a_band_is_passive_by_the_equations() -> None:
     angles = [np.min(np.real(z) / np.abs(z)) for z in (respond_port(one, params, f) for one in (free, bound))]
     assert angles[0] < -0.01 and angles[1] > 0.0
     assert passivity(bound, STAND, params).holds(band)
+    link = find_link(bound, SWING, params)  # with the images that sampling folds back
+    sampled = apparent_impedance(link, link.outer(Impedance(stiffness=0.0, damping=0.0)), f)
+    np.testing.assert_allclose(sampled, respond_port(bound, params, f), rtol=3e-5)
+    assert np.min(np.real(sampled)) > 0.0
     found = passivity(free, SWING, params)
     assert found.violated_hz is not None
     around = respond_port(free, params, found.violated_hz * np.array([0.999, 1.001]))
