@@ -55,10 +55,11 @@ class Parameter:
 
     def __post_init__(self) -> None:
         for what, text in (("name", self.name), ("unit", self.unit)):
-            require_type(text, str, f"{what} of a parameter", "give a text", ParameterError)
+            if type(text) is not str:
+                require_type(text, str, f"{what} of a parameter", "give a text", ParameterError)
         for what in ("value", "min", "max", "prior_std", "std"):
             number = getattr(self, what)
-            if number is not None:
+            if number is not None and type(number) is not float:
                 require_number(number, f"{what} of parameter {self.name}", ParameterError)
         if not math.isfinite(self.value):
             unit = unit_after(self.unit)

@@ -11,6 +11,7 @@ move where they are not level.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -174,6 +175,7 @@ def _augment(g: Float[np.ndarray, "nd nx w"], nu: int, *, joined: bool) -> Float
     return n
 
 
+@lru_cache(maxsize=32)
 def _make_lines(nx: int, nu: int, clock: Clock) -> tuple[Float[np.ndarray, "2 m v"], Float[np.ndarray, "2 m v"]]:
     """Return L, z = L w at the start of the older and of the newer stretch, each with its derivative by the delay."""
     joined, inputs = clock.hold == "first", len(clock.lags)

@@ -27,6 +27,7 @@ from seaopt.units import factor, same_dimension
 EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
+BEGINNING = 64  # samples
 Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
@@ -339,7 +340,7 @@ class Experiment:
     def _note_same_columns(self) -> list[str]:
         """Return what to know of channels with the same samples."""
         named = [name for name in (*self.plant.inputs, *self.outputs) if name in self.log.signals]
-        pairs = [(a, b) for a, b in combinations(named, 2) if np.array_equal(self.log[a], self.log[b], equal_nan=True)]
+        pairs = [(a, b) for a, b in combinations(named, 2) if _are_same(self.log[a], self.log[b])]
         pairs = [(a, b) for a, b in pairs if b in self.outputs and not is_constant(self.log[b])]
         return [
             f"{a} and {b} are the same samples: "
@@ -388,6 +389,11 @@ class Experiment:
 def is_constant(values: Float[np.ndarray, " n"]) -> bool:
     """Tell whether all samples are the same, as far as they are there."""
     return bool(np.fmin.reduce(values) == np.fmax.reduce(values))
+
+
+def _are_same(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether two channels are the same samples; of most that are not, the beginning tells."""
+    return all(np.array_equal(first[:end], second[:end], equal_nan=True) for end in (BEGINNING, None))
 
 
 def cut_into_shots(n: int, shots: int) -> Int[np.ndarray, " shots1"]:

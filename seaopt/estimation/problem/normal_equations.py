@@ -118,11 +118,9 @@ def eliminate(matrix: Float[np.ndarray, "n n"], p: int, cut: float = 1e-12) -> F
 
 def _factor(matrix: Float[np.ndarray, "n n"], cut: float) -> tuple[Float[np.ndarray, " n"], _Spectrum | _Arrow]:
     """Return the scale of the unknowns, and the factors of the matrix scaled to a unit diagonal."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    shape = find_arrow(matrix)
-    if shape is None:
-        return scale, _Spectrum.of(matrix / np.outer(scale, scale), cut)
-    return scale, _Arrow.of(matrix / np.outer(scale, scale), shape, cut)
+    scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+    shape, scaled = find_arrow(matrix), matrix / (scale[:, None] * scale)
+    return scale, _Spectrum.of(scaled, cut) if shape is None else _Arrow.of(scaled, shape, cut)
 
 
 @record(eq=False)
@@ -139,12 +137,15 @@ class _Spectrum:
         return cls(values=values, vectors=vectors, seen=values > cut * np.max(values, initial=largest))
 
     def solve(self, right: Float[np.ndarray, "... n m"]) -> Float[np.ndarray, "... n m"]:
-        inverse = np.where(self.seen, 1.0 / np.where(self.seen, self.values, 1.0), 0.0)
-        return self.vectors @ (inverse[..., None] * (np.swapaxes(self.vectors, -1, -2) @ right))
+        return self.vectors @ (self._invert_values()[..., None] * (self.vectors.swapaxes(-1, -2) @ right))
 
     def invert(self) -> Float[np.ndarray, "... n n"]:
-        inverse = np.where(self.seen, 1.0 / np.where(self.seen, self.values, 1.0), 0.0)
-        return (self.vectors * inverse[..., None, :]) @ np.swapaxes(self.vectors, -1, -2)
+        return (self.vectors * self._invert_values()[..., None, :]) @ self.vectors.swapaxes(-1, -2)
+
+    def _invert_values(self) -> Float[np.ndarray, "... n"]:
+        if self.seen.all():
+            return 1.0 / self.values
+        return np.where(self.seen, 1.0 / np.where(self.seen, self.values, 1.0), 0.0)
 
     def unseen(self) -> Float[np.ndarray, "... n"]:
         return np.sum(np.where(self.seen[..., None, :], 0.0, self.vectors) ** 2, axis=-1)
