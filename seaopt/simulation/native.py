@@ -110,7 +110,8 @@ def load_library(source: str) -> ctypes.CDLL | None:
     compiler, folder = find_compiler(), cache_folder()
     if compiler is None or folder is None:
         return None
-    key = hashlib.sha256("\0".join((source, *FLAGS, *compiler, sys.platform, _processor())).encode()).hexdigest()
+    content = (source, *FLAGS, *CLONES, *NATIVE, *compiler, sys.platform, _processor())
+    key = hashlib.sha256("\0".join(content).encode()).hexdigest()
     library = folder / f"{key}.so"
     for ready in (_is_whole, partial(_compile_once, compiler, source)):
         if ready(library) and _is_private(library):

@@ -60,7 +60,8 @@ typedef struct {
 } state;
 
 #define BLOCK 16
-#define ALL (NJP / 4) /* vectors of a row of Z; with one alone derivatives are not made, but for what shares it with x */
+#define ALL (NJP / 4) /* vectors of a row of Z */
+#define DERIVED(wide) (MEASURED && (wide) == ALL) /* whether derivatives are made, but for what shares a vector with x */
 #define INLINE static inline __attribute__((always_inline)) /* so that `wide` is a constant */
 #define ONCE static __attribute__((noinline)) /* what both ways of a pass share: compiling it twice takes longer than it saves */
 
@@ -167,7 +168,7 @@ INLINE void one_step(hot *q, double t, const line *in, const double *c, double h
     const double *arg[SZ_ARG] = {&t, x, in->u0, in->u1, c, &h};
     double *res[SZ_RES] = {after, a, b};
     for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
-    if (wide < ALL) {
+    if (!DERIVED(wide)) {
         seaopt_plain_step(arg, res, 0, q->work, 0);
         for (int i = 0; i < NX; i++) ((vec *)q->z[i])[0] = (vec){after[i], 0.0, 0.0, 0.0};
         return;
@@ -190,7 +191,7 @@ INLINE void output(hot *q, double t, const double *u, const double *du, const do
     const double *arg[SZ_ARG] = {&t, x, u, c};
     double *res[SZ_RES] = {y, hx, hp, hu};
     for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
-    if (wide < ALL) seaopt_plain_output(arg, res, 0, q->work, 0);
+    if (!DERIVED(wide)) seaopt_plain_output(arg, res, 0, q->work, 0);
     else {
         seaopt_output(arg, res, 0, q->work, 0);
         chain(hx, hp, NY, (const double (*)[NJP])q->z, out);
@@ -205,10 +206,10 @@ INLINE void slope(hot *q, double t, const double *u, const double *du, const dou
                   double (*restrict k)[NJP], int wide) {
     double x[NX], f[NX], fx[NNZ_FX + 1], fp[NNZ_FP + 1];
     const double *arg[SZ_ARG] = {&t, x, u, du, c};
-    double *res[SZ_RES] = {f, wide == ALL ? fx : 0, wide == ALL ? fp : 0};
+    double *res[SZ_RES] = {f, DERIVED(wide) ? fx : 0, DERIVED(wide) ? fp : 0};
     for (int i = 0; i < NX; i++) x[i] = z[i][0];
     seaopt_rate(arg, res, 0, q->work, 0);
-    if (wide == ALL) seaopt_rate_chain(fx, fp, z, k);
+    if (DERIVED(wide)) seaopt_rate_chain(fx, fp, z, k);
     else for (int i = 0; i < NX; i++) ((vec *)k[i])[0] = (vec){0.0, 0.0, 0.0, 0.0};
     for (int i = 0; i < NX; i++) k[i][0] = f[i];
 }
@@ -243,10 +244,10 @@ INLINE void one_step(hot *q, double t, const line *in, const double *c, double h
 INLINE void output(hot *q, double t, const double *u, const double *du, const double *c, double (*restrict out)[NJP], int wide) {
     double x[NX], y[NY], hx[NNZ_HX + 1], hp[NNZ_HP + 1];
     const double *arg[SZ_ARG] = {&t, x, u, du, c};
-    double *res[SZ_RES] = {y, wide == ALL ? hx : 0, wide == ALL ? hp : 0};
+    double *res[SZ_RES] = {y, DERIVED(wide) ? hx : 0, DERIVED(wide) ? hp : 0};
     for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
     seaopt_output(arg, res, 0, q->work, 0);
-    if (wide == ALL) seaopt_output_chain(hx, hp, (const double (*)[NJP])q->z, out);
+    if (DERIVED(wide)) seaopt_output_chain(hx, hp, (const double (*)[NJP])q->z, out);
     for (int o = 0; o < NY; o++) out[o][0] = y[o];
 }
 #endif
@@ -436,7 +437,7 @@ ONCE void deliver(hot *q, const seaopt_pass_args *a) {
 }
 
 INLINE void one_pass(const seaopt_pass_args *a, int wide) {
-    const int summed = MEASURED && wide == ALL, compared = summed || (MEASURED && CORRECT);
+    const int summed = DERIVED(wide), compared = summed || (MEASURED && CORRECT);
     hot here, *const q = &here;
     long slot = 0; /* of the ring of influences */
     begin(q, a);
