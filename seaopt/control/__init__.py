@@ -3,6 +3,8 @@
 from seaopt.control.compensation.compensate import add_compensation
 from seaopt.control.compensation.ripple_fit import RippleFit, identify_ripple
 from seaopt.control.deploy.export import export
+from seaopt.control.frontier.free_law import FreeLaw, bound_free_law
+from seaopt.control.frontier.frontier import Frontier, sweep
 from seaopt.control.given.assessment import assess
 from seaopt.control.given.law_file import GivenLaw, read_law
 from seaopt.control.given.pid_forms import cascade_pid, drive_pid, ideal_pid, parallel_pid
@@ -41,8 +43,6 @@ from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, Schedu
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.control.scheduling.tuning import tune_schedule
 from seaopt.control.tuning.corners import corners, draw
-from seaopt.control.tuning.free_law import FreeLaw, bound_free_law
-from seaopt.control.tuning.frontier import Frontier, sweep
 from seaopt.control.tuning.tuner import tune
 
 __all__ = [

@@ -1,1 +1,1 @@
-"""Tuning: the optimisation problem, starts, convex-concave steps, interior point, and the frontier of bandwidths."""
+"""Tuning: the optimisation problem, starts, convex-concave steps and interior point."""

@@ -9,6 +9,7 @@ from functools import partial
 from types import NoneType
 from typing import Any
 
+from seaopt.control.frontier.free_law import FreeLaw, bound_free_law
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
@@ -16,7 +17,6 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.tuning.free_law import FreeLaw, bound_free_law
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
 from seaopt.control.tuning.tuner import (
