@@ -37,20 +37,8 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.tuning.frequencies import choose_prominent
-from seaopt.control.tuning.optimisation_problem import (
-    CURVES,
-    FRICTION,
-    K_D,
-    K_P,
-    K_V,
-    PASSIVE,
-    Grid,
-    LawNumbers,
-    LawResponse,
-    Path,
-    Task,
-    use_disc,
-)
+from seaopt.control.tuning.grid import Grid, LawResponse, Path, use_disc
+from seaopt.control.tuning.optimisation_problem import CURVES, FRICTION, K_D, K_P, K_V, PASSIVE, LawNumbers, Task
 from seaopt.records import record
 
 MOST_PROGRAMS = 8

@@ -27,6 +27,7 @@ from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
 from seaopt.control.loops.measured.loop import leave_positive
 from seaopt.control.tuning.frequencies import choose_prominent
+from seaopt.control.tuning.grid import Grid, LawResponse, Path
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     DAMPING,
@@ -47,10 +48,7 @@ from seaopt.control.tuning.optimisation_problem import (
     T_Q,
     W_C,
     W_R,
-    Grid,
     LawNumbers,
-    LawResponse,
-    Path,
     Task,
 )
 from seaopt.executors import IPOPT

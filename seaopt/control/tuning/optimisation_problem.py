@@ -43,7 +43,7 @@ from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
 from seaopt.control.laws.limits import (
     BY_NAME,
@@ -51,7 +51,6 @@ from seaopt.control.laws.limits import (
     LIMITS,
     STEADY,
     STEADY_PERIODS,
-    LimitCurve,
     MeasuredLoop,
     Scope,
 )
@@ -79,11 +78,12 @@ from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
-from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
+from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.tuning.grid import Grid, LawResponse, Path, measured_discs, use_disc
 from seaopt.plants import Plant
 from seaopt.plants.roles import Friction
 from seaopt.records import record
@@ -92,7 +92,6 @@ OBJECTIVE_HZ = 0.1  # disturbances count from here
 NO_LIMIT = 1e9
 NO_FLOOR = 1e-9
 NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
-LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 NEARLY_KEPT = 1.001
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
 SLOWEST_SPEED_RATE = 4.0 * INTEGRAL_RAD_S  # 1/T_v, rad/s, of a speed loop that integrates
@@ -111,100 +110,6 @@ MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hund
 # k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
 LawNumbers = Float[np.ndarray, " 14"]
 K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH, PREFILTER_W, DAMPING = range(14)
-
-
-@record(eq=False)
-class Path:
-    """A sum over the signals that a law reads, affine in its feedback: fixed + y C_y + v C_v, C_v of a speed loop."""
-
-    fixed: Complex[np.ndarray, "..."]
-    y: Complex[np.ndarray, "..."]
-    v: Complex[np.ndarray, "..."]
-
-    def add_up(self, c_y: Complex[np.ndarray, "..."], c_v: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
-        """Return the sum of a law."""
-        return self.fixed + self.y * c_y + self.v * c_v
-
-    def change(self, by_y: Complex[np.ndarray, "..."], by_v: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
-        """Return the change of the sum with those of C_y and C_v."""
-        return self.y * by_y + self.v * by_v
-
-    def at(self, index: Any) -> Path:
-        """Return some of the frequencies, or rows and frequencies."""
-        return Path(fixed=self.fixed[index], y=self.y[index], v=self.v[index])
-
-
-@record(eq=False)
-class Grid:
-    """Responses at frequencies.
-
-    Parameters
-    ----------
-    f, q
-        Frequencies in Hz, and exp(-j omega T_s).
-    p : array, shape (plants, m)
-        Plants with hold and delay; the first is the design plant.
-    discs : array, shape (plants, m)
-        Radii of the discs around them of those that are measured; zeros of models.
-    fixed, speed : arrays, shape (plants, m)
-        B of the module's docstring without a speed loop, and the speed per command as the law has it; ones and zeros
-        where the law reads nothing further.
-    rows : tuple of int
-        Which of the task's plants they are.
-    kept, inverse
-        The nominal plant's parts at q; zeros without an observer.
-    port, force : Path
-        The loop with link 2 held and the force on it, of a `PassivityCondition`, in the passive band; 1 elsewhere.
-    unit
-        G_22/abs(G_22) there; zero elsewhere.
-    friction, friction_size : Path, shapes (frictions, m) and (frictions, signals, m)
-        1 + plants C and weights C of a `FeedbackLimit` for each plant with friction of which a margin is aimed at.
-    levels : mapping of limit to array, shape (m,)
-        Of every limit that is looked at.
-
-    """
-
-    f: Float[np.ndarray, " m"]
-    q: Complex[np.ndarray, " m"]
-    p: Complex[np.ndarray, "n m"]
-    discs: Float[np.ndarray, "n m"]
-    fixed: Complex[np.ndarray, "n m"]
-    speed: Complex[np.ndarray, "n m"]
-    rows: tuple[int, ...]
-    kept: Complex[np.ndarray, " m"]
-    inverse: Complex[np.ndarray, " m"]
-    port: Path
-    force: Path
-    unit: Complex[np.ndarray, " m"]
-    friction: Path
-    friction_size: Path
-    levels: Mapping[str, Float[np.ndarray, " m"]]
-
-    @property
-    def reads_more(self) -> bool:
-        """Whether the loop has a path besides that of the regulated signal."""
-        return bool(np.any(self.speed) or np.any(self.fixed != 1.0))
-
-    def at(self, index: Int[np.ndarray, " k"]) -> Grid:
-        """Return some of the frequencies."""
-        return Grid(
-            f=self.f[index], q=self.q[index], p=self.p[:, index], discs=self.discs[:, index],
-            fixed=self.fixed[:, index], speed=self.speed[:, index], rows=self.rows,
-            kept=self.kept[index], inverse=self.inverse[index], port=self.port.at(index), force=self.force.at(index),
-            unit=self.unit[index], friction=self.friction.at((..., index)),
-            friction_size=self.friction_size.at((..., index)),
-            levels={name: level[index] for name, level in self.levels.items()},
-        )  # fmt: skip
-
-
-@record(eq=False)
-class LawResponse:
-    """Laws at a grid's frequencies: C_y and C_r of one or of n, C_v of a speed loop, and B on the grid's plants."""
-
-    c_y: Complex[np.ndarray, "*n m"]
-    c_r: Complex[np.ndarray, "*n m"]
-    c_v: Complex[np.ndarray, " m"]
-    rest: Complex[np.ndarray, "k m"]
 
 
 @record(eq=False)
@@ -699,17 +604,3 @@ def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:
 def close_plant(plant: DigitalPlant | MeasuredPlant, law: Law) -> Loop | DiscLoop:
     """Return the loop of a law around a plant, a model or a measured one."""
     return DiscLoop(plant=plant, law=law) if isinstance(plant, MeasuredPlant) else Loop(plant=plant, law=law)
-
-
-def use_disc(
-    curve: LimitCurve, level: Float[np.ndarray, "..."], p: Complex[np.ndarray, "..."], discs: Float[np.ndarray, "..."],
-    c_y: Complex[np.ndarray, "..."], c_r: Complex[np.ndarray, "..."], rest: Complex[np.ndarray, "..."],
-) -> Float[np.ndarray, "..."]:  # fmt: skip
-    """Return the usage of a limit by the worst of the responses in discs."""
-    least, most = bound_disc(curve.of, p, discs, c_y, c_r, rest)
-    return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level
-
-
-def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return the radii of the discs around a plant's responses; zeros of a model."""
-    return plant.discs(f) if isinstance(plant, MeasuredPlant) else np.zeros(f.size)

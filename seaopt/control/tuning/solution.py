@@ -25,8 +25,9 @@ from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.absolute_stability import SIMPLEST
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.frequencies import place_frequencies
+from seaopt.control.tuning.grid import Grid
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import FRICTION, K_I, W_R, Grid, LawNumbers, Task
+from seaopt.control.tuning.optimisation_problem import FRICTION, K_I, W_R, LawNumbers, Task
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, count_off, divide, ignore
 

@@ -35,6 +35,7 @@ from seaopt.control.laws.limits import INTEGRAL_RAD_S
 from seaopt.control.laws.spec import HIGHEST_CORNER
 from seaopt.control.laws.structures import CASCADE, LawTerms
 from seaopt.control.tuning.frequencies import count_growing, find_light_modes
+from seaopt.control.tuning.grid import Grid, LawResponse
 from seaopt.control.tuning.optimisation_problem import (
     K_D,
     K_I,
@@ -51,9 +52,7 @@ from seaopt.control.tuning.optimisation_problem import (
     TRACKING,
     W_C,
     W_R,
-    Grid,
     LawNumbers,
-    LawResponse,
     Task,
 )
 from seaopt.records import record
