@@ -319,9 +319,9 @@ class Experiment:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was done to the log, and which of its samples have no weight, one sentence each."""
-        log, pieces = self.log, self.log.segments
+        log, pieces = self.log, self.stretches
         notes = list(log.notes)
-        if log.gaps:
+        if pieces != (slice(0, len(log)),):
             alone = len(log) - sum(piece.stop - piece.start for piece in pieces)
             notes.append(
                 f"{format_count(len(log.gaps), 'gap')} split the log into {format_count(len(pieces), 'segment')}"
