@@ -103,14 +103,14 @@ def _gather(
         if delay:
             u = np.concatenate([np.repeat(u[:1], min(delay, len(u)), axis=0), u[: max(len(u) - delay, 0)]])
         used = segment.mark_counted(0)
-        last = int(np.max(np.flatnonzero(np.any(used, axis=1)), initial=-1)) + 1
+        last = max((row.size - int(np.argmax(row[::-1])) for row in used.T if row.any()), default=0)
         error = np.where(used, -left.raw, 0.0)
         error = np.where(np.isfinite(error), error, 0.0)
         measured = np.stack([np.asarray(channel) for channel in samples.y], axis=1)
         measured = np.where(used, measured, measured + left.raw)
         if last > 1 and np.all(np.isfinite(measured[:last])):
             moving.append(u[:last])
-            signals.append(np.concatenate([measured, _tame(error, used)], axis=1)[:last])
+            signals.append(np.concatenate([measured.T, _tame(error, used).T])[:, :last].T)  # cut by signal later
     if not moving:
         return [], []
     spread = np.ptp(np.concatenate(moving), axis=0)
