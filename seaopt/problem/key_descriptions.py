@@ -284,7 +284,7 @@ KEYS: dict[str, dict[str, str]] = {
         "over": "A state that is measured, such as an angle; or a parameter known as the law runs, such as a load.",
         "points": "Its values, ascending, in its SI unit; the ends are the range.",
         "bandwidth_hz": "One per point, in place of the controller's.",
-        "min_rate": "That sweeps must reach, in its unit per second; only stated where left out.",
+        "min_rate": "Its units per second that sweeps, and plants that move it, must reach; stated only if left out.",
     },
     "MPCTable": {
         "current_slew_A_per_s": "Largest rate of the command, in its unit per second; no limit where left out.",

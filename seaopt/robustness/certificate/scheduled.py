@@ -295,8 +295,8 @@ def certify_schedule(
         As in `seaopt.certify`; the draws are spread evenly over the points and the values between them. What the
         schedule is over has no range: its points are it.
     min_rate : float, optional
-        Required of the fastest sweep that keeps its judgement, in the variable's unit per second; if left out, the
-        rate is stated, not required.
+        Required of the fastest sweep that keeps its judgement, and reached by a plant that moves the variable itself,
+        in the variable's unit per second; if left out, the rates are stated, not required.
     simulations : bool
         Simulate the points on the plants that hold the variable, and the sweeps.
     executor : concurrent.futures.Executor, optional
