@@ -37,7 +37,7 @@ ROUNDS, LONG_ROUNDS = 5, 9  # of the interior point; integrals of a cascade move
 QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
-LEAST_MARGIN = 1e-3  # of the one asked: less is not looked for
+LEAST_MARGIN = 1e-3  # of the one asked: of a law without any, less is not looked for
 SCAN, IMPROVEMENT, REFINEMENT, RECHECK = 1.0, 1.0, 3.0, 0.5  # of the time of a solution
 ONCE, RAISING = 1.0, 4.0  # of that of one with a friction margin: each of four solutions, and a bisection
 Solution = tuple[LawNumbers, list[MeasuredLoop]]  # with the loop of every plant
@@ -92,7 +92,7 @@ def _raise_friction_margin(
     """
     high = task.spec.level(FRICTION)
     assert high is not None
-    low, f = max(_least_slope(loops), LEAST_MARGIN * high), place_frequencies(task)
+    low, f = _least_slope(loops) or LEAST_MARGIN * high, place_frequencies(task)
     least, asked = low, high
     while high / low > MARGIN_RESOLUTION:
         left = _count_halvings(low, high) / _count_halvings(least, asked)
