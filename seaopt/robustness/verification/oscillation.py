@@ -25,12 +25,15 @@ class Oscillation:
         In the window's second half, in the signal's unit.
     growth : float
         Ratio of that to the amplitude in the first half.
+    peak : float
+        The largest deviation in the second half, that of bursts included.
 
     """
 
     frequency_hz: float
     amplitude: float
     growth: float
+    peak: float
 
     @property
     def sustained(self) -> bool:
@@ -87,7 +90,10 @@ def find_oscillation(
     power = 2.0 * float(np.mean(fast[halves[1]] ** 2))
     if last <= floor / size or last**2 < LINE_SHARE * power:
         return None
-    return Oscillation(frequency_hz=f, amplitude=size * last, growth=last / max(first, 1e-300))
+    return Oscillation(
+        frequency_hz=f, amplitude=size * last, growth=last / max(first, 1e-300),
+        peak=size * float(np.max(np.abs(fast[halves[1]]))),
+    )  # fmt: skip
 
 
 def measure_swing(signal: Float[np.ndarray, " n"], sample_time_s: float, *, lowest_hz: float) -> Oscillation:
@@ -106,15 +112,16 @@ def measure_swing(signal: Float[np.ndarray, " n"], sample_time_s: float, *, lowe
     >>> import numpy as np
     >>> t = np.arange(400) * 1e-3
     >>> swing = measure_swing(100 * t + 3.0 * np.sin(2 * np.pi * 40 * t), 1e-3, lowest_hz=10.0)
-    >>> round(swing.frequency_hz), round(swing.amplitude, 1), swing.sustained
-    (40, 3.0, True)
+    >>> round(swing.frequency_hz), round(swing.amplitude, 1), round(swing.peak, 1), swing.sustained
+    (40, 3.0, 3.2, True)
 
     """
     fast = _remove_slow(signal, sample_time_s, lowest_hz)
-    first, last = (math.sqrt(2.0 * float(np.mean(half**2))) for half in np.array_split(fast, 2))
+    halves = np.array_split(fast, 2)
+    first, last = (math.sqrt(2.0 * float(np.mean(half**2))) for half in halves)
     return Oscillation(
         frequency_hz=_find_frequency(fast, sample_time_s) if last else 0.0, amplitude=last,
-        growth=last / max(first, 1e-300),
+        growth=last / max(first, 1e-300), peak=float(np.max(np.abs(halves[1]))),
     )  # fmt: skip
 
 

@@ -156,6 +156,23 @@ def test_a_law_whose_estimate_trusts_a_coarse_reading_rings_and_is_not_met(stand
     assert again.constrained == runs and again.runs.rows == found.runs.rows
     ideal = certify_mpc(mpc, {"stand": stand}, thor, **options)
     assert ideal.passed and ideal.constrained.largest_ring < 0.01
+    options |= {"runs": 1, "seed": 14}  # a run that swings half as much in the end as just before
+    fading = certify_mpc(mpc, {"stand": stand}, thor, sensors=coarse, **options).constrained
+    assert fading.ringing == 1 and fading.remedy.startswith("finer sensors")
+
+
+def test_what_a_run_swings_is_its_peak(mpc, stand, thor):
+    """By the simulation of this test, of other steps and with the quantum as coarse."""
+    coarse = so.Sensors(quantisation={"F1": 20.0})
+    runs = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=3, sensors=coarse).constrained
+    force = [simulate_rounded(mpc, thor, r, 20.0)[-160:] for r in (412.3, 777.0, 1003.9, 1234.5)]
+    assert 0.0 < max(np.ptp(one) / 2 for one in force) <= runs.largest_ring
+
+
+def test_devices_that_keep_a_run_from_settling_are_named(mpc, stand, thor):
+    short = so.Sensors(saturation={"F1": 100.0})
+    runs = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, sensors=short).constrained
+    assert runs.not_settled == 1 and "more range" in runs.remedy
 
 
 def test_what_an_amplifier_rounds_reaches_the_steps_of_the_linear_region_too(mpc, stand, thor):
