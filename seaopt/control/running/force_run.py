@@ -163,7 +163,8 @@ def close_loop(
     ------
     ControlError
         `preview_samples` is no number of samples, the plant has no such output or state, or that output responds to the
-        current at once, the parameters contain another condition than `delay_s`, or the loop diverges.
+        current at once, the parameters contain another condition than `delay_s`, a sensor's error or current_step_A is
+        negative, that step is above the limit, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
 
@@ -181,6 +182,11 @@ def close_loop(
     if not current_step_A >= 0.0:
         raise ControlError(f"current_step_A = {current_step_A:g} is negative; give the amplifier's step, 0 for none")
     most = largest_current(current_limit_A, current_step_A)
+    if not most:
+        raise ControlError(
+            f"current_step_A = {current_step_A:g} is above the limit of the command, {current_limit_A:g}, so that "
+            "every command is zero; give the amplifier's step"
+        )
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
     x = np.zeros(len(plant.states)) if start_state is None else start_state
     if place is not None and place not in plant.states:

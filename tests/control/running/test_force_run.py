@@ -78,9 +78,10 @@ def test_sensors_and_amplifier_err_here_as_there(thor):
     [
         ({"current_step_A": -1.0}, "current_step_A"),
         ({"sensors": so.Sensors(noise_std={"F1": -1.0})}, "noise_std of F1"),
+        ({"current_step_A": 5.0, "current_limit_A": 4.0}, "above the limit of the command, 4"),
     ],
 )
-def test_negative_errors_are_refused(swing, thor, options, named):
+def test_devices_that_cannot_be_are_refused(swing, thor, options, named):
     with pytest.raises(ControlError, match=named):
         close_loop(lambda s, r, y: (0.0, s), None, swing, thor, np.zeros(5), **options)
 
