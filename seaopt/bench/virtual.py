@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import field
+from collections.abc import Collection, Mapping
+from dataclasses import field, fields
 
 import numpy as np
 from jaxtyping import Float
@@ -43,6 +43,13 @@ class Sensors:
     offset: Mapping[str, float] = field(default_factory=dict[str, float])
     quantisation: Mapping[str, float] = field(default_factory=dict[str, float])
     saturation: Mapping[str, float] = field(default_factory=dict[str, float])
+
+    def of(self, names: Collection[str]) -> Sensors:
+        """Return the errors of these alone."""
+        return Sensors(**{
+            each.name: {name: value for name, value in getattr(self, each.name).items() if name in names}
+            for each in fields(self)
+        })  # fmt: skip
 
     def read(self, name: str, values: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Return what the sensor of one output records."""

@@ -54,6 +54,7 @@ from seaopt.robustness import (
     linear_controller,
     tune_certified,
 )
+from seaopt.robustness.verification.verification import list_readings
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
@@ -307,10 +308,12 @@ def certify_schedule_problem(
     """
     table = problem.robustness
     assert problem.schedule is not None
+    plants = problem.certified_plants()
     return certify_schedule(
-        schedule, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
+        schedule, plants, source, ranges=problem.ranges, others=problem.parameters,
         samples=table.samples, seed=table.seed, max_failure_probability=table.max_failure_probability,
-        min_rate=problem.schedule.min_rate, sensors=problem.sensors, current_step_A=table.step, executor=executor,
+        min_rate=problem.schedule.min_rate, current_step_A=table.step, executor=executor,
+        sensors=problem.sensors.of(list_readings(schedule.controllers[0], plants)),
         progress=progress,
     )  # fmt: skip
 
@@ -424,20 +427,22 @@ def certify_problem(
     table, measured = problem.robustness, problem.measure_responses(source)
     if problem.designs_on_response:
         return certify(controller, problem.certified_plants(), source, seed=table.seed, measured=measured)
+    plants = problem.certified_plants()
+    sensors = problem.sensors.of(list_readings(controller, plants))  # the file may name those of its other plants
     if problem.mpc is not None:
         return certify_mpc(
-            design_mpc(problem, source), problem.certified_plants(), source, ranges=problem.ranges,
+            design_mpc(problem, source), plants, source, ranges=problem.ranges,
             others=problem.parameters, samples=table.samples, seed=table.seed,
             bounds=Budget() if table.bounds else None,
             max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
             runs=table.constrained_runs, bound_tolerance=table.bound_tolerance,
-            sensors=problem.sensors, current_step_A=table.step, executor=executor, progress=progress,
+            sensors=sensors, current_step_A=table.step, executor=executor, progress=progress,
         )  # fmt: skip
     return certify(
-        controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
+        controller, plants, source, ranges=problem.ranges, others=problem.parameters,
         samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
         max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
-        sensors=problem.sensors, current_step_A=table.step, executor=executor, progress=progress,
+        sensors=sensors, current_step_A=table.step, executor=executor, progress=progress,
         measured=measured,
     )  # fmt: skip
 

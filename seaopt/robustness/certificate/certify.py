@@ -65,6 +65,7 @@ from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, failur
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
+from seaopt.robustness.verification.verification import check_sensors
 
 CONFIDENCE = 1.0 - 1e-6
 AMPLITUDES = 9  # looked at for the remark on bandwidth
@@ -185,6 +186,7 @@ def certify(
     min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
     seen = {name: controller.see(plant) for name, plant in plants.items()}
     models, others = _with_design(controller, seen, others or ParameterSet())
+    check_sensors(sensors, controller, models)
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
     ranges = _add_warm_winding(ranges or {}, models, parameters, others)
     unknown = combine_uncertainty(parameters, others, ranges, models)

@@ -28,6 +28,7 @@ from seaopt.robustness.certificate.certificate import Certificate, Requirement
 from seaopt.robustness.certificate.certify import CONFIDENCE, STEPS, certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, run_constrained
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
+from seaopt.robustness.verification.verification import check_sensors
 
 CONSTRAINED_FAILURES, CONSTRAINED_PROBABILITY = "constrained_failures", "constrained_failure_probability"
 LINEAR_RUN, CONSTRAINED_RUN = 8.0, 0.35  # seconds that a part takes as a rule: all of the linear region, one run
@@ -143,6 +144,7 @@ def certify_mpc(
         progress, LINEAR_RUN, STEPS * real, CONSTRAINED_RUN * runs * max(len(plants), 1)
     )
     law = linear_controller(mpc)
+    check_sensors(sensors, law, {"design": mpc.design[0], **plants})
     certificate = certify(
         law, plants, parameters, ranges=ranges, others=others, seed=seed, confidence=confidence,
         max_failure_probability=max_failure_probability, simulations=False, executor=executor, progress=linearly,

@@ -25,7 +25,13 @@ from seaopt.robustness.verification.environments import StabilityMap, coupled_st
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
 from seaopt.robustness.verification.scenarios import step_scenarios
-from seaopt.robustness.verification.verification import Verification, check_plants, describe_witness, verify
+from seaopt.robustness.verification.verification import (
+    Verification,
+    check_plants,
+    check_sensors,
+    describe_witness,
+    verify,
+)
 
 Result = TypeVar("Result")
 SIMULATION_FAILURES = "simulation_failures"
@@ -162,6 +168,7 @@ def run_simulations(
             "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
         )
     check_plants(plants, draws or {}, {})
+    check_sensors(sensors, controller, plants)
     plant, values = controller.design
     device = sensors or Sensors()
     swept = _list_sweeps(controller, plants, parameters)

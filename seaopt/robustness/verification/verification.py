@@ -262,6 +262,7 @@ def verify(
 
     """
     check_plants(plants, draws or {}, partners or {})
+    check_sensors(sensors, controller, plants)
     plants = {name: controller.see(plant) for name, plant in plants.items()}
     stages = {
         name: Stage(
@@ -377,6 +378,31 @@ def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners
         for name in names:
             if name not in plants:
                 raise ControlError(f'{argument} = {{"{name}": ...}} is none of the plants; {suggestion(name, plants)}')
+
+
+def list_readings(controller: Controller, plants: Mapping[str, Plant]) -> list[str]:
+    """Return what sensors may read of the plants: their outputs, and what the law reads besides."""
+    compensation = controller.compensation
+    named = [*controller.signals, *(() if compensation is None else compensation.reads)]
+    return list(dict.fromkeys([*named, *(name for plant in plants.values() for name in plant.outputs)]))
+
+
+def check_sensors(sensors: Sensors | None, controller: Controller, plants: Mapping[str, Plant]) -> None:
+    """Refuse errors of a sensor that reads nothing of the plants: they would be in no run.
+
+    Raises
+    ------
+    ControlError
+        A name is no output of any plant, and nothing that the law reads.
+
+    """
+    if sensors is None:
+        return
+    known = list_readings(controller, plants)
+    for kind in ("noise_std", "offset", "quantisation", "saturation"):
+        for name in getattr(sensors, kind):
+            if name not in known:
+                raise ControlError(f'sensors: {kind} of "{name}" is of nothing that is read; {suggestion(name, known)}')
 
 
 def _partner(plant: Plant, partner: Plant | None) -> Plant | None:

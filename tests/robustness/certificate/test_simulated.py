@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.control import MPCSpec, force_mpc
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
-from seaopt.robustness import run_simulations
+from seaopt.robustness import certify_mpc, run_simulations, verify
 from tests.laws import scaled
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
@@ -121,6 +122,21 @@ def test_a_plant_that_cannot_be_simulated_has_not_passed(controller, linear, sta
     assert "smooth the friction" in row.where
     assert found.simulated.verification is None
     assert found.simulated.simulation_dict()["passed"] is False
+
+
+@pytest.mark.parametrize("kind", ["noise_std", "offset", "quantisation", "saturation"])
+def test_a_sensor_of_nothing_that_is_read_is_refused(controller, linear, stand, thor, kind):
+    """Its errors would be in no run, and the certificate would count them."""
+    wrong = so.Sensors(**{kind: {"F_1": 500.0}})
+    mpc = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
+    for certify in (
+        lambda: so.certify(controller, {"stand": stand}, thor, sensors=wrong),
+        lambda: linear.with_simulation(sensors=wrong),
+        lambda: verify(controller, {"stand": stand}, thor, sensors=wrong),
+        lambda: certify_mpc(mpc, {"stand": stand}, thor, sensors=wrong),
+    ):
+        with pytest.raises(ControlError, match=f'{kind} of "F_1".*F1'):
+            certify()
 
 
 def test_a_controller_without_its_design_plant_is_refused(controller, stand, thor):
