@@ -23,7 +23,7 @@ from seaopt.control import (
     sweep,
     tune_schedule,
 )
-from seaopt.control.tuning import frontier
+from seaopt.control.frontier import frontier
 from seaopt.estimation import bootstrap
 from seaopt.executors import Processes, Shared, _restore
 from seaopt.files import to_json
