@@ -20,6 +20,7 @@ from seaopt.logs.quality.report import CHANNEL_HEAD, format_channel
 from seaopt.logs.reading.selection import ClockError, is_time_name
 from seaopt.progress import divide
 from seaopt.signals import Table
+from seaopt.units import is_unit, same_dimension
 
 READING, LOOKING, DRAWING = 1.0, 1.0, 1.0  # of the time, of a long log
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
@@ -91,14 +92,23 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
         return read(time=clock)
     except ClockError as error:
         if error.column is None:
-            likely = error.candidates[0] if error.candidates else "COLUMN"
-            raise LogError(f"{error}; type {_spell_clock(path, likely, 's')}") from error
+            raise LogError(f"{error}; type {_spell_clock(path, *_choose_clock(path, error.candidates))}") from error
         if not is_time_name(error.column):
-            raise LogError(f"{error}; type {_spell_clock(path, error.column, 's')}") from error
+            raise LogError(f"{error}; type {_spell_clock(path, *_choose_clock(path, [error.column]))}") from error
         table = read(time=Column(column=error.column, unit="s"))
         other = _spell_clock(path, error.column, "ms")
         note = f'column "{error.column}" has no unit: seconds were assumed; for milliseconds type {other}'
         return replace(table, notes=(note, *table.notes))
+
+
+def _choose_clock(path: Path, candidates: Sequence[str]) -> tuple[str, str]:
+    """Return the first column whose header states a unit of time, with that unit; else the first one, in seconds."""
+    from seaopt.problem.proposal.vocabulary import read_header  # deferred: the problem file's classes take time
+
+    stated = {field.name: field.unit for field in contents(path).fields}
+    units = {name: read_header(name, stated.get(name)).unit for name in candidates}
+    timed = ((name, unit) for name, unit in units.items() if is_unit(unit) and same_dimension(unit, "s"))
+    return next(timed, (candidates[0] if candidates else "COLUMN", "s"))
 
 
 def _spell_clock(path: Path, column: str, unit: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -146,3 +147,15 @@ def test_a_clock_that_is_not_clear_is_the_command_to_type(tmp_path):
         inspect_log(path, time="my stamp")
     inspect_log(path, rate_hz=10.0, folder=tmp_path)
     assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 10.0
+
+
+@pytest.mark.parametrize("header", ["F1 [N],tick(ms)", "F1 [N],tick_ms"])
+def test_the_command_to_type_has_the_unit_of_the_column_s_name(tmp_path, header):
+    path = tmp_path / "ticks.csv"
+    path.write_text(f"{header}\n5,0\n6,1\n4,2\n7,3\n", encoding="utf-8")
+    with pytest.raises(SeaoptError) as raised:
+        inspect_log(path)
+    column, unit = shlex.split(str(raised.value).rpartition(" --time ")[2])[::2]
+    assert (column, unit) == (header.split(",")[1], "time=ms")
+    inspect_log(path, time=column, units=[unit], folder=tmp_path)
+    assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 1000.0
