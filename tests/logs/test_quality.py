@@ -136,6 +136,20 @@ def test_a_frozen_sensor_is_stuck(short_log, length, quantum):
     assert finding.where_s[0] == (short_log.time[2000], short_log.time[1999 + length])
 
 
+def test_samples_of_a_joint_that_stuck_are_to_be_left():
+    """A mass of 1 kg under a sine of 3 N, with dry friction of 2 N: it sticks at each reversal."""
+    time = np.arange(0.0, 10.0, 1e-3)
+    force, position, speed = 3.0 * np.sin(2.0 * np.pi * time), np.zeros(time.size), 0.0
+    for k in range(1, time.size):
+        driven = speed + 1e-3 * force[k]
+        speed = np.sign(driven) * max(abs(driven) - 2e-3, 0.0)
+        position[k] = position[k - 1] + 1e-3 * speed
+    signals = {"F": Signal(name="F", values=force, unit="N"), "x": Signal(name="x", values=position, unit="m")}
+    (finding,) = assess_quality(Table(time=time, signals=signals, source="test")).of("stuck")
+    assert finding.channel == "x"
+    assert "If the joint stuck there, leave those samples, for a fit of friction needs them" in finding.sentence
+
+
 def test_rest_and_coarse_encoders_are_not_stuck(short_log):
     values = channels(short_log)
     for name in values:

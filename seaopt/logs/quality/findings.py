@@ -126,7 +126,8 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
         longest = int(np.max(channel.stuck.lengths))
         text = (
             f"{name} stands still {format_count(len(channel.stuck), 'time')}, up to {longest} samples, where it "
-            "otherwise changes: a sensor or a message that stopped; cut the log there, or set those samples to NaN. An "
+            "otherwise changes: a sensor or a message that stopped, or a joint that stuck. If the joint stuck there, "
+            "leave those samples, for a fit of friction needs them; else cut the log there, or set them to NaN. An "
             f'input that holds its value is named: --input {name} (inputs=["{name}"])'
         )
         yield _runs_finding("stuck", "warning", channel, channel.stuck, time, text)
