@@ -165,8 +165,8 @@ def certify_here(certify_one):
     return to_json(drop_clock(certify_one(None).to_dict()))
 
 
-SLOW = (certify_link, certify_points)
-OTHERS = [certify_friction, certify_plan, *(pytest.param(one, marks=pytest.mark.slow) for one in SLOW)]
+SLOW = (certify_friction, certify_link, certify_points)
+OTHERS = [certify_plan, *(pytest.param(one, marks=pytest.mark.slow) for one in SLOW)]
 
 
 @pytest.mark.parametrize("certify_one", OTHERS)

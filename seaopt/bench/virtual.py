@@ -44,6 +44,11 @@ class Sensors:
     quantisation: Mapping[str, float] = field(default_factory=dict[str, float])
     saturation: Mapping[str, float] = field(default_factory=dict[str, float])
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Whose errors these are."""
+        return tuple(dict.fromkeys(name for each in fields(self) for name in getattr(self, each.name)))
+
     def of(self, names: Collection[str]) -> Sensors:
         """Return the errors of these alone."""
         return Sensors(**{

@@ -428,23 +428,28 @@ def certify_problem(
     if problem.designs_on_response:
         return certify(controller, problem.certified_plants(), source, seed=table.seed, measured=measured)
     plants = problem.certified_plants()
-    sensors = problem.sensors.of(list_readings(controller, plants))  # the file may name those of its other plants
+    read = list_readings(controller, plants)
+    sensors = problem.sensors.of(read)  # the file may name those of its other laws
     if problem.mpc is not None:
-        return certify_mpc(
-            design_mpc(problem, source), plants, source, ranges=problem.ranges,
-            others=problem.parameters, samples=table.samples, seed=table.seed,
-            bounds=Budget() if table.bounds else None,
+        certificate = certify_mpc(
+            design_mpc(problem, source), plants, source, ranges=problem.ranges, others=problem.parameters,
+            samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
             max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
             runs=table.constrained_runs, bound_tolerance=table.bound_tolerance,
             sensors=sensors, current_step_A=table.step, executor=executor, progress=progress,
         )  # fmt: skip
-    return certify(
-        controller, plants, source, ranges=problem.ranges, others=problem.parameters,
-        samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
-        max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
-        sensors=sensors, current_step_A=table.step, executor=executor, progress=progress,
-        measured=measured,
-    )  # fmt: skip
+    else:
+        certificate = certify(
+            controller, plants, source, ranges=problem.ranges, others=problem.parameters, samples=table.samples,
+            seed=table.seed, bounds=Budget() if table.bounds else None,
+            max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
+            sensors=sensors, current_step_A=table.step, executor=executor, progress=progress, measured=measured,
+        )  # fmt: skip
+    unread = [name for name in problem.sensors.names if name not in read]
+    if not unread:
+        return certificate
+    note = f"errors of {', '.join(unread)} in sensors are in no run: the law reads {', '.join(read)}"
+    return replace(certificate, remarks=(*certificate.remarks, note))
 
 
 class Stages:

@@ -50,11 +50,18 @@ def test_the_report_has_plan_and_certificate(planned, seaopt):
 
 
 def test_it_is_designed_certified_and_exported(planned, seaopt):
+    """Its sensors count, and those that it does not read are named."""
+    (planned / "plan.toml").write_text(
+        PLANNED + "current_step_A = 0.01\nsensors = { noise_std = { F1 = 1.0, F2 = 9.0 } }\n", encoding="utf-8"
+    )
     out = seaopt("tune", "plan.toml", "-o", "out")
     assert out.returncode == 0 and "Predictive control: F1, 20 Hz, every limit met" in out.stdout
     assert seaopt("certify", "plan.toml", "-o", "out").returncode == 0
     robustness = json.loads((planned / "out" / "robustness.json").read_text(encoding="utf-8"))
-    assert robustness["passed"] and robustness["constrained"]["runs"] == 1
+    runs = robustness["constrained"]
+    assert robustness["passed"] and runs["runs"] == 1 and runs["largest_ring"] > 0.0
+    assert runs["sensors"]["noise_std"] == {"F1": 1.0} and runs["current_step_A"] == 0.01
+    assert any("F2" in note and "no run" in note for note in robustness["remarks"])
     assert seaopt("export", "out", "--c", "code").returncode == 0
     problem = so.read_problem(planned / "plan.toml")
     export_mpc(design_mpc(problem, problem.parameters), planned / "python")
@@ -101,7 +108,10 @@ def test_its_own_controller_is_certified_as_that_plan(planned, seaopt):
     out = seaopt("certify", "plan.toml", "-o", "other", "--controller", "kept.json")
     assert out.returncode == 0, out.stderr
     robustness = json.loads((planned / "other" / "robustness.json").read_text(encoding="utf-8"))
-    assert robustness["passed"] and robustness["constrained"]["runs"] == 1
+    runs = robustness["constrained"]
+    assert robustness["passed"] and runs["runs"] == 1 and runs["largest_ring"] > 0.0
+    assert runs["sensors"]["noise_std"] == {"F1": 1.0} and runs["current_step_A"] == 0.01
+    assert any("F2" in note and "no run" in note for note in robustness["remarks"])
     own = json.loads(kept.read_text(encoding="utf-8"))
     written = json.loads((planned / "other" / "controller.json").read_text(encoding="utf-8"))
     assert all(written[name] == own[name] for name in ("law", "spec", "mpc"))

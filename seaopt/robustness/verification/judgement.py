@@ -19,10 +19,11 @@ A run passes if:
 - no oscillation sustains itself in the last phase (`oscillation`), above the level of noise and quantisation. Where a
   link moves, oscillations slower than a tenth of the bandwidth are excluded: an undamped link may swing; so are those
   of the link on its spring while friction holds the drive, which no law can damp;
-- the scenario's limits are met: the final error, a mean, with an allowance of four standard deviations of its noise,
-  and of none in the run without noise; of a step from rest, as its user sees it, the largest force over the reference,
-  and the time until the force stays within a tenth of it, both without noise. A step whose current saturates may
-  overshoot further only where the limit makes it: the same step without the limit must keep the peak.
+- the scenario's limits are met: the final error, a mean, with an allowance of four standard deviations of its noise
+  and of half a step of reading and command, which no law can tell from its reference, and of none in the run without;
+  of a step from rest, as its user sees it, the largest force over the reference, and the time until the force stays
+  within a tenth of it, both without noise. A step whose current saturates may overshoot further only where the limit
+  makes it: the same step without the limit must keep the peak.
 """
 
 from __future__ import annotations
@@ -387,7 +388,8 @@ def _judge_final_error(
     end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
     error, alone = (float(np.mean(_error(scenario, one, run, one.outputs[name][run])[end])) for one in (trace, twin))
     findings.figures["final_error_N"] = error
-    spare = MEAN_SIGMAS * stage.sensors.noise_std.get(name, 0.0) / math.sqrt(end.stop - end.start)
+    (noise, count), rounding = stage.reading_errors, stage.current_step_A / stage.controller.command.per_effort
+    spare = MEAN_SIGMAS * noise / math.sqrt(end.stop - end.start) + 0.5 * (count + rounding)
     for value, more, what in ((error, spare, ""), (alone, 0.0, " without noise")):
         if scenario.final_error is not None and not abs(value) <= scenario.final_error + more:
             allowed = scenario.final_error + more

@@ -19,6 +19,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.impacts import check_held
+from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
@@ -381,19 +382,23 @@ def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners
 
 
 def list_readings(controller: Controller, plants: Mapping[str, Plant]) -> list[str]:
-    """Return what sensors may read of the plants: their outputs, and what the law reads besides."""
+    """Return the signals whose sensors' errors are in the runs: what the law reads, and encoders that make it."""
     compensation = controller.compensation
     named = [*controller.signals, *(() if compensation is None else compensation.reads)]
-    return list(dict.fromkeys([*named, *(name for plant in plants.values() for name in plant.outputs)]))
+    seen = [controller.see(plant) for plant in plants.values()]
+    encoders = (
+        name for plant in seen for signal in named if signal in plant.outputs for name in weigh_encoders(plant, signal)
+    )
+    return list(dict.fromkeys([*named, *encoders]))
 
 
 def check_sensors(sensors: Sensors | None, controller: Controller, plants: Mapping[str, Plant]) -> None:
-    """Refuse errors of a sensor that reads nothing of the plants: they would be in no run.
+    """Refuse errors of a sensor that the law does not read: they would be in no run.
 
     Raises
     ------
     ControlError
-        A name is no output of any plant, and nothing that the law reads.
+        A name is nothing that the law reads, and no encoder that it is computed from.
 
     """
     if sensors is None:
@@ -402,7 +407,10 @@ def check_sensors(sensors: Sensors | None, controller: Controller, plants: Mappi
     for kind in ("noise_std", "offset", "quantisation", "saturation"):
         for name in getattr(sensors, kind):
             if name not in known:
-                raise ControlError(f'sensors: {kind} of "{name}" is of nothing that is read; {suggestion(name, known)}')
+                raise ControlError(
+                    f'sensors: {kind} of "{name}" would be in no run, for the law reads {", ".join(known)}; '
+                    + suggestion(name, known)
+                )
 
 
 def _partner(plant: Plant, partner: Plant | None) -> Plant | None:

@@ -140,6 +140,7 @@ def test_a_law_reads_what_its_sensor_rounds(mpc, stand, thor):
     np.testing.assert_allclose(run.force, simulate_rounded(mpc, thor, 777.0, 5.0, 0.3), atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_law_whose_estimate_trusts_a_coarse_reading_rings_and_is_not_met(stand, thor):
     noise = NoiseModel(sensor_std={"F1": 0.002}, input_noise={"I": 0.05}, input_drift={"I": 0.05})
     spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=50, noise=noise, max_sensitivity=False, max_complementary=False)

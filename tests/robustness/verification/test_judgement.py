@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import Gains, Loop
@@ -69,6 +70,39 @@ def test_noise_on_a_healthy_loop_is_no_fault(controller, stand, swing, thor, on_
                 cell = so.Sensors(noise_std={"F1": std})
                 verification = verify(healthy, {"p": plant}, thor, scenarios=scenarios, sensors=cell, seed=seed)
                 assert verification.passed, (std, seed, verification)
+
+
+def end_rounded(controller, params, force, quantum):
+    """Return how far off the force ends, by the exact response of the stand and a reading that is rounded."""
+    v = {name: params[name].value for name in params}
+    r = v["l"] / (2 * np.pi * v["N_p"])
+    mass, b = v["J"] / r**2 + v["m_l"], v["b_r"] / r**2
+    a = np.array([[0.0, 1.0], [-v["k"] / mass, -b / mass]])
+    push = np.array([[0.0], [v["eta"] * v["K_tau"] / r / mass]])
+    step, push = cont2discrete((a, push, np.eye(2), np.zeros((2, 1))), 1e-3)[:2]
+    law = runnable(controller)
+    x, state, waiting, out = np.zeros(2), law.reset(), 0.0, []
+    for _ in range(3000):
+        out.append(v["k"] * x[0])
+        command, state = law.step(state, force, quantum * np.floor(out[-1] / quantum + 0.5))
+        x, waiting = step @ x + push[:, 0] * waiting, command
+    return abs(force - np.mean(out[-600:]))
+
+
+def test_a_step_may_end_half_a_count_off_and_no_more(controller, stand, thor):
+    """What an integral cannot see is no fault: its reading is the reference, or hops about it."""
+    small = chosen(controller, stand, "2 % step")
+    force, quantum = small.phases[-1].force_N, 20.0
+    off = end_rounded(controller, thor, force, quantum)
+    assert small.final_error < off < small.final_error + 0.5 * quantum
+    cell = so.Sensors(quantisation={"F1": quantum})
+    row = verify(controller, {"p": stand}, thor, scenarios=[small], sensors=cell).rows[0]
+    assert abs(row.final_error_N) == pytest.approx(off, rel=0.05) and not any(
+        fault.kind == "steady error" for fault in row.faults
+    )
+    offset = so.Sensors(quantisation={"F1": quantum}, offset={"F1": 40.0})
+    row = verify(controller, {"p": stand}, thor, scenarios=[small], sensors=offset).rows[0]
+    assert any(fault.kind == "steady error" for fault in row.faults)
 
 
 @pytest.mark.parametrize("cell", [so.Sensors(), so.Sensors(noise_std={"F1": 60.0}, quantisation={"F1": 5.0})])

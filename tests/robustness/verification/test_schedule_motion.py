@@ -81,6 +81,7 @@ def test_a_loop_that_rings_while_it_moves_is_found():
     assert "rings" in describe_motion(motion, "phi", "rad")
 
 
+@pytest.mark.slow
 def test_a_link_too_heavy_for_the_rate_asked_shows_less():
     """A push of 5 A turns 20 kg m^2 by at most F L_a t/I_p in its 20 periods of the bandwidth: 2.9 rad/s."""
     schedule, (_, swing, values) = tune_knee(), read_knee()
