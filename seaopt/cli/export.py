@@ -13,6 +13,7 @@ from seaopt.cli.session import SCHEDULE_SCHEMAS, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.deploy.schedule_export import is_schedule
+from seaopt.control.laws.realisation import find_raised_limit
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.mpc.export import SOURCES, write_code
 from seaopt.control.mpc.stored import read_code
@@ -52,6 +53,12 @@ def export_controller(
     written = [str(file) for file in write(content, target, **options)]
     met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, certificate)
     certified = broken is not None
+    if raised_from := _find_raised_limit(content, options):
+        what, says = ("certified", "certificate says") if certified else ("designed", "figures say")
+        Terminal(stderr=True).wrap(
+            f"warning: the limit asked for is above the one that the controller was {what} with, {raised_from}: its "
+            f"{says} nothing of more; raise the limit in the problem file, then tune and certify again"
+        )
     if json:
         result = {
             "schema": "seaopt/export/1", "feasible": content["feasible"], "fit_met": met,
@@ -74,6 +81,17 @@ def export_controller(
         for note in content.get("notes") or () if amount == "verbose" else ():
             console.wrap(f"note: {note}", indent=2)
     return content["feasible"] and met and not broken
+
+
+def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> str:
+    """Return the limit that the controller was designed with, where an option asks for a higher one; else ""."""
+    asked = [options[name] for name in ("current_limit_A", "command_limit") if options.get(name) is not None]
+    if not asked:
+        return ""
+    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+
+    stored = read_controller(content["controllers"][0] if is_schedule(content) else content)
+    return find_raised_limit(stored["command"], stored["spec"], asked[0])
 
 
 def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tuple[Path, ...]:

@@ -24,6 +24,22 @@ def test_json_names_the_files(folder, done, seaopt):
     assert "CURRENT_LIMIT_A 3.0" in (folder / content["files"][0]).read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(("limit", "warned"), [("30", True), ("inf", True), ("9", False), ("3", False)])
+def test_a_limit_above_the_certified_one_is_warned_of(done, seaopt, tmp_path, limit, warned):
+    out = seaopt("export", done.results, "--c", tmp_path / "out", "--current-limit", limit)
+    assert out.returncode == 0
+    said = " ".join(out.stderr.split())
+    assert ("the controller was certified with, 9 A: its certificate says nothing of more" in said) == warned
+    header = (tmp_path / "out" / "force_law.h").read_text(encoding="utf-8")
+    assert ("It was designed with a limit of 9 A" in header) == warned
+
+
+def test_a_raised_limit_of_a_controller_without_a_certificate_is_of_its_design(done, seaopt, tmp_path):
+    (tmp_path / "controller.json").write_bytes((done.results / "controller.json").read_bytes())
+    out = seaopt("export", tmp_path, "--c", tmp_path / "out", "--current-limit", "30")
+    assert "the controller was designed with, 9 A: its figures say nothing of more" in " ".join(out.stderr.split())
+
+
 def one_line(out):
     assert out.returncode == 2
     (line,) = out.stderr.strip().splitlines()

@@ -30,7 +30,7 @@ from seaopt.control.deploy.schedule_export import export_schedule, is_schedule
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import PlausibilityGate
-from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
+from seaopt.control.laws.realisation import RunnableLaw, choose_limit, find_raised_limit, realise
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
@@ -165,6 +165,7 @@ def export(
         "name": prefix,
         "NAME": prefix.upper(),
         "fit_met": fit_met,
+        "raised_from": strip_markup(find_raised_limit(stored["command"], stored["spec"], limit)),
     }
     numbers = {".m": repr, ".h": literal(precision), ".c": literal(precision)}
     texts = {

@@ -25,7 +25,7 @@ from seaopt.control.deploy.c_text import (
     strip_markup,
 )
 from seaopt.control.laws.command import name_gain_units
-from seaopt.control.laws.realisation import choose_limit
+from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES, LAW_GAINS
 from seaopt.control.scheduling.gain_table import GainTable
@@ -84,7 +84,8 @@ def export_schedule(
         raise FileError(f"{folder}: is a file; give a folder")
     check_command_limits(current_limit_A, command_limit)
     content = schedule.to_dict() if isinstance(schedule, ScheduledController) else schedule
-    law, first = read_runnable(content, command_limit if current_limit_A is None else current_limit_A, tracking_time_s)
+    limit = command_limit if current_limit_A is None else current_limit_A
+    law, first = read_runnable(content, limit, tracking_time_s)
     if not content["feasible"] and not allow_infeasible:
         raise ControlError(
             f"the schedule misses {'; '.join(content['broken'])}; tune one that does not, or allow an infeasible one"
@@ -93,6 +94,7 @@ def export_schedule(
         fit_met = content.get("fit_met", True) is True if fit_met is None else fit_met
     context = _describe(content, law, first, precision) | {
         "name": prefix, "NAME": prefix.upper(), "precision": precision, "fit_met": fit_met,
+        "raised_from": strip_markup(find_raised_limit(first["command"], first["spec"], limit)),
     }  # fmt: skip
     texts = {pattern.format(prefix): render(template, context) for pattern, template in TEMPLATES.items()}
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())

@@ -332,6 +332,15 @@ def choose_limit(command: Command, spec: ControllerSpec, asked: float | None) ->
     return command.limit(spec.limit_asked if asked is None else asked)
 
 
+def find_raised_limit(command: Command, spec: ControllerSpec, asked: float | None) -> str:
+    """Return the limit that a controller was designed with, where the one asked for is higher; else "".
+
+    Its figures and its certificate are of that one.
+    """
+    own, running = (choose_limit(command, spec, limit) for limit in (None, asked))
+    return command.show(own) if own is not None and running is not None and running > own else ""
+
+
 def realise(
     law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None,
     gate: PlausibilityGate | None = None, command: tuple[str, str] = ("I", "A"), heat: HeatGuard | None = None,

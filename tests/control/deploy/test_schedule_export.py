@@ -121,6 +121,12 @@ def test_a_table_that_was_edited_or_is_not_feasible_is_not_exported(tmp_path, sc
     assert "NOT FEASIBLE" in (tmp_path / "force_law.h").read_text()
 
 
+@pytest.mark.parametrize(("limit", "stated"), [(6.0, True), (5.0, False)])
+def test_a_limit_above_that_of_the_design_is_stated(tmp_path, schedule, limit, stated):
+    so.export(schedule, tmp_path, current_limit_A=limit)
+    assert ("It was designed with a limit of 5 A" in (tmp_path / "force_law.h").read_text()) == stated
+
+
 def test_a_gate_is_refused(tmp_path, schedule):
     with pytest.raises(ControlError, match="derate"):
         so.export(schedule, tmp_path, derate=True)
