@@ -112,7 +112,8 @@ class PossibleBandwidths:
         if self.largest_hz is None and self.closest_hz is None:
             return "no stable law was found at other bandwidths"
         if self.largest_hz is None:
-            return f"none is known that keeps them; {self.closest_hz:.4g} Hz misses them least, by {self.missed_by:.1%}"
+            least = f"{self.closest_hz:.4g} Hz misses least, by {self.missed_by:.1%}"
+            return f"no other is known that keeps them; of those {least}"
         nearest = " and ".join(f"{f:.4g} Hz" for f in self.nearest_hz)
         most = "" if self.largest_hz in self.nearest_hz else f", {self.largest_hz:.4g} Hz at most"
         return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
