@@ -16,6 +16,7 @@ from seaopt.records import record
 from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.failures import Failure, group_failures
+from seaopt.robustness.certificate.scheduled import MOTION_RATE
 from seaopt.robustness.verification.verification import Verification
 
 UNMET = "on a fit that is not met"
@@ -222,9 +223,11 @@ def judge_schedule_certificate(certificate: ScheduleCertificate, again: str = ""
     broken = [row for row in certificate.requirements if not row.met]
     reasons = tuple(explain_failure(one) for one in group_failures(broken))
     command = f"type {again}" if again else "tune again"
+    slow = all(row.name == MOTION_RATE and row.value > 0.0 for row in broken)  # 0 where it rings or departs
+    change = "ask a smaller min_rate, or allow more current" if slow else "raise reserve, or add points"
     return StageVerdict(
         met=False, text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
-        reasons=reasons, next=(certificate.schedule.remedy or f"raise reserve, or add points; then {command}",),
+        reasons=reasons, next=(certificate.schedule.remedy or f"{change}; then {command}",),
     )  # fmt: skip
 
 

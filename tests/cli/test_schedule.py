@@ -8,6 +8,7 @@ import pytest
 KNEE = Path(__file__).resolve().parents[2] / "problems" / "lever_knee.toml"
 SHORTER = {
     "points = [0.0, 0.3, 0.55, 0.75, 0.9, 1.05, 1.15]": "points = [0.0, 0.35]",
+    "min_rate = 2.0": "min_rate = 1.0",  # as far as the link swings there
     "[robustness]": "[robustness]\nsamples = 50",
 }
 
@@ -52,12 +53,21 @@ def test_a_whole_run_is_met_and_its_report_has_the_schedule(knee, seaopt):
     assert "not certified" not in seaopt("export", "out", "--c", "c").stdout
 
 
+@pytest.mark.slow
+def test_a_rate_that_the_link_does_not_reach_is_named_with_what_to_change(knee, seaopt, text):
+    (knee / "knee.toml").write_text(text.replace("min_rate = 1.0", "min_rate = 2.0"), encoding="utf-8")
+    out = seaopt("run", "knee.toml")
+    assert out.returncode == 1 and "min_motion_rate" in out.stdout
+    (advice,) = [line for line in out.stdout.splitlines() if "next:" in line]
+    assert "min_rate" in advice and "reserve" not in advice
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ('over = "phi"', 'over = "ph"', 'did you mean "phi"'),
         ("points = [0.0, 0.35]", "points = [0.35, 0.0]", "do not ascend"),
-        ("min_rate = 2.0", "bandwidth_hz = [30.0]", "give one per point"),
+        ("min_rate = 1.0", "bandwidth_hz = [30.0]", "give one per point"),
         ("I_p = [0.3, 0.42]", "phi = [0.3, 0.42]", "robustness.parameters.phi"),
         ("samples = 50", "retune = 2", "robustness.retune"),
         ("[robustness]", "[expect.controller]\n[robustness]", "expect.controller"),

@@ -57,6 +57,7 @@ from seaopt.units import unit_after
 
 SCHEDULE_ROBUSTNESS_SCHEMA = "seaopt/schedule_robustness/1"
 DESIGN = "design"  # the design plant's name where the caller does not list it
+MOTION_RATE = "min_motion_rate"
 POINT, BOUND, SWEEP = 4.0, 0.2, 5.0  # seconds that a part takes as a rule: of a point, a stretch, the sweeps of a plant
 
 
@@ -548,7 +549,7 @@ def _require_motion(motion: Motion, schedule: ScheduledController, least: float 
     short = not motion.fault and motion.rate < asked
     remedy = "; ask a smaller min_rate, or give the command a higher limit" if short else ""
     return Requirement(
-        name="min_motion_rate", limit=asked, value=0.0 if motion.fault else motion.rate,
+        name=MOTION_RATE, limit=asked, value=0.0 if motion.fault else motion.rate,
         met=not motion.fault and not short,
         where=f"{describe_motion(motion, schedule.over, schedule.unit)}{remedy}",
     )  # fmt: skip
