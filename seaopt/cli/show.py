@@ -223,6 +223,8 @@ def show_certificate(console: Terminal, certificate: Certificate) -> None:
         failed = len(runs.failures)
         console.wrap(f"simulation: {failed} of {len(runs.rows)} runs failed" if failed else
                      f"simulation: {len(runs.rows)} runs passed", indent=2)  # fmt: skip
+        for line in runs.describe_tracking():  # no step is judged where the link gives way
+            console.wrap(line, indent=2)
     _show_notes(console, certificate.notes)
 
 
