@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench.excitation import Excitation, excite
-from seaopt.errors import SimulationError, suggestion
+from seaopt.errors import SeaoptError, SimulationError, suggestion
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
@@ -48,6 +48,18 @@ class Sensors:
     def names(self) -> tuple[str, ...]:
         """Whose errors these are."""
         return tuple(dict.fromkeys(name for each in fields(self) for name in getattr(self, each.name)))
+
+    @property
+    def erring(self) -> set[str]:
+        """Those whose readings are off, clipped or rounded, besides noise."""
+        return {*self.offset, *self.saturation, *self.quantisation}
+
+    def refuse_negative(self, names: Collection[str], error: type[SeaoptError]) -> None:
+        """Refuse what cannot be negative, of these."""
+        for what in ("noise_std", "quantisation", "saturation"):
+            for name in names:
+                if not getattr(self, what).get(name, 0.0) >= 0.0:
+                    raise error(f"{what} of {name} is negative; give zero or more")
 
     def of(self, names: Collection[str]) -> Sensors:
         """Return the errors of these alone."""

@@ -430,20 +430,18 @@ def certify_problem(
     plants = problem.certified_plants()
     read = list_readings(controller, plants)
     sensors = problem.sensors.of(read)  # the file may name those of its other laws
-    if problem.mpc is not None:
-        certificate = certify_mpc(
-            design_mpc(problem, source), plants, source, ranges=problem.ranges, others=problem.parameters,
-            samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
-            max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
-            runs=table.constrained_runs, bound_tolerance=table.bound_tolerance,
-            sensors=sensors, current_step_A=table.step, executor=executor, progress=progress,
-        )  # fmt: skip
+    options: dict[str, Any] = {
+        "ranges": problem.ranges, "others": problem.parameters, "samples": table.samples, "seed": table.seed,
+        "bounds": Budget() if table.bounds else None, "max_failure_probability": table.max_failure_probability,
+        "min_friction_margin": table.min_friction_margin, "sensors": sensors, "current_step_A": table.step,
+        "executor": executor, "progress": progress,
+    }  # fmt: skip
+    if problem.mpc is None:
+        certificate = certify(controller, plants, source, measured=measured, **options)
     else:
-        certificate = certify(
-            controller, plants, source, ranges=problem.ranges, others=problem.parameters, samples=table.samples,
-            seed=table.seed, bounds=Budget() if table.bounds else None,
-            max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
-            sensors=sensors, current_step_A=table.step, executor=executor, progress=progress, measured=measured,
+        certificate = certify_mpc(
+            design_mpc(problem, source), plants, source, runs=table.constrained_runs,
+            bound_tolerance=table.bound_tolerance, **options,
         )  # fmt: skip
     unread = [name for name in problem.sensors.names if name not in read]
     if not unread:

@@ -245,12 +245,8 @@ class _Reading:
 
 def _place_sensor(sensors: Sensors, plant: Plant, values: CompletedParameters, measured: str) -> _Reading:
     """Return the sensor of an output, with the encoders that it is computed from."""
-    for what in ("noise_std", "quantisation", "saturation"):
-        for name, value in getattr(sensors, what).items():
-            if not value >= 0.0:
-                raise ControlError(f"sensors: {what} of {name} = {value:g} is negative; give zero or more")
-    names = list(plant.outputs)
-    erring = {*sensors.offset, *sensors.saturation, *sensors.quantisation} & plant.outputs.keys()
+    sensors.refuse_negative(sensors.names, ControlError)
+    names, erring = list(plant.outputs), sensors.erring & plant.outputs.keys()
     weights = evaluate_weights(plant, values, measured)
     return _Reading(
         sensors=sensors, name=measured, row=names.index(measured),

@@ -89,10 +89,7 @@ class SampledLoop:
         for what in ("current_step_A", "longest_delay_s"):
             if not getattr(self, what) >= 0.0:
                 raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")
-        for what in ("noise_std", "quantisation", "saturation"):
-            for name in (*self.signals, *self.encoders):
-                if not getattr(self.sensors, what).get(name, 0.0) >= 0.0:
-                    raise SimulationError(f"{what} of {name} is negative; give zero or more")
+        self.sensors.refuse_negative((*self.signals, *self.encoders), SimulationError)
         if self.current_step_A and not self.most_A:
             limit = show_command(self.law.current_limit_A, *self.law.command)
             raise SimulationError(
@@ -139,8 +136,7 @@ class SampledLoop:
     @property
     def encoders(self) -> tuple[str, ...]:
         """The encoders that the measured outputs are computed from and that have an offset, a range or a step."""
-        sensors = self.sensors
-        erring = {*sensors.offset, *sensors.saturation, *sensors.quantisation} & self.plant.outputs.keys()
+        erring = self.sensors.erring & self.plant.outputs.keys()
         signals = [name for name in self.signals if name not in self.standing]
         used = [name for signal in signals for name in weigh_encoders(self.plant, signal) if name in erring]
         return tuple(dict.fromkeys(used))
