@@ -130,7 +130,7 @@ def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int,
 def load_passes(model: Model, layout: Layout, delayed: int, *, measured: bool) -> Kernel | None:
     """Return the compiled passes of a model, or None where there is no compiler."""
     kernel = load_kernel(kernel_source(model, layout, delayed, measured=measured), "seaopt_passes")
-    sums = load_library(_text("sums.h") + _text("sums.c"))
+    sums = load_library(_text("sums.h") + _text("sums.c"), "seaopt_sums")
     if kernel is None or sums is None:
         return None
     table = ctypes.c_char.in_dll(sums, "seaopt_sums")

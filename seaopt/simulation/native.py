@@ -6,9 +6,10 @@ threads.
 
 The shared libraries live in a folder of the user's own (mode 0700, refused if anyone else can write to it, or if it is
 a link) under the hash of their source, flags and compiler. A file with the hash of the library itself stands beside
-each: Python would die of a library that was cut off, so one that does not match is compiled again. A compiler that
-does not end within a minute is not asked again for a day. ``SEAOPT_COMPILER`` names a compiler, or "none" to use none;
-``SEAOPT_CACHE_DIR`` names the folder.
+each: Python would die of a library that was cut off, so one that does not match is compiled again. A new library is
+first loaded in a process apart, whatever the compiler's exit status says of it. A compiler that does not end within
+a minute is not asked again for an hour. Where one fails, a line is logged, and all is computed without it.
+``SEAOPT_COMPILER`` names a compiler, or "none" to use none; ``SEAOPT_CACHE_DIR`` names the folder.
 
 Threads write to arrays by address, which nothing but this module keeps alive. An interrupt (Ctrl-C) reaches the main
 thread alone, while the others still write: `Kernel.run` raises it when they have ended. Between two instructions of
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import logging
 import os
 import platform
 import re
@@ -59,6 +61,7 @@ FLAGS = (
 )
 CLONES = ("-fipa-cp-clone",)  # copies of a pass for constant arguments; clang and zig refuse what they do not know
 NATIVE = ("-march=native", "-mprefer-vector-width=256", "-mno-avx512f")
+LOAD = "import ctypes, sys; getattr(ctypes.CDLL(sys.argv[1]), sys.argv[2])"  # 15 ms, of the half second of a compiler
 
 
 def find_compiler() -> list[str] | None:
@@ -105,15 +108,18 @@ def _is_private(path: Path) -> bool:
 
 
 @lru_cache(maxsize=64)
-def load_library(source: str) -> ctypes.CDLL | None:
-    """Return the shared library of a C source, compiled or from the cache; None without compiler or folder."""
+def load_library(source: str, name: str) -> ctypes.CDLL | None:
+    """Return the shared library of a C source that exports `name`, compiled or from the cache.
+
+    None without compiler or folder.
+    """
     compiler, folder = find_compiler(), cache_folder()
     if compiler is None or folder is None:
         return None
-    content = (source, *FLAGS, *CLONES, *NATIVE, *compiler, sys.platform, _processor())
+    content = (source, LOAD, *FLAGS, *CLONES, *NATIVE, *compiler, sys.platform, _processor())
     key = hashlib.sha256("\0".join(content).encode()).hexdigest()
     library = folder / f"{key}.so"
-    for ready in (_is_whole, partial(_compile_once, compiler, source)):
+    for ready in (_is_whole, partial(_compile_once, compiler, source, name)):
         if ready(library) and _is_private(library):
             try:
                 return ctypes.CDLL(str(library))
@@ -144,10 +150,10 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
 
 
-def _compile_once(compiler: list[str], source: str, library: Path) -> bool:
+def _compile_once(compiler: list[str], source: str, name: str, library: Path) -> bool:
     """Compile as `_compile` does; of several processes that want one library at a time, one does, and others wait."""
     with _lock(library.with_suffix(".lock")):
-        return _is_whole(library) or _compile(compiler, source, library)
+        return _is_whole(library) or _compile(compiler, source, name, library)
 
 
 @contextmanager
@@ -164,24 +170,34 @@ def _lock(path: Path) -> Generator[None]:
             path.unlink()
 
 
-def _compile(compiler: list[str], source: str, library: Path) -> bool:
+def _compile(compiler: list[str], source: str, name: str, library: Path) -> bool:
     """Compile a source to a library with its hash beside it; whatever goes wrong, there is none, and it is False."""
     hung = _hung_marker(compiler, library.parent)
-    try:
-        if time.time() - hung.lstat().st_mtime < HUNG_S:
-            return False
-    except OSError:  # it never hung
-        pass
     _sweep(library.parent)
     try:
-        wanted = ((*CLONES, *NATIVE), NATIVE, CLONES, ())
-        return any(_run_compiler([*compiler, *FLAGS, *extra], source, library) for extra in wanted)
-    except subprocess.TimeoutExpired:
+        if hung.exists() and time.time() - hung.lstat().st_mtime < HUNG_S:
+            trouble = f"did not end less than {HUNG_S / 60:g} minutes ago, and is not asked again so soon"
+        elif any(
+            _run_compiler([*compiler, *FLAGS, *extra], source, name, library)
+            for extra in ((*CLONES, *NATIVE), NATIVE, CLONES, ())
+        ):
+            return True
+        else:
+            trouble = "fails, or makes nothing that can be loaded"
+    except subprocess.TimeoutExpired as error:
+        trouble = f"did not end within {error.timeout:.2g} s"
         with suppress(OSError):
             hung.touch()
-    except OSError:  # no room on the disk, among others
-        pass
+    except OSError as error:  # no room on the disk, among others
+        trouble = error.strerror or str(error)
+    _tell(f"C compiler {' '.join(compiler)}: {trouble}; slower without it; SEAOPT_COMPILER names another, or none")
     return False
+
+
+@lru_cache(maxsize=8)
+def _tell(text: str) -> None:
+    """Log a line, once per process."""
+    logging.getLogger("seaopt").warning("seaopt: %s", text)
 
 
 def _hung_marker(compiler: list[str], folder: Path) -> Path:
@@ -201,8 +217,8 @@ def _sweep(folder: Path) -> None:
                 shutil.rmtree(left, ignore_errors=True)
 
 
-def _run_compiler(command: list[str], source: str, library: Path) -> bool:
-    """Compile a source, and move the library into its place once all of it is on the disk.
+def _run_compiler(command: list[str], source: str, name: str, library: Path) -> bool:
+    """Compile a source, load what comes of it, and move it into its place once all of it is on the disk.
 
     Raises
     ------
@@ -213,10 +229,12 @@ def _run_compiler(command: list[str], source: str, library: Path) -> bool:
 
     """
     with tempfile.TemporaryDirectory(dir=library.parent, prefix=BUILD, ignore_cleanup_errors=True) as folder:
-        code, built, beside = (Path(folder) / name for name in ("kernel.c", "kernel.so", "kernel.sha256"))
+        code, built, beside = (Path(folder) / file for file in ("kernel.c", "kernel.so", "kernel.sha256"))
         code.write_text(source, encoding="utf-8")
-        _wait_for([*command, str(code), "-o", str(built), "-lm"], COMPILER_S + PER_CHARACTER_S * len(source))
-        if not built.exists():
+        compiling = [*command, str(code), "-o", str(built), "-lm"]
+        loading = [sys.executable, "-I", "-S", "-c", LOAD, str(built), name]  # may die of it: SIGBUS, SIGSEGV
+        limit_s = COMPILER_S + PER_CHARACTER_S * len(source)
+        if not all(_succeeds(step, limit_s) for step in (compiling, loading)):
             return False
         beside.write_text(hashlib.sha256(built.read_bytes()).hexdigest(), encoding="ascii")
         for file, target in ((built, library), (beside, _hash_beside(library))):
@@ -227,11 +245,12 @@ def _run_compiler(command: list[str], source: str, library: Path) -> bool:
     return True
 
 
-def _wait_for(command: list[str], limit_s: float) -> None:
+def _succeeds(command: list[str], limit_s: float) -> bool:
+    """Run a command and tell whether it ends with status 0; one that does not end is killed with all it started."""
     silent = subprocess.DEVNULL
     process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)  # noqa: S603
     try:
-        process.wait(limit_s)
+        return process.wait(limit_s) == 0
     except BaseException:
         with suppress(OSError):
             os.killpg(process.pid, signal.SIGKILL)  # a compiler's driver starts others
@@ -325,7 +344,7 @@ def _join(futures: list[Future[None]], interrupt: BaseException | None) -> None:
 
 def load_kernel(source: str, name: str) -> Kernel | None:
     """Return the function `name` of a C source as a kernel; None where there is no compiler."""
-    library = load_library(source)
+    library = load_library(source, name)
     if library is None:
         return None
     function = getattr(library, name)

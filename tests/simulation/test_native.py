@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -184,6 +185,7 @@ def kernels(tmp_path, monkeypatch):
     """Return an empty folder for kernels."""
     monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path))
     native.load_library.cache_clear()
+    native._tell.cache_clear()
     yield native.cache_folder()
     native.load_library.cache_clear()
 
@@ -225,7 +227,7 @@ def lose_hash(library):
 
 LOAD = """
 from seaopt.simulation import native
-library = native.load_library({source!r})
+library = native.load_library({source!r}, "answer")
 print(library.answer(None, 0))
 """
 
@@ -235,7 +237,7 @@ print(library.answer(None, 0))
 def test_a_damaged_kernel_is_compiled_again(kernels, damage):
     """Loading a library that was cut off ends Python with SIGBUS, in every run from then on: so in a process apart."""
     source = ANSWER % damage.__name__
-    assert native.load_library(source) is not None
+    assert native.load_library(source, "answer") is not None
     (library,) = kernels.glob("*.so")
     copy = library.with_name("copy")  # this process has the library itself mapped
     copy.write_bytes(library.read_bytes())
@@ -251,21 +253,23 @@ def test_a_damaged_kernel_is_compiled_again(kernels, damage):
     assert (library.stat().st_ino == inode) == (damage is damage_nothing)
 
 
-def test_a_compiler_that_hangs_is_asked_once(kernels, make_compiler, monkeypatch, tmp_path):
+def test_a_compiler_that_hangs_is_asked_once(kernels, make_compiler, monkeypatch, tmp_path, caplog):
     """It and what it started are killed; the next process does not wait again."""
     make_compiler(f'echo asked >> "{tmp_path}/asked"; sleep 30 & wait')
     monkeypatch.setattr(native, "COMPILER_S", 0.3)
     begin = time.monotonic()
-    assert native.load_library(ANSWER % "hangs") is None
+    assert native.load_library(ANSWER % "hangs", "answer") is None
+    (line,) = caplog.messages
+    assert line.startswith("seaopt: C compiler ") and "did not end within 0." in line
     native.load_library.cache_clear()
-    assert native.load_library(ANSWER % "hangs") is None
-    assert native.load_library(ANSWER % "hangs with another source") is None
+    assert native.load_library(ANSWER % "hangs", "answer") is None
+    assert native.load_library(ANSWER % "hangs with another source", "answer") is None
     assert time.monotonic() - begin < 5.0
     assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == 1
     assert not list(kernels.glob(f"{native.BUILD}*"))
     (marker,) = kernels.glob("*.hung")
     os.utime(marker, (1.0, 1.0))
-    assert native.load_library(ANSWER % "another day") is None
+    assert native.load_library(ANSWER % "another day", "answer") is None
     assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == 2
 
 
@@ -286,12 +290,51 @@ def test_a_compiler_that_refuses_options_compiles_without_them(kernels, make_com
     make_compiler(
         f'for option; do case "$option" in {unknown}) exit 1;; esac; done; exec {native.shutil.which("cc")} "$@"'
     )
-    assert native.load_library(ANSWER % unknown) is not None
+    assert native.load_library(ANSWER % unknown, "answer") is not None
 
 
-def test_a_compiler_that_fails_leaves_nothing(kernels, make_compiler):
-    make_compiler("exit 1")
-    assert native.load_library(ANSWER % "fails") is None
+# What a shell script does in the compiler's place, once $out is the file that it is to write and $good a good library.
+FAULTY = {
+    "fails": "exit 1",
+    "fails with half a library": 'head -c 5000 "$good" > "$out"; exit 1',
+    "fails with a whole library": 'cp "$good" "$out"; exit 1',
+    "is killed over half a library": 'head -c 5000 "$good" > "$out"; kill -9 $$',
+    "is killed over a whole library": 'cp "$good" "$out"; kill -SEGV $$',
+    "calls half a library good": 'head -c 5000 "$good" > "$out"',
+    "calls a library of nothing good": ': > "$out"',
+    "calls text good": 'echo "int x;" > "$out"',
+    "calls a folder good": 'mkdir "$out"',
+    "writes nothing": "exit 0",
+    "writes another library": 'cp "$good" "$out"',
+}
+
+
+FAULTY_RUNS = """
+import json, os, sys
+from seaopt.simulation import native
+for script in json.load(sys.stdin):
+    with open(os.environ["SEAOPT_COMPILER"], "w") as stream:
+        stream.write(script)
+    for _ in range(2):
+        print(native.load_kernel({source!r} + script.splitlines()[-1] + "*/", "answer"), flush=True)
+        native.load_library.cache_clear()
+"""
+
+
+@needs_compiler
+def test_what_a_faulty_compiler_leaves_is_never_loaded(kernels, make_compiler, compiler, tmp_path):
+    """In a process apart: half a library with its own hash beside it ended every later run with SIGBUS."""
+    good, code = tmp_path / "good.so", tmp_path / "good.c"
+    code.write_text("int another(void) { return 7; }", encoding="utf-8")
+    subprocess.run([*compiler, "-shared", "-fPIC", str(code), "-o", str(good)], check=True)
+    make_compiler("")
+    head = f'#!/bin/sh\ngood="{good}"; while [ "$1" != "-o" ]; do shift; done; out="$2"\n'
+    done = subprocess.run(
+        [sys.executable, "-c", FAULTY_RUNS.format(source=ANSWER.partition("%")[0])],
+        input=json.dumps([head + fault for fault in FAULTY.values()]), capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout.split()) == (0, ["None"] * 2 * len(FAULTY)), done.stderr
+    assert done.stderr.startswith("seaopt: C compiler ") and done.stderr.count("\n") == 1
     assert not list(kernels.iterdir())
 
 
@@ -302,7 +345,7 @@ def test_what_killed_compilers_left_is_swept(kernels):
         left.mkdir()
         (left / "kernel.c").write_text("int x;", encoding="utf-8")
     os.utime(old, (1.0, 1.0))
-    assert native.load_library(ANSWER % "sweeps") is not None
+    assert native.load_library(ANSWER % "sweeps", "answer") is not None
     assert not old.exists() and new.exists()
 
 
@@ -312,5 +355,5 @@ def test_a_full_disk_under_the_kernels_is_as_no_compiler(kernels, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(native.os, "fsync", refuse)
-    assert native.load_library(ANSWER % "full disk") is None
+    assert native.load_library(ANSWER % "full disk", "answer") is None
     assert not list(kernels.glob("*.so"))
