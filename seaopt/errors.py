@@ -1,14 +1,17 @@
 """Errors that say what was wrong, with which value, and what to do about it.
 
 Every error that bad input can cause is a `SeaoptError`. Its text names the argument, the value and the
-remedy, on one line; the command line prints that line and exits with 2.
+remedy, on one line; the command line prints that line and exits with 2. A defect of seaopt itself, whatever the
+input, is an `InternalError`, with which it exits with 70.
 """
 
 from __future__ import annotations
 
 import difflib
 import numbers
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 
@@ -68,6 +71,27 @@ class ProblemError(SeaoptError):
 
 class FileError(SeaoptError):
     """A file cannot be read or written."""
+
+
+class InternalError(Exception):
+    """A defect of seaopt, not of the input: no SeaoptError, so that nothing takes it for one.
+
+    Its text is one line, its note what it takes to see the defect again, and its cause the error that came up.
+    """
+
+    @classmethod
+    def of(cls, error: Exception, call: str, request: str) -> InternalError:
+        """Return the error that reports another one of a call, with what was asked of it."""
+        own = Path(__file__).parent
+        places = [frame for frame in traceback.extract_tb(error.__traceback__) if own in Path(frame.filename).parents]
+        place = "".join(f" at {Path(frame.filename).relative_to(own)}:{frame.lineno}" for frame in places[-1:])
+        reason = " ".join(str(error).split()) or "no text"
+        out = cls(
+            f"{call} came upon a defect of seaopt, {type(error).__name__}{place}: {reason}; please report it with the "
+            "request below, and change the request a little to go on"
+        )
+        out.add_note(request)
+        return out
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

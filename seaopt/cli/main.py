@@ -1,4 +1,4 @@
-"""Commands, options, exit codes: 0 done and all requirements met, 1 one is not met, 2 bad input, 130 Ctrl-C."""
+"""Commands, options, exit codes: 0 all requirements met, 1 one is not, 2 bad input, 70 a defect, 130 Ctrl-C."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import typer
 from typer.core import TyperGroup
 
 from seaopt.cli.terminal import Amount, prepare_streams
-from seaopt.errors import ControlError, FileError, LogError, SeaoptError, UnitError
+from seaopt.errors import ControlError, FileError, InternalError, LogError, SeaoptError, UnitError
 from seaopt.formatting import printable
 
 INTERRUPTED = 130  # exit code, as a shell's
+DEFECT = 70  # exit code: EX_SOFTWARE of sysexits.h
 # A command, a line of TOML, an option or the word that was meant stands in it.
 TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]|did you mean \"")
 
@@ -455,7 +456,10 @@ def schema(
 
 
 def main() -> None:
-    """Run the command line; a SeaoptError is one line on stderr, with the place in a text, and exit code 2."""
+    """Run the command line; a SeaoptError is one line on stderr, with the place in a text, and exit code 2.
+
+    An InternalError has another exit code, that of a defect, and the request to report it with.
+    """
     prepare_streams()
     try:
         try:
@@ -464,6 +468,8 @@ def main() -> None:
             sys.stdout.flush()
     except SeaoptError as error:
         _end(_add_remedy(error), _list_notes(error))
+    except InternalError as error:
+        _end(str(error), _list_notes(error), DEFECT)
     except BrokenPipeError:
         raise SystemExit(0) from None
     except MemoryError:
@@ -494,8 +500,8 @@ def _list_notes(error: BaseException | None) -> list[str]:
     return notes
 
 
-def _end(text: str, notes: Iterable[str] = ()) -> NoReturn:
-    """Write one line on stderr, as a terminal may see it, with notes below; leave with the exit code of bad input."""
+def _end(text: str, notes: Iterable[str] = (), exit_code: int = 2) -> NoReturn:
+    """Write one line on stderr, as a terminal may see it, with notes below; leave, with the exit code of bad input."""
     for line in (f"seaopt: {' '.join(text.split())}", *notes):
         sys.stderr.write(f"{printable(line)}\n")
-    raise SystemExit(2)
+    raise SystemExit(exit_code)

@@ -38,7 +38,17 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control.tuning.frequencies import choose_prominent
 from seaopt.control.tuning.grid import Grid, LawResponse, Path, use_disc
-from seaopt.control.tuning.optimisation_problem import CURVES, FRICTION, K_D, K_P, K_V, PASSIVE, LawNumbers, Task
+from seaopt.control.tuning.optimisation_problem import (
+    CURVES,
+    FRICTION,
+    K_D,
+    K_P,
+    K_V,
+    NEXT_TO_NO_NOISE,
+    PASSIVE,
+    LawNumbers,
+    Task,
+)
 from seaopt.records import record
 
 MOST_PROGRAMS = 8
@@ -259,12 +269,12 @@ def _expand_objective(
     at, count = law.law, len(law.by_y)
     if task.spec.objective == "noise":
         used = np.abs(at.c_y / (at.rest[0] + grid.p[0] * at.c_y))[None]
-        index = choose_prominent(used / np.max(used), ROWS_PER_LIMIT)
+        index = choose_prominent(used / max(np.max(used), NEXT_TO_NO_NOISE), ROWS_PER_LIMIT)
         one, used = at.rest[0, index] + grid.p[0, index] * at.c_y[index], used[0, index]
         by_y = law.by_y[:, index]
         by_loop = grid.p[0, index] * by_y + grid.speed[0, index] * law.by_speed[:, index]
         slope = _differentiate_size(at.c_y[index], by_y) - used[:, None] * _differentiate_size(one, by_loop)
-        size = np.max(used)
+        size = max(np.max(used), NEXT_TO_NO_NOISE)
         return np.zeros((count, count)), used / size, slope / np.abs(one)[:, None] / size
     w = task.weights(grid.f)
     inside = w > 0.0

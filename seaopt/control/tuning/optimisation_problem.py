@@ -93,6 +93,7 @@ NO_LIMIT = 1e9
 NO_FLOOR = 1e-9
 NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
 NEARLY_KEPT = 1.001
+NEXT_TO_NO_NOISE = 1e-9  # N/N, of a law without feedback: the objective's logarithm is taken
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
 SLOWEST_SPEED_RATE = 4.0 * INTEGRAL_RAD_S  # 1/T_v, rad/s, of a speed loop that integrates
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
@@ -584,7 +585,7 @@ class Task:
         """Return the objective on a grid."""
         distance = np.abs(law.rest + grid.p * law.c_y)
         if self.spec.objective == "noise":
-            return float(np.max(np.abs(law.c_y) / distance[: self.design_states]))
+            return max(float(np.max(np.abs(law.c_y) / distance[: self.design_states])), NEXT_TO_NO_NOISE)
         return float(np.max((1.0 / distance) @ self.weights(grid.f)))
 
 

@@ -42,6 +42,7 @@ from seaopt.control.tuning.optimisation_problem import (
     K_P,
     K_V,
     LOWEST_NOTCH,
+    NEXT_TO_NO_NOISE,
     NOTCH_W,
     OBJECTIVE_HZ,
     PREFILTER_W,
@@ -377,7 +378,7 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
         elif row < task.design_states:
             value = np.maximum(value, np.max(np.abs(c_y / distance), axis=1))
-    return np.log(value) + _price(worst) + np.where(turned < LEAST_TURN, 50.0, 0.0)
+    return np.log(np.maximum(value, NEXT_TO_NO_NOISE)) + _price(worst) + np.where(turned < LEAST_TURN, 50.0, 0.0)
 
 
 def _judge_tracking(

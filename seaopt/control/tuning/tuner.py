@@ -63,7 +63,7 @@ from seaopt.control.tuning.optimisation_problem import (
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
 from seaopt.control.tuning.solution import solve
-from seaopt.errors import ControlError, require_number, require_type, suggestion
+from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.frequency import MeasuredResponse
@@ -128,6 +128,8 @@ def tune(
 
     Raises
     ------
+    InternalError
+        A defect of seaopt; its note has the request.
     ControlError
         The measured output does not respond to the motor at 0 Hz, a draw names a parameter that no plant has, delay or
         current limit make the request impossible for every controller, a passive band is required of a plant without
@@ -144,6 +146,43 @@ def tune(
 
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
+    raised: list[Exception] = []  # by the caller's own hook, which is how a caller stops a tune
+
+    def hook(note: str, share: float | None = None, /) -> None:
+        try:
+            progress(note, share)
+        except Exception as error:
+            raised.append(error)
+            raise
+
+    try:
+        return _tune(plant, params, spec, robust_to or {}, draws, hook)
+    except (SeaoptError, MemoryError):
+        raise
+    except Exception as error:
+        if error in raised:
+            raise
+        raise InternalError.of(error, "tune", _describe_request(plant, params, spec, robust_to or {}, draws)) from error
+
+
+def _describe_request(
+    plant: Plant | MeasuredResponse, params: Fit | ParameterSet, spec: ControllerSpec, robust_to: RobustTo,
+    draws: Sequence[Mapping[str, float]],
+) -> str:  # fmt: skip
+    """Return what it takes to repeat a call."""
+    values = params.parameters if isinstance(params, Fit) else params
+    others = {name: one[0].name if isinstance(one, tuple) else one.name for name, one in robust_to.items()}
+    numbers = {name: parameter.value for name, parameter in values.items()}
+    return (
+        f"plant: {plant.name}; parameters: {numbers}; specification: {spec.to_dict()}; "
+        f"robust_to: {others}; draws: {[dict(values) for values in draws]}"
+    )
+
+
+def _tune(
+    plant: Plant | MeasuredResponse, params: Fit | ParameterSet, spec: ControllerSpec, robust_to: RobustTo,
+    draws: Sequence[Mapping[str, float]], progress: Progress,
+) -> Controller:  # fmt: skip
     model = name_design(plant)
     if spec.structure == CUSTOM:
         raise ControlError('structure = "custom" is of a law that is given, which nothing tunes; use seaopt.assess')
@@ -157,7 +196,7 @@ def tune(
     values = model.complete(params)
     if model.winding is not None:
         rate_motor(model, values)  # the controller states it: refused here, not when it is printed
-    task = make_task(plant, values, spec, robust_to or {}, draws)
+    task = make_task(plant, values, spec, robust_to, draws)
     if isinstance(task.plants[0], DigitalPlant):
         check_delay(spec, task.plants[0])
     command = command_of(model, values, spec.regulated)
