@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
@@ -65,11 +64,10 @@ def literal(precision: Precision) -> Callable[[float], str]:
 
 def render(template: str, context: Mapping[str, Any]) -> str:
     """Return a template of this package filled in."""
-    from jinja2 import Environment, StrictUndefined, select_autoescape
+    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
         autoescape=select_autoescape(default=False), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-        undefined=StrictUndefined,
+        undefined=StrictUndefined, loader=PackageLoader("seaopt.control.deploy"),
     )  # fmt: skip
-    text = files("seaopt.control.deploy").joinpath("templates", template).read_text(encoding="utf-8")
-    return environment.from_string(text).render(context)
+    return environment.get_template(template).render(context)

@@ -29,7 +29,7 @@ from seaopt.control.deploy.c_text import (
 from seaopt.control.deploy.schedule_export import export_schedule, is_schedule
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, choose_limit, find_raised_limit, realise
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
@@ -321,6 +321,7 @@ def _numbers(
             }
             for i, name in enumerate(map(identifier, others), start=1)
         ],
+        "largest": number(LARGEST),
         "effort_limit": number(min(law.force_limit_N, largest)),
         "command_limit": number(min(law.current_limit_A, largest)),
         "per_effort": number(law.per_effort),

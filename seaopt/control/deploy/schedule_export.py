@@ -25,6 +25,7 @@ from seaopt.control.deploy.c_text import (
     strip_markup,
 )
 from seaopt.control.laws.command import name_gain_units
+from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES, LAW_GAINS
@@ -177,6 +178,7 @@ def _describe(
         "fallback": number(law.fallback),
         "period": number(table.sample_time_s),
         "half_period": number(0.5 * table.sample_time_s),
+        "largest": number(LARGEST),
         "effort_limit": number(min(most, largest)),
         "command_limit": number(min(law.limit, largest)),
         "per_effort": number(law.per_effort),

@@ -30,7 +30,15 @@ from seaopt.records import record
 
 SETTLED = 1e-12  # of the largest term: a response below it is over
 MOST_TERMS = 200_000
-LARGEST, MOST_HELD = 1e30, 1_000_000  # what float and unsigned long of every target hold
+LARGEST, MOST_HELD = 1e15, 1_000_000  # what float and unsigned long of every target hold, and what follows from it
+
+
+def is_number(value: float) -> bool:
+    """Tell whether a running law takes a number: finite, and so small that nothing which follows overflows.
+
+    A law that took 1e308 once would have a state from which every later command overflows.
+    """
+    return bool(-LARGEST <= value <= LARGEST)
 
 
 @record

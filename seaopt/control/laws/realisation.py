@@ -39,7 +39,7 @@ from jaxtyping import Float
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.plausibility import GateState, PlausibilityGate
+from seaopt.control.laws.plausibility import LARGEST, GateState, PlausibilityGate, is_number
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
 from seaopt.control.loops.law import Law
@@ -63,7 +63,7 @@ class LawState:
     current_A : float
         The last command, in its unit.
     held : int
-        Samples in a row that were not used because a number in them was not finite.
+        Samples in a row that were not used because a number in them was not finite, or beyond 1e15.
     gate : GateState
         What the plausibility gate, where there is one, has seen.
     heat : (float, float)
@@ -179,7 +179,8 @@ class RunnableLaw:
         Raises
         ------
         ControlError
-            An input is not finite, the measurement is outside the gate's range, or the current is above the limit.
+            An input is not finite or beyond 1e15, the measurement is outside the gate's range, or the current is above
+            the limit.
 
         """
         for name, value in (("reference", reference), ("current_A", current_A)):
@@ -188,9 +189,12 @@ class RunnableLaw:
         measurement = self._check_measurement(measurement)
         if self.gate is not None and known:
             seen = self.gate.start(float(np.ravel(measurement)[0]))
-        if not (math.isfinite(reference) and np.all(np.isfinite(measurement))):
+        if not all(map(is_number, (reference, current_A, *np.ravel(measurement), *readings))):
             given = measurement if isinstance(measurement, np.ndarray) else f"{measurement:g}"
-            raise ControlError(f"reference = {reference:g}, measurement = {given}: give finite numbers")
+            raise ControlError(
+                f"reference = {reference:g}, measurement = {given}, current_A = {current_A:g}"
+                f"{f', readings = {list(readings)}' if readings else ''}: give finite numbers, within +-{LARGEST:g}"
+            )
         if not abs(current_A) <= self.current_limit_A:
             limit = show_command(self.current_limit_A, *self.command)
             raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
@@ -224,8 +228,8 @@ class RunnableLaw:
     ) -> tuple[float, LawState]:
         """Return the command (a current in A, as a rule) of this sample, and the next state.
 
-        A sample with a number that is not finite, in its inputs or in what would follow, is not used: the last command
-        is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and takes the
+        A sample with a number that is not finite (or beyond 1e15), in its inputs or in what would follow, is not used:
+        the last command is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and takes the
         command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
         `readings` are of the outputs that the compensation reads, in their order.
         """
@@ -247,6 +251,7 @@ class RunnableLaw:
             if seen.fault:
                 current = self.gate.ramp(state.current_A, self.sample_time_s)
                 return current, LawState(x=state.x, current_A=current, held=state.held, gate=seen, memory=state.memory)
+        taken = all(map(is_number, (reference, *np.ravel(measurement), *readings)))
         added, memory = 0.0, state.memory
         with np.errstate(all="ignore"):
             if self.compensation is not None:
@@ -255,7 +260,7 @@ class RunnableLaw:
             applied = min(max(force, -most), most)
             x = self.a @ state.x + self.b_reference * reference - np.dot(self.b_measurement, measurement)
             x += self.anti_windup * (applied - force)
-        if not (math.isfinite(force + memory[1]) and all(map(math.isfinite, readings)) and np.all(np.isfinite(x))):
+        if not (taken and math.isfinite(force) and np.all(np.isfinite(x))):
             return state.current_A, replace(state, held=state.held + 1, gate=seen)
         current = applied * self.per_effort
         current = min(max(current, -limit_A), limit_A)  # a limit to the last bit

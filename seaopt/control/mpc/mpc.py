@@ -33,7 +33,7 @@ from jaxtyping import Float
 from seaopt.control.laws.command import Command, command_of, limit_notes
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.limits import MeasuredLoop
-from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.spec import describe_lifted
 from seaopt.control.laws.verdict import Verdict, explain_broken, join_labels, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
@@ -241,7 +241,7 @@ class ForceMPC:
     def step(
         self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float
     ) -> MPCStep:  # fmt: skip
-        """Return the current for a reference and a measured force; one that is not finite is predicted instead.
+        """Return the current for a reference and a measured force; one that is not finite is predicted.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ class ForceMPC:
         Raises
         ------
         ControlError
-            A reference is not a finite number, or there are more of them than the specification says.
+            A reference is not a finite number within +-1e15, or there are more of them than the specification says.
 
         """
         began = time.perf_counter()
@@ -265,6 +265,7 @@ class ForceMPC:
         if self.gate is not None:
             _, seen = self.gate.screen(seen, measurement_N)
             measurement_N = np.nan if seen.held else measurement_N
+        measurement_N = measurement_N if is_number(measurement_N) else np.nan
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
         drift = float(ahead[-1])
         u_s, targets = self._targets(drift, references)
@@ -340,7 +341,7 @@ class ForceMPC:
                 f"reference_N has the shape {references.shape}, and preview_samples = {count - 1} takes up to {count}; "
                 f"give preview_samples = {references.size - 1} in the specification"
             )
-        if not np.all(np.isfinite(references)):
+        if not all(map(is_number, references)):
             raise ControlError(f"reference_N = {given}: not a force; hold the last one instead")
         return np.concatenate([references, np.full(count - references.size, references[-1])])
 

@@ -13,8 +13,8 @@ changes never makes a jump of what is stored in them. With gains that stand stil
 filter, so that its change is not differentiated. K is the anti-windup of `seaopt.control.laws.realisation` at every
 point, interpolated too.
 
-A scheduling variable that is not finite is not used: the last one that was stands, and the value of `fallback` where
-there was none since the reset.
+A scheduling variable that is not finite, or beyond 1e15, is not used: the last one that was stands, and the value of
+`fallback` where there was none since the reset.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.laws.plausibility import LARGEST, is_number
 from seaopt.control.laws.realisation import realise
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.errors import ControlError, require_number
@@ -119,16 +120,16 @@ class RunnableSchedule:
         Raises
         ------
         ControlError
-            Reference, measurement or command is not finite, or the command is above the limit.
+            Reference, measurement or command is not finite or beyond 1e15, or the command is above the limit.
 
         """
         for name, value in (("reference", reference), ("measurement", measurement), ("command", command)):
-            if not math.isfinite(require_number(value, name, ControlError)):
-                raise ControlError(f"{name} = {value:g}: give a finite number")
+            if not is_number(require_number(value, name, ControlError)):
+                raise ControlError(f"{name} = {value:g}: give a finite number, within +-{LARGEST:g}")
         if not abs(command) <= self.limit:
             limit = show_command(self.limit, *self.command)
             raise ControlError(f"command = {command:g} is above the limit of {limit}; lower it")
-        known = math.isfinite(place)
+        known = is_number(place)
         at_rest = ScheduleState(
             reference=reference, measurement=measurement, place=place if known else self.fallback, command=command,
             misplaced=0 if known else 1,
@@ -157,10 +158,10 @@ class RunnableSchedule:
     ) -> tuple[float, ScheduleState]:
         """Return the command of this sample, and the next state.
 
-        A sample whose reference or measurement is not finite, or what would follow from them, is not used: the last
-        command is held, the state stays, and `held` counts.
+        A sample whose reference or measurement is not finite (or beyond 1e15), or what would follow from them, is not
+        used: the last command is held, the state stays, and `held` counts.
         """
-        missing = not math.isfinite(place)
+        missing = not is_number(place)
         at = state.place if missing else place
         misplaced = state.misplaced + 1 if missing else 0
         with np.errstate(all="ignore"):
@@ -174,8 +175,7 @@ class RunnableSchedule:
                 measurement=state.measurement + turn * (measurement - state.measurement),
                 place=at, command=min(max(applied * self.per_effort, -self.limit), self.limit), misplaced=misplaced,
             )  # fmt: skip
-        used = (effort, following.effort, following.reference, following.measurement)
-        if not all(map(math.isfinite, used)):
+        if not all((is_number(reference), is_number(measurement), *map(math.isfinite, (effort, following.effort)))):
             return state.command, ScheduleState(
                 effort=state.effort, reference=state.reference, measurement=state.measurement, place=at,
                 command=state.command, held=state.held + 1, misplaced=misplaced,

@@ -8,6 +8,13 @@
 #include <math.h>
 #include <string.h>
 
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0)) || defined(_M_FP_FAST)
+#error "compile without -ffast-math and -ffinite-math-only: they take out the check for numbers that are not finite"
+#endif
+#if defined(__clang__) || !defined(__GNUC__)
+#pragma STDC FP_CONTRACT OFF
+#endif
+
 #define VARIABLES FORCE_MPC_VARIABLES
 #define ROWS FORCE_MPC_ROWS
 

@@ -2,6 +2,13 @@
 
 #include <string.h>
 
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0)) || defined(_M_FP_FAST)
+#error "compile without -ffast-math and -ffinite-math-only: they take out the check for numbers that are not finite"
+#endif
+#if defined(__clang__) || !defined(__GNUC__)
+#pragma STDC FP_CONTRACT OFF
+#endif
+
 #define STATES FORCE_MPC_STATES
 #define PLANT (FORCE_MPC_PLANT_STATES)
 #define KNOTS FORCE_MPC_KNOTS
@@ -17,6 +24,9 @@
 typedef force_mpc_real real;
 
 static int finite_number(real x) { return x - x == 0; }
+
+/* Of what is given: finite, and within a range in which nothing that follows overflows. */
+static int is_number(real x) { return x >= (real)-1e15 && x <= (real)1e15; }
 
 static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
 
@@ -156,7 +166,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   real ahead[STATES], error[PLANT + 1], target[PREVIEW + 1], delta[KNOWN + 1], plan[KNOTS];
   real least, most;
   real innovation = measurement - mpc_offset - dot(mpc_C, s->z, STATES);
-  int used = finite_number(innovation);
+  int used = is_number(measurement);
 #if FORCE_MPC_GATE
   used = believed(s, measurement);
 #endif
@@ -171,7 +181,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   admissible_rest(drift, &least, &most);
   real last = s->reference, rest = 0;
   for (int i = 0; i <= PREVIEW; i++) {
-    if (i < count && finite_number(references[i])) last = references[i];
+    if (i < count && is_number(references[i])) last = references[i];
     if (i == 0) s->reference = last;
     rest = clip(last / mpc_static_gain - drift, least, most);
     target[i] = mpc_static_gain * (rest + drift);

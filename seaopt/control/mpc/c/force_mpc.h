@@ -1,6 +1,8 @@
 /* Constrained force control, written by seaopt: one step a sample, no allocation.
  * Compile force_mpc.c and active_set.c (example.c is a program around them), with
- *     cc -std=c99 -O2 force_mpc.c active_set.c example.c -lm */
+ *     cc -std=c99 -O2 -ffp-contract=off force_mpc.c active_set.c example.c -lm
+ * (fused products and sums round differently from Python; -ffast-math and -ffinite-math-only are refused, for they take
+ * out the check for numbers that are not finite). */
 #ifndef FORCE_MPC_H
 #define FORCE_MPC_H
 
@@ -32,7 +34,7 @@ void force_mpc_reset(force_mpc *s);
 
 /* What to command (FORCE_MPC_COMMAND, in FORCE_MPC_COMMAND_UNIT) for a reference and a measurement, both in
  * FORCE_MPC_UNIT; it is within limits whatever the input.
- * A measurement that is not finite is predicted; a reference that is not finite leaves the last one. */
+ * A measurement that is not finite or beyond +-1e15 is predicted; such a reference leaves the last one. */
 force_mpc_real force_mpc_step(force_mpc *s, force_mpc_real reference, force_mpc_real measurement);
 
 /* The same with references known ahead: `count` of them, of this sample and of those that follow, the last of which is
