@@ -15,9 +15,18 @@ exponentials, and of the tuned law's own Q, so that the tuned law is among those
 its parts in all directions, :math:`|z| = \max_\psi \mathrm{Re}\, e^{-j\psi} z`; a linear program has some directions at
 some frequencies, those that its answer breaks are added until none is (Kelley's cutting planes), by the solver HiGHS.
 
-**In which sense it is a bound.** A program with fewer directions and frequencies has a smaller optimum: for laws of the
-`functions` counted the value is a lower bound, whether or not the last cuts changed it. For all laws it is the limit of
-many functions; `seaopt.control.tuning.feasibility` has what is proved for all. With several plants it is a bound only:
+The integral of abs(S) is taken interval by interval of the program's frequencies, u = ln f, and
+
+.. math:: \int_I |S|\, du \ge \Big| \int_I S\, du \Big|,
+
+a modulus of what is linear in Q, which the program takes in place of abs(S) at a frequency. It is less by the turning
+of S within an interval, half the variance of its angle there, and never more, as a rule of trapezoids is where abs(S)
+is convex.
+
+**In which sense it is a bound.** A program with fewer directions and frequencies has a smaller optimum, and so has one
+with these integrals: for laws of the `functions` counted the value is a lower bound, whether or not the last cuts
+changed it, up to the rounding of quadrature and solver. For all laws it is the limit of many functions, from above, and
+no bound; `seaopt.control.tuning.feasibility` has what is proved for all. With several plants it is a bound only:
 those besides the design plant ask more of a tuned law, and here nothing of a free one. So do a passive band, a friction
 margin, and the limits of a structure (the derivative's filter, the integral's rate).
 """
@@ -52,7 +61,8 @@ OPTIMAL, INFEASIBLE = 0, 2  # of linprog's status
 LONGEST_S = 60.0  # of one linear program, which takes a third of a second
 LEAST_SIZE = 1e-7  # of the largest combination of functions
 TOLERANCE = 2e-4  # by which a modulus may be beyond its limit, or the objective beyond the program's
-FINER = 7  # times as many frequencies, on which the answer is looked at again
+FINER = 7  # times as many frequencies, on which the answer's limits are looked at again
+NODES = 7  # of Gauss and Legendre in every interval of the objective's integral
 
 
 @record(eq=False)
@@ -66,12 +76,12 @@ class FreeLaw:
     objective : str
         Which one it is.
     bound : float or None
-        The least value of the objective; None where there is none.
+        No law of the functions counted has less of the objective; None where there is none.
     missed : float or None
         By which share the law found is beyond a limit between the frequencies of the program: if that is small, a law
         with nearly this value exists.
     reached : float or None
-        The objective of the law found, on many frequencies.
+        The objective of the law found, on many frequencies; never below the bound.
     functions : int
         Of which Q is a sum.
     frequencies : int
@@ -99,6 +109,19 @@ class _Terms:
     def s(self, x: Float[np.ndarray, " n"]) -> Complex[np.ndarray, " m"]:
         """Return S."""
         return 1.0 - self.p * (self.basis @ x)
+
+
+@record(eq=False)
+class _Integral:
+    """The integral over ln f of what is known at nodes, several in each interval: sums of `weights` times values."""
+
+    terms: _Terms
+    weights: Float[np.ndarray, "i k"]
+
+    def add_up(self, values: Complex[np.ndarray, "m ..."]) -> Complex[np.ndarray, "i ..."]:
+        """Return the integral of each interval."""
+        shape = (*self.weights.shape, *values.shape[1:])
+        return np.einsum("ik,ik...->i...", self.weights, values.reshape(shape))
 
 
 @record(eq=False)
@@ -148,13 +171,15 @@ def bound_free_law(
         return FreeLaw(status="unstable plant", objective=spec.objective)
     own = [law for law in laws if _is_stable(plant, law)]
     f = _place(spec)
-    terms = _make_terms(plant, spec, own, f, functions)
-    answer = _Program(spec, terms).solve()
+    terms = _make_terms(plant, spec, own, _add_rest(spec, f), functions)
+    nodes, weights = _place_nodes(spec, f)
+    integral = _Integral(terms=_make_terms(plant, spec, own, nodes, functions), weights=weights)
+    answer = _Program(spec, terms, integral).solve()
     if isinstance(answer, str):
         return FreeLaw(status=answer, objective=spec.objective, functions=terms.basis.shape[1], frequencies=f.size)
     value, x = answer
     fine = np.unique(np.concatenate([f, *(f[:-1] + share * np.diff(f) for share in np.arange(1, FINER) / FINER)]))
-    reached, missed = _look_again(spec, _make_terms(plant, spec, own, fine, functions), x)
+    reached, missed = _look_again(spec, _make_terms(plant, spec, own, _add_rest(spec, fine), functions), integral, x)
     return FreeLaw(
         status="optimal", objective=spec.objective, bound=value, reached=reached, missed=missed,
         functions=terms.basis.shape[1], frequencies=f.size,
@@ -173,12 +198,25 @@ def _place(spec: ControllerSpec) -> Float[np.ndarray, " m"]:
     return np.unique(np.concatenate([slow, base, np.linspace(spec.bandwidth_hz, nyquist, EVEN), ends]))
 
 
+def _add_rest(spec: ControllerSpec, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
+    """Return frequencies with 0 Hz before them where the law integrates."""
+    return f if spec.structure == "pd" else np.concatenate([[0.0], f])
+
+
+def _place_nodes(
+    spec: ControllerSpec, f: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "i k"]]:
+    """Return the nodes and weights of the integral over ln f from 0.1 Hz to the bandwidth, of each interval a row."""
+    u = np.log(f[(f >= OBJECTIVE_HZ * (1 - 1e-9)) & (f <= spec.bandwidth_hz * (1 + 1e-9))])
+    at, share = np.polynomial.legendre.leggauss(NODES)
+    middle, half = 0.5 * (u[1:] + u[:-1]), 0.5 * np.diff(u)
+    return np.exp(middle[:, None] + half[:, None] * at).ravel(), half[:, None] * share
+
+
 def _make_terms(
     plant: DigitalPlant, spec: ControllerSpec, laws: Sequence[Law], f: Float[np.ndarray, " m"], functions: int
 ) -> _Terms:
-    """Return plant and functions at frequencies, and at 0 Hz where the law integrates: the first of them then."""
-    if spec.structure != "pd":
-        f = np.concatenate([[0.0], f])
+    """Return plant and functions at frequencies."""
     ts, z = plant.sample_time_s, np.exp(2j * np.pi * f * plant.sample_time_s)
     q = 1.0 / z
     a = np.exp(-2 * np.pi * min(LAGUERRE_AT * spec.bandwidth_hz, 0.2 / ts) * ts)
@@ -208,7 +246,7 @@ def _orthogonalise(terms: _Terms) -> Float[np.ndarray, "n k"]:
 class _Program:
     """The linear program, and the cuts it has so far."""
 
-    def __init__(self, spec: ControllerSpec, terms: _Terms) -> None:
+    def __init__(self, spec: ControllerSpec, terms: _Terms, integral: _Integral) -> None:
         self.spec, self.terms = spec, terms
         self.noise = spec.objective == "noise"
         m, self.turn = terms.f.size, _orthogonalise(terms)
@@ -231,10 +269,10 @@ class _Program:
             self.weights, self.owner = np.ones(1), np.zeros(m, dtype=int)
             self.aim = _Modulus(constant=np.zeros(m) + 0j, slope=basis, level=np.zeros(m))
         else:
-            weights = weigh(f, spec.bandwidth_hz)
-            counted = np.flatnonzero(weights > 0.0)
-            self.weights, self.owner = weights[counted], np.arange(counted.size)
-            self.aim = _Modulus(constant=one[counted] + 0j, slope=loop[some][counted], level=0.0 * counted)
+            self.weights, own = np.sum(integral.weights, axis=1), integral.terms
+            mean = integral.add_up(-own.p[:, None] * (own.basis @ self.turn)) / self.weights[:, None]
+            self.owner = np.arange(self.weights.size)
+            self.aim = _Modulus(constant=np.ones(self.weights.size) + 0j, slope=mean, level=0.0 * self.weights)
         self.rows: list[Float[np.ndarray, "r v"]] = []
         self.ends: list[Float[np.ndarray, " r"]] = []
 
@@ -314,17 +352,10 @@ def _s_level(spec: ControllerSpec, f: Float[np.ndarray, " m"]) -> Float[np.ndarr
     return np.minimum(np.where(slow, HALF_POWER, ms), 1e3)
 
 
-def weigh(f: Float[np.ndarray, " m"], bandwidth_hz: float) -> Float[np.ndarray, " m"]:
-    """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are among the frequencies."""
-    inside = (f >= OBJECTIVE_HZ * (1 - 1e-9)) & (f <= bandwidth_hz * (1 + 1e-9))
-    out, step = np.zeros(f.size), 0.5 * np.diff(np.log(f[inside]))
-    out[np.flatnonzero(inside)[:-1]] += step
-    out[np.flatnonzero(inside)[1:]] += step
-    return out
-
-
-def _look_again(spec: ControllerSpec, terms: _Terms, x: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the objective on many frequencies, and by which share a limit is missed at most."""
+def _look_again(
+    spec: ControllerSpec, terms: _Terms, integral: _Integral, x: Float[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """Return the objective, and by which share a limit is missed at most on many frequencies."""
     positive, every = terms.f > 0.0, terms.basis @ x
     f, s, q = terms.f[positive], terms.s(x)[positive], every[positive]
     usage = [np.abs(s) / _s_level(spec, f)]
@@ -335,7 +366,6 @@ def _look_again(spec: ControllerSpec, terms: _Terms, x: Float[np.ndarray, " n"])
     disk = spec.level("min_disk_margin")
     if disk is not None:
         usage.append(np.abs(2.0 * s - 1.0) * disk / 2.0)
-    value = (
-        float(np.max(np.abs(every))) if spec.objective == "noise" else float(weigh(f, spec.bandwidth_hz) @ np.abs(s))
-    )
-    return value, max(0.0, max(float(np.max(one)) for one in usage) - 1.0)
+    noise = spec.objective == "noise"
+    value = np.max(np.abs(every)) if noise else np.sum(integral.add_up(np.abs(integral.terms.s(x)) + 0j).real)
+    return float(value), max(0.0, max(float(np.max(one)) for one in usage) - 1.0)

@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 
 import seaopt as so
 from seaopt.control import DigitalPlant, bound_free_law, sweep
+from seaopt.control.frontier import free_law
 from seaopt.control.tuning.feasibility import sensitivity_possible
 from seaopt.errors import ControlError
 
@@ -125,6 +126,48 @@ def test_no_tuned_law_of_twenty_specifications_is_better_than_the_bound(monkeypa
         assert found.status == "optimal"
         assert found.bound <= measured_by(case.spec, controller, STAND, case.params) * (1.0 + 1e-3)
         compared += 1
+
+
+def draw_plant(rng, rate):
+    """A mode and a lag, sampled, some samples late."""
+    mode = np.exp(2 * np.pi * rng.uniform(2.0, 40.0) / rate * np.exp(1j * rng.uniform(1.7, 2.9)))
+    a = np.array([[mode.real, mode.imag, 0.3], [-mode.imag, mode.real, 0.0], [0.0, 0.0, rng.uniform(0.3, 0.9)]])
+    b, c = np.array([0.0, 0.0, 1.0]), np.array([1.0, rng.uniform(-1.0, 1.0), 0.0])
+    gain = float(c @ np.linalg.solve(np.eye(3) - a, b))
+    return DigitalPlant(
+        a=a, b=b / gain, c=c, d=0.0, sample_time_s=1.0 / rate, delay_samples=int(rng.integers(0, 3)), static_gain=1.0
+    )
+
+
+def integrate_by_hand(plant, spec, functions, x):
+    """Return the integral of abs(S) on 40,000 frequencies, of coefficients of Laguerre's functions and exponentials."""
+    f, ts = np.geomspace(0.1, spec.bandwidth_hz, 40_001), plant.sample_time_s
+    z = np.exp(2j * np.pi * f * ts)
+    a = np.exp(-2 * np.pi * min(2.0 * spec.bandwidth_hz, 0.2 / ts) * ts)
+    q = sum(x[k] * np.sqrt(1 - a * a) * z * (1 - a * z) ** k / (z - a) ** (k + 1) for k in range(functions))
+    for coefficient, corner in zip(x[functions:], np.geomspace(0.01, spec.bandwidth_hz, 12), strict=True):
+        pole = np.exp(-2 * np.pi * corner * ts)
+        q = q + coefficient * (1 - pole) * z / (z - pole)
+    p = np.array([plant.c @ np.linalg.solve(one * np.eye(3) - plant.a, plant.b) for one in z]) / z**plant.delay_samples
+    return np.trapezoid(np.abs(1.0 - p * q), np.log(f))
+
+
+@pytest.mark.parametrize("seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
+def test_the_bound_is_below_its_own_answer_and_close(monkeypatch, seed):
+    rng, solve, answers = np.random.default_rng(seed), free_law._Program.solve, []
+    monkeypatch.setattr(free_law._Program, "solve", lambda self: answers.append(solve(self)) or answers[-1])
+    rate, functions = float(rng.choice([400.0, 1000.0])), 8 if seed < 2 else int(rng.integers(10, 40))
+    spec = so.ControllerSpec(
+        structure=str(rng.choice(["pd", "pid"])), bandwidth_hz=float(rng.uniform(15.0, 40.0)), sample_rate_hz=rate,
+        **{**LIFTED, "max_sensitivity": float(rng.uniform(1.3, 2.0)), "min_sensitivity_bandwidth_hz": 1.0},
+    )  # fmt: skip
+    plant = draw_plant(rng, rate)
+    found = bound_free_law(plant, spec, functions=functions)
+    assert found.status == "optimal"
+    answer = integrate_by_hand(plant, spec, functions, answers[0][1])
+    assert found.bound <= answer * (1.0 + 1e-9)
+    assert found.reached == pytest.approx(answer, rel=1e-4)
+    assert found.bound >= 0.9 * answer
 
 
 def test_a_plant_that_grows_has_no_bound_and_no_functions_are_refused():
