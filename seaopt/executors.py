@@ -18,11 +18,12 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import lru_cache
+from types import NoneType
 from typing import Any, Generic, TypeVar
 
 from seaopt.errors import SeaoptError, require_type
 
-__all__ = ["Processes", "Shared", "connect_dask", "count_cores", "count_workers", "map_ordered"]
+__all__ = ["Processes", "Shared", "check_executor", "connect_dask", "count_cores", "count_workers", "map_ordered"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -101,6 +102,16 @@ def _live_with_parent() -> None:
             os._exit(1)  # the queue that it waits at has no other end any more
 
         threading.Thread(target=follow, daemon=True).start()
+
+
+def check_executor(executor: Any, error: type[SeaoptError] = SeaoptError) -> None:
+    """Refuse what is no executor, or None, and one whose processes would be forked, in which polars waits for ever."""
+    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", error)
+    if isinstance(executor, ProcessPoolExecutor) and executor._mp_context.get_start_method() == "fork":
+        raise error(
+            "executor: its processes are forked, with locks that threads here hold, and could wait for ever; give "
+            'seaopt.executors.Processes(), or ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+        )
 
 
 def count_cores() -> int:
@@ -183,7 +194,7 @@ def map_ordered(
     Raises
     ------
     SeaoptError
-        `executor` is none of `concurrent.futures`.
+        `executor` is none of `concurrent.futures`, or forks this process.
 
     Examples
     --------
@@ -195,10 +206,10 @@ def map_ordered(
     [3, 2, 1]
 
     """
+    check_executor(executor)
     if executor is None:
         yield from map(function, items)
         return
-    require_type(executor, Executor, "executor", "give a concurrent.futures.Executor")
     most, flying = QUEUED * count_workers(executor), deque[Future[Result]]()
     try:
         for item in items:

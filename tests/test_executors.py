@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import time
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 
 import pytest
 
+import seaopt as so
 from seaopt.errors import SeaoptError
 from seaopt.executors import QUEUED, Processes, connect_dask, count_workers, map_ordered
 
@@ -36,6 +38,20 @@ def test_results_come_in_order_whoever_is_first():
     with ThreadPoolExecutor(4) as threads:
         assert list(map_ordered(late, range(20), threads)) == list(range(20))
     assert list(map_ordered(late, range(4))) == list(range(4))
+
+
+@pytest.mark.parametrize("method", [None, "fork", "spawn", "forkserver"])
+def test_processes_that_are_forked_are_refused(method):
+    """A fleet waited for ever in one: polars has threads, whose locks a forked process inherits."""
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context if method else None) as executor:
+        if context.get_start_method() == "fork":
+            with pytest.raises(SeaoptError, match="are forked"):
+                so.fit_fleet("none.toml", [], executor=executor)
+            with pytest.raises(SeaoptError, match="are forked"):
+                list(map_ordered(abs, [-1], executor))
+        else:
+            assert list(map_ordered(abs, [-1], executor)) == [1]
 
 
 def test_few_are_in_flight():

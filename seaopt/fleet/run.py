@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import NoneType
 from typing import Any
 
 import polars as pl
 
-from seaopt.errors import FileError, LogError, SeaoptError, require_number, require_type
-from seaopt.executors import Processes
+from seaopt.errors import FileError, LogError, SeaoptError, require_number
+from seaopt.executors import Processes, check_executor
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.fleet.dispatch import Dispatcher
 from seaopt.fleet.logs import FleetLog, find_logs
@@ -103,8 +102,8 @@ def fit_fleet(
     ({'met': 2, 'not met': 0, 'failed': 0}, ['joint1', 'joint2'])
 
     """
+    check_executor(executor)
     problem = problem if isinstance(problem, Problem) else read_problem(problem)
-    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor")
     if time_limit_s is not None and not require_number(time_limit_s, "time_limit_s") > 0.0:
         raise SeaoptError(f"time_limit_s = {time_limit_s:g} leaves no time; give seconds above zero, or None")
     chosen = _choose_logs(logs, identity)

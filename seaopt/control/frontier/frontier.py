@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from functools import partial
-from types import NoneType
 from typing import Any
 
 from seaopt.control.frontier.free_law import FreeLaw, bound_free_law
@@ -31,7 +30,7 @@ from seaopt.control.tuning.tuner import (
 )
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.executors import Shared, map_ordered
+from seaopt.executors import Shared, check_executor, map_ordered
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_table
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
@@ -216,7 +215,7 @@ def sweep(
 
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
-    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", ControlError)
+    check_executor(executor, ControlError)
     design = name_design(plant)
     require_type(bandwidths_hz, Collection, "bandwidths_hz", "give a sequence of frequencies in Hz", ControlError)
     if free_law and not isinstance(spec.measured, str):

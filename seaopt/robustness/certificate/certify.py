@@ -22,7 +22,7 @@ from seaopt.control.loops.measured.figures import measure_discs
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.executors import Shared
+from seaopt.executors import Shared, check_executor
 from seaopt.formatting import format_count
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
@@ -177,7 +177,7 @@ def certify(
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
     require_type(simulations, bool, "simulations", "give True or False", ControlError)
-    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", ControlError)
+    check_executor(executor, ControlError)
     if not simulations and (sensors is not None or current_step_A):
         raise ControlError(
             "sensors and current_step_A are of the simulations, which are left out; give simulations=True"

@@ -22,7 +22,6 @@ from dataclasses import fields, replace
 from functools import partial
 from hashlib import sha256
 from itertools import pairwise
-from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.executors import Shared, map_ordered
+from seaopt.executors import Shared, check_executor, map_ordered
 from seaopt.formatting import format_count, html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -326,7 +325,7 @@ def certify_schedule(
     """
     require_type(schedule, ScheduledController, "schedule", "give a ScheduledController", ControlError)
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
-    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", ControlError)
+    check_executor(executor, ControlError)
     if min_rate is not None and not require_number(min_rate, "min_rate", ControlError) > 0.0:
         raise ControlError(f"min_rate = {min_rate:g} is not positive; give a rate in {schedule.unit}/s")
     ranges, others = dict(ranges or {}), others or ParameterSet()
