@@ -84,7 +84,9 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
             _chain_code("output", rates.output_pattern, model.ny),
         )
         generated += "\n".join((generate_code(rates.rate, rates.output), *chains))
-    return "\n".join((define_constants(constants), _text("sums.h"), _text("layout.h"), generated, _text("pass.c")))
+    return "\n".join(
+        (define_constants(constants), *map(_text, ("sums.h", "stack.h", "layout.h")), generated, _text("pass.c"))
+    )
 
 
 def _write_sampling(model: Model) -> str:
@@ -106,7 +108,7 @@ def _drop_derivatives(function: ca.Function, name: str) -> ca.Function:
     return ca.Function(name, arguments, function.call(arguments)[:1], {"cse": True})
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _text(name: str) -> str:
     return files("seaopt.simulation").joinpath(name).read_text(encoding="utf-8")
 

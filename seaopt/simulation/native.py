@@ -297,6 +297,8 @@ class Kernel:
         ------
         KeyboardInterrupt
             Once no thread works on these jobs any more; those that none has begun are left.
+        MemoryError
+            There is no room for the stack that a plant of many states needs.
 
         """
         inside = threading.current_thread().name.startswith(
@@ -306,28 +308,34 @@ class Kernel:
         bounds, size = np.linspace(0, len(jobs), parts + 1).astype(int), jobs.dtype.itemsize
         spans = [(jobs.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds)]
         owners = (jobs, buffers)
-        futures = [Future[None]() for _ in spans[1:]]  # ahead of their calls: an interrupt may lose what submit returns
+        futures = [Future[int]() for _ in spans[1:]]  # ahead of their calls: an interrupt may lose what submit returns
         interrupt: BaseException | None = None
+        failed = 0
         try:
             for future, span in zip(futures, spans[1:], strict=True):
                 threads().submit(_call, future, self.function, *span, owners)
-            self.function(*spans[0])
+            failed = self.function(*spans[0])
         except BaseException as error:
             interrupt = error
-        _join(futures, interrupt)
+        if _join(futures, interrupt) or failed:
+            raise MemoryError("no room for the stack of a simulation")
 
 
-def _call(future: Future[None], function: Any, address: int, count: int, owners: object) -> None:
+def _call(future: Future[int], function: Any, address: int, count: int, owners: object) -> None:
     """Call a native function unless its future is cancelled; hold on to the `owners` of its memory meanwhile."""
     if future.set_running_or_notify_cancel():
+        failed = 1
         try:
-            function(address, count)
+            failed = function(address, count)
         finally:
-            future.set_result(None)
+            future.set_result(failed)
 
 
-def _join(futures: list[Future[None]], interrupt: BaseException | None) -> None:
-    """Wait for all that have begun, and without an interrupt for all; the last interrupt is raised at the end."""
+def _join(futures: list[Future[int]], interrupt: BaseException | None) -> bool:
+    """Wait for all that have begun, and without an interrupt for all; the last interrupt is raised at the end.
+
+    Returns whether one failed.
+    """
     waiting = True
     while waiting:
         try:
@@ -340,6 +348,7 @@ def _join(futures: list[Future[None]], interrupt: BaseException | None) -> None:
             interrupt = error
     if interrupt is not None:
         raise interrupt
+    return any(future.result() for future in futures)
 
 
 def load_kernel(source: str, name: str) -> Kernel | None:

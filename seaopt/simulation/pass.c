@@ -480,12 +480,24 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     deliver(q, a);
 }
 
-EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
+typedef struct { const seaopt_pass_args *list; long count; } jobs;
+
+static void *run_jobs(void *given) {
+    const jobs *all = given;
     const unsigned long mode = flush_denormals();
-    for (long i = 0; i < count; i++) {
-        if (MEASURED && (ALL == 1 || list[i].gram || list[i].columns || list[i].into.into)) one_pass(list + i, ALL);
-        else one_pass(list + i, 1);
+    for (long i = 0; i < all->count; i++) {
+        const seaopt_pass_args *one = all->list + i;
+        if (MEASURED && (ALL == 1 || one->gram || one->columns || one->into.into)) one_pass(one, ALL);
+        else one_pass(one, 1);
     }
     restore_denormals(mode);
     return 0;
+}
+
+/* Both ways of a pass have their arrays in one frame; then come those of a step, of CasADi's functions, and of influences. */
+#define STACK (3 * sizeof(hot) + sizeof(double) * (24 * (NX + NY) * (NJP + 2 * NU + 2) + 4 * NY * NY))
+
+EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
+    jobs all = {list, count};
+    return on_own_stack(run_jobs, &all, STACK);
 }
