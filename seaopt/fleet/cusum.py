@@ -1,15 +1,17 @@
 r"""CUSUM charts of standardised innovations, and how often they raise an alarm where nothing has changed.
 
-A chart of one parameter of one actuator has a run of value :math:`y_t` with variance :math:`R_t` (of the fit, and
-between runs) at a time. While nothing changes, :math:`y_t = \mu + e_t`; the mean of the runs so far, weighted by
-:math:`1/R`, has the variance :math:`P_{t-1} = 1 / \sum_{j<t} 1/R_j`, and the innovations
+A chart of one parameter of one actuator has a run of value :math:`y_t` at a time, whose fit has the variance
+:math:`R_t`. While nothing changes, :math:`y_t = \mu + u_t + v_t`, with v of the fit, and u of what differs from run to
+run: of variance :math:`\sigma^2`, and alike in runs that follow each other, :math:`u_t = \phi u_{t-1} + w_t`. A Kalman
+filter of :math:`\mu` and u, which knows nothing of :math:`\mu` before the first run, has the innovations
 
-.. math:: z_t = (y_t - m_{t-1}) / \sqrt{P_{t-1} + R_t}, \qquad t = 2, 3, \ldots
+.. math:: z_t = (y_t - m_{t-1} - \phi \hat u_{t-1}) / s_t, \qquad t = 2, 3, \ldots
 
-are independent and standard normal, although the baseline is learnt from the same runs: they are recursive residuals
-(Brown, Durbin and Evans 1975). Charts of them start by themselves (Hawkins 1987) and need no healthy period. Where R
-is an estimate of few degrees of freedom, Student's distribution is mapped to the normal one. An innovation counts for
-no more than `CLIP`, in chart and baseline alike: one wild run raises no alarm, two that agree do. Both sides are
+with their stds s. They are independent and standard normal, although the baseline is learnt from the same runs: for
+:math:`\phi = 0` they are recursive residuals (Brown, Durbin and Evans 1975). Charts of them start by themselves
+(Hawkins 1987) and need no healthy period. Where runs have heavy tails, or variances are estimates of few degrees of
+freedom, Student's distribution is mapped to the normal one. An innovation counts for no more than `CLIP`, in chart and
+baseline alike: one wild run raises no alarm, two that agree do. Both sides are
 
 .. math:: S^\pm_t = \max(0,\ S^\pm_{t-1} \pm z_t - k), \qquad \text{alarm where } S^\pm_t > h
 
@@ -37,6 +39,7 @@ CLIP = 4.0
 STATES = 200  # of the Markov chain: average run lengths are right within 0.1 %
 LARGEST = 40.0  # threshold that is looked for
 LEAST = 1e-6  # false_alarms: of each side of some thousand charts rounding then leaves digits
+STEPS = 10  # to the most likely mean of Student's t
 LEARNT_DOF = 1e6  # from where on a variance is known
 
 
@@ -138,8 +141,10 @@ class Charts:
 
     Parameters
     ----------
+    ratios : array
+        Innovations over their stds; nan at the first run and where there is none.
     innovations : array
-        As they counted; nan at the first run and where there is none.
+        The same as they counted.
     upper, lower : array
         S+ and S-.
     alarm : array of int
@@ -147,6 +152,7 @@ class Charts:
 
     """
 
+    ratios: Float[np.ndarray, "actuators runs"]
     innovations: Float[np.ndarray, "actuators runs"]
     upper: Float[np.ndarray, "actuators runs"]
     lower: Float[np.ndarray, "actuators runs"]
@@ -158,7 +164,11 @@ def chart_runs(
     variances: Float[np.ndarray, "actuators runs"],
     threshold: float,
     *,
+    between: float = 0.0,
+    correlation: float = 0.0,
+    scale: float = 1.0,
     dof: float = np.inf,
+    start: int = 1,
     allowance: float = ALLOWANCE,
 ) -> Charts:
     """Chart runs, the values of each actuator in the order of time.
@@ -170,11 +180,15 @@ def chart_runs(
     values : array
         nan where an actuator has no run.
     variances : array
-        Of each value: that of its fit, and between runs.
+        Of each value: independent from run to run, as that of its fit.
     threshold, allowance : float
         h and k, in standard deviations.
-    dof : float
-        Degrees of freedom of the variances; infinite where they are known.
+    between, correlation : float
+        Variance between runs, and the correlation of that in runs that follow each other.
+    scale, dof : float
+        Of Student's t, of which innovations over their stds are; 1 and infinite where they are normal.
+    start : int
+        Runs that a baseline starts from, without a chart of them: of heavy tails several, by Student's t.
 
     Examples
     --------
@@ -189,24 +203,66 @@ def chart_runs(
 
     """
     count, runs = values.shape
-    innovations, sums = np.full((count, runs), np.nan), np.zeros((2, count, runs))
-    mean, weight, now = np.zeros(count), np.zeros(count), np.zeros((2, count))
-    alarm = np.full(count, -1)
+    ratios, innovations = np.full((2, count, runs), np.nan)
+    sums, now, alarm = np.zeros((2, count, runs)), np.zeros((2, count)), np.full(count, -1)
+    # mean and state u of each actuator, with their variances and covariance
+    mean, state, begun = np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
+    of_mean, of_both, of_state = np.zeros(count), np.zeros(count), np.full(count, between)
     for run in range(runs):
         present = np.isfinite(values[:, run])
-        known = present & (weight > 0.0)
-        variance = np.where(present, variances[:, run], 1.0)
-        spread = np.sqrt(variance + 1.0 / np.where(weight > 0.0, weight, 1.0))
-        z = np.where(known, np.clip(_normalise((values[:, run] - mean) / spread, dof), -CLIP, CLIP), 0.0)
-        innovations[known, run] = z[known]
+        known = present & begun
+        own = np.where(present, variances[:, run], 1.0)
+        state, of_both = correlation * state, correlation * of_both
+        of_state = correlation**2 * of_state + (1.0 - correlation**2) * between
+        spread = scale * np.sqrt(of_mean + 2.0 * of_both + of_state + own)
+        ratio = (values[:, run] - mean - state) / spread
+        z = np.where(known, np.clip(_normalise(ratio, dof), -CLIP, CLIP), 0.0)
+        ratios[known, run], innovations[known, run] = ratio[known], z[known]
         now = np.where(known, np.maximum(0.0, now + np.stack([z, -z]) - allowance), now)
         sums[:, :, run] = now
         alarm[(alarm < 0) & np.any(now > threshold, axis=0)] = run
-        learns = present & (alarm < 0)
-        gain = 1.0 / (1.0 + variance * weight)  # of the new run's weight in the mean
-        mean = np.where(learns, np.where(known, mean + gain * z * spread, values[:, run]), mean)
-        weight = weight + np.where(learns, 1.0 / variance, 0.0)
-    return Charts(innovations=innovations, upper=sums[0], lower=sums[1], alarm=alarm)
+        # Kalman's gains, of the innovation as it counted
+        total = (spread / scale) ** 2
+        gain, gain_state = (of_mean + of_both) / total, (of_both + of_state) / total
+        learns = known & (alarm < 0)
+        mean = mean + np.where(learns, gain * z * spread, 0.0)
+        state = state + np.where(known, gain_state * z * spread, 0.0)
+        of_mean = of_mean - np.where(learns, gain**2 * total, 0.0)
+        of_both = np.where(learns, of_both - gain * gain_state * total, 0.0)
+        of_state = of_state - np.where(known, gain_state**2 * total, 0.0)
+        starts = present & ~begun & (run >= start - 1)
+        if starts.any():
+            begun |= starts
+            mean[starts], of_mean[starts], of_both[starts] = _start(
+                values[starts, : run + 1], variances[starts, : run + 1], between, correlation, scale, dof
+            )
+            state[starts], of_state[starts] = 0.0, between
+    return Charts(ratios=ratios, innovations=innovations, upper=sums[0], lower=sums[1], alarm=alarm)
+
+
+def _start(
+    values: Float[np.ndarray, "actuators runs"], variances: Float[np.ndarray, "actuators runs"],
+    between: float, correlation: float, scale: float, dof: float,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:  # fmt: skip
+    """Return the mean of the first runs, its variance, and its covariance with u of the last of them.
+
+    They tell mean and u together, and nothing of u alone. Of several runs it is the most likely mean of Student's t.
+    """
+    known = np.isfinite(values)
+    if values.shape[1] == 1:
+        return values[:, 0], between + variances[:, 0], np.full(len(values), -between)
+    count, apart = known.sum(axis=1), np.arange(values.shape[1])
+    weights = known / (between + np.where(known, variances, 1.0))
+    mean = np.nanmedian(values, axis=1)
+    for _ in range(STEPS):
+        square = np.where(known, (values - mean[:, None]) ** 2, 0.0) * weights / scale**2
+        own = weights * (1.0 + 1.0 / dof) / (1.0 + square / dof)
+        mean = np.sum(own * np.where(known, values, 0.0), axis=1) / own.sum(axis=1)
+    alike = between * correlation ** np.abs(apart[:, None] - apart)
+    pairs = known[:, :, None] & known[:, None, :]
+    spread = np.where(pairs, alike, 0.0).sum(axis=(1, 2)) + np.where(known, variances, 0.0).sum(axis=1)
+    spread *= (1.0 + 3.0 / dof) / (1.0 + 1.0 / dof)
+    return mean, spread / count**2, -np.where(known, alike[-1], 0.0).sum(axis=1) / count
 
 
 def _normalise(ratio: Float[np.ndarray, " n"], dof: float) -> Float[np.ndarray, " n"]:

@@ -1,34 +1,45 @@
 """What the parameters of each actuator do over time: their trends, and an alarm where one has changed.
 
-A value differs from run to run by more than the std of its fit: the actuator is warmer, screwed down again, run in. The
-variance between runs is estimated once for each parameter, over all actuators, from the differences of runs that
-follow each other, which neither slow drift nor a step now and then spoils; differences beyond `CLIP_SQUARE` count as
-that, whatever they are (Huber's scale, for differences of unlike variances). With it each actuator has a chart of its
-innovations (`seaopt.fleet.cusum`), and a trend by weighted least squares.
+A value differs from run to run by more than the std of its fit: the actuator is warmer, screwed down again, run in. By
+how much, how alike in runs that follow each other, and with what tails is estimated over all actuators
+(`seaopt.fleet.scatter`). With it each actuator has a chart of its innovations (`seaopt.fleet.cusum`), and a trend by
+weighted least squares.
+
+How many alarms a healthy fleet would raise is said only where its runs bear out what the charts assume: actuators
+without an alarm are counted at a threshold so low that about a quarter of healthy ones would go beyond it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import polars as pl
 from jaxtyping import Float, Int
-from scipy.optimize import brentq
-from scipy.stats import chi2
 
 from seaopt.errors import SeaoptError, suggestion
 from seaopt.fleet.cusum import ALLOWANCE, Charts, alarm_probabilities, chart_runs, choose_threshold, find_change
 from seaopt.fleet.history import LABEL, TIME, History, format_time, order_runs, parse_time
 from seaopt.fleet.result import Fleet
+from seaopt.fleet.scatter import (
+    BETWEEN_HEAD,
+    FEWEST_ACTUATORS,
+    FEWEST_PAIRS,
+    MOST_OF_TAILS,
+    Between,
+    differ_in_scatter,
+    estimate_between_runs,
+    estimate_tails,
+)
 from seaopt.fleet.worker import FAILED, MET
 from seaopt.formatting import format_count, format_number, format_table, html_text, join_words
 from seaopt.records import record
 
 FALSE_ALARMS, PER_RUNS = 0.01, 100  # per actuator, within so many runs
-CLIP_SQUARE = 6.0  # standardised squared differences count for no more; 1.4 % of those of healthy actuators are larger
-FEWEST_PAIRS = 8  # of runs that follow each other, in the whole fleet, from which a variance can be told
+LOW_CHANCE = 0.25  # of an alarm at the threshold by which it is seen whether healthy actuators scatter as assumed
+MATTERS = 1.3  # times as many beyond it as should be are no longer as assumed
 FEWEST_OF_TREND = 3  # runs
 CELLS = 2_000_000  # of arrays at once
 _PLACE, _RUN = "place:", "run:"  # columns that are added
@@ -84,25 +95,6 @@ class Alarm:
         return f"{self.parameter} {word}{share}, {values}, since {self.since_time} ({format_count(self.runs, 'run')})"
 
 
-@record
-class Between:
-    """How much a parameter differs from run to run, beyond the std of its fits.
-
-    Parameters
-    ----------
-    std : float
-    pairs : int
-        Runs that follow each other, of which that is known.
-    dof : float
-        Degrees of freedom of the variance of a run, fit and between runs together.
-
-    """
-
-    std: float
-    pairs: int
-    dof: float
-
-
 @record(eq=False, repr=False)
 class Drift:
     """What `find_drift` returns; ``print(drift)`` is a summary.
@@ -123,12 +115,14 @@ class Drift:
         h of the charts, in standard deviations.
     false_alarms : float
         Probability that a healthy actuator raises an alarm within 100 runs; at most this.
-    expected : float
-        How many actuators would have one here, if all were healthy; at most this.
+    expected : float or None
+        How many actuators would have one here, if all were healthy; at most this. None where that is not known.
     left_out : mapping of reason to int
         Logs that no chart has.
     missing : str
         Why there are no charts; "" where there are.
+    doubt : str
+        Why it is not known how many would have an alarm if all were healthy; "" where it is.
 
     """
 
@@ -139,9 +133,10 @@ class Drift:
     between: Mapping[str, Between]
     threshold: float
     false_alarms: float
-    expected: float
+    expected: float | None
     left_out: Mapping[str, int]
     missing: str = ""
+    doubt: str = ""
 
     @property
     def verdict(self) -> str:
@@ -150,7 +145,13 @@ class Drift:
             return f"not looked for: {self.missing}"
         count = len({one.actuator for one in self.alarms})
         found = f"{count or 'none'} of {format_count(self.actuators, 'actuator')} with an alarm"
-        return f"{found}; were all healthy, {format_number(self.expected, 2)} would be expected"
+        return f"{found}; {self.describe_expected()}"
+
+    def describe_expected(self) -> str:
+        """Return how many actuators would have an alarm if all were healthy, or why that is not known."""
+        if self.expected is None:
+            return f"how many would have one if all were healthy is not known: {self.doubt}"
+        return f"were all healthy, {format_number(self.expected, 2)} would be expected"
 
     def describe_left_out(self) -> str:
         """Return which logs no chart has, "2 not met and 1 without a time"; empty where all are in one."""
@@ -163,9 +164,14 @@ class Drift:
             "verdict": self.verdict, "actuators": self.actuators, "time": self.history.source,
             "time_unit": self.history.unit, "actuator": list(self.history.actuator), "false_alarms": self.false_alarms,
             "per_runs": PER_RUNS, "threshold": self.threshold, "allowance": ALLOWANCE, "expected": self.expected,
+            "doubt": self.doubt,
             "left_out": dict(self.left_out),
             "between_runs": {
-                name: {"std": one.std, "pairs": one.pairs, "dof": one.dof} for name, one in self.between.items()
+                name: {
+                    "std": one.std, "pairs": one.pairs, "dof": one.dof, "correlation": one.correlation,
+                    "tails": one.tails if np.isfinite(one.tails) else None, "scale": one.scale,
+                }
+                for name, one in self.between.items()
             },
             "alarms": [
                 {name: getattr(one, name) for name in names} | {"text": one.describe()} for one in self.alarms
@@ -176,8 +182,8 @@ class Drift:
         lines = [f"Drift: {self.verdict}", *(f"  {one.actuator}: {one.describe()}" for one in self.alarms[:20])]
         if len(self.alarms) > 20:
             lines.append(f"  and {len(self.alarms) - 20} more: drift.alarms")
-        cells = [(name, format_number(one.std), str(one.pairs)) for name, one in self.between.items()]
-        table = format_table(cells, ("parameter", "std between runs", "of pairs"), "<>>") if cells else []
+        cells = [(name, *one.describe()) for name, one in self.between.items()]
+        table = format_table(cells, ("parameter", *BETWEEN_HEAD), "<>>>>") if cells else []
         return "\n".join([*lines, *(f"  {line}" for line in table)])
 
     _repr_html_ = html_text
@@ -233,8 +239,10 @@ def find_drift(
 
     Notes
     -----
-    What is assumed: the values of a healthy actuator scatter around its own mean independently from run to run, with
-    the variance of the fits and one between runs that is the same in the whole fleet.
+    What is assumed: the values of a healthy actuator scatter around its own mean with the variance of the fits, which
+    are independent, and one between runs; the latter, its correlation in runs that follow each other and the tails are
+    the same in the whole fleet. Where the runs are too few to tell, or tell otherwise, `expected` is None and `doubt`
+    says why.
 
     Examples
     --------
@@ -258,85 +266,92 @@ def find_drift(
     tables: list[pl.DataFrame] = []
     alarms: list[Alarm] = []
     between: dict[str, Between] = {}
-    longest = np.zeros(actuators, dtype=int)
+    unlike: list[str] = []
+    tops = _Tops(level=np.zeros(actuators), runs=np.zeros(actuators, dtype=int), charts=max(len(names), 1))
     labels = {label: place for place, label in enumerate(history.rows[LABEL].unique(maintain_order=True))}
     for name in names:
         known = rows.filter(pl.col(name).is_finite() & pl.col(f"{name}_std").is_finite())
         if len(known) < len(rows):
             left_out[f"{name} not identified"] = len(rows) - len(known)
         batches = list(_batch_runs(known, name))
-        spread = estimate_between_runs([(batch.values, batch.variances) for batch in batches])
+        runs = [(batch.values, batch.variances) for batch in batches]
+        spread = estimate_between_runs(runs)
         if spread is None:
             continue
-        between[name] = spread
+        if differ_in_scatter(runs, spread):
+            unlike.append(name)
+        between[name] = spread = _shape(batches, spread, threshold)
         for batch in batches:
-            charts = chart_runs(batch.values, batch.variances + spread.std**2, threshold, dof=spread.dof)
+            charts = chart_runs(batch.values, batch.variances, threshold, **spread.chart)
             tables.append(_tabulate(batch, name, fleet.units[name], spread, charts, threshold))
             alarms += _list_alarms(batch, history, name, fleet.units[name], spread, charts, threshold)
             own = np.array([labels[label] for label in batch.actuators], dtype=int)
-            longest[own] = np.maximum(longest[own], np.isfinite(batch.values).sum(axis=1))
-    within = 2 * max(len(names), 1) * alarm_probabilities(threshold, max(int(longest.max(initial=0)) - 1, 0))
+            highest = np.maximum(charts.upper, charts.lower).max(axis=1)
+            tops.level[own] = np.maximum(tops.level[own], highest)
+            tops.runs[own] = np.maximum(tops.runs[own], np.isfinite(batch.values).sum(axis=1))
+    doubt = _doubt(tops, threshold, between, unlike) if between else ""
     return Drift(
         table=pl.concat(tables) if tables else pl.DataFrame(), alarms=_order_alarms(alarms), actuators=actuators,
         history=history, between=between, threshold=threshold, false_alarms=false_alarms,
-        expected=float(np.minimum(within, 1.0)[np.maximum(longest - 1, 0)].sum()), left_out=left_out,
-        missing="" if between else _explain_missing(history, rows),
+        expected=None if doubt else float(tops.expect(threshold).sum()), left_out=left_out,
+        missing="" if between else _explain_missing(history, rows), doubt=doubt,
     )  # fmt: skip
 
 
-def estimate_between_runs(
-    runs: Sequence[tuple[Float[np.ndarray, "actuators runs"], Float[np.ndarray, "actuators runs"]]],
-) -> Between | None:
-    """Return how much values differ from run to run beyond the variances of their fits; None of too few runs.
-
-    Parameters
-    ----------
-    runs : sequence of (values, variances)
-        A row an actuator in the order of time, nan where there is no run.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> values = rng.normal(size=(50, 1)) + 0.3 * rng.normal(size=(50, 40)) + 0.4 * rng.normal(size=(50, 40))
-    >>> round(estimate_between_runs([(values, np.full((50, 40), 0.3**2))]).std, 2)
-    0.39
-
-    """
-    squares = np.concatenate([_select(np.diff(values, axis=1) ** 2) for values, _ in runs] or [np.zeros(0)])
-    fits = np.concatenate([_select(variances[:, 1:] + variances[:, :-1]) for _, variances in runs] or [np.zeros(0)])
-    if squares.size < FEWEST_PAIRS or not squares.any():
-        return None
-    expected = chi2.cdf(CLIP_SQUARE, 3) + CLIP_SQUARE * chi2.sf(CLIP_SQUARE, 1)  # of a clipped square, if normal
-
-    def exceed(variance: float) -> float:
-        ratios = squares / np.maximum(2.0 * variance + fits, 1e-300)
-        return float(np.mean(np.minimum(ratios, CLIP_SQUARE)) - expected)
-
-    largest = float(squares.max())
-    variance = 0.0 if exceed(0.0) <= 0.0 else _find_root(exceed, largest)
-    return Between(std=variance**0.5, pairs=squares.size, dof=_count_freedom(fits, variance))
+def _shape(batches: Sequence[_Runs], between: Between, threshold: float) -> Between:
+    """Return the same with tails, of the innovations until what led to an alarm; of some actuators of many."""
+    step = -(-sum(batch.values.size for batch in batches) // (2 * MOST_OF_TAILS))
+    ratios: list[Float[np.ndarray, " n"]] = []
+    for batch in batches:
+        values, variances = batch.values[::step], batch.variances[::step]
+        charts = chart_runs(values, variances, threshold, **between.chart)
+        end = np.full(len(values), values.shape[1])
+        for one in np.flatnonzero(charts.alarm >= 0):
+            runs = slice(int(charts.alarm[one]) + 1)
+            end[one] = find_change(values[one, runs], 1.0 / (variances[one, runs] + between.std**2))
+        own = charts.ratios[np.arange(values.shape[1]) < end[:, None]]
+        ratios.append(own[np.isfinite(own)])
+    tails, scale = estimate_tails(np.concatenate(ratios))
+    return replace(between, tails=tails, scale=scale)
 
 
-def _find_root(function: Callable[[float], float], largest: float) -> float:
-    """Return where a falling function is zero, between zero and `largest`."""
-    solver: Any = brentq
-    return float(solver(function, 0.0, largest, xtol=1e-12 * largest))
+@record(eq=False)
+class _Tops:
+    """The largest charts of each actuator, and how many runs it has."""
+
+    level: Float[np.ndarray, " actuators"]  # of S+ and S- of all its parameters
+    runs: Int[np.ndarray, " actuators"]
+    charts: int
+
+    def expect(self, threshold: float) -> Float[np.ndarray, " actuators"]:
+        """Return with which probability each actuator would have an alarm, if healthy; at most this."""
+        longest = max(int(self.runs.max(initial=0)) - 1, 0)
+        within = 2 * self.charts * alarm_probabilities(threshold, longest)
+        return np.minimum(within, 1.0)[np.maximum(self.runs - 1, 0)]
 
 
-def _count_freedom(fits: Float[np.ndarray, " n"], variance: float) -> float:
-    """Return the degrees of freedom of a run's variance, from the sampling variance of the clipped mean square.
-
-    Differences that share a run are correlated by -1/2, their squares by 1/4: half as much again as if they were not.
-    """
-    second = 3.0 * chi2.cdf(CLIP_SQUARE, 5) + CLIP_SQUARE**2 * chi2.sf(CLIP_SQUARE, 1)
-    first = chi2.cdf(CLIP_SQUARE, 3) + CLIP_SQUARE * chi2.sf(CLIP_SQUARE, 1)
-    slope = np.mean(2.0 / (2.0 * variance + fits)) * chi2.cdf(CLIP_SQUARE, 3)
-    sampling = 1.5 * (second - first**2) / fits.size / slope**2
-    return float(2.0 * (variance + np.median(fits) / 2.0) ** 2 / sampling)
-
-
-def _select(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, " n"]:
-    return values[np.isfinite(values)]
+def _doubt(tops: _Tops, threshold: float, between: Mapping[str, Between], unlike: Sequence[str]) -> str:
+    """Return why nobody can say how many healthy actuators would have an alarm; "" where one can."""
+    few = [name for name, one in between.items() if not one.shaped]
+    healthy = tops.level <= threshold
+    if few or tops.runs.size < FEWEST_ACTUATORS:
+        least = between[few[0]].pairs if few else min(one.pairs for one in between.values())
+        return (
+            f"{format_count(tops.runs.size, 'actuator')} and {least} times one run after another are too few to tell "
+            "how healthy ones scatter"
+        )
+    if unlike:
+        return f"actuators scatter unlike one another in {join_words(unlike)}"
+    if healthy.sum() < tops.runs.size / 2:
+        return "more than half of them have one, so that healthy ones are not known"
+    low = choose_threshold(LOW_CHANCE, max(int(np.median(tops.runs)) - 1, 1), tops.charts)
+    beyond, share = tops.level[healthy] > low, 1.0 - np.exp(-tops.expect(low)[healthy])
+    if beyond.sum() > max(share.sum() * MATTERS, share.sum() + 3.0 * share.sum() ** 0.5):
+        return (
+            f"{beyond.sum()} of the {beyond.size} without one are beyond a threshold that {share.sum():.0f} should be: "
+            "values wander over many runs, as with season, temperature or wear"
+        )
+    return ""
 
 
 def _choose_parameters(fleet: Fleet, parameters: Sequence[str] | None) -> tuple[str, ...]:
@@ -404,12 +419,14 @@ def _tabulate(batch: _Runs, name: str, unit: str, spread: Between, charts: Chart
     """Return the rows of a parameter in the table of trends."""
     with np.errstate(invalid="ignore", divide="ignore"):
         weights = np.nan_to_num(1.0 / (batch.variances + spread.std**2))
+        widened = np.nan_to_num(spread.widen(batch.variances) * weights**2)  # of a weighted sum of runs
         total = weights.sum(axis=1)
         values, times = np.nan_to_num(batch.values), np.nan_to_num(batch.times)
         mean, middle = (weights * values).sum(axis=1) / total, (weights * times).sum(axis=1) / total
         away = weights * (times - middle[:, None])
         lever = (away * (times - middle[:, None])).sum(axis=1)
-        slope, slope_std = (away * values).sum(axis=1) / lever, lever**-0.5
+        slope = (away * values).sum(axis=1) / lever
+        slope_std = (widened * (times - middle[:, None]) ** 2).sum(axis=1) ** 0.5 / lever
     runs, (first, last) = (
         np.isfinite(batch.values).sum(axis=1),
         (f(batch.times, axis=1) for f in (np.nanmin, np.nanmax)),
@@ -419,7 +436,8 @@ def _tabulate(batch: _Runs, name: str, unit: str, spread: Between, charts: Chart
     now = np.maximum(charts.upper[:, -1], charts.lower[:, -1]) / threshold
     return pl.DataFrame({
         "actuator": batch.actuators, "parameter": name, "unit": unit, "runs": runs, "first": first, "last": last,
-        "mean": mean, "mean_std": total**-0.5, "slope": slope, "slope_std": slope_std, "change": slope * (last - first),
+        "mean": mean, "mean_std": widened.sum(axis=1) ** 0.5 / total,
+        "slope": slope, "slope_std": slope_std, "change": slope * (last - first),
         "change_std": slope_std * (last - first), "level": now, "alarm": charts.alarm >= 0,
     })  # fmt: skip
 
@@ -434,6 +452,7 @@ def _list_alarms(
         raised, runs = int(charts.alarm[own]), int(np.isfinite(batch.values[own]).sum())
         weights = 1.0 / (batch.variances[own, :runs] + spread.std**2)
         rises = bool(charts.upper[own, raised] > charts.lower[own, raised])
+        widened = spread.widen(batch.variances[own, :runs]) * weights**2
         start, end, before, after = _measure_change(batch.values[own, :runs], weights, raised, rises=rises)
         first, then = (history.rows.row(int(batch.places[own, run]), named=True) for run in (start, raised))
         alarms.append(
@@ -448,9 +467,9 @@ def _list_alarms(
                 raised_time=format_time(then[TIME], history.unit),
                 begun=first[TIME],
                 before=before,
-                before_std=float(weights[:start].sum() ** -0.5),
+                before_std=float(widened[:start].sum() ** 0.5 / weights[:start].sum()),
                 after=after,
-                after_std=float(weights[start:end].sum() ** -0.5),
+                after_std=float(widened[start:end].sum() ** 0.5 / weights[start:end].sum()),
                 runs=end - start,
                 level=float(max(charts.upper[own].max(), charts.lower[own].max()) / threshold),
             )

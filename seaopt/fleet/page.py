@@ -18,6 +18,7 @@ from seaopt.fleet.population import ALIGN as POPULATION_ALIGN
 from seaopt.fleet.population import HEAD as POPULATION_HEAD
 from seaopt.fleet.population import Population
 from seaopt.fleet.result import ALIGN, HEAD, Fleet, list_cells
+from seaopt.fleet.scatter import BETWEEN_HEAD
 from seaopt.fleet.worker import FAILED, MET, NOT_MET
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.reporting.page.fleet import (
@@ -145,7 +146,8 @@ def _glance(fleet: Fleet, drift: Drift) -> tuple[tuple[str, str, str], ...]:
     ]
     if not drift.missing:
         alarmed = len({one.actuator for one in drift.alarms})
-        figures.append(("with an alarm", str(alarmed), f"{format_number(drift.expected, 2)} if all were healthy"))
+        healthy = "not known" if drift.expected is None else format_number(drift.expected, 2)
+        figures.append(("with an alarm", str(alarmed), f"{healthy} if all were healthy"))
     return tuple(figures)
 
 
@@ -259,10 +261,9 @@ def _list_tables(fleet: Fleet, drift: Drift, population: Population | None) -> t
         tables.append(
             PageTable(
                 heading="From run to run",
-                heads=(("parameter", "<"), ("std beyond the fit's", ">"), ("pairs of runs", ">")),
+                heads=(("parameter", "<"), *((head, ">") for head in BETWEEN_HEAD)),
                 rows=tuple(
-                    (f"{name}{unit_after(fleet.units[name])}", format_number(one.std), str(one.pairs))
-                    for name, one in drift.between.items()
+                    (f"{name}{unit_after(fleet.units[name])}", *one.describe()) for name, one in drift.between.items()
                 ),
             )
         )
@@ -276,16 +277,17 @@ def _explain(drift: Drift) -> tuple[str, ...]:
     charts = join_words(list(drift.between))
     texts = [
         f"Each actuator has a chart of {charts} (CUSUM of innovations, k = {ALLOWANCE:g}, h = {drift.threshold:.2f}): "
-        "it adds up by how much each run lies off the mean of those before it, in stds of its fit and between runs. At "
-        f"most {100 * drift.false_alarms:g} % of healthy actuators raise an alarm within {PER_RUNS} runs; of the "
-        f"{drift.actuators} here {format_number(drift.expected, 2)} would.",
+        "it adds up by how much each run lies off the mean of those before it, in stds of its fit and between runs. "
+        f"The threshold is where at most {100 * drift.false_alarms:g} % of healthy actuators raise an alarm within "
+        f"{PER_RUNS} runs. Of the {drift.actuators} here: {drift.describe_expected()}.",
         f"Time: {drift.history.source}." + (f" Careful: {drift.history.warning}." if drift.history.warning else ""),
     ]
     if drift.left_out:
         total = format_count(len(drift.history.rows), "log")
         texts.append(f"Left out, of {total}: {drift.describe_left_out()}.")
     texts.append(
-        "This holds where the runs of a healthy actuator scatter independently around a mean of its own, as widely as "
-        "those of its siblings. A temperature that comes and goes over many runs raises alarms, too."
+        "This holds where the runs of a healthy actuator scatter around a mean of its own as those of its siblings do: "
+        "as widely, with such tails, and as alike in runs that follow each other, which are estimated over the whole "
+        "fleet. A temperature that comes and goes over many runs raises alarms, too."
     )
     return tuple(texts)

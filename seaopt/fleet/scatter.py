@@ -1,0 +1,258 @@
+r"""How the runs of healthy actuators scatter: by how much, how alike runs are that follow each other, with what tails.
+
+Three figures of each parameter are estimated over the whole fleet, each so that a step, a slow drift or a wild run of
+some actuators does not spoil it.
+
+*Std and correlation.* The part of a run that is not of its fit is taken as :math:`u_t = \phi u_{t-1} + \ldots` of std
+:math:`\sigma`. Runs that are k apart differ by a variance of :math:`2 \sigma^2 (1 - \phi^k)` and those of their fits.
+Squared differences beyond `CLIP_SQUARE` count as that, whatever they are (Huber's scale, for differences of unlike
+variances); over k this is a robust variogram, to which the two figures are fitted. The charts take :math:`\phi` one
+standard error larger: too large a one makes alarms rarer.
+
+*Tails.* The innovations of the charts, until what led to an alarm, are taken as Student's t: its scale and degrees of
+freedom by maximum likelihood, where that is likelier than a normal distribution by more than chance.
+
+*What does not fit.* With all this each chart's innovations should be independent and normal. A chart at a threshold so
+low that about a quarter of healthy actuators go beyond it tells whether they are, by its count; and so does whether
+actuators scatter unlike one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import brentq, minimize, minimize_scalar
+from scipy.stats import chi2, norm, t
+
+from seaopt.formatting import format_number
+from seaopt.records import record
+
+CLIP_SQUARE = 6.0  # standardised squared differences count for no more; 1.4 % of those of healthy actuators are larger
+CLIPPED = chi2.cdf(CLIP_SQUARE, 3) + CLIP_SQUARE * chi2.sf(CLIP_SQUARE, 1)  # mean of a clipped square, if normal
+CLIPPED_SQUARE = 3.0 * chi2.cdf(CLIP_SQUARE, 5) + CLIP_SQUARE**2 * chi2.sf(CLIP_SQUARE, 1)  # of its square
+FEWEST_PAIRS = 8  # of runs that follow each other, in the whole fleet, from which a variance can be told
+FEWEST_OF_SHAPE = 200  # pairs from which correlation and tails can be told
+FEWEST_ACTUATORS = 10  # of which it can be told whether they scatter alike
+UNLIKE = 0.05  # by which the stds of actuators may differ: charts then raise 1.2 times as many alarms
+LAGS = 6  # runs apart, at most, of which differences are taken
+LARGEST_CORRELATION = 0.95
+HEAVIEST, LIGHTEST = 2.2, 200.0  # degrees of freedom of Student's t
+MOST_OF_TAILS = 20_000  # innovations of which tails are estimated
+HEAVY = 30.0  # degrees of freedom from which on a first run is no worse than any other
+FIRST_OF_HEAVY = 6  # runs that a baseline starts from below that: a wild one alone would spoil it for long
+CHANCE = 6.0  # by which twice the log-likelihood must rise for heavy tails: 1 % of normal fleets do
+
+BETWEEN_HEAD = ("std between runs", "correlation", "tails, as t of", "of pairs")
+
+Runs = Float[np.ndarray, "actuators runs"]
+
+
+@record
+class Between:
+    """How a parameter differs from run to run, beyond the std of its fits.
+
+    Parameters
+    ----------
+    std : float
+    pairs : int
+        Runs that follow each other, of which that is known.
+    dof : float
+        Degrees of freedom of the variance of a run, fit and between runs together.
+    correlation : float
+        Of runs that follow each other, as the charts take it; 0 where too few runs tell it.
+    tails, scale : float
+        Degrees of freedom and scale of Student's t that standardised innovations follow; infinite and 1 of normal ones.
+    shaped : bool
+        Whether the runs are enough to tell correlation and tails.
+
+    """
+
+    std: float
+    pairs: int
+    dof: float
+    correlation: float = 0.0
+    tails: float = np.inf
+    scale: float = 1.0
+    shaped: bool = False
+
+    @property
+    def chart(self) -> dict[str, Any]:
+        """Return the arguments of `seaopt.fleet.cusum.chart_runs`."""
+        return {
+            "between": self.std**2, "correlation": self.correlation, "scale": self.scale,
+            "dof": 1.0 / (1.0 / self.dof + 1.0 / self.tails), "start": FIRST_OF_HEAVY if self.tails < HEAVY else 1,
+        }  # fmt: skip
+
+    def describe(self) -> tuple[str, str, str, str]:
+        """Return what stands under `BETWEEN_HEAD`."""
+        correlation, tails = "not known", "not known"
+        if self.shaped:
+            correlation = format_number(self.correlation, 2)
+            tails = format_number(self.tails, 2) if np.isfinite(self.tails) else "normal"
+        return format_number(self.std), correlation, tails, str(self.pairs)
+
+    def widen(self, variances: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return by what each run counts in the variance of a mean of many, from the variances of their fits."""
+        tails = self.tails / (self.tails - 2.0) if np.isfinite(self.tails) else 1.0
+        alike = (1.0 + self.correlation) / (1.0 - self.correlation)
+        return self.scale**2 * tails * (variances + self.std**2 * alike)
+
+
+def estimate_between_runs(runs: Sequence[tuple[Runs, Runs]]) -> Between | None:
+    """Return how much values differ from run to run beyond the variances of their fits; None of too few runs.
+
+    Parameters
+    ----------
+    runs : sequence of (values, variances)
+        A row an actuator in the order of time, nan where there is no run.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> values = rng.normal(size=(50, 1)) + 0.3 * rng.normal(size=(50, 40)) + 0.4 * rng.normal(size=(50, 40))
+    >>> between = estimate_between_runs([(values, np.full((50, 40), 0.3**2))])
+    >>> round(between.std, 2), round(between.correlation, 2)
+    (0.4, 0.04)
+
+    """
+    first = _list_differences(runs, 1)
+    if first[0].size < FEWEST_PAIRS or not first[0].any():
+        return None
+    variogram = [_find_variance(*first)]
+    dof, pairs = _count_freedom(first[1], variogram[0]), first[0].size
+    for lag in range(2, LAGS + 1):
+        squares, fits = _list_differences(runs, lag)
+        if pairs < FEWEST_OF_SHAPE or squares.size < pairs / 2:  # few runs, or short histories
+            break
+        variogram.append(_find_variance(squares, fits))
+    if len(variogram) == 1 or not variogram[0]:
+        return Between(std=variogram[0] ** 0.5, pairs=pairs, dof=dof, shaped=len(variogram) > 1)
+    variance, correlation = _fit_variogram(np.array(variogram), np.median(first[1]) / 2.0, pairs)
+    return Between(std=variance**0.5, pairs=pairs, dof=dof, correlation=correlation, shaped=True)
+
+
+def _list_differences(
+    runs: Sequence[tuple[Runs, Runs]], lag: int
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the squares of the differences of runs so far apart, and the variances of their fits."""
+    squares = [_select((values[:, lag:] - values[:, :-lag]) ** 2) for values, _ in runs]
+    fits = [_select(variances[:, lag:] + variances[:, :-lag]) for _, variances in runs]
+    return np.concatenate(squares or [np.zeros(0)]), np.concatenate(fits or [np.zeros(0)])
+
+
+def _find_variance(squares: Float[np.ndarray, " n"], fits: Float[np.ndarray, " n"]) -> float:
+    """Return the variance of one of two runs, beyond that of the fits, which squared differences have."""
+
+    def exceed(variance: float) -> float:
+        ratios = squares / np.maximum(2.0 * variance + fits, 1e-300)
+        return float(np.mean(np.minimum(ratios, CLIP_SQUARE)) - CLIPPED)
+
+    return 0.0 if exceed(0.0) <= 0.0 else _find_root(exceed, float(squares.max()))
+
+
+def _find_root(function: Callable[[float], float], largest: float) -> float:
+    """Return where a falling function is zero, between zero and `largest`."""
+    solver: Any = brentq
+    return float(solver(function, 0.0, largest, xtol=1e-12 * largest))
+
+
+def _fit_variogram(variogram: Float[np.ndarray, " n"], fit: float, pairs: int) -> tuple[float, float]:
+    """Return variance and correlation, by least squares of sigma^2 (1 - phi^k); the latter by an error larger."""
+    lags = np.arange(1, variogram.size + 1)
+
+    def fit_variance(correlation: float) -> float:
+        shape = 1.0 - correlation**lags
+        return float(shape @ variogram / (shape @ shape))
+
+    def miss(correlation: float) -> float:
+        return float(np.sum((variogram - fit_variance(correlation) * (1.0 - correlation**lags)) ** 2))
+
+    solver: Any = minimize_scalar
+    best = float(solver(miss, bounds=(0.0, LARGEST_CORRELATION), method="bounded").x)
+    error = min(1.0 + fit / variogram[0], 3.0) / pairs**0.5  # fits that tell little hide it
+    correlation = min((best if miss(best) < miss(0.0) else 0.0) + error, LARGEST_CORRELATION)
+    return fit_variance(correlation), float(correlation)
+
+
+def _count_freedom(fits: Float[np.ndarray, " n"], variance: float) -> float:
+    """Return the degrees of freedom of a run's variance, from the sampling variance of the clipped mean square.
+
+    Differences that share a run are correlated by -1/2, their squares by 1/4: half as much again as if they were not.
+    """
+    slope = np.mean(2.0 / (2.0 * variance + fits)) * chi2.cdf(CLIP_SQUARE, 3)
+    sampling = 1.5 * (CLIPPED_SQUARE - CLIPPED**2) / fits.size / slope**2
+    return float(2.0 * (variance + np.median(fits) / 2.0) ** 2 / sampling)
+
+
+def estimate_tails(ratios: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return degrees of freedom and scale of Student's t; infinite and 1 where ratios may as well be normal.
+
+    Parameters
+    ----------
+    ratios : array
+        Standardised innovations of healthy runs, before they are clipped.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> dof, scale = estimate_tails(0.7 * rng.standard_t(3, 5000))
+    >>> round(dof, 1), round(scale, 2), estimate_tails(rng.normal(size=5000))
+    (3.0, 0.69, (inf, 1.0))
+
+    """
+    if ratios.size < FEWEST_OF_SHAPE:
+        return np.inf, 1.0
+    own = ratios[:: -(-ratios.size // MOST_OF_TAILS)]
+
+    def miss(unknown: Float[np.ndarray, " two"]) -> float:
+        dof, scale = 1.0 / unknown[0], np.exp(unknown[1])
+        return float(own.size * np.log(scale) - np.sum(t.logpdf(own / scale, dof)))
+
+    solver: Any = minimize
+    bounds = [(1.0 / LIGHTEST, 1.0 / HEAVIEST), (-3.0, 3.0)]
+    found = solver(miss, np.array([0.1, 0.0]), bounds=bounds, method="L-BFGS-B")
+    normal = own.size * np.log(np.std(own)) - float(np.sum(norm.logpdf(own / np.std(own))))
+    if 2.0 * (normal - found.fun) < CHANCE:
+        return np.inf, 1.0
+    return float(1.0 / found.x[0]), float(np.exp(found.x[1]))
+
+
+def differ_in_scatter(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bool:
+    """Return whether some actuators scatter more than others, by more than chance and enough to matter.
+
+    What differs shows in both halves of an actuator's history alike, chance does not.
+
+    Parameters
+    ----------
+    runs : sequence of (values, variances)
+        As in `estimate_between_runs`.
+    between : Between
+        Of all of them.
+
+    """
+    halves = np.concatenate([_measure_halves(values, variances, between) for values, variances in runs])
+    halves = halves[np.isfinite(halves).all(axis=1)]
+    if len(halves) < FEWEST_ACTUATORS:
+        return False
+    covariance = np.cov(halves.T)
+    own = covariance[0, 1] / halves.mean() ** 2  # variance of the actuators' own scatter, a square, over its mean
+    chance = (covariance[0, 0] * covariance[1, 1] / len(halves)) ** 0.5
+    return bool(own > (2.0 * UNLIKE) ** 2 and covariance[0, 1] > 3.0 * chance)
+
+
+def _measure_halves(values: Runs, variances: Runs, between: Between) -> Float[np.ndarray, "actuators 2"]:
+    """Return the mean clipped square of the differences in the first and the second half of each history."""
+    fits = variances[:, 1:] + variances[:, :-1]
+    expected = 2.0 * between.std**2 * (1.0 - between.correlation) + fits
+    squares = np.minimum(np.diff(values, axis=1) ** 2 / expected, CLIP_SQUARE)
+    known = np.isfinite(squares)
+    later = np.cumsum(known, axis=1) > known.sum(axis=1, keepdims=True) / 2
+    halves = [np.where(known & part, squares, 0.0).sum(axis=1) / (known & part).sum(axis=1) for part in (~later, later)]
+    return np.stack(halves, axis=1)
+
+
+def _select(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, " n"]:
+    return values[np.isfinite(values)]

@@ -1,0 +1,139 @@
+"""Alarms of healthy fleets whose runs are not independent and normal: as many as stated, or nothing is stated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import polars as pl
+import pytest
+from jaxtyping import Float
+from scipy.stats import poisson
+
+from seaopt.fleet import Drift, Fleet, find_drift
+from seaopt.fleet.scatter import estimate_between_runs, estimate_tails
+
+Values = Float[np.ndarray, "actuators runs"]
+RUNS, FIT = 61, 0.5  # std of a fit, in stds between runs
+
+
+def judge(values: Values, seed: int = 0) -> Drift:
+    """Return the drift of a fleet whose actuators differ, and whose fits have a noise of their own."""
+    rng = np.random.default_rng([seed, 7])
+    count, runs = values.shape
+    stds = FIT * rng.uniform(0.5, 1.5, values.shape)
+    values = 100.0 + 20.0 * rng.normal(size=(count, 1)) + values + stds * rng.normal(size=values.shape)
+    unit, run = np.divmod(np.arange(values.size), runs)
+    rows = pl.DataFrame({
+        "log": [f"{u}/{r}.csv" for u, r in zip(unit, run, strict=True)], "status": "met", "unit": unit.astype(str),
+        "run": (run + 1).astype(str), "J": values.ravel(), "J_std": stds.ravel(),
+    })  # fmt: skip
+    return find_drift(Fleet(rows=rows, units={"J": "kg m^2"}, identity=("unit", "run"), fitted=("J",)))
+
+
+def correlate(noise: Values, correlation: float) -> Values:
+    """Return an autoregression of the noise, of its variance."""
+    values = noise.copy()
+    for run in range(1, values.shape[1]):
+        values[:, run] = correlation * values[:, run - 1] + (1.0 - correlation**2) ** 0.5 * noise[:, run]
+    return values
+
+
+def draw(kind: str, actuators: int, seed: int, runs: int = RUNS) -> Values:
+    """Return runs of unit variance (but for a season) of healthy actuators."""
+    rng = np.random.default_rng(seed)
+    normal = rng.normal(size=(actuators, runs))
+    own = np.arange(actuators)[:, None]
+    kinds: dict[str, Callable[[], Values]] = {
+        "normal": lambda: normal,
+        "t(3)": lambda: rng.standard_t(3, normal.shape) / 3**0.5,
+        "AR(0.3)": lambda: correlate(normal, 0.3),
+        "AR(0.6)": lambda: correlate(normal, 0.6),
+        "wild": lambda: normal * np.where(rng.random(normal.shape) < 0.1, 3.0, 1.0),
+        "season": lambda: normal + np.sin(2 * np.pi * np.arange(runs) / 50),
+        "own seasons": lambda: normal + np.sin(2 * np.pi * (np.arange(runs) / 50 + rng.random((actuators, 1)))),
+        "wear of all": lambda: normal + 0.03 * np.arange(runs),
+        "some scatter twice": lambda: normal * np.where(own % 10, 1.0, 2.0),
+        "half AR(0.6)": lambda: np.where(own % 2, normal, correlate(rng.normal(size=normal.shape), 0.6)),
+    }
+    return kinds[kind]()
+
+
+def count_alarms(drift: Drift) -> int:
+    return len({one.actuator for one in drift.alarms})
+
+
+BORNE_OUT = ("normal", "t(3)", "AR(0.3)", "AR(0.6)", "wild")
+DOUBTED = ("season", "own seasons", "wear of all", "some scatter twice", "half AR(0.6)")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("kind", BORNE_OUT)
+def test_alarms_of_healthy_actuators_are_those_that_are_stated(kind: str, seed: int) -> None:
+    drift = judge(draw(kind, 400, seed), seed)
+    assert drift.expected is not None, drift.doubt
+    low, high = poisson.ppf([0.001, 0.999], drift.expected)  # one in 500 fleets of 25 here
+    assert low <= count_alarms(drift) <= high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", DOUBTED)
+def test_what_no_chart_is_made_for_has_no_expectation(kind: str, seed: int) -> None:
+    drift = judge(draw(kind, 400, seed), seed)
+    assert drift.expected is None and drift.doubt in drift.verdict and "is not known" in drift.verdict
+
+
+@pytest.mark.parametrize(("kind", "words"), [
+    ("AR(0.6)", ""), ("t(3)", ""), ("season", "wander"), ("some scatter twice", "unlike one another in J"),
+])  # fmt: skip
+def test_a_hundred_actuators(kind: str, words: str) -> None:
+    drift = judge(draw(kind, 100, 1, 41), 1)
+    if words:
+        assert drift.expected is None and (words in drift.doubt or "more than half" in drift.doubt)
+        assert drift.to_dict()["expected"] is None and drift.to_dict()["doubt"] == drift.doubt
+    else:
+        assert drift.expected == pytest.approx(0.33, abs=0.05) and count_alarms(drift) < 3
+
+
+def test_few_runs_tell_no_expectation() -> None:
+    for actuators, runs in ((5, 100), (12, 8)):
+        drift = judge(draw("normal", actuators, 2, runs))
+        assert drift.expected is None and "too few" in drift.verdict and drift.between["J"].std > 0.5
+
+
+@pytest.mark.parametrize("correlation", [0.3, 0.6, 0.9])
+def test_correlation_and_std_are_those_that_were_put_in(correlation: float) -> None:
+    rng = np.random.default_rng(3)
+    values = 2.0 * correlate(rng.normal(size=(300, 60)), correlation) + 0.5 * rng.normal(size=(300, 60))
+    values[:10, 30:] += 50.0  # steps of a few do not count
+    between = estimate_between_runs([(values, np.full(values.shape, 0.25))])
+    assert between is not None
+    assert between.correlation == pytest.approx(correlation, abs=0.04)
+    assert between.std == pytest.approx(2.0, rel=0.15)
+
+
+def test_tails_are_those_that_were_put_in() -> None:
+    rng = np.random.default_rng(3)
+    dof, scale = estimate_tails(1.3 * rng.standard_t(4, 20000))
+    assert dof == pytest.approx(4.0, rel=0.1) and scale == pytest.approx(1.3, rel=0.03)
+    assert estimate_tails(rng.normal(size=20000)) == (np.inf, 1.0)
+
+
+@pytest.mark.parametrize("kind", ["AR(0.6)", "t(3)"])
+def test_trends_of_what_does_not_drift_are_within_their_stds(kind: str) -> None:
+    table = judge(draw(kind, 150, 9)).table
+    ratios = (table["slope"] / table["slope_std"]).to_numpy()
+    assert 0.8 < np.std(ratios) < 1.1
+
+
+@pytest.mark.parametrize("kind", ["normal", "AR(0.3)", "t(3)"])
+def test_a_step_of_three_stds_is_found(kind: str) -> None:
+    values = draw(kind, 60, 4, 50)
+    values[:6, 25:] += 3.0 * (1.0 + FIT**2) ** 0.5
+    drift = judge(values)
+    found = {one.actuator: int(one.raised_time.removeprefix("run ")) - 25 for one in drift.alarms}
+    assert {str(unit) for unit in range(6)} <= set(found) and len(found) < 9
+    assert np.median(list(found.values())) <= {"normal": 4, "AR(0.3)": 7, "t(3)": 6}[kind]
+    assert drift.expected is not None
