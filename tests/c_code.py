@@ -14,51 +14,59 @@ from seaopt.control.deploy.export import export
 STRICT = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
 
 
-class CompiledLaw:
-    """An exported law through ctypes."""
+class LoadedLaw:
+    """A law that was exported to a folder, compiled there, through ctypes."""
 
-    def __init__(self, compiler, folder, controller, precision, **options):
-        export(controller, folder, precision=precision, name="law", **options)
+    def __init__(self, compiler, folder, name, inputs, precision="double", gated=False):
         library = folder / "law.so"
-        command = [*compiler, *STRICT, "-O2", "-shared", "-fPIC", str(folder / "law.c"), "-o", str(library)]
+        command = [*compiler, *STRICT, "-O2", "-shared", "-fPIC", str(folder / f"{name}.c"), "-o", str(library)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         real = ctypes.c_double if precision == "double" else ctypes.c_float
-        order = int(re.search(r"_ORDER (\d+)", (folder / "law.h").read_text())[1])
+        order = int(re.search(r"_ORDER (\d+)", (folder / f"{name}.h").read_text())[1])
+        gate = (("refused", ctypes.c_ulong), ("measurement_N", real), ("known", ctypes.c_int))
 
         class Law(ctypes.Structure):
             _fields_ = (
-                ("x", real * max(order, 1)),
-                ("current_A", real),
-                ("held", ctypes.c_ulong),
-                ("status", ctypes.c_int),
-                ("refused", ctypes.c_ulong),
-                ("measurement_N", real),
-                ("known", ctypes.c_int),
-            )  # fmt: skip; the last three are there with a gate
+                ("x", real * max(order, 1)), ("current_A", real), ("held", ctypes.c_ulong), ("status", ctypes.c_int),
+                *(gate if gated else ()),
+            )  # fmt: skip
 
         self.law, self.library = Law(), ctypes.CDLL(str(library))
-        read = controller.law.d.size - 1
-        self.library.law_step.argtypes = [ctypes.POINTER(Law), real, *[real] * read]
-        self.library.law_step.restype = real
-        self.library.law_reset.argtypes = [ctypes.POINTER(Law), real, *[real] * read, real]
-        self.library.law_init(ctypes.byref(self.law))
+        self._step, self._reset = (getattr(self.library, f"{name}_{what}") for what in ("step", "reset"))
+        self._step.argtypes = [ctypes.POINTER(Law), *[real] * inputs]
+        self._step.restype = real
+        self._reset.argtypes = [ctypes.POINTER(Law), *[real] * inputs, real]
+        self._init = getattr(self.library, f"{name}_init")
+        self.init()
+
+    def init(self):
+        self._init(ctypes.byref(self.law))
 
     def step(self, reference, *measurements):
-        return self.library.law_step(ctypes.byref(self.law), float(reference), *map(float, measurements))
+        return self._step(ctypes.byref(self.law), float(reference), *map(float, measurements))
 
     def reset(self, *values):
-        self.library.law_reset(ctypes.byref(self.law), *values)
+        self._reset(ctypes.byref(self.law), *values)
 
     def run(self, references, measurements):
         return np.array([self.step(r, *np.ravel(y)) for r, y in zip(references, measurements, strict=True)])
 
 
-class CompiledMPC:
-    """An exported `ForceMPC`: its files without a warning, as the program of its example."""
+class CompiledLaw(LoadedLaw):
+    """A law, exported and compiled."""
 
-    def __init__(self, compiler, folder, mpc, **options):
-        self.folder = export_mpc(mpc, folder, **options)
+    def __init__(self, compiler, folder, controller, precision, **options):
+        export(controller, folder, precision=precision, name="law", **options)
+        gated = options.get("gate") is not None
+        super().__init__(compiler, folder, "law", controller.law.d.size, precision, gated)
+
+
+class LoadedMPC:
+    """Predictive control that was exported to a folder: its files without a warning, as the program of its example."""
+
+    def __init__(self, compiler, folder):
+        self.folder = folder
         files = sorted(path.name for path in self.folder.glob("*.c"))
         subprocess.run([*compiler, *STRICT, "-O1", *files, "-lm", "-o", "example"], cwd=self.folder, check=True)
 
@@ -71,3 +79,10 @@ class CompiledMPC:
         lines = "\n".join(" ".join(repr(float(x)) for x in (*np.atleast_1d(r), y)) for r, y in samples)
         said = subprocess.run([str(self.folder / "example")], input=lines, capture_output=True, text=True, check=True)
         return np.array([line.split() for line in said.stdout.splitlines()], dtype=float)
+
+
+class CompiledMPC(LoadedMPC):
+    """A `ForceMPC`, exported and compiled."""
+
+    def __init__(self, compiler, folder, mpc, **options):
+        super().__init__(compiler, export_mpc(mpc, folder, **options))

@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from seaopt.cli.provenance import FILES, SCHEDULE_FILES, check_unedited, digest
 from seaopt.cli.session import SCHEDULE_SCHEMAS, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.deploy.schedule_export import is_schedule
-from seaopt.control.laws.realisation import find_raised_limit
+from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
-from seaopt.control.mpc.export import SOURCES, write_code
+from seaopt.control.mpc.export import SOURCES, set_gate, write_code
 from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
+from seaopt.records import record
 from seaopt.reporting.verdict import UNMET
+
+
+@record
+class GateOptions:
+    """What is typed of a plausibility gate, in the names of [controller.gate]; `leave_out` for none at all."""
+
+    range_N: str | None = None
+    max_step_N: float | None = None
+    max_held: int | None = None
+    ramp_s: float | None = None
+    leave_out: bool = False
 
 
 def export_controller(
     results: Path, target: Path, json: bool, derate_margin_K: float | None = None, amount: Amount = "usual",
-    **options: Any,
+    gate: GateOptions | None = None, **options: Any,
 ) -> bool:  # fmt: skip
     """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
 
@@ -49,6 +63,7 @@ def export_controller(
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
         options["derate"] = read_guard(content, derate_margin_K) or True
+    options["gate"] = _choose_gate(content, gate or GateOptions(), options)
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
     met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, certificate)
@@ -83,6 +98,62 @@ def export_controller(
     return content["feasible"] and met and not broken
 
 
+def _choose_gate(
+    content: Mapping[str, Any], asked: GateOptions, options: Mapping[str, Any]
+) -> PlausibilityGate | Literal[False] | None:
+    """Return the gate that is typed; False for none, None for that of the controller."""
+    typed = [
+        name for name, value in (
+            ("gate-max-step", asked.max_step_N), ("gate-max-held", asked.max_held), ("gate-ramp", asked.ramp_s)
+        ) if value is not None
+    ]  # fmt: skip
+    if asked.range_N is None or asked.leave_out:
+        if typed or (asked.range_N is not None and asked.leave_out):
+            option = typed[0] if typed else "no-gate"
+            how = (
+                "is of a gate whose range is not typed; add --gate LOW:HIGH"
+                if typed
+                else "and --gate: type one of them"
+            )
+            raise ProblemError(f"--{option} {how}")
+        return False if asked.leave_out else None
+    try:
+        low, high = (float(end) for end in asked.range_N.split(":"))
+    except ValueError:
+        raise ProblemError(
+            f"--gate {asked.range_N}: is not a range; type --gate LOW:HIGH, such as -4000:4000"
+        ) from None
+    if is_schedule(content):
+        raise ProblemError(
+            "--gate: is not exported with a schedule; leave it out, and check the reading before the step"
+        )
+    own = ((content.get("guards") or {}).get("gate") or {}).get("max_step_N")
+    step, limit = asked.max_step_N or own, _find_limit(content, options)
+    if step is None:
+        raise ProblemError(
+            "--gate: controller.json does not say how far the plant moves in a sample; type --gate-max-step, or write "
+            f"[controller.gate] with range_N = [{low:g}, {high:g}] in the problem file: seaopt tune computes it then"
+        )
+    if limit is None:
+        raise ProblemError("--gate: the command has no limit from which it goes to zero; type --current-limit")
+    held, ramp = 5 if asked.max_held is None else asked.max_held, 0.1 if asked.ramp_s is None else asked.ramp_s
+    if not ramp > 0.0:
+        raise ProblemError(f"--gate-ramp {ramp:g}: is not a time; type seconds above zero, such as 0.1")
+    return PlausibilityGate(range_N=(low, high), max_step_N=step, max_held=held, ramp_A_per_s=limit / ramp)
+
+
+def _find_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> float | None:
+    """Return the limit of the command of the exported law; None where it has none."""
+    if "mpc" in content:
+        return read_code(content["mpc"]["code"]).numbers["limit"]
+    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+
+    stored = read_controller(content)
+    asked = options["command_limit"] if options["current_limit_A"] is None else options["current_limit_A"]
+    limit = choose_limit(stored["command"], stored["spec"], asked)
+    return None if limit is None or not math.isfinite(limit) else limit
+
+
 def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> str:
     """Return the limit that the controller was designed with, where an option asks for a higher one; else ""."""
     asked = [options[name] for name in ("current_limit_A", "command_limit") if options.get(name) is not None]
@@ -99,15 +170,19 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
     if not content["feasible"] and not options.pop("allow_infeasible", False):
         missed = join_labels(content["active_constraints"])
         raise ProblemError(f"the controller misses {missed}; tune one that does not, or type --allow-infeasible")
+    gate = options.pop("gate")
     given = {name for name, value in options.items() if value not in (None, False)} - {"precision", "name"}
     if given or options["name"] != "force_law":
         raise ProblemError(
             "the C code of predictive control has the limits and the names that it was designed with: force_mpc_...; "
-            "leave out all options but --precision"
+            "leave out all options but --precision and those of --gate"
         )
     if options["precision"] not in ("double", "float"):
         raise ProblemError(f'precision = "{options["precision"]}" is not known; use "double" or "float"')
-    folder = write_code(read_code(content["mpc"]["code"]), target, single_precision=options["precision"] == "float")
+    code = read_code(content["mpc"]["code"])
+    if gate is not None:
+        code = set_gate(code, gate or None, content["sample_time_s"])
+    folder = write_code(code, target, single_precision=options["precision"] == "float")
     return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h"))
 
 

@@ -353,6 +353,22 @@ def export(
         bool, typer.Option("--derate", help='Lower the limit as the winding warms up, by the part "thermal".')
     ] = False,
     derate_margin: Annotated[float | None, typer.Option(metavar="KELVIN", help="The same, so far below T_max.")] = None,
+    gate: Annotated[
+        str | None,
+        typer.Option(metavar="LOW:HIGH", help="Believe readings within this range, that move no further than:"),
+    ] = None,
+    gate_max_step: Annotated[
+        float | None, typer.Option(metavar="VALUE", help="So far in a sample; that of [controller.gate] if left out.")
+    ] = None,
+    gate_max_held: Annotated[
+        int | None, typer.Option(metavar="N", help="Bridge so many others in a row, 5 if left out; then stop.")
+    ] = None,
+    gate_ramp: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="In which the command goes to zero then; 0.1 if left out.")
+    ] = None,
+    no_gate: Annotated[
+        bool, typer.Option("--no-gate", help="Leave out the gate of [controller.gate], and believe all readings.")
+    ] = False,
     allow_infeasible: Annotated[
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
     ] = False,
@@ -361,7 +377,7 @@ def export(
     verbose: Verbose = False,
 ) -> None:
     """Write the controller in DIR as C99, with its gains as a C header and a MATLAB script."""
-    from seaopt.cli.export import export_controller
+    from seaopt.cli.export import GateOptions, export_controller
 
     options = {
         "current_limit_A": current_limit, "command_limit": command_limit, "tracking_time_s": tracking_time,
@@ -373,6 +389,9 @@ def export(
         json,
         derate_margin,
         amount=_choose_amount(quiet, verbose),
+        gate=GateOptions(
+            range_N=gate, max_step_N=gate_max_step, max_held=gate_max_held, ramp_s=gate_ramp, leave_out=no_gate
+        ),
         precision=precision,
         name=name,
         **options,

@@ -279,6 +279,14 @@ KEYS: dict[str, dict[str, str]] = {
         "step_N": "Size of the step that is judged.",
         "reserve": "Share of each limit that is kept free.",
         "schedule": "One controller per point of a variable, with lines between their gains, in place of one for all.",
+        "gate": "Which readings the exported law believes, and what it does about the others.",
+    },
+    "GateTable": {
+        "range_N": "Of the sensor, in units of what is measured; readings outside are not believed.",
+        "max_step_N": "Largest change of a reading in a sample; where left out, that of the design plant times margin.",
+        "max_held": "Readings in a row that are bridged; one more is a fault, and the command goes to zero.",
+        "ramp_s": "In which it goes there from its limit.",
+        "margin": "On the design plant's largest step, for what the world does to it.",
     },
     "ScheduleTable": {
         "over": "A state that is measured, such as an angle; or a parameter known as the law runs, such as a load.",

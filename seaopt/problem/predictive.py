@@ -40,7 +40,7 @@ def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
 
 
 def _check_keys(table: ProblemTable, asked: ControllerTable) -> None:
-    given = sorted(asked.model_fields_set - {"plant", "measured", "structure", *SHARED})
+    given = sorted(asked.model_fields_set - {"plant", "measured", "structure", "gate", *SHARED})
     if given:
         raise ProblemError(f'controller.{given[0]} is of gains, and structure = "mpc" plans; take it out')
     if not isinstance(asked.measured, str):

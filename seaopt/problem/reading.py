@@ -141,7 +141,7 @@ def _make_plant_of_kind(table: PlantTable) -> Plant:
 def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    built = {"notch", "prefilter", "link_feedforward", "compensate", "schedule"}
+    built = {"notch", "prefilter", "link_feedforward", "compensate", "schedule", "gate"}
     fields = table.controller.model_dump(exclude={"plant", "robust_to", "frf_confidence", "draws", *built})
     low_pass = table.controller.prefilter
     prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass

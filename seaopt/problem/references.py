@@ -115,6 +115,7 @@ def _check_beside_schedule(table: ProblemTable, over: str) -> None:
         ("controller.prefilter", law is not None and law.prefilter is not None),
         ("controller.link_feedforward", law is not None and law.link_feedforward is not False),
         ("controller.compensate", law is not None and bool(law.compensate)),
+        ("controller.gate", law is not None and law.gate is not None),
         ("impedance", table.impedance is not None),
         ("robustness.retune", robustness is not None and robustness.retune),
         ("expect.controller", expect is not None and expect.controller is not None),

@@ -135,6 +135,16 @@ class ScheduleTable(StrictTable):
     min_rate: Annotated[Number, Field(gt=0)] | None = None
 
 
+class GateTable(StrictTable):
+    """Which readings the exported law believes."""
+
+    range_N: tuple[Number, Number]
+    max_step_N: Annotated[Number, Field(gt=0.0)] | None = None
+    max_held: Annotated[Whole, Field(ge=0)] = 5
+    ramp_s: Annotated[Number, Field(gt=0.0)] = 0.1
+    margin: Annotated[Number, Field(gt=0.0)] = 3.0
+
+
 class ControllerTable(StrictTable):
     """What is asked of the controller."""
 
@@ -171,6 +181,7 @@ class ControllerTable(StrictTable):
     step_N: Number | None = None
     reserve: Number = 0.005
     schedule: ScheduleTable | None = None
+    gate: GateTable | None = None
 
     @property
     def compensation(self) -> CompensationTable:

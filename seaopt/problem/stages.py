@@ -31,9 +31,10 @@ from seaopt.control import (
     tune_schedule,
 )
 from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.mpc.stored import check_described
-from seaopt.errors import ProblemError, SeaoptError
+from seaopt.errors import ControlError, ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
 from seaopt.files import parse_file
@@ -154,7 +155,9 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
             f"{problem.source}: predictive control takes a model, and [controller] is designed on "
             f"{problem.response_names[0]}; name a plant there"
         )
-    return force_mpc(problem.design_plant, source, problem.mpc)
+    mpc = force_mpc(problem.design_plant, source, problem.mpc)
+    gate = _make_gate(problem, mpc)
+    return mpc if gate is None else replace(mpc, gate=gate)
 
 
 def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:
@@ -230,7 +233,7 @@ def tune_problem(
 
 
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
-    """Return a controller with the problem's outer loop, and with what it compensates.
+    """Return a controller with the problem's outer loop, its plausibility gate, and with what it compensates.
 
     Raises
     ------
@@ -239,6 +242,7 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
 
     """
     controller = add_outer_loop(problem, controller, source)
+    controller = replace(controller, gate=_make_gate(problem, controller))
     assert problem.table.controller is not None
     asked = problem.table.controller.compensation
     if asked.friction is None and asked.gravity is None and asked.ripple is None:
@@ -253,6 +257,18 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
         ripple=None if asked.ripple is None else CompensateRipple(**asked.ripple.model_dump()),
         link=link,
     )
+
+
+def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> PlausibilityGate | None:
+    """Return the gate that the file asks for; None where it asks for none."""
+    assert problem.table.controller is not None
+    table = problem.table.controller.gate
+    if table is None:
+        return None
+    try:
+        return PlausibilityGate.of_controller(controller, **table.model_dump())
+    except ControlError as error:
+        raise ProblemError(f"{problem.source}: controller.gate: {error}") from error
 
 
 def _refuse_schedule(problem: Problem, done: str) -> None:

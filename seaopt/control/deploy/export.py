@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -62,7 +62,7 @@ def export(
     current_limit_A: float | None = None,
     command_limit: float | None = None,
     tracking_time_s: float | None = None,
-    gate: PlausibilityGate | None = None,
+    gate: PlausibilityGate | Literal[False] | None = None,
     derate: bool | HeatGuard = False,
     allow_infeasible: bool = False,
     fit_met: bool | None = None,
@@ -84,8 +84,9 @@ def export(
         In place of the specification's limit: of a current, or of whatever is commanded, in its unit. Give one.
     tracking_time_s : float, optional
         As in `seaopt.control.laws.realisation.runnable`.
-    gate : PlausibilityGate, optional
-        Which readings the law believes, and what it does about the others.
+    gate : PlausibilityGate or False, optional
+        Which readings the law believes, and what it does about the others; the controller's own if left out, none with
+        False.
     derate : bool or HeatGuard
         Lower the limit as the winding warms up, by `seaopt.plants.motor.heat_guard`: of a design plant with the part
         "thermal" that is commanded a current; or by a guard of your own, with a margin say, at the law's sample time.
@@ -118,9 +119,9 @@ def export(
 
     """
     if isinstance(controller, ScheduledController) or (isinstance(controller, Mapping) and is_schedule(controller)):
-        if gate is not None or derate:
+        if gate or derate:
             raise ControlError(
-                f"{'gate' if gate is not None else 'derate'}: is not exported with a schedule; leave it out, and check "
+                f"{'gate' if gate else 'derate'}: is not exported with a schedule; leave it out, and check "
                 "the reading, or lower the command's limit, before the step"
             )
         return export_schedule(
@@ -158,6 +159,7 @@ def export(
             "commanded a current"
         )
     limit = command_limit if current_limit_A is None else current_limit_A
+    gate = stored["gate"] if gate is None else gate or None
     law = _law(stored, limit, tracking_time_s, gate, heat if derate else None)
     context = _describe(stored, law) | {
         "achieved": figures,

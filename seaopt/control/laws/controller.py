@@ -17,6 +17,7 @@ from seaopt.control.laws.command import (
     name_rates,
 )
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
+from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Prefilter, SpeedLoop
 from seaopt.control.laws.verdict import (
@@ -120,6 +121,8 @@ class Controller:
     compensation : Compensation or None
         What is added to its effort for the plant's friction (`seaopt.control.add_compensation`). The figures and the
         friction margin are those of the law without it.
+    gate : PlausibilityGate or None
+        Which readings the exported law believes.
 
     """
 
@@ -146,6 +149,7 @@ class Controller:
     link: LinkPath | None = None
     reads: tuple[str, ...] = ()
     compensation: Compensation | None = None
+    gate: PlausibilityGate | None = None
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -321,6 +325,11 @@ class Controller:
         return None if rating is None or self.command.unit != "A" else HeatGuard.of_rating(rating, self.sample_time_s)
 
     @property
+    def per_effort(self) -> float:
+        """The command for one unit of effort."""
+        return self.command.per_effort
+
+    @property
     def command_limit(self) -> float | None:
         """The limit of the command: what is asked for, and no more than the plant's actuation takes; None for none."""
         return self.command.limit(self.spec.limit_asked)
@@ -400,6 +409,7 @@ class Controller:
             "link_feedforward": None if self.link is None else asdict(self.link),
             "impedance": None if self.outer is None else asdict(self.outer),
             "compensation": None if self.compensation is None else self.compensation.to_dict(),
+            "guards": {"gate": None if self.gate is None else asdict(self.gate)},
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
             "possible": None if self.possible is None else asdict(self.possible),
@@ -501,6 +511,7 @@ class Controller:
                 *self._force_lines(),
                 *([] if self.outer is None else [f"  {self.outer.describe()}"]),
                 *self._compensation_lines(),
+                *self._gate_lines(),
                 *(f"  {line}" for line in (self.rating.describe() if self.rating is not None else ())),
                 f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
                 if self.feasible
@@ -570,6 +581,10 @@ class Controller:
         if self.compensation is None:
             return []
         return [f"  compensates {line}" for line in self.compensation.describe(self.command.effort_unit)]
+
+    def _gate_lines(self) -> list[str]:
+        """Say which readings are believed."""
+        return [] if self.gate is None else [f"  {self.gate.describe(self.command.reference_unit)}"]
 
     def _force_lines(self) -> list[str]:
         slow, fast = self.force_limit(0.0), self.force_limit(self.spec.bandwidth_hz)

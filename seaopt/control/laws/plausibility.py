@@ -23,9 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.errors import ControlError, require_number, require_type
+from seaopt.errors import ControlError, require_number
 from seaopt.records import record
 
 SETTLED = 1e-12  # of the largest term: a response below it is over
@@ -140,17 +139,19 @@ class PlausibilityGate:
 
     @classmethod
     def of_controller(
-        cls, controller: Controller, *, range_N: tuple[float, float], max_held: int = 5, ramp_s: float = 0.1,
-        margin: float = 3.0,
+        cls, controller: Any, *, range_N: tuple[float, float], max_step_N: float | None = None, max_held: int = 5,
+        ramp_s: float = 0.1, margin: float = 3.0,
     ) -> PlausibilityGate:  # fmt: skip
         """Return a gate with the step that the design plant makes at most, times a margin for what the world does.
 
         Parameters
         ----------
-        controller : Controller
+        controller : Controller or ForceMPC
             With its design plant and a current limit.
         range_N : (low, high)
             Of the sensor.
+        max_step_N : float, optional
+            In place of what is computed from the design plant.
         max_held : int
             Readings in a row that are bridged.
         ramp_s : float
@@ -174,17 +175,27 @@ class PlausibilityGate:
 
 
         """
-        require_type(controller, Controller, "controller", "give a Controller", ControlError)
+        if not hasattr(controller, "command_limit"):
+            raise ControlError(f"controller = {controller!r:.80}: give a Controller, or a ForceMPC")
         for name, value in (("ramp_s", ramp_s), ("margin", margin)):
             _check_positive(value, name)
         limit = controller.command_limit
-        if limit is None or controller.design is None:
-            raise ControlError(
-                "the controller has no current limit (or command_limit), or no design plant; give max_step_N yourself"
-            )
-        plant = controller.close(*controller.design).plant
-        step = largest_step(plant, limit / controller.command.per_effort)
-        return cls(range_N=range_N, max_step_N=margin * step, max_held=max_held, ramp_A_per_s=limit / ramp_s)
+        if limit is None:
+            raise ControlError("the controller has no current limit (or command_limit); give its specification one")
+        if max_step_N is None and controller.design is None:
+            raise ControlError("the controller has no design plant to compute the largest step of; give max_step_N")
+        if max_step_N is None:
+            plant = controller.close(*controller.design).plant
+            max_step_N = margin * largest_step(plant, limit / controller.per_effort)
+        return cls(range_N=range_N, max_step_N=max_step_N, max_held=max_held, ramp_A_per_s=limit / ramp_s)
+
+    def describe(self, unit: str) -> str:
+        """Return in one line which readings are believed."""
+        low, high = self.range_N
+        return (
+            f"readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample are "
+            f"believed, {self.max_held} others in a row are bridged; the certificate's runs are without this gate"
+        )
 
 
 def _check_range(range_N: Any) -> None:

@@ -229,8 +229,8 @@ class RunnableLaw:
         """Return the command (a current in A, as a rule) of this sample, and the next state.
 
         A sample with a number that is not finite (or beyond 1e15), in its inputs or in what would follow, is not used:
-        the last command is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and takes the
-        command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
+        the last command is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and
+        takes the command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
         `readings` are of the outputs that the compensation reads, in their order.
         """
         if self.heat is None:

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict, model_validator
 
 from seaopt.control.laws.command import Command
+from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import (
     AGREES,
@@ -291,6 +292,28 @@ class StoredLinkPath(ResultTable):
     high_pass_hz: Annotated[Finite, Field(ge=0.0)]
 
 
+class StoredGate(ResultTable):
+    """A plausibility gate."""
+
+    range_N: tuple[Finite, Finite]
+    max_step_N: Finite
+    max_held: Whole
+    ramp_A_per_s: Finite
+
+    def build(self) -> PlausibilityGate:
+        """Return the gate."""
+        try:
+            return PlausibilityGate(**self.model_dump())
+        except ControlError as error:
+            raise _contradict("guards.gate", f"is none: {error}") from error
+
+
+class StoredGuards(ResultTable):
+    """What stands between the law and the world."""
+
+    gate: StoredGate | None = None
+
+
 class StoredController(ResultTable):
     """A controller.json."""
 
@@ -314,6 +337,7 @@ class StoredController(ResultTable):
     impedance: StoredOuterLoop | None = None
     compensation: StoredCompensation | None = None
     link_feedforward: StoredLinkPath | None = None
+    guards: StoredGuards = StoredGuards()
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -357,6 +381,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "measured": tuple(one.build() for one in table.measured_responses),
         "outer": outer,
         "compensation": None if table.compensation is None else table.compensation.build(spec.sample_time_s),
+        "gate": None if table.guards.gate is None else table.guards.gate.build(),
         "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
 

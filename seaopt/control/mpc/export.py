@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
@@ -94,17 +96,13 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": mpc.delay_samples,
         "KNOTS": prediction.knots.size, "ROWS": len(prediction.rows), "SLEWS": len(prediction.M),
         "SIGNALS": len(outputs.names), "SAMPLES": outputs.samples, "PREVIEW": spec.preview_samples,
-        "HORIZON": spec.samples, "MAX_ITERATIONS": spec.max_iterations, "GATE": int(mpc.gate is not None),
-        "MAX_HELD": 0 if mpc.gate is None else mpc.gate.max_held,
+        "HORIZON": spec.samples, "MAX_ITERATIONS": spec.max_iterations,
     }  # fmt: skip
     numbers = {
         "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
         "offset": float(kalman.offset[0]), "violation": VIOLATION, "penalty": PENALTY, "wide": WIDE,
         "slack_unit": SLACK_UNIT, "lag": spec.lag_s / spec.sample_time_s,
     }  # fmt: skip
-    if mpc.gate is not None:
-        (numbers["low"], numbers["high"]), numbers["step"] = mpc.gate.range_N, mpc.gate.max_step_N
-        numbers["ramp"] = mpc.gate.ramp_A_per_s * spec.sample_time_s
     arrays = {
         "A": kalman.A, "B": kalman.B[:, 0], "C": kalman.C[0], "gain": kalman.gain[:, 0], "rest": mpc.rest,
         "F": prediction.F, "M": prediction.M, "R": prediction.R, "shift": mpc.shift, "free": outputs.free,
@@ -115,11 +113,22 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "COMMAND_UNIT": mpc.actuation.unit,
         "UNIT": mpc.design[0].outputs[mpc.measured],
     }
-    return MPCCode(
+    code = MPCCode(
         sizes=sizes, numbers={name: value for name, value in numbers.items() if np.isfinite(value)}, units=units,
         arrays={name: value for name, value in arrays.items() if value.size}, hessian=stack_hessian(prediction),
         rows=prediction.rows,
     )  # fmt: skip
+    return set_gate(code, mpc.gate, spec.sample_time_s)
+
+
+def set_gate(code: MPCCode, gate: PlausibilityGate | None, sample_time_s: float) -> MPCCode:
+    """Return the numbers of a controller's C code with a gate in place of the one that they have; None for none."""
+    sizes = {**code.sizes, "GATE": int(gate is not None), "MAX_HELD": 0 if gate is None else gate.max_held}
+    numbers = {name: value for name, value in code.numbers.items() if name not in ("low", "high", "step", "ramp")}
+    if gate is not None:
+        (numbers["low"], numbers["high"]), numbers["step"] = gate.range_N, gate.max_step_N
+        numbers["ramp"] = gate.ramp_A_per_s * sample_time_s
+    return replace(code, sizes=sizes, numbers=numbers)
 
 
 def _format_data(code: MPCCode, single_precision: bool) -> str:

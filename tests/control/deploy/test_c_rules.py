@@ -1,4 +1,4 @@
-"""What the exported C asks of compilers: refused and wanted flags, strict warnings, MISRA; and extreme numbers in it."""
+"""What the exported C asks of compilers: refused and wanted flags, strict warnings, MISRA; and extreme numbers."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_c_takes_extreme_numbers_as_python_does(gate, compiler, tuned, tmp_path)
     rng = np.random.default_rng(2)
     for seed in range(8):
         state = law.reset()
-        compiled.library.law_init(ctypes.byref(compiled.law))
+        compiled.init()
         for reference, reading, current in mix(seed, EXTREME):
             if rng.random() < 0.05:
                 compiled.reset(reference, reading, current)
