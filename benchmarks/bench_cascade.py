@@ -78,7 +78,7 @@ class Case:
         measured = ("tau_s", "thetad_m") if structure == "cascade" else "tau_s"
         limits = {name: level for name, level in self.limits.items() if structure == "cascade" or "other" not in name}
         return so.ControllerSpec(
-            structure=structure, measured=measured, speed_loop=self.speed_loop, delay_samples=self.delay,
+            structure=structure, measured=measured, speed_loop=self.speed_loop, compute_delay_samples=self.delay,
             bandwidth_range_hz=(3.0, 60.0), **limits,
         )  # fmt: skip
 

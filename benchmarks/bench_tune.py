@@ -50,7 +50,7 @@ def draw(rng: np.random.Generator) -> Case:
     structure = str(rng.choice(["pd", "pid", "pid", "pid_dob"]))
     noise = float(np.exp(rng.uniform(np.log(25), np.log(300)))) if rng.random() < 0.7 else False
     spec = so.ControllerSpec(
-        structure=structure, bandwidth_hz=float(rng.uniform(15, 60)), delay_samples=int(rng.integers(0, 3)),
+        structure=structure, bandwidth_hz=float(rng.uniform(15, 60)), compute_delay_samples=int(rng.integers(0, 3)),
         sample_rate_hz=float(rng.choice([500.0, 1e3, 1e3, 2e3])), max_sensitivity=float(rng.uniform(1.45, 2.2)),
         max_complementary=maybe(0.6, 1.15, 1.6), max_reference_peak=maybe(0.6, 1.05, 1.5), max_noise_gain=noise,
         min_disk_margin=maybe(0.2, 0.6, 1.1), objective=str(rng.choice(["disturbance", "disturbance", "noise"])),

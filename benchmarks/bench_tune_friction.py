@@ -40,7 +40,10 @@ class Case:
     @property
     def spec(self) -> so.ControllerSpec:
         return so.ControllerSpec(
-            bandwidth_hz=self.bandwidth_hz, bandwidth_range_hz=RANGE_HZ, delay_samples=self.delay_samples, **LIMITS
+            bandwidth_hz=self.bandwidth_hz,
+            bandwidth_range_hz=RANGE_HZ,
+            compute_delay_samples=self.delay_samples,
+            **LIMITS,
         )
 
     def tune(self) -> so.Controller:

@@ -108,7 +108,7 @@ class Scratch:
     ],
 )
 def test_what_the_tuner_and_the_certificate_claim(stand, swing, thor, structure, bandwidth, delay):
-    spec = so.ControllerSpec(structure=structure, bandwidth_hz=bandwidth, delay_samples=delay, **LIMITS)
+    spec = so.ControllerSpec(structure=structure, bandwidth_hz=bandwidth, compute_delay_samples=delay, **LIMITS)
     controller = so.tune(stand, thor, spec, robust_to={"swing": swing})
     certificate = so.certify(
         controller, {"stand": stand, "swing": swing}, thor, ranges={"I_p": (0.3, 0.4)}, samples=50, simulations=False

@@ -146,7 +146,7 @@ def test_what_a_passive_band_costs_the_quiet_law(stand, thor):
 
 
 def test_what_late_samples_cost(stand, thor):
-    spec = so.ControllerSpec(bandwidth_hz=50, max_sensitivity=1.6, max_noise_gain=60, delay_samples=1)
+    spec = so.ControllerSpec(bandwidth_hz=50, max_sensitivity=1.6, max_noise_gain=60, compute_delay_samples=1)
     law = so.tune(stand, thor, spec)
     ms = [
         Loop(plant=sample(stand, thor, "F1", law.command.per_effort, 1e-3, late), law=law.law).figures().ms

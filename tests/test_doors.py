@@ -16,7 +16,7 @@ tries = {
     "list": lambda: so.fit(bench, thor.free("J")),
     "one fit": lambda: so.compare(so.fit([bench], thor.free("J"), method=so.OutputError(search=False))),
     "text bandwidth": lambda: so.ControllerSpec(bandwidth_hz="30"),
-    "float delay": lambda: so.ControllerSpec(delay_samples=1.0),
+    "float delay": lambda: so.ControllerSpec(compute_delay_samples=1.0),
     "robust_to": lambda: so.tune(stand, thor, so.ControllerSpec(), ["swing"]),
 }
 out = {}

@@ -27,7 +27,7 @@ from seaopt.cli.responses import estimate_responses
 from seaopt.cli.show import show_all, show_figures, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
-from seaopt.control.laws.delay import settle_delay, warn_short_delay
+from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
@@ -76,11 +76,11 @@ from seaopt.testing.expectations import list_expectations
 SCHEMAS = {
     "fit": "seaopt/fit/2",
     "frf": "seaopt/frf/1",
-    "tune": "seaopt/controller/2",
+    "tune": "seaopt/controller/3",
     "sweep": "seaopt/frontier/1",
     "certify": "seaopt/robustness/2",
 }
-SCHEDULE_SCHEMAS = {"tune": "seaopt/schedule/1", "certify": "seaopt/schedule_robustness/1"}
+SCHEDULE_SCHEMAS = {"tune": "seaopt/schedule/2", "certify": "seaopt/schedule_robustness/1"}
 LABELS = {
     "simulate": "simulating",
     "frf": "frequency responses",
@@ -93,7 +93,7 @@ LABELS = {
 READING, SIMULATING = 0.1, 0.3  # of the time of a fit, and of a report of earlier results
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 FILTERS = ("notch", "prefilter", "link_feedforward")
-OF_THE_LAW = ("structure", *FILTERS, "reference_weights", "sample_rate_hz", "delay_samples")
+OF_THE_LAW = ("structure", *FILTERS, "reference_weights", "sample_rate_hz", *DELAY_KEYS)
 IN_PARTS = ("tune", "sweep", "certify")  # stages that several processes can work on
 
 
@@ -229,9 +229,8 @@ class Session:
         """Return the specification with its delay; one that is shorter than the experiments' is warned of."""
         assert self.problem.spec is not None  # whoever tunes has asked for the design plant before
         design, source = self.problem.design_plant, self.parameters()
-        spec = settle_delay(self.problem.spec, design, source)
-        self._warn(warn_short_delay(spec.loop_delay_samples, spec.sample_rate_hz, design, source))
-        return spec
+        self._warn(warn_delays(self.problem.spec, design, source))
+        return settle_delays(self.problem.spec, design, source)[0]
 
     def _warn(self, notes: Iterable[str]) -> None:
         """Write each warning on stderr, once."""

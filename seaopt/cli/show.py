@@ -137,9 +137,10 @@ def show_fit(console: Terminal, fit: Fit, scores: Iterable[ModelledOutputs] = ()
 def show_controller(console: Terminal, controller: Controller) -> None:
     """Print the gains, and the figures of the design plant beside what was asked."""
     spec = controller.spec
-    delay = format_count(controller.delay_samples, "sample")
     heading(
-        console, "Controller", f"{controller.structure} on {spec.regulated}, {spec.sample_rate_hz:g} Hz, {delay} late"
+        console,
+        "Controller",
+        f"{controller.structure} on {spec.regulated}, {spec.sample_rate_hz:g} Hz, {controller.delays}",
     )
     units, command = name_gain_units(controller.command), controller.engineering
     gains = [
@@ -172,7 +173,7 @@ def show_designed(console: Terminal, result: Controller | ScheduledController) -
     spec = result.spec
     heading(
         console, "Schedule", f"{spec.structure} on {spec.regulated} over {result.over}, {spec.sample_rate_hz:g} Hz, "
-        f"{format_count(spec.loop_delay_samples, 'sample')} late"
+        f"{result.controllers[0].delays}"
     )  # fmt: skip
     rows, heads, gains = result.list_rows(), result.row_heads, len(result.table.gains) + 1
     _tabulate(console, [row[:gains] for row in rows], heads[:gains], ">" * gains)

@@ -31,6 +31,7 @@ Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
 Energy = Callable[[Any, Any], Any]
 ENERGY = "energy"  # among the outputs of a simulation, what the plant stores (J)
+DRIVE_DELAY = "drive_delay_s"  # among parameters: seconds from a command to its effect
 Matrices = tuple[
     Float[np.ndarray, "nx nx"],
     Float[np.ndarray, "nx nu"],
@@ -70,6 +71,9 @@ class Plant:
         smoothed curve.
     sampling : Sampling, optional
         States that hold what was sampled; f is zero for them.
+    drive_offset_s : float
+        Of one actuator whose drive was found as fast here and as slow there: what this one's delay is beyond that of
+        the others, the parameters' ``drive_delay_s``, s.
 
     Raises
     ------
@@ -114,6 +118,7 @@ class Plant:
     winding: Winding | None = field(default=None, repr=False)
     sticks: bool = False
     sampling: Sampling | None = field(default=None, repr=False)
+    drive_offset_s: float = field(default=0.0, repr=False)
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
     u: Any = field(init=False, repr=False)
@@ -306,8 +311,9 @@ class CompletedParameters(ParameterSet):
         self.vector: Float[np.ndarray, " np"] = np.array([parameter.value for parameter in self.values()], dtype=float)
 
     def drop_conditions(self) -> CompletedParameters:
-        """Return the same parameters, and nothing else as given."""
-        return self.plant.complete(ParameterSet(self.values()))
+        """Return the same parameters, and of what else is given only the drive's delay, which is there everywhere."""
+        late = [self.given[DRIVE_DELAY]] if DRIVE_DELAY in self.given else []
+        return self.plant.complete(ParameterSet([*self.values(), *late]))
 
     @property
     def by_attribute(self) -> SimpleNamespace:

@@ -269,7 +269,10 @@ KEYS: dict[str, dict[str, str]] = {
         "reference_weights": '"tuned": of how the reference enters; "error", "measurement": fixed.',
         "bandwidth_range_hz": "Within which bandwidths are sensible; 15 to 60 where left out.",
         "sample_rate_hz": "At which it runs.",
-        "delay_samples": "Whole samples from measurement to command, besides the hold; that of the fit where left out.",
+        "compute_delay_samples": "Whole samples from a reading to the command being put out, besides the hold: the "
+        "user's program. Left out: 0 where the log shows a delay behind a held command, else 1.",
+        "drive_delay_s": "From the command to its effect, where no log tells it; that of the fit where left out.",
+        "delay_samples": "The older key: both delays together, in whole samples. Not beside the other two.",
         "objective": "Of what the limits leave: least disturbance, or least noise.",
         "robust_to": 'Plants on which stability, Ms and Mt hold too; "frf:NAME" for a measured frequency response.',
         "frf_confidence": "That the discs about measured frequency responses hold the truth, all of them.",

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from seaopt.control import MPCSpec, NoiseModel
+from seaopt.control.laws.delay import DELAY_KEYS
 from seaopt.errors import ProblemError
 from seaopt.problem.schema import MPC, ControllerTable, MPCTable, ProblemTable
 
 SHARED = (  # keys of [controller] that a plan has too
-    "bandwidth_hz", "sample_rate_hz", "delay_samples", "current_limit_A", "command_limit", "max_sensitivity",
+    "bandwidth_hz", "sample_rate_hz", *DELAY_KEYS, "current_limit_A", "command_limit", "max_sensitivity",
     "max_complementary", "min_disk_margin", "max_reference_peak", "max_droop_db", "max_noise_gain",
     "min_sensitivity_bandwidth_hz",
 )  # fmt: skip

@@ -13,7 +13,8 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
-from seaopt.control.loops.sampled_plant import list_names
+from seaopt.control.laws.delay import find_drive_delay
+from seaopt.control.loops.sampled_plant import add_drive_delay, list_names
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
     Experiment,
@@ -226,7 +227,9 @@ class Problem:
 
     def values(self, source: Fit | ParameterSet) -> ParameterSet:
         """Return the values to design with: a fit's, the file's for what it does not have."""
-        return self.parameters.with_parameters(*source.parameters.values()) if isinstance(source, Fit) else source
+        values = self.parameters.with_parameters(*source.parameters.values()) if isinstance(source, Fit) else source
+        asked = self.mpc if self.spec is None else self.spec
+        return values if asked is None else add_drive_delay(values, find_drive_delay(asked, self.design_plant, source))
 
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
         """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges."""

@@ -268,7 +268,7 @@ def _check_delay(place: str, longest_s: float, rate_hz: float) -> None:
         raise ProblemError(
             f"{place} s reaches {longest_s * rate_hz:.4g} sample times of controller.sample_rate_hz = {rate_hz:g}, and "
             f"takes at most {MAX_LINK_DELAY_SAMPLES} ({MAX_LINK_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and "
-            f"whole samples that are always there are delay_samples = {max(1, round(longest_s * rate_hz))}"
+            f"a delay that is always there is controller.drive_delay_s = {longest_s:g}"
         )
 
 

@@ -160,6 +160,8 @@ class ControllerTable(StrictTable):
     bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
     sample_rate_hz: Number = 1000.0
+    compute_delay_samples: Whole | None = None
+    drive_delay_s: Number | None = None
     delay_samples: Whole | None = None
     max_sensitivity: Level = _limit("max_sensitivity")
     max_complementary: Level = _limit("max_complementary")

@@ -30,7 +30,7 @@ from seaopt.control import (
     tune,
     tune_schedule,
 )
-from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.delay import DELAY_KEYS, DelayedSpec, settle_delays
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.mpc.stored import check_described
@@ -214,7 +214,7 @@ def tune_problem(
         return linear_controller(design_mpc(problem, source))
     design, robust_to = list_plants(problem, source)
     assert problem.spec is not None
-    spec, table = settle_delay(problem.spec, problem.design_plant, source), problem.robustness
+    (spec, _), table = settle_delays(problem.spec, problem.design_plant, source), problem.robustness
     draws = problem.draws(source)
     if not table.retune:
         tuned = tune(design, problem.values(source), spec, robust_to, draws=draws, progress=progress)
@@ -296,7 +296,7 @@ def tune_schedule_problem(
 
     """
     assert problem.spec is not None and problem.schedule is not None
-    spec, asked = settle_delay(problem.spec, problem.design_plant, source), problem.schedule
+    (spec, _), asked = settle_delays(problem.spec, problem.design_plant, source), problem.schedule
     values = problem.values(source)
     return tune_schedule(
         problem.design_plant, values, spec, asked.over, asked.points, problem.robust_to(values),
@@ -405,8 +405,9 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
             f'correct one of them: measured = "{regulated}"'
         )
     spec = replace(
-        problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, delay_samples=given.delay_samples, measured=measured
-    )
+        problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, measured=measured,
+        **_choose_delays(problem.spec, given),
+    )  # fmt: skip
     if problem.designs_on_response:
         raise ProblemError(
             f"{problem.source}: a law of one's own is measured on a model, and [controller] is designed on "
@@ -417,6 +418,14 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
     law = given.to_effort(command_of(design, values, spec.regulated).per_effort)
     controller = assess(design, values, law, spec, robust_to, draws=problem.draws(source))
     return complete_controller(problem, controller, source)
+
+
+def _choose_delays(spec: DelayedSpec, given: GivenLaw) -> dict[str, Any]:
+    """Return the delays that a law's file states; the problem's of the drive where it states none."""
+    stated = dict.fromkeys(DELAY_KEYS) | dict(given.delays)
+    if stated["delay_samples"] is None and stated["drive_delay_s"] is None:
+        stated["drive_delay_s"] = spec.drive_delay_s
+    return stated
 
 
 def certify_problem(

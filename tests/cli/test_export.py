@@ -72,7 +72,7 @@ def test_without_a_target_it_is_a_usage_error(done, seaopt):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("seaopt/controller/2", "seaopt/controller/1", "schema is"),
+        ("seaopt/controller/3", "seaopt/controller/1", "schema is"),
         ('"den": [', '"den": [2.0,', "was edited"),
         ('"reference"', '"referense"', "was edited"),
         ('"made_from": {', '"made_from": {}, "before": {', "made_from does not say of which problem file"),

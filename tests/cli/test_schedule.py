@@ -33,7 +33,7 @@ def test_tune_writes_a_schedule_that_export_takes(knee, seaopt):
     out = seaopt("tune", "knee.toml")
     assert out.returncode == 0, out.stderr
     content = json.loads((knee / "out" / "schedule.json").read_text(encoding="utf-8"))
-    assert content["schema"] == "seaopt/schedule/1" and content["points"] == [0.0, 0.35]
+    assert content["schema"] == "seaopt/schedule/2" and content["points"] == [0.0, 0.35]
     assert not (knee / "out" / "controller.json").exists()
     written = seaopt("export", "out", "--c", "c", "--name", "knee")
     assert written.returncode == 0 and {path.name for path in (knee / "c").iterdir()} == {"knee.h", "knee.c"}

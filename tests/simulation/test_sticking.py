@@ -166,7 +166,7 @@ def rubbing(thor):
 
 @pytest.fixture(scope="module")
 def controller(stand, rubbing):
-    spec = so.ControllerSpec(bandwidth_hz=20, max_noise_gain=25, delay_samples=2, current_limit_A=10)
+    spec = so.ControllerSpec(bandwidth_hz=20, max_noise_gain=25, compute_delay_samples=2, current_limit_A=10)
     return so.tune(stand, rubbing, spec)
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from seaopt.control.laws.delay import describe_delays
 from seaopt.errors import ControlError
 
 Precision = Literal["double", "float"]
@@ -71,3 +72,15 @@ def render(template: str, context: Mapping[str, Any]) -> str:
         undefined=StrictUndefined, loader=PackageLoader("seaopt.control.deploy"),
     )  # fmt: skip
     return environment.get_template(template).render(context)
+
+
+def describe_timing(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what files say of the delays of a stored controller."""
+    computing, drive, period = stored["compute_delay_samples"], stored["drive_delay_s"], stored["sample_time_s"]
+    return {
+        "compute_delay_samples": computing,
+        "drive_delay_s": repr(float(drive)),
+        "drive_delay_ms": f"{1e3 * drive:.4g}" if drive else "",
+        "older": stored["spec"].delay_samples is not None,
+        "delays": describe_delays(computing, drive, period),
+    }

@@ -10,7 +10,7 @@ from typing import Any
 
 from seaopt.control.frontier.free_law import FreeLaw, bound_free_law
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.delay import settle_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
@@ -225,8 +225,7 @@ def sweep(
         )
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
         raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
-    spec = settle_delay(spec, design, params)
-    params = params.parameters if isinstance(params, Fit) else params
+    spec, params = settle_delays(spec, design, params)
     # What is wrong with any row is said before the first is tuned.
     specs = [replace(spec, bandwidth_hz=require_number(f, "bandwidths_hz", ControlError)) for f in bandwidths_hz]
     robust_to = robust_to or {}

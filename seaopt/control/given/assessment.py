@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.delay import settle_delays
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
@@ -85,15 +85,15 @@ def assess(
             f"{spec.sample_rate_hz:g}; give sample_rate_hz = {1.0 / given.sample_time_s:g}, or sample the law again"
         )
     given = replace(given, sample_time_s=spec.sample_time_s)
+    spec, values = settle_delays(spec, plant, params)
     spec = replace(
-        settle_delay(spec, plant, params),
+        spec,
         structure=CUSTOM,
         notch=None,
         prefilter=None,
         link_feedforward=None,
         reference_weights="tuned",
     )
-    values = params.parameters if isinstance(params, Fit) else params
     task = make_task(plant, plant.complete(values), spec, robust_to or {}, draws)
     loops = task.measure_law(
         given, filter_samples=count_filter_samples(given), integral_rad_s=find_integral_rate(given)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,14 +17,14 @@ from seaopt.control.laws.structures import AGREES, COMPARED
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import Measured
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.documents import Whole, check_table
+from seaopt.documents import Number, Whole, check_table
 from seaopt.errors import ControlError, FileError
 from seaopt.files import parse_file
 from seaopt.records import record
 
 Positive = Annotated[Finite, Field(gt=0.0)]
 # A whole one, in one line.
-LAW_EXAMPLE = "sample_rate_hz = 1000, delay_samples = 1, pid = { k_p = 2.0, k_i = 30.0 }"
+LAW_EXAMPLE = "sample_rate_hz = 1000, compute_delay_samples = 1, pid = { k_p = 2.0, k_i = 30.0 }"
 PID_GAINS = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
 
 
@@ -35,8 +36,8 @@ class GivenLaw:
     ----------
     law : Law
         From reference and measured to effort; or to the command, where `to_command`.
-    delay_samples : int
-        Whole samples from measurement to output, besides the hold.
+    delays : mapping
+        Of `seaopt.ControllerSpec`, what the file states: compute_delay_samples, drive_delay_s, delay_samples.
     measured : str, tuple of str or None
         What it measures; None where the file does not say.
     to_command : bool
@@ -47,7 +48,7 @@ class GivenLaw:
     """
 
     law: Law
-    delay_samples: int
+    delays: Mapping[str, Any]
     measured: Measured | None = None
     to_command: bool = False
     per_effort: float | None = None
@@ -118,7 +119,9 @@ class LawFile(_Strict):
 
     sample_time_s: Positive | None = None
     sample_rate_hz: Positive | None = None
-    delay_samples: Annotated[Whole, Field(ge=0)]
+    compute_delay_samples: Annotated[Whole, Field(ge=0)] | None = None
+    drive_delay_s: Annotated[Number, Field(ge=0.0)] | None = None
+    delay_samples: Annotated[Number, Field(ge=0.0)] | None = None
     output: Literal["effort", "command"] = "effort"
     measured: list[str] | str | None = None
     law: _StateSpace | None = None
@@ -155,6 +158,8 @@ class LawFile(_Strict):
     def _check_law(self) -> LawFile:
         if (self.sample_time_s is None) == (self.sample_rate_hz is None):
             raise ValueError("should have one of sample_time_s and sample_rate_hz")
+        if self.compute_delay_samples is None and self.delay_samples is None:
+            raise ValueError("should have compute_delay_samples, the samples from a reading to the command, such as 1")
         if (self.reference is None) != (self.measurement is None):
             raise ValueError("should have both of reference and measurement, each with num and den")
         if (self.pid is not None) == (self.law is not None or self.reference is not None):
@@ -164,6 +169,15 @@ class LawFile(_Strict):
         if isinstance(self.measured, list) and not self.measured:
             raise ValueError("should name what is measured")
         return self
+
+    @property
+    def delays(self) -> dict[str, Any]:
+        """What is stated of time; of a controller.json what was asked, for its drive's delay may be that of a fit."""
+        if self.compute_delay_samples is None:
+            whole = float(self.delay_samples or 0.0).is_integer()
+            return {"delay_samples": int(self.delay_samples or 0) if whole else self.delay_samples}
+        asked = self.spec.get("drive_delay_s") if isinstance(self.spec, dict) else self.drive_delay_s
+        return {"compute_delay_samples": self.compute_delay_samples, "drive_delay_s": asked}
 
     def build(self, source: str) -> GivenLaw:
         """Return the law."""
@@ -179,7 +193,7 @@ class LawFile(_Strict):
                 f"{source}: the law reads {law.d.size - 1} signals, and measured names {len(names)}; name each"
             )
         return GivenLaw(
-            law=law, delay_samples=self.delay_samples, measured=measured, to_command=self.output == "command",
+            law=law, delays=self.delays, measured=measured, to_command=self.output == "command",
             per_effort=self.command.per_effort,
         )  # fmt: skip
 
@@ -217,10 +231,10 @@ def read_law(path: Path | str) -> GivenLaw:
     Parameters
     ----------
     path : path
-        A file with sample_time_s or sample_rate_hz, delay_samples, and one of ``law`` (A, B, C, D from reference and
-        measured to effort), ``reference`` and ``measurement`` (num and den in ascending powers of 1/z: effort =
-        reference F_ref - measurement F; of several signals a list, one for each name in ``measured``), and ``pid``
-        (gains of `parallel_pid` or `ideal_pid`, by ``form``). With
+        A file with sample_time_s or sample_rate_hz, compute_delay_samples, and one of ``law`` (A, B, C, D from
+        reference and measured to effort), ``reference`` and ``measurement`` (num and den in ascending powers of 1/z:
+        effort = reference F_ref - measurement F; of several signals a list, one for each name in ``measured``), and
+        ``pid`` (gains of `parallel_pid` or `ideal_pid`, by ``form``). With
         ``output = "command"`` the law gives the command itself (A, V, a duty).
 
     Raises
@@ -232,7 +246,7 @@ def read_law(path: Path | str) -> GivenLaw:
     --------
     >>> import pathlib, tempfile
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "law.toml"
-    >>> _ = path.write_text('sample_rate_hz = 1000.0\ndelay_samples = 1\n[pid]\nk_p = 2.0\nk_i = 30.0\n')
+    >>> _ = path.write_text('sample_rate_hz = 1000.0\ncompute_delay_samples = 1\n[pid]\nk_p = 2.0\nk_i = 30.0\n')
     >>> read_law(path).law.integrators
     1
 

@@ -109,6 +109,7 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
             'moves: moving_output, two_link or rotary(link="free")'
         )
     measured, per_effort = controller.spec.regulated, controller.command.per_effort
+    params = controller.delay(params)
     sliding = take_sliding(plant, params)
     port = port_of(sliding, params, controller.signals, per_effort)
     linear, _ = linearise_sets(sliding, [sliding.complete(params)], str(plant.port.motion), per_effort)
@@ -121,7 +122,7 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
         )
     return Link(
         port=port, load=_read_load(port, linear, plant.name), law=controller.law,
-        delay_samples=controller.delay_samples, direction=-1.0 / ratio.real,
+        delay_samples=controller.compute_delay_samples, direction=-1.0 / ratio.real,
     )  # fmt: skip
 
 

@@ -171,12 +171,13 @@ def scorecard(
 
 def _score(controller: Controller, plant: Plant, parameters: ParameterSet) -> Score:
     figures = controller.close(plant, parameters).figures()
+    parameters = controller.delay(parameters)
     port = port_of(take_sliding(plant, parameters), parameters, controller.signals, controller.command.per_effort)
     found = passivity(controller, plant, parameters)
     period = controller.sample_time_s
     top = min(figures.bandwidth_hz or 1.0 / period, 0.49 / period)
     f = np.union1d(np.geomspace(LOWEST_HZ, max(top, 2 * LOWEST_HZ), POINTS), [1.0])
-    late = hold_response(f, period, controller.delay_samples)
+    late = hold_response(f, period, controller.compute_delay_samples)
     response = port.response(f)
     law = -controller.law.responses(f)[1:] * late
     size = np.abs(response.impedance(law))

@@ -16,6 +16,7 @@ from seaopt.control.laws.command import (
     name_gain_units,
     name_rates,
 )
+from seaopt.control.laws.delay import describe_delays
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
@@ -36,7 +37,7 @@ from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.loops.sampled_plant import DigitalPlant, list_names, sample
+from seaopt.control.loops.sampled_plant import DigitalPlant, add_drive_delay, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
 from seaopt.formatting import (
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
 
 # Among what controller.json says is achieved:
 FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
-CONTROLLER_SCHEMA = "seaopt/controller/2"
+CONTROLLER_SCHEMA = "seaopt/controller/3"
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
@@ -83,8 +84,10 @@ class Controller:
         For reading; what counts is `law`. Empty of a custom law.
     sample_time_s : float
         Seconds.
-    delay_samples : int
-        Whole samples from measurement to output, besides the hold.
+    compute_delay_samples : int
+        Whole samples from a reading to the command being put out, besides the hold: the user's program.
+    drive_delay_s : float
+        Seconds from the command to its effect: the drive, on the design plant.
     law : Law
         From (reference, measured) to effort.
     command : Command
@@ -131,7 +134,8 @@ class Controller:
     structure: str
     gains: Mapping[str, float]
     sample_time_s: float
-    delay_samples: int
+    compute_delay_samples: int
+    drive_delay_s: float
     law: Law
     command: Command
     spec: ControllerSpec
@@ -150,6 +154,20 @@ class Controller:
     reads: tuple[str, ...] = ()
     compensation: Compensation | None = None
     gate: PlausibilityGate | None = None
+
+    @property
+    def delay_samples(self) -> float:
+        """Both delays together, in samples; a fraction as the drive has it."""
+        return self.compute_delay_samples + self.drive_delay_s / self.sample_time_s
+
+    @property
+    def delays(self) -> str:
+        """Both delays and their sum, in words."""
+        return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s)
+
+    def delay(self, params: ParameterSet) -> ParameterSet:
+        """Return parameters with the delay of this controller's drive, where they have none of their own."""
+        return add_drive_delay(params, self.drive_delay_s)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -349,11 +367,11 @@ class Controller:
         """Return a plant as this controller sees it: from effort, through its own command per effort."""
         return sample(
             self.see(plant),
-            params,
+            self.delay(params),
             self.signals,
             self.command.per_effort,
             self.sample_time_s,
-            self.delay_samples,
+            self.compute_delay_samples,
         )
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
@@ -384,13 +402,15 @@ class Controller:
         return float(self.command_limit / self.command.per_effort / force)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of controller.json (schema seaopt/controller/2)."""
+        """Return the content of controller.json (schema seaopt/controller/3)."""
         reference, *measurements = ({"num": one.num, "den": one.den} for one in multiply_out(self.law, self.link))
         return {
             "schema": CONTROLLER_SCHEMA,
             "structure": self.structure,
             "gains": dict(self.gains),
             "sample_time_s": self.sample_time_s,
+            "compute_delay_samples": self.compute_delay_samples,
+            "drive_delay_s": self.drive_delay_s,
             "delay_samples": self.delay_samples,
             "measured": list(self.signals),
             "law": self.law.to_dict(),
@@ -456,10 +476,11 @@ class Controller:
         gain, spec = stored["command"].per_effort, stored["spec"]
         sliding = take_sliding(plant, params)
         reads = stored["reads"] or list_names(spec.measured)
-        sampled = sample(sliding, params, reads, gain, stored["sample_time_s"], stored["delay_samples"])
+        params = add_drive_delay(params, stored["drive_delay_s"])
+        sampled = sample(sliding, params, reads, gain, stored["sample_time_s"], stored["compute_delay_samples"])
         achieved = Loop(plant=sampled, law=stored["law"]).figures()
         (loop,) = make_friction_loops(
-            plant, [params], reads, gain, stored["delay_samples"], stored["law"]
+            plant, [params], reads, gain, stored["compute_delay_samples"], stored["law"]
         )  # fmt: skip
         friction = None if loop is None else friction_margin(loop)
         check_achieved(content.get("achieved"), _list_achieved(achieved))
@@ -500,8 +521,7 @@ class Controller:
         verdict = "every limit met" if self.feasible else "NOT FEASIBLE"
         return "\n".join(
             [
-                f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
-                f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
+                f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, {self.delays}: {verdict}",
                 *self._gain_lines(),
                 f"  bandwidth {format_number(a.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}), "
                 f"tracking band {format_band(a.tracking_band_hz, 'Hz')}",

@@ -1,20 +1,29 @@
-"""The delay that a fit found or was given, as whole samples of a controller, for tuner and certificate.
+"""The two delays of a loop: the drive's, which the plant has, and the program's, in whole samples.
 
 An experiment's delay runs from a row's command to its effect in the log's measurement: what command path, drive, sensor
-and transport add, as far as the log's clock sees it. In a loop that commands and measures over the same path it is the
-delay from measurement to output, besides the hold, once the controller answers in the sample in which it measures.
+and transport add, as far as the log's clock sees it. That is the drive's delay. It is a condition of every plant
+(`seaopt.control.loops.sampled_plant`), exact in fractions of a sample. The program adds whole samples between a reading
+and the command being put out: none where the program that logged read and wrote in one tick, as its log shows.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
+import casadi as ca
+import numpy as np
+
+from seaopt.control.loops.sampled_plant import DRIVE_DELAY, Measured, add_drive_delay, list_names, read_conditions
+from seaopt.errors import ControlError
 from seaopt.estimation import Fit
+from seaopt.estimation.result.covariance import Covariance
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.records import record
 
 
 @runtime_checkable
@@ -24,8 +33,18 @@ class DelayedSpec(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
+    def compute_delay_samples(self) -> int | None:
+        """Whole samples from a reading to the command being put out; None: not given."""
+        ...
+
+    @property
+    def drive_delay_s(self) -> float | None:
+        """Seconds from the command to its effect; None: that of the fit."""
+        ...
+
+    @property
     def delay_samples(self) -> int | None:
-        """Whole samples from measurement to output, besides the hold; None: not given."""
+        """The older key: both together, in whole samples; None: not given."""
         ...
 
     @property
@@ -33,44 +52,184 @@ class DelayedSpec(Protocol):
         """Of the controller."""
         ...
 
+    @property
+    def measured(self) -> Measured:
+        """What it reads."""
+        ...
+
+
+@record
+class Drive:
+    """The drive's delay, s, and the experiment whose fit it is of; None of one that is given."""
+
+    delay_s: float
+    fitted_in: str | None = None
+
+    def take_covariance(self, fit: Fit) -> Covariance:
+        """Return a fit's covariance of the parameters, and of this delay with them."""
+        joint, own = fit.delay_covariance, f"{self.fitted_in}.delay_s"
+        if joint is None or own not in joint.names:
+            return fit.covariance
+        names = (*fit.covariance.names, own)
+        rows = [joint.names.index(name) for name in names]
+        return Covariance(names=(*fit.covariance.names, DRIVE_DELAY), matrix=joint.matrix[np.ix_(rows, rows)])
+
 
 SpecT = TypeVar("SpecT", bound=DelayedSpec)
-NEGLIGIBLE = 0.01  # of a sample: a delay that is beyond whole samples by less is that many
+DELAY_KEYS = ("compute_delay_samples", "drive_delay_s", "delay_samples")
+TOLD_STDS = 3.0  # by which two fitted delays differ that are two
+NEGLIGIBLE = 0.01  # of a sample: a delay that is beyond another by less is as long
 
 
-def count_delay_samples(delay_s: float, sample_rate_hz: float) -> int:
-    """Return a delay in samples, rounded up to whole ones.
+def check_delays(spec: DelayedSpec, most: int) -> None:
+    """Refuse delays that are none, or two that say the same.
+
+    Raises
+    ------
+    ControlError
+        As said.
+
+    """
+    for name in ("compute_delay_samples", "delay_samples"):
+        value: Any = getattr(spec, name)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
+            raise ControlError(f"{name} = {value!r} is not a whole number of samples from 0 to {most}; give {name} = 1")
+    drive: Any = spec.drive_delay_s
+    longest = most / spec.sample_rate_hz
+    if drive is not None and (
+        isinstance(drive, bool) or not isinstance(drive, (int, float)) or not 0.0 <= drive <= longest
+    ):
+        raise ControlError(
+            f"drive_delay_s = {drive!r} is not from 0 to {longest:g} s, {most} samples; it is in seconds: 0.002 is 2 ms"
+        )
+    new = [name for name in ("compute_delay_samples", "drive_delay_s") if getattr(spec, name) is not None]
+    if spec.delay_samples is not None and new:
+        raise ControlError(
+            f"delay_samples = {spec.delay_samples} and {new[0]} = {getattr(spec, new[0]):g} are both given, and "
+            "delay_samples is the whole loop; keep compute_delay_samples and drive_delay_s"
+        )
+
+
+def count_loop_samples(spec: DelayedSpec) -> int:
+    """Return the whole samples that a controller waits: as given, or 1."""
+    given = spec.compute_delay_samples if spec.delay_samples is None else spec.delay_samples
+    return 1 if given is None else given
+
+
+def find_given_drive_delay(spec: DelayedSpec) -> float | None:
+    """Return the drive's delay that a specification states; none is left where the whole loop is given."""
+    return spec.drive_delay_s if spec.delay_samples is None else 0.0
+
+
+def find_drive_delay(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> float:
+    """Return the drive's delay: as the specification states it, or as the fit or the parameters have it."""
+    return find_drive(spec, plant, source).delay_s
+
+
+def find_drive(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> Drive:
+    """Return the drive's delay, and of a fit the experiment that tells it: the one with the longest."""
+    given = find_given_drive_delay(spec)
+    if given is not None:
+        return Drive(delay_s=float(given))
+    if not isinstance(source, Fit):
+        return Drive(delay_s=read_conditions(plant, source).get(DRIVE_DELAY, 0.0))
+    known = source.list_delayed(plant)
+    name = max(known, key=lambda one: known[one].delay_s, default=None)
+    return Drive(delay_s=0.0) if name is None else Drive(delay_s=known[name].delay_s, fitted_in=name)
+
+
+def split_delayed(
+    spec: DelayedSpec, design: Plant, plants: Mapping[str, Plant], source: Fit | ParameterSet
+) -> dict[str, Plant]:
+    """Return plants with the delays that their own experiments have; one twice whose experiments differ.
+
+    The parameters have the longest delay of the design plant, from which each plant's own is counted.
+    """
+    if not isinstance(source, Fit) or find_given_drive_delay(spec) is not None:
+        return dict(plants)
+    least, nominal = NEGLIGIBLE / spec.sample_rate_hz, source.delay_s(design)
+    out: dict[str, Plant] = {}
+    for name, plant in plants.items():
+        own = [one for one in source.list_delayed(plant).values() if plant is design or one.plant == plant.name]
+        if not own:
+            out[name] = plant
+            continue
+        first, last = min(own, key=lambda one: one.delay_s), max(own, key=lambda one: one.delay_s)
+        offset = last.delay_s - nominal
+        out[name] = replace(plant, drive_offset_s=offset) if abs(offset) > least else plant
+        spread, std = last.delay_s - first.delay_s, math.hypot(*(one.std.get("delay_s", 0.0) for one in (first, last)))
+        if spread > max(least, TOLD_STDS * std):
+            out[f"{name}, shortest delay"] = replace(plant, drive_offset_s=first.delay_s - nominal)
+    return out
+
+
+def settle_delays(
+    spec: SpecT, plant: Plant, source: Fit | ParameterSet, *, plans: bool = False
+) -> tuple[SpecT, ParameterSet]:
+    """Return a specification with its samples, and values with the drive's delay: what a loop is closed with.
+
+    Samples that are left out are none where the design plant's log shows what a program does that reads and writes in
+    one tick: a delay behind a command that is held. It takes an output without the present command in it, and a law
+    that does not plan; else it is 1.
+    """
+    values = source.parameters if isinstance(source, Fit) else source
+    late = find_drive_delay(spec, plant, source)
+    values = add_drive_delay(ParameterSet(one for name, one in values.items() if name != DRIVE_DELAY), late)
+    if spec.compute_delay_samples is not None or spec.delay_samples is not None:
+        return spec, values
+    at_once = isinstance(source, Fit) and source.shows_delay(plant) and not plans
+    return replace(spec, compute_delay_samples=0 if at_once and not _answers_at_once(plant, spec) else 1), values
+
+
+def _answers_at_once(plant: Plant, spec: DelayedSpec) -> bool:
+    """Tell whether what is measured contains the present command."""
+    outputs = list(plant.outputs)
+    rows = [plant.output[outputs.index(name)] for name in list_names(spec.measured) if name in outputs]
+    return any(ca.depends_on(row, plant.u[0]) for row in rows)
+
+
+def describe_delays(compute_delay_samples: int, drive_delay_s: float, sample_time_s: float) -> str:
+    """Return both delays and their sum, in the words of terminal, page and header.
 
     Examples
     --------
-    >>> count_delay_samples(2.04e-3, 1000.0), count_delay_samples(2.0e-3, 1000.0), count_delay_samples(0.0, 1000.0)
-    (3, 2, 0)
+    >>> describe_delays(0, 1.32e-3, 1e-3)
+    'compute delay 0 samples + drive delay 1.32 ms = 1.32 samples'
+    >>> describe_delays(1, 0.0, 1e-3)
+    'compute delay 1 sample, no drive delay'
 
     """
-    return max(0, math.ceil(delay_s * sample_rate_hz - NEGLIGIBLE))
+    computing = f"compute delay {format_count(compute_delay_samples, 'sample')}"
+    if not drive_delay_s:
+        return f"{computing}, no drive delay"
+    total = compute_delay_samples + drive_delay_s / sample_time_s
+    return f"{computing} + drive delay {1e3 * drive_delay_s:.4g} ms = {total:.4g} samples"
 
 
-def settle_delay(spec: SpecT, plant: Plant, source: Fit | ParameterSet) -> SpecT:
-    """Return a specification with its delay: as given, or that of a fit's experiments rounded up, 1 at least."""
-    if spec.delay_samples is not None:
-        return spec
-    found = count_delay_samples(source.delay_s(plant), spec.sample_rate_hz) if isinstance(source, Fit) else 0
-    return replace(spec, delay_samples=max(1, found))
-
-
-def warn_short_delay(
-    delay_samples: int, sample_rate_hz: float, plant: Plant, source: Fit | ParameterSet
-) -> tuple[str, ...]:
-    """Return a warning where a controller counts on less delay than the fit's experiments have."""
+def warn_delays(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> tuple[str, ...]:
+    """Return warnings of an older key, and of less delay in the whole loop than the fit's experiments have."""
+    if spec.delay_samples is None:
+        older: tuple[str, ...] = ()
+    else:
+        older = (
+            f"delay_samples = {spec.delay_samples} is an older key, the whole loop in samples with the drive's delay "
+            "in it; give compute_delay_samples (from a reading to the command being put out), and drive_delay_s where "
+            "no log tells it",
+        )
     if not isinstance(source, Fit):
-        return ()
-    delay_s = source.delay_s(plant)
-    needed = count_delay_samples(delay_s, sample_rate_hz)
-    if delay_samples >= needed:
-        return ()
-    counted = format_count(delay_samples, "sample")
+        return older
+    settled, _ = settle_delays(spec, plant, source)
+    found, rate = source.delay_s(plant), spec.sample_rate_hz
+    counted = count_loop_samples(settled) + find_drive_delay(spec, plant, source) * rate
+    if counted >= found * rate - NEGLIGIBLE:
+        return older
+    name = "delay_samples" if spec.delay_samples is not None else "drive_delay_s"
+    stated = f"{name} = {getattr(spec, name):g}"
     return (
-        f"delay_samples = {delay_samples}, but the experiments have a delay of {1e3 * delay_s:.4g} ms, "
-        f"{format_count(needed, 'sample')} at {sample_rate_hz:g} Hz: a loop with that delay has smaller margins than "
-        f"stated for {counted}; give delay_samples = {needed}, or leave it out",
+        *older,
+        f"{stated}, but the experiments have a delay of {1e3 * found:.4g} ms, {found * rate:.4g} samples at "
+        f"{rate:g} Hz: a loop with that delay has smaller margins than stated for {counted:.4g} samples; leave {name} "
+        "out, and the fit's delay is taken",
     )

@@ -61,5 +61,6 @@ def take_friction_out(
 ) -> list[FrictionLoop | None]:  # fmt: skip
     """Return `make_friction_loops` of a controller."""
     return make_friction_loops(
-        plant, sets, controller.signals, controller.command.per_effort, controller.delay_samples, controller.law
-    )
+        plant, [controller.delay(params) for params in sets], controller.signals, controller.command.per_effort,
+        controller.compute_delay_samples, controller.law,
+    )  # fmt: skip

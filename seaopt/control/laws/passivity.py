@@ -184,11 +184,13 @@ def passivity(
         raise ControlError(
             f"low_hz = {low_hz:g}, high_hz = {high:g} is not a band; give 0 < low < high <= {0.5 / ts:g} Hz"
         )
-    port = port_of(take_sliding(plant, params), params, controller.signals, controller.command.per_effort)
+    port = port_of(
+        take_sliding(plant, params), controller.delay(params), controller.signals, controller.command.per_effort
+    )
     law = controller.law
-    impedance, angle = _make_curves(port, law, ts, controller.delay_samples)
+    impedance, angle = _make_curves(port, law, ts, controller.compute_delay_samples)
     f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, ts, low_hz, high)))
-    stable = is_held_stable(port, law, ts, controller.delay_samples)
+    stable = is_held_stable(port, law, ts, controller.compute_delay_samples)
     bands, violated = _find_bands(lambda x: angle(x) + COSINE_ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
     least = int(np.argmin(np.real(z)))

@@ -8,6 +8,7 @@ from dataclasses import asdict, fields
 from typing import Any, Literal
 
 from seaopt.control.laws.command import Command
+from seaopt.control.laws.delay import check_delays, count_loop_samples
 from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, FIELDS, LIMITS, Limit, list_given_limits
 from seaopt.control.laws.structures import (
     CASCADE,
@@ -72,9 +73,14 @@ class ControllerSpec:
         k_r = 1/P(0) + k_p and c = 1; or the derivative on the measurement alone, c = 0, with k_r tuned.
     sample_rate_hz : float
         Of the controller.
+    compute_delay_samples : int, optional
+        Whole samples from a reading to the command being put out, besides the hold. Left out it is 0 where
+        `seaopt.tune` is given a fit whose experiments on the design plant show a delay, else 1
+        (`seaopt.control.laws.delay`).
+    drive_delay_s : float, optional
+        Seconds from the command to its effect, exact in fractions of a sample; left out, that of the fit.
     delay_samples : int, optional
-        Whole samples from measurement to output, besides the hold. Left out: where `seaopt.tune` is given a fit, the
-        delay of its experiments on the design plant, rounded up; at least 1.
+        The older key: the whole loop in samples, the drive's delay among them. Not beside the other two.
     max_sensitivity, max_complementary : float, optional
         Ms and Mt, peaks of abs(S) and abs(L/(1+L)), on every plant.
     min_disk_margin : float, optional
@@ -129,6 +135,8 @@ class ControllerSpec:
     prefilter: PrefilterOrder | Prefilter | None = None
     reference_weights: ReferenceWeights = "tuned"
     sample_rate_hz: float = 1000.0
+    compute_delay_samples: int | None = None
+    drive_delay_s: float | None = None
     delay_samples: int | None = None
     max_sensitivity: Level = BY_NAME["max_sensitivity"].default
     max_complementary: Level = BY_NAME["max_complementary"].default
@@ -178,15 +186,12 @@ class ControllerSpec:
             raise ControlError(
                 f'objective = "{self.objective}" is not known; use "noise", or objective = "disturbance"'
             )
-        if not 0 <= self.loop_delay_samples <= MAX_DELAY_SAMPLES:
-            raise ControlError(
-                f"delay_samples = {self.delay_samples} is not from 0 to {MAX_DELAY_SAMPLES}; give delay_samples = 1"
-            )
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
             raise ControlError(
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
                 f"sample more than four times as fast: sample_rate_hz = {10.0 * self.bandwidth_hz:g}"
             )
+        check_delays(self, MAX_DELAY_SAMPLES)
         self._check_limits()
 
     def _check_measured(self) -> None:
@@ -204,10 +209,6 @@ class ControllerSpec:
             )
 
     def _check_types(self) -> None:
-        if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int | None):
-            raise ControlError(
-                f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give delay_samples = 1"
-            )
         for name in ("bandwidth_hz", "sample_rate_hz", "reserve", "bandwidth_tolerance", *OPTIONAL):
             value = getattr(self, name)
             if value is None and name in OPTIONAL:
@@ -309,8 +310,8 @@ class ControllerSpec:
 
     @property
     def loop_delay_samples(self) -> int:
-        """Whole samples of delay that a loop is closed with: as given, or 1."""
-        return 1 if self.delay_samples is None else self.delay_samples
+        """Whole samples of delay that a loop is closed with besides the drive's: as given, or 1."""
+        return count_loop_samples(self)
 
     @property
     def limit_asked(self) -> float | None:
@@ -385,7 +386,10 @@ class ControllerSpec:
         stated = {name: None if one is None else asdict(one) for name, one in filters.items()}
         if self.bandwidth_tolerance == BANDWIDTH_TOLERANCE:
             del values["bandwidth_tolerance"]  # stands in no file of a law that was tuned
-        return values | stated | {"delay_samples": self.loop_delay_samples}
+        if self.delay_samples is None:
+            del values["delay_samples"]
+            values["compute_delay_samples"] = self.loop_delay_samples
+        return values | stated
 
 
 def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, float]) -> None:

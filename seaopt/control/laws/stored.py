@@ -320,7 +320,9 @@ class StoredController(ResultTable):
     structure: str
     gains: dict[str, Finite]
     sample_time_s: Finite
-    delay_samples: Whole
+    compute_delay_samples: Annotated[Whole, Field(ge=0)]
+    drive_delay_s: Annotated[Finite, Field(ge=0.0)]
+    delay_samples: Finite
     law: StoredLaw
     measured: list[str] | None = None
     reference: StoredReading
@@ -351,7 +353,9 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     """
     table = check_table(StoredController, plain(content), "controller.json", remedy=TUNE_AGAIN)
     spec, robust_to = _build_spec(table.spec)
-    for name, expected in (("structure", spec.structure), ("delay_samples", spec.loop_delay_samples)):
+    for name, expected in (
+        ("structure", spec.structure), ("compute_delay_samples", spec.loop_delay_samples)
+    ):  # fmt: skip
         if getattr(table, name) != expected:
             raise _contradict(name, f"is {getattr(table, name)!r} and spec.{name} {expected!r}")
     if not abs(table.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
@@ -375,7 +379,8 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "law": law,
         "structure": spec.structure, "gains": table.gains, "sample_time_s": table.sample_time_s,
-        "delay_samples": table.delay_samples, "command": _build_command(table.command), "spec": spec,
+        "compute_delay_samples": table.compute_delay_samples, "drive_delay_s": table.drive_delay_s,
+        "command": _build_command(table.command), "spec": spec,
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
         "observer": observer, "link": link, "reads": reads, "blocked_by": tuple(table.blocked_by),
         "measured": tuple(one.build() for one in table.measured_responses),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.sampled_plant import DELAY, Measured, find_rows, read_conditions
+from seaopt.control.loops.sampled_plant import Measured, find_delay, find_rows, read_conditions
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -194,7 +194,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: 
         speed=list(probe.states).index(port.rate),
         place=list(probe.states).index(port.coordinate),
         mass=values[port.inertia].value,
-        delay_s=read_conditions(plant, params).get(DELAY, 0.0),
+        delay_s=float(find_delay(plant, read_conditions(plant, params))),
         place_unit=probe.states[port.coordinate],
         others=read[1:] if len(read) > 1 else None,
     )

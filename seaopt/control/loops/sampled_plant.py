@@ -5,10 +5,12 @@ Besides parameters, a plant has conditions, which stand in the same `ParameterSe
 a state of the plant (``phi``)
     It is linearised at rest there, the first input and the other states being what keeps it at rest, instead of at
     zero.
+``drive_delay_s``
+    Seconds from a command to its effect: the drive's delay, which no program adds or can take away.
 ``delay_s``
-    Seconds of delay besides the controller's whole samples. With :math:`w` whole samples and a rest :math:`\tau` in
-    it, the older of two commands acts for :math:`\tau` and the newer for what is left of a period:
-    :math:`x^+ = e^{AT} x + [\Gamma(T) - \Gamma(T - \tau)] u_{k-w-1} + \Gamma(T - \tau) u_{k-w}` with
+    Seconds of delay besides the controller's whole samples and the drive's. With :math:`w` whole samples and a rest
+    :math:`\tau` in both together, the older of two commands acts for :math:`\tau` and the newer for what is left of a
+    period: :math:`x^+ = e^{AT} x + [\Gamma(T) - \Gamma(T - \tau)] u_{k-w-1} + \Gamma(T - \tau) u_{k-w}` with
     :math:`\Gamma(t) = \int_0^t e^{As} ds\, B` (Astrom, Wittenmark, Computer-Controlled Systems, 3rd ed., 2.3).
 """
 
@@ -28,7 +30,7 @@ from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import SLIDING, friction_states, remembers, rest_jacobians
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
-from seaopt.plants.plant import dynamics_function, refuse_samples
+from seaopt.plants.plant import DRIVE_DELAY, dynamics_function, refuse_samples
 from seaopt.records import record
 from seaopt.units import factor
 
@@ -46,6 +48,7 @@ SampledPlants = tuple[
 Measured = str | tuple[str, ...]  # one output by its name, or several, the regulated one first
 
 DELAY = "delay_s"
+DELAYS = (DELAY, DRIVE_DELAY)
 MAPPED = 512  # plants in one call of CasADi
 REACH, DEGREE = 0.125, 10  # of the exponential's Taylor polynomial: 0.125^11 / 11! = 3e-18
 NEWTON_STEPS = 30
@@ -167,7 +170,7 @@ def linearise_sets(
     places = [read_conditions(plant, values) for values in sets]
     at = {name: np.array([place[name] for place in places]) for name in places[0]}
     linear = linearise(plant, np.column_stack([values.vector for values in sets]), at, measured, gain)
-    return linear, at.get(DELAY, np.zeros(len(sets)))
+    return linear, np.zeros(len(sets)) + find_delay(plant, at)
 
 
 def sample_linear(
@@ -207,10 +210,34 @@ def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float
 
 def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
     """Return what a plant's `ParameterSet` may hold besides its parameters."""
-    known = {DELAY: Parameter(name=DELAY, value=0.0, unit="s", min=0.0, description="delay besides the controller's")}
+    described = {DELAY: "delay besides the controller's and the drive's", DRIVE_DELAY: "from a command to its effect"}
+    known = {
+        name: Parameter(name=name, value=0.0, unit="s", min=0.0, description=text) for name, text in described.items()
+    }
     for plant in plants:
         known |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
     return known
+
+
+def find_delay(plant: Plant, at: Mapping[str, Any]) -> Any:
+    """Return the seconds of delay besides the controller's samples where a plant's conditions are, numbers or arrays.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> find_delay(so.plants.high_impedance(), {"drive_delay_s": 0.002, "delay_s": 0.001})
+    0.003
+
+    """
+    late = at.get(DELAY, 0.0) + at.get(DRIVE_DELAY, 0.0)
+    return np.maximum(late + plant.drive_offset_s, 0.0) if plant.drive_offset_s else late
+
+
+def add_drive_delay(params: ParameterSet, drive_delay_s: float) -> ParameterSet:
+    """Return parameters with a drive's delay among their conditions, where they have none yet."""
+    if DRIVE_DELAY in params or not drive_delay_s:
+        return params
+    return params.with_parameters(Parameter(name=DRIVE_DELAY, value=drive_delay_s, unit="s", min=0.0))
 
 
 def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
@@ -345,7 +372,7 @@ def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarr
     -88.70 N, -88.70 N
 
     """
-    at = {name: np.array([value]) for name, value in read_conditions(plant, params).items() if name != DELAY}
+    at = {name: np.array([value]) for name, value in read_conditions(plant, params).items() if name not in DELAYS}
     cool = freeze_heat(plant)
     x, u = _solve_rest(_let_slide(cool), params.vector[:, None], at)
     rest = dict(zip(cool.states, x[:, 0], strict=True))  # a winding is cold there, though a current flows

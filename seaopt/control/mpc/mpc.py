@@ -21,6 +21,7 @@ and the step says so.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import field, replace
@@ -31,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import Command, command_of, limit_notes
-from seaopt.control.laws.delay import settle_delay, warn_short_delay
+from seaopt.control.laws.delay import NEGLIGIBLE, settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.spec import describe_lifted
@@ -40,7 +41,7 @@ from seaopt.control.loops.absolute_stability import FrictionMargin, friction_mar
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
-from seaopt.control.loops.sampled_plant import DigitalPlant, sample
+from seaopt.control.loops.sampled_plant import DRIVE_DELAY, DigitalPlant, sample
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.knots import interpolate_knots, spread_knots
@@ -508,9 +509,21 @@ def force_mpc(
         raise ControlError(
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
         )
-    spec = settle_delay(spec, plant, params)
-    warnings = warn_short_delay(spec.loop_delay_samples, spec.sample_rate_hz, plant, params)
-    return _design(plant, params.parameters if isinstance(params, Fit) else params, spec, gate, warnings)
+    warnings = warn_delays(spec, plant, params)
+    spec, values = settle_delays(spec, plant, params, plans=True)
+    spec, values = _round_up_delay(spec, values)
+    return _design(plant, values, spec, gate, warnings)
+
+
+def _round_up_delay(spec: MPCSpec, values: ParameterSet) -> tuple[MPCSpec, ParameterSet]:
+    """Return a specification that counts the drive's delay in whole samples, and values without it."""
+    if DRIVE_DELAY not in values:
+        return spec, values
+    late = math.ceil(values[DRIVE_DELAY].value * spec.sample_rate_hz - NEGLIGIBLE)
+    counted = replace(
+        spec, compute_delay_samples=spec.loop_delay_samples + late, drive_delay_s=0.0, delay_samples=None
+    )  # fmt: skip
+    return counted, ParameterSet(one for name, one in values.items() if name != DRIVE_DELAY)
 
 
 def _find_possible(mpc: ForceMPC) -> float | None:

@@ -9,6 +9,7 @@ from types import NoneType
 
 import numpy as np
 
+from seaopt.control.laws.delay import check_delays, count_loop_samples
 from seaopt.control.laws.limits import BY_NAME, Limit
 from seaopt.control.laws.spec import Level
 from seaopt.control.mpc.noise import NoiseModel
@@ -50,9 +51,13 @@ class MPCSpec:
         horizon may miss it by more than 2 %.
     sample_rate_hz : float
         Of the controller.
+    compute_delay_samples : int, optional
+        Whole samples from a reading to the command being put out, besides the hold; 1 if left out.
+    drive_delay_s : float, optional
+        Seconds from the command to its effect; left out, where `force_mpc` is given a fit, that of its experiments on
+        the design plant.
     delay_samples : int, optional
-        Whole samples from measurement to output, besides the hold. Left out: where `force_mpc` is given a fit, the
-        delay of its experiments on the design plant, rounded up; at least 1.
+        The older key: the whole loop in samples, the drive's delay among them. Not beside the other two.
     decay : float
         Time constant with which the force error should die out, times 2 pi bandwidth_hz, from 0 to below 1: the
         larger, the less overshoot and the more noise in the current.
@@ -91,6 +96,8 @@ class MPCSpec:
     measured: str = "F1"
     bandwidth_hz: float = 30.0
     sample_rate_hz: float = 1000.0
+    compute_delay_samples: int | None = None
+    drive_delay_s: float | None = None
     delay_samples: int | None = None
     decay: float = 0.8
     horizon_s: float = 0.05
@@ -122,13 +129,11 @@ class MPCSpec:
         if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
             raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
         ranges = {
-            "delay_samples": (0, MAX_MPC_DELAY_SAMPLES), "moves": (2, MAX_HORIZON_SAMPLES),
-            "max_iterations": (1, MAX_MPC_ITERATIONS), "preview_samples": (0, MAX_HORIZON_SAMPLES),
+            "moves": (2, MAX_HORIZON_SAMPLES), "max_iterations": (1, MAX_MPC_ITERATIONS),
+            "preview_samples": (0, MAX_HORIZON_SAMPLES),
         }  # fmt: skip
         for name, (least, most) in ranges.items():
             value = getattr(self, name)
-            if name == "delay_samples" and value is None:
-                continue
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise ControlError(f"{name} = {value!r} is not a whole number from {least} to {most}")
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
@@ -136,6 +141,7 @@ class MPCSpec:
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
                 "sample more than four times as fast"
             )
+        check_delays(self, MAX_MPC_DELAY_SAMPLES)
         if not self.moves <= self.samples <= MAX_HORIZON_SAMPLES:
             raise ControlError(
                 f"horizon_s = {self.horizon_s:g} is {self.samples} samples; it takes {self.moves} (moves) to "
@@ -174,8 +180,8 @@ class MPCSpec:
 
     @property
     def loop_delay_samples(self) -> int:
-        """Whole samples of delay that a loop is closed with: as given, or 1."""
-        return 1 if self.delay_samples is None else self.delay_samples
+        """Whole samples of delay that a loop is closed with besides the drive's: as given, or 1."""
+        return count_loop_samples(self)
 
     @property
     def limits(self) -> tuple[Limit, ...]:

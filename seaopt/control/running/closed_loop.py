@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.control.loops.sampled_plant import DELAY, read_conditions
+from seaopt.control.loops.sampled_plant import find_delay, read_conditions
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names, whole_samples
 from seaopt.errors import SimulationError, StepSizeError, suggestion
@@ -46,7 +46,7 @@ from seaopt.plants.plant import ENERGY, Matrices, name_input
 from seaopt.records import record
 from seaopt.units import name_command, unit_after
 
-__all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
+__all__ = ["ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
 
 MAX_LOOP_SUBSTEPS = 512
 ALIKE = 0.5  # of its largest value, by which a state of a run that is lost may differ between two numbers of steps
@@ -321,10 +321,10 @@ def _lags(loop: SampledLoop, params: Sequence[CompletedParameters]) -> dict[str,
     queue = loop.waiting
     lag, late_s = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
     for run, values in enumerate(params):
-        delay = read_conditions(loop.plant, values).get(DELAY, 0.0)
+        delay = float(find_delay(loop.plant, read_conditions(loop.plant, values)))
         if not 0.0 <= delay <= loop.longest_delay_s:
             raise SimulationError(
-                f"{DELAY} = {delay:g} is outside 0 to longest_delay_s = {loop.longest_delay_s:g}; give the loop the "
+                f"a delay of {delay:g} s is outside 0 to longest_delay_s = {loop.longest_delay_s:g}; give the loop the "
                 "longest of all runs"
             )
         whole, late_s[run] = whole_samples(delay, loop.law.sample_time_s)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
-from seaopt.control.loops.sampled_plant import DELAY, read_conditions
+from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditions
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
 from seaopt.control.running.sampled_loop import largest_current, whole_samples
@@ -163,7 +163,7 @@ def close_loop(
     ------
     ControlError
         `preview_samples` is no number of samples, the plant has no such output or state, or that output responds to the
-        current at once, the parameters contain another condition than `delay_s`, a sensor's error or current_step_A is
+        current at once, the parameters contain another condition than delays, a sensor's error or current_step_A is
         negative, that step is above the limit, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
@@ -262,12 +262,12 @@ def _check(plant: Plant, params: CompletedParameters, measured: str, delay_sampl
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
     conditions = read_conditions(plant, params)
-    moved = [name for name, value in conditions.items() if name != DELAY and value]
+    moved = [name for name, value in conditions.items() if name not in DELAYS and value]
     if moved:
         raise ControlError(
             f"the parameters hold {', '.join(moved)}, but close_loop starts at rest at zero; leave it out"
         )
-    extra_delay_s = conditions.get(DELAY, 0.0)
+    extra_delay_s = float(find_delay(plant, conditions))
     row = plant.output[list(plant.outputs).index(measured)]
     if not delay_samples and not extra_delay_s and ca.depends_on(row, plant.u[0]):
         raise ControlError(

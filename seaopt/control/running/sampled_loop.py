@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import field
 
 import casadi as ca
@@ -11,8 +12,9 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control.laws.realisation import RunnableLaw
-from seaopt.control.loops.sampled_plant import Measured
+from seaopt.control.loops.sampled_plant import Measured, find_delay, read_conditions
 from seaopt.errors import SimulationError, suggestion
+from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick
 from seaopt.plants.plant import ENERGY
@@ -42,7 +44,8 @@ class SampledLoop:
         What the command is rounded to, in its unit; 0 for not at all. The largest is the last whole step within the
         law's limit.
     longest_delay_s : float
-        The longest `delay_s` of any run's parameters: delay besides `delay_samples`, of any length.
+        The longest delay among the conditions of any run's parameters (`find_longest_delay`): the drive's and what is
+        besides `delay_samples`, of any length.
     sticks : bool
         Dry friction jumps at rest, so that what sticks stands still (`seaopt.simulation.sticking`), in place of the
         smoothed curve.
@@ -152,6 +155,11 @@ class SampledLoop:
     def most_A(self) -> float:
         """The largest current: the law's limit, or the last whole step of the amplifier within it."""
         return largest_current(self.law.current_limit_A, self.current_step_A)
+
+
+def find_longest_delay(plant: Plant, params: Iterable[ParameterSet]) -> float:
+    """Return the longest delay, s, among the conditions of several runs' parameters."""
+    return max(float(find_delay(plant, read_conditions(plant, each))) for each in params)
 
 
 def channel_names(plant: Plant) -> tuple[str, ...]:

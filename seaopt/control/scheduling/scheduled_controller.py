@@ -26,7 +26,7 @@ from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 from seaopt.units import unit_after
 
-SCHEDULE_SCHEMA = "seaopt/schedule/1"
+SCHEDULE_SCHEMA = "seaopt/schedule/2"
 PARTS = 4  # of every stretch between two points, at whose ends the limits are judged
 LEAST_BANDWIDTH = 0.9  # of the one asked, that the law has between the points
 SAME_GAIN = 0.01  # of its largest, by which a gain that is called the same may change
@@ -255,7 +255,7 @@ class ScheduledController:
         )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of schedule.json (schema seaopt/schedule/1)."""
+        """Return the content of schedule.json (schema seaopt/schedule/2)."""
         return {
             "schema": SCHEDULE_SCHEMA,
             "over": self.over,

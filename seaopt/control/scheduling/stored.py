@@ -30,7 +30,7 @@ class StoredPlace(ResultTable):
 class StoredSchedule(ResultTable):
     """A schedule.json."""
 
-    document: Annotated[Literal["seaopt/schedule/1"], Field(alias="schema")]
+    document: Annotated[Literal["seaopt/schedule/2"], Field(alias="schema")]
     over: str
     unit: str
     points: Annotated[list[Finite], Field(min_length=2)]

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.delay import settle_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import list_broken_limits
-from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.control.loops.sampled_plant import DELAYS
 from seaopt.control.scheduling.gain_table import STRUCTURES, check_points
 from seaopt.control.scheduling.scheduled_controller import (
     Plants,
@@ -110,11 +110,10 @@ def tune_schedule(
     _check_structure(spec)
     places = np.asarray(points, dtype=float)
     check_points(over, places)
-    spec = settle_delay(spec, plant, params)
-    values = params.parameters if isinstance(params, Fit) else params
+    spec, values = settle_delays(spec, plant, params)
     others = _pair_plants(robust_to or {}, values)
-    if over == DELAY:
-        raise ControlError(f'over = "{DELAY}": a delay cannot be read as the law runs; give a state or a parameter')
+    if over in DELAYS:
+        raise ControlError(f'over = "{over}": a delay cannot be read as the law runs; give a state or a parameter')
     if any(over in draw for draw in draws):
         raise ControlError(f'draws have "{over}", which the schedule is over; take it out of the draws')
     unit = find_unit(over, {"the design plant": plant, **{name: one for name, (one, _) in others.items()}})

@@ -82,7 +82,7 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
 
     """
     wanted, ms = spec.sensitivity_bandwidth_limit_hz, spec.level("max_sensitivity")
-    late = plant.delay_samples + (plant.d == 0.0)
+    late = _count_waiting(plant)
     if ms is None or wanted <= 0.0 or late < 1 or sensitivity_possible(wanted, ms, spec.sample_time_s, late):
         return
     low, high = LEAST_SHARE * spec.sample_rate_hz, wanted
@@ -91,12 +91,22 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
         low, high = (
             (middle, high) if sensitivity_possible(middle, ms, spec.sample_time_s, late) else (low, middle)
         )  # fmt: skip
-    asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with delay_samples = {spec.loop_delay_samples}"
+    asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with a delay of {late - 1} whole samples"
     raise ControlError(
         f"{asked} at {spec.sample_rate_hz:g} Hz: no controller keeps |S| below -3 dB up to {wanted:.4g} Hz with "
         f"max_sensitivity = {ms:g}; the delay allows at most {low:.3g} Hz, so lower bandwidth_hz or "
         "min_sensitivity_bandwidth_hz, or the delay"
     )
+
+
+def _count_waiting(plant: DigitalPlant) -> int:
+    """Return after how many samples an output first answers, the drive's delay among them."""
+    if plant.d:
+        return plant.delay_samples
+    x, late = plant.b, 1
+    while plant.c @ x == 0.0 and late <= x.size:
+        x, late = plant.a @ x, late + 1
+    return plant.delay_samples + late
 
 
 def _advise(spec: ControllerSpec, limit: float) -> str:

@@ -21,7 +21,7 @@ from jaxtyping import Complex
 
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.delay import settle_delays
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
@@ -47,7 +47,15 @@ from seaopt.control.loops.measured.figures import measure_all_discs
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
-from seaopt.control.loops.sampled_plant import DigitalPlant, find_signals, list_names, sample
+from seaopt.control.loops.sampled_plant import (
+    DRIVE_DELAY,
+    DigitalPlant,
+    add_drive_delay,
+    find_signals,
+    list_names,
+    read_conditions,
+    sample,
+)
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.easing import ROOM, ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
@@ -108,7 +116,7 @@ def tune(
         which all limits hold for every response in the discs: the bandwidth is placed on their centres, and none is
         below 0.97 of it.
     params : Fit or ParameterSet
-        Its parameters; of a fit also the delay, where the specification leaves delay_samples out. Of a measured
+        Its parameters; of a fit also the drive's delay. Of a measured
         response they only say what effort the command makes, in which gains are counted.
     spec : ControllerSpec
         Bandwidth and limits.
@@ -191,8 +199,7 @@ def _tune(
             f'measured = {list(spec.measured)}: structure = "{spec.structure}" feeds back one output; name one, or '
             'give structure = "cascade"'
         )
-    spec = settle_delay(spec, model, params)
-    params = params.parameters if isinstance(params, Fit) else params
+    spec, params = settle_delays(spec, model, params)
     values = model.complete(params)
     if model.winding is not None:
         rate_motor(model, values)  # the controller states it: refused here, not when it is printed
@@ -297,7 +304,11 @@ def make_task(
         first[f"frf:{plant.name}"] = spec.see_response(plant, command)
     else:
         named["design plant"] = (plant, values)
-    named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in models_given.items()}
+    late = read_conditions(design, values).get(DRIVE_DELAY, 0.0)
+    named |= {
+        str(name): (p[0], add_drive_delay(p[1], late)) if isinstance(p, tuple) else (p, values)
+        for name, p in models_given.items()
+    }
     link = _find_link(spec, named, bool(first), gain)
     if link is not None:
         named = {name: (link.see(model), given) for name, (model, given) in named.items()}
@@ -539,7 +550,8 @@ def describe_law(
         structure=spec.structure,
         gains=gains,
         sample_time_s=spec.sample_time_s,
-        delay_samples=spec.loop_delay_samples,
+        compute_delay_samples=spec.loop_delay_samples,
+        drive_delay_s=read_conditions(name_design(plant), params).get(DRIVE_DELAY, 0.0),
         law=law,
         command=command_of(name_design(plant), params, spec.regulated),
         spec=spec,

@@ -135,7 +135,8 @@ class Nuisance:
 
     `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise
     over each state's size (of a prediction-error fit), `substeps` how many integration steps each sample took (a linear
-    plant needs one), `plant` the name of the experiment's plant, empty in older files.
+    plant needs one), `plant` the name of the experiment's plant, empty in older files, `hold` what its inputs did
+    between samples.
     """
 
     delay_s: float
@@ -147,6 +148,7 @@ class Nuisance:
     noise: dict[str, float] = field(default_factory=dict[str, float])
     std: dict[str, float] = field(default_factory=dict[str, float])
     plant: str = ""
+    hold: str = "zero"
 
     @property
     def fitted(self) -> dict[str, DerivedFigure]:

@@ -58,6 +58,8 @@ class Fit:
         Of the free parameters; posterior, and allowing for coloured residuals.
     white_covariance : Covariance
         The covariance for white residuals; compared with the other it shows the effect of their colour.
+    delay_covariance : Covariance or None
+        Of the free parameters and of the delays that were fitted, `chirp.delay_s`; None where none was.
     derived : mapping
         Figures that follow from the parameters.
     outputs : mapping of experiment to mapping of output to OutputFit
@@ -111,6 +113,7 @@ class Fit:
     method: str = "output_error"
     findings: tuple[FitFinding, ...] = ()
     notes: tuple[str, ...] = ()
+    delay_covariance: Covariance | None = field(default=None, repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
     minimum: Minimum | None = field(default=None, repr=False)
 
@@ -167,10 +170,19 @@ class Fit:
 
         A fitted one that its log hardly tells does not count where another log tells its own ten times better.
         """
-        own = [one for one in self.nuisance.values() if one.plant in ("", plant.name)] or [*self.nuisance.values()]
-        stds = [one.std["delay_s"] for one in own if "delay_s" in one.std]
+        return max((one.delay_s for one in self.list_delayed(plant).values()), default=0.0)
+
+    def shows_delay(self, plant: Plant) -> bool:
+        """Tell whether an experiment of the plant has a delay behind a command that is held until the next."""
+        return any(one.delay_s > 0.0 and one.hold == "zero" for one in self.list_delayed(plant).values())
+
+    def list_delayed(self, plant: Plant) -> dict[str, Nuisance]:
+        """Return those experiments of a plant, of all where it has none, whose delay is known."""
+        of_plant = {name: one for name, one in self.nuisance.items() if one.plant in ("", plant.name)}
+        own = of_plant or dict(self.nuisance)
+        stds = [one.std["delay_s"] for one in own.values() if "delay_s" in one.std]
         known = max(KNOWN_DELAY_S, BETTER * min(stds, default=0.0))
-        return max((one.delay_s for one in own if one.std.get("delay_s", 0.0) <= known), default=0.0)
+        return {name: one for name, one in own.items() if one.std.get("delay_s", 0.0) <= known}
 
     @property
     def own_unknowns(self) -> dict[str, DerivedFigure]:
@@ -272,6 +284,7 @@ class Fit:
             },
             "covariance": {"names": list(self.covariance.names), "matrix": self.covariance.matrix},
             "white_covariance": {"names": list(self.white_covariance.names), "matrix": self.white_covariance.matrix},
+            **self._delay_dict(),
             "outputs": {
                 name: {output: _fields(one) for output, one in row.items()} for name, row in self.outputs.items()
             },
@@ -294,6 +307,11 @@ class Fit:
             "notes": list(self.notes),
             "provenance": {"wall_s": self.wall_s},
         }
+
+    def _delay_dict(self) -> dict[str, Any]:
+        """Return the covariance with the delays, where one was fitted."""
+        joint = self.delay_covariance
+        return {} if joint is None else {"delay_covariance": {"names": list(joint.names), "matrix": joint.matrix}}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], experiments: tuple[Experiment, ...] = ()) -> Fit:

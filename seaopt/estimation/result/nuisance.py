@@ -81,4 +81,5 @@ def describe_nuisance(
         },
         substeps=experiment.count_steps(z),
         plant=experiment.data.plant.name,
+        hold=experiment.data.hold,
     )

@@ -128,6 +128,7 @@ class StoredExperiment(ResultTable):
     noise: dict[str, Number] = {}
     std: dict[str, NullIsInfinite] = {}
     plant: str = ""
+    hold: Literal["zero", "first"] = "zero"
 
     def restore(self) -> Nuisance:
         """Return the unknowns."""
@@ -171,6 +172,7 @@ class StoredFit(ResultTable):
     parameters: dict[str, StoredParameter]
     covariance: StoredCovariance
     white_covariance: StoredCovariance | None = None
+    delay_covariance: StoredCovariance | None = None
     derived: dict[str, StoredDerived]
     outputs: dict[str, dict[str, StoredOutput]]
     experiments: dict[str, StoredExperiment] = {}
@@ -205,6 +207,7 @@ def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
             f"{', '.join(parameters.free_names)}; {FIT_AGAIN}"
         )
     white = covariance if stored.white_covariance is None else stored.white_covariance.restore("white_covariance")
+    joint = stored.delay_covariance
     kept = (
         "status", "message", "cost", "iterations", "samples", "step_error_sigma", "step_error_parameter",
         "log_likelihood", "unknowns", "method",
@@ -214,6 +217,7 @@ def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
         "parameters": parameters,
         "covariance": covariance,
         "white_covariance": white,
+        "delay_covariance": None if joint is None else joint.restore("delay_covariance"),
         "derived": {name: DerivedFigure(**figure.model_dump()) for name, figure in stored.derived.items()},
         "outputs": {
             name: {output: OutputFit(**row.model_dump()) for output, row in outputs.items()}

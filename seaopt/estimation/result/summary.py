@@ -58,11 +58,13 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     if not np.isfinite(evaluation.cost):
         raise EstimationError(f"the fit has no finite cost: {solution.message}")
     statistics = compute_statistics(problem, z) if diagnostics else None
-    seen_white, seen_robust, unseen, variance = _compute_covariances(problem, evaluation, statistics)
+    seen_white, seen_robust, joint, unseen, variance = _compute_covariances(problem, evaluation, statistics)
     names = unknowns.names[:p]
     known = assess_identifiability(evaluation.hessian, names, z[:p])
     unseen = np.where([name in known.unidentified for name in names], 1.0, unseen)
     white, robust = mark_unseen(seen_white, unseen), mark_unseen(seen_robust, unseen)
+    joint[:p, :p] = robust
+    delayed = tuple(f"{e.name}.delay_s" for e in problem.experiments if e.slots.delay.index is not None)
     if known.rank < known.free:
         known = replace(known, structural_rank=compute_structural_rank(problem, z))
     std = np.sqrt(np.diag(robust))
@@ -98,6 +100,7 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         parameters=fitted,
         covariance=Covariance(names=names, matrix=robust),
         white_covariance=Covariance(names=names, matrix=white),
+        delay_covariance=Covariance(names=(*names, *delayed), matrix=joint) if delayed else None,
         derived=_derive_figures(experiments, fitted, Covariance(names=names, matrix=seen_robust), known),
         outputs=outputs,
         nuisance={
@@ -156,21 +159,25 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 
 def _compute_covariances(
     problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
-) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"], Float[np.ndarray, " p"], Float[np.ndarray, " n"]]:
+) -> tuple[
+    Float[np.ndarray, "p p"], Float[np.ndarray, "p p"], Float[np.ndarray, "q q"], Float[np.ndarray, " p"],
+    Float[np.ndarray, " n"],
+]:  # fmt: skip
     """Return the parameters' covariance for white residuals, for those that there are, and what is unseen.
 
-    Both are over what is seen alone, and the third is how much of each parameter is not (0 to 1, squared). The last are
-    the variances of all unknowns: of parameters, delays and gains for the residuals that there are, of others for white
-    ones.
+    Both are over what is seen alone, and so is the third, of parameters and delays together; the fourth is how much of
+    each parameter is not seen (0 to 1, squared). The last are the variances of all unknowns: of parameters, delays and
+    gains for the residuals that there are, of others for white ones.
     """
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
     bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z) + np.diag(prior)
     inverse, unseen = invert(bread)
     variance = np.diag(inverse).copy()
-    own = [slot.index for e in problem.experiments for slot in (e.slots.delay, *e.slots.gain) if slot.index is not None]
-    stated = [*range(p), *own]
+    delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
+    gains = [slot.index for e in problem.experiments for slot in e.slots.gain if slot.index is not None]
+    stated, q = [*range(p), *delays, *gains], p + len(delays)
     if not stated:
-        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), variance
+        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), variance
     columns = inverse[:, stated]
     known = (columns.T * prior) @ columns
     white = inverse[stated][:, stated]
@@ -179,7 +186,7 @@ def _compute_covariances(
         white = columns.T @ compute_white_meat(problem, z, sums) @ columns + known
     robust = white if statistics is None else compute_meat(problem, z, columns, statistics) + known
     variance[stated] = np.diag(robust)
-    return white[:p, :p], robust[:p, :p], unseen[:p], variance
+    return white[:p, :p], robust[:p, :p], robust[:q, :q].copy(), unseen[:p], variance
 
 
 def _compute_log_likelihood(problem: FitProblem, evaluation: Evaluation) -> float:

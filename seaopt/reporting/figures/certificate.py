@@ -202,7 +202,7 @@ def impedance_panel(controller: Controller) -> Panel:
 
         upper, lower = axes
         f = np.geomspace(LOWEST_HZ, 0.499 / period, PORT_POINTS)
-        law = controller.law.feedback_responses(f) * hold_response(f, period, controller.delay_samples)
+        law = controller.law.feedback_responses(f) * hold_response(f, period, controller.compute_delay_samples)
         open_port, closed = port.response(f).impedance(0.0 * law), port.response(f).impedance(law)
         for z, colour, style, label in ((open_port, MEASURED, "--", "no control"), (closed, BLUE, "-", "controlled")):
             upper.plot(f, np.abs(z), color=colour, linestyle=style, linewidth=1.3, label=label)

@@ -126,7 +126,7 @@ def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, bal
     """Return bounds on the arcs; `ball` coordinates of a box count only where they are in the unit ball."""
     (nums, den), box = _expand_law(controller.law), arcs.box
     below = _expand_powers(den, np.zeros(box.size, dtype=int), arcs, plant.denominator.c.shape[1])
-    delay = controller.delay_samples + plant.whole[box]
+    delay = controller.compute_delay_samples + plant.whole[box]
     open_loop = (_pack(plant.denominator, box), below)
     parts = [open_loop]
     for num, head, tail in zip(nums, plant.heads, plant.tails, strict=True):
@@ -153,7 +153,7 @@ def _keeps_degree(controller: Controller, plant: ImpulseTransfer) -> Bool[np.nda
     last = plant.heads[0][:, -1] * -float(controller.law.d[1])
     for head, d_c in zip(plant.heads[1:], controller.law.d[2:], strict=True):
         last = last + head[:, -1] * -float(d_c)
-    return (controller.delay_samples + plant.whole > 0) | (np.abs(1.0 + last.c) > last.reach)
+    return (controller.compute_delay_samples + plant.whole > 0) | (np.abs(1.0 + last.c) > last.reach)
 
 
 def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:

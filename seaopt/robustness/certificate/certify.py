@@ -17,9 +17,9 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller
-from seaopt.control.laws.delay import warn_short_delay
+from seaopt.control.laws.delay import Drive, find_drive, find_given_drive_delay, split_delayed, warn_delays
 from seaopt.control.loops.measured.figures import measure_discs
-from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.control.loops.sampled_plant import DELAY, DRIVE_DELAY
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor
@@ -186,10 +186,11 @@ def certify(
     min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
     seen = {name: controller.see(plant) for name, plant in plants.items()}
     models, others = _with_design(controller, seen, others or ParameterSet())
+    models = split_delayed(controller.spec, controller.design[0], models, parameters)
     check_sensors(sensors, controller, models)
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
     ranges = _add_warm_winding(ranges or {}, models, parameters, others)
-    unknown = combine_uncertainty(parameters, others, ranges, models)
+    unknown = combine_uncertainty(parameters, others, ranges, models, find_own_drive(controller, parameters))
     _check_delay(controller, unknown.ranges)
     nominal, varied = unknown.nominal, unknown.varied()
     plants = split_friction(models, nominal, [row.name for row in varied])
@@ -275,7 +276,16 @@ def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tup
     """Return a warning where the controller counts on less delay than the fit's experiments have."""
     assert controller.design is not None
     plant, _ = controller.design
-    return warn_short_delay(controller.delay_samples, controller.spec.sample_rate_hz, plant, parameters)
+    return warn_delays(controller.spec, plant, parameters)
+
+
+def find_own_drive(controller: Controller, source: Fit | ParameterSet) -> Drive:
+    """Return a certificate's delay of the drive: the fit's or the parameters', or else what the law counts on."""
+    assert controller.design is not None
+    stated = isinstance(source, Fit) or DRIVE_DELAY in source or find_given_drive_delay(controller.spec) is not None
+    if not stated:
+        return Drive(delay_s=controller.drive_delay_s)
+    return find_drive(controller.spec, controller.design[0], source)
 
 
 def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nominal: ParameterSet) -> tuple[str, ...]:

@@ -277,8 +277,9 @@ def _find_largest_eigenvalue(controller: Controller, plant: Plant, params: Param
     )  # fmt: skip
     sliding = take_sliding(plant, params)
     sampled = sample(
-        sliding, params, tuple(signals), controller.command.per_effort, law.sample_time_s, controller.delay_samples
-    )
+        sliding, controller.delay(params), tuple(signals), controller.command.per_effort, law.sample_time_s,
+        controller.compute_delay_samples,
+    )  # fmt: skip
     return float(np.max(np.abs(Loop(plant=sampled, law=whole).eigenvalues())))
 
 

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, tune
-from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.delay import settle_delays
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_table, format_values, html_text
@@ -191,8 +191,8 @@ def tune_certified(
     require_number(confidence, "confidence", ControlError)
     if rounds < 1:
         raise ControlError(f"rounds = {rounds} is not a number of rounds; give 1 or more")
-    spec = settle_delay(spec, plant, parameters)
-    values = _merge_values(parameters, others or ParameterSet())
+    spec, settled = settle_delays(spec, plant, parameters)
+    values = _merge_values(settled, others or ParameterSet())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share = 1.0 - (1.0 - confidence) / rounds
     done: list[Round] = []

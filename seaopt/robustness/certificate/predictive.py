@@ -17,6 +17,7 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, ControllerSpec, ForceMPC, Law, MPCSpec, assess
+from seaopt.control.laws.delay import DELAY_KEYS
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
 from seaopt.errors import ControlError, require_number, require_type
@@ -64,8 +65,8 @@ def linear_spec(spec: MPCSpec) -> ControllerSpec:
     return ControllerSpec(
         structure=CUSTOM, measured=spec.measured, bandwidth_hz=spec.bandwidth_hz,
         bandwidth_range_hz=(min(15.0, spec.bandwidth_hz), max(60.0, spec.bandwidth_hz)),
-        sample_rate_hz=spec.sample_rate_hz, delay_samples=spec.delay_samples, min_filter_samples=False,
-        bandwidth_tolerance=MPC_BANDWIDTH_TOLERANCE, **levels,
+        sample_rate_hz=spec.sample_rate_hz, min_filter_samples=False, bandwidth_tolerance=MPC_BANDWIDTH_TOLERANCE,
+        **levels, **{name: getattr(spec, name) for name in DELAY_KEYS},
     )  # fmt: skip
 
 

@@ -50,8 +50,8 @@ def design_requirements(controller: Controller, states: Mapping[str, Plant], val
     spec, band = controller.spec, controller.spec.passive_band_hz
     port = None
     if band is not None and controller.design is not None:
-        held = port_of(states[name], values, controller.signals, controller.command.per_effort)
-        port = measure_port(held, controller.law, controller.sample_time_s, controller.delay_samples, band)
+        held = port_of(states[name], controller.delay(values), controller.signals, controller.command.per_effort)
+        port = measure_port(held, controller.law, controller.sample_time_s, controller.compute_delay_samples, band)
     verdicts = judge(spec, controller.measure(name, achieved, port), "design plant")
     for other, loop in stuck:
         verdicts += judge(spec, MeasuredLoop(name=other, figures=loop), "design plant", stuck=True)

@@ -29,6 +29,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control import LoopFigures, ScheduledController
+from seaopt.control.laws.delay import split_delayed
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
@@ -43,7 +44,7 @@ from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
 from seaopt.robustness.certificate.certificate import DESIGN_PLANT, Certificate, Requirement
-from seaopt.robustness.certificate.certify import CONFIDENCE, certify, failure_bound
+from seaopt.robustness.certificate.certify import CONFIDENCE, certify, failure_bound, find_own_drive
 from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty, find_modes
@@ -331,6 +332,7 @@ def certify_schedule(
     ranges, others = dict(ranges or {}), others or ParameterSet()
     _check_variable(schedule, parameters, ranges)
     models = _with_design(schedule, plants)
+    models = split_delayed(schedule.spec, schedule.design[0], models, parameters)
     values = sorted({*schedule.points, *list_inner(schedule.points, PARTS)})
     standing, proving, sweeping = divide(
         progress, POINT * len(schedule.points), BOUND * len(values) * len(models), SWEEP * len(models) * simulations
@@ -338,7 +340,8 @@ def certify_schedule(
     count = -(-samples // len(values))
     rng = np.random.default_rng([seed, *_digest(schedule)])
     sources = [_place_source(schedule, parameters, others, value) for value in values]
-    unknowns = [combine_uncertainty(source, rest, ranges, models) for source, rest in sources]
+    drive = find_own_drive(schedule.controllers[0], parameters)
+    unknowns = [combine_uncertainty(source, rest, ranges, models, drive) for source, rest in sources]
     drawn = [unknown.draw(count if unknown.size else 0, rng) for unknown in unknowns]
     shared, nominal = Shared((schedule, models)), unknowns[-1].nominal
     standing_at = map_ordered(partial(_certify_place, shared), zip(values, unknowns, drawn, strict=True), executor)

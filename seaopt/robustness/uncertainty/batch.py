@@ -20,7 +20,14 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.response import LARGEST_ENTRY
-from seaopt.control.loops.sampled_plant import DELAY, LinearPlants, conditions, hold, linearise, read_conditions
+from seaopt.control.loops.sampled_plant import (
+    LinearPlants,
+    conditions,
+    find_delay,
+    hold,
+    linearise,
+    read_conditions,
+)
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
@@ -80,7 +87,7 @@ def batch_figures(
         Whether to compute Ms and Mt; if not, they are NaN where stable.
 
     """
-    values, extra = expand_draws(plant, nominal, draws)
+    values, extra = expand_draws(plant, controller.delay(nominal), draws)
     count = values.shape[1]
     columns = np.vstack([values, *extra.values()])
     if count > 1 and np.array_equal(columns, np.repeat(columns[:, :1], count, axis=1)):
@@ -92,16 +99,14 @@ def batch_figures(
             spectral_radius=np.repeat(single.spectral_radius, count), ms=np.repeat(single.ms, count),
             mt=np.repeat(single.mt, count),
         )  # fmt: skip
-    chain = float(np.max(extra.get(DELAY, np.zeros(1))))
     parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
     with ThreadPoolExecutor(threads) as pool:
         for start in range(0, count, DRAW_BLOCK):
             block = slice(start, min(start + DRAW_BLOCK, count))
             at = {name: column[block] for name, column in extra.items()}
-            none = np.zeros(block.stop - block.start)
-            delays = at.get(DELAY, none) if chain else none
+            delays = np.zeros(block.stop - block.start) + find_delay(plant, at)
             continuous = linearise(plant, values[:, block], at, controller.signals, controller.command.per_effort)
-            pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, none.size, CURVE_BLOCK)]
+            pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, delays.size, CURVE_BLOCK)]
             parts += pool.map(
                 lambda piece, matrices=continuous, delay=delays: _close_piece(
                     controller, tuple(matrix[piece] for matrix in matrices), delay[piece], peaks
@@ -188,7 +193,7 @@ def compute_products(
     """Return S of every plant behind its hold, from the eigenvalues of the open and of the closed loop."""
     law = controller.law
     ac, bc, cc, dc = law.a, -law.b[:, 1:], law.c, -law.d[1:]
-    count, nx, k = a.shape[0], a.shape[1], controller.delay_samples
+    count, nx, k = a.shape[0], a.shape[1], controller.compute_delay_samples
     n, m = nx + k, cc.size
     plant, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, dc.size, n))
     plant[:, :nx, :nx], sense[:, :, :nx] = a, c

@@ -122,11 +122,12 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     """
     period = controller.sample_time_s
     sliding, effort = take_sliding(plant, params), controller.command.per_effort
-    linear, before = linearise_sets(sliding, [sliding.complete(params)], controller.signals, effort)
+    late = sliding.complete(controller.delay(params))
+    linear, before = linearise_sets(sliding, [late], controller.signals, effort)
 
     @cache
     def delay_loop(part: float) -> _DelayedLoop:
-        (sampled,) = sample_linear(linear, before + part * period, period, controller.delay_samples)
+        (sampled,) = sample_linear(linear, before + part * period, period, controller.compute_delay_samples)
         return _measure_delayed(Loop(plant=sampled, law=controller.law), part)
 
     grid = _build_grid(delay_loop)

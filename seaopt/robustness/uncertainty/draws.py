@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.control.loops.sampled_plant import conditions
+from seaopt.control.laws.delay import Drive
+from seaopt.control.loops.sampled_plant import DRIVE_DELAY, add_drive_delay, conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import Parameter, ParameterSet
@@ -229,10 +230,12 @@ def combine_uncertainty(
     others: ParameterSet,
     ranges: Mapping[str, tuple[float, float]],
     plants: Mapping[str, Plant],
+    drive: Drive | None = None,
 ) -> Uncertainty:
     """Combine a fit's covariance (or a ParameterSet's prior_stds) and the declared ranges into one description.
 
-    `others` has the values of parameters that `source` lacks; those with a prior_std are uncertain too.
+    `others` has the values of parameters that `source` lacks; those with a prior_std are uncertain too. `drive` has the
+    drive's delay, which is uncertain as the fit of one experiment left it, together with the parameters.
 
     Raises
     ------
@@ -243,11 +246,12 @@ def combine_uncertainty(
     known = {name for plant in plants.values() for name in plant.parameters}
     check_ranges(ranges, plants)
     if isinstance(source, Fit):
-        nominal, names, matrix = source.parameters, source.covariance.names, source.covariance.matrix
+        covariance = source.covariance if drive is None else drive.take_covariance(source)
+        nominal, names, matrix = source.parameters, covariance.names, covariance.matrix
         if source.status not in ("converged", "not_identifiable"):
             raise ControlError(f"the fit has not converged ({source.message}); nothing can be certified from it")
         for name in names:
-            if not np.isfinite(source.covariance.std(name)) and name not in ranges:
+            if not np.isfinite(covariance.std(name)) and name not in ranges:
                 raise ControlError(
                     f"parameter {name} is not identifiable in the fit, so nothing can be certified; "
                     "fix it, give it a prior_std, or give its range"
@@ -266,8 +270,11 @@ def combine_uncertainty(
     whole[: len(names), : len(names)] = matrix
     whole[len(names) :, len(names) :] = np.diag(np.square(list(stds.values())))
     uncertain = (*names, *stds)
+    known.add(DRIVE_DELAY)
     used = [i for i, name in enumerate(uncertain) if name not in ranges and name in known and np.isfinite(whole[i, i])]
     nominal = nominal.with_parameters(*others.values())
+    if drive is not None:
+        nominal = add_drive_delay(ParameterSet(p for n, p in nominal.items() if n != DRIVE_DELAY), drive.delay_s)
     nominal, scale = _in_plant_units(nominal, plants)
     factors = np.array([scale.get(name, 1.0) for name in uncertain])
     whole *= factors[:, None] * factors

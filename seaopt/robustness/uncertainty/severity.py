@@ -21,7 +21,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
-from seaopt.control.loops.sampled_plant import DELAY, differentiate_linearisation, hold
+from seaopt.control.loops.sampled_plant import DELAYS, differentiate_linearisation, find_delay, hold
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import BatchFigures, Products, compute_products, expand_draws, find_peaks
@@ -122,7 +122,7 @@ def _sample_plants(
     count, width = points.shape
     repeated = np.repeat(points, width, axis=0)  # once per coordinate: each carries one complex step
     slopes = unknown.slopes(points)
-    p, at = expand_draws(plant, unknown.nominal, unknown.values(repeated))
+    p, at = expand_draws(plant, controller.delay(unknown.nominal), unknown.values(repeated))
     dp = np.stack([slopes.get(name, np.zeros(points.shape)).ravel() for name in plant.parameters])
     dat = {name: slopes.get(name, np.zeros(points.shape)).ravel() for name in at}
     none = np.zeros(count * width)
@@ -130,7 +130,7 @@ def _sample_plants(
         plant, p, at, dp, dat, controller.signals, controller.command.per_effort
     )
     a, b, c, d = (value + 1j * COMPLEX_STEP * slope for value, slope in zip(matrices, derivatives, strict=True))
-    late = at.get(DELAY, none) + 1j * COMPLEX_STEP * dat.get(DELAY, none)
+    late = none + find_delay(plant, at) + 1j * COMPLEX_STEP * sum(dat[name] for name in DELAYS if name in dat)
     stepped = hold(a, b, c, d, controller.sample_time_s, late)
     a, b, c, d = (matrix.reshape(count, width, *matrix.shape[1:]) for matrix in stepped)
     da, db, dc, dd = (np.imag(matrix) / COMPLEX_STEP for matrix in (a, b, c, d))
@@ -169,7 +169,7 @@ def _loop_slopes(
     controller: Controller, sampled: _SampledPlants, z: Complex[np.ndarray, " n"]
 ) -> Complex[np.ndarray, "n k"]:
     """Return the derivatives of L, at one point per plant."""
-    law = -controller.law.evaluate(z - 1.0)[1:] * z**-controller.delay_samples  # (y, n)
+    law = -controller.law.evaluate(z - 1.0)[1:] * z**-controller.compute_delay_samples  # (y, n)
     inner = z[:, None, None] * np.eye(sampled.b.shape[1]) - sampled.a
     right = np.linalg.solve(inner, sampled.b[:, :, None].astype(complex))[:, :, 0]
     fed_back = np.einsum("yn,nyi->ni", law, sampled.c)

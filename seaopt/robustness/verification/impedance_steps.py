@@ -17,6 +17,7 @@ from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.running.outer_run import enclose_controller
+from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_dry_friction
@@ -89,9 +90,11 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
         return ()
     motion, completed = str(plant.port.motion), plant.complete(params)
     law, measured = enclose_controller(controller, motion)
+    params = controller.delay(params)
     loop = SampledLoop(
-        plant=plant, law=law, measured=measured, delay_samples=controller.delay_samples, sticks=can_stick(plant)
-    )
+        plant=plant, law=law, measured=measured, delay_samples=controller.compute_delay_samples,
+        longest_delay_s=find_longest_delay(plant, [params]), sticks=can_stick(plant),
+    )  # fmt: skip
     samples = _count_samples(controller, plant, completed)
     steps: list[ImpedanceStep] = []
     for effort in _size_efforts(controller, find_dry_friction(plant, completed)):

@@ -24,6 +24,7 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
+from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.errors import ControlError
 from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
@@ -155,6 +156,7 @@ def large_signal(
     (30, True)
 
     """
+    parameters = controller.delay(parameters)
     limit, period, band = controller.command_limit, controller.sample_time_s, controller.spec.bandwidth_hz
     values = plant.complete(parameters)
     friction = sum(find_dry_friction(plant, values).values())
@@ -166,8 +168,9 @@ def large_signal(
     if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
     loop = SampledLoop(
-        plant=plant, law=runnable(controller), measured=controller.signals, delay_samples=controller.delay_samples
-    )
+        plant=plant, law=runnable(controller), measured=controller.signals,
+        delay_samples=controller.compute_delay_samples, longest_delay_s=find_longest_delay(plant, [parameters]),
+    )  # fmt: skip
     if frequencies_hz is None:
         wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)
     else:

@@ -16,6 +16,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.limit_cycles import LimitCycle, predict_limit_cycles
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
+from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.errors import SimulationError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -136,10 +137,13 @@ def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle:
     """Return what a run that starts beyond a predicted cycle ends in."""
     period = controller.sample_time_s
     lasting = min(max(PERIODS / cycle.frequency_hz, LEAST_S), LONGEST_S)
-    values = plant.complete(params).drop_conditions()
-    measured, delay = controller.signals, controller.delay_samples
+    values = plant.complete(controller.delay(params)).drop_conditions()
+    measured, delay = controller.signals, controller.compute_delay_samples
     try:
-        loop = SampledLoop(plant=plant, law=runnable(controller), measured=measured, delay_samples=delay)
+        loop = SampledLoop(
+            plant=plant, law=runnable(controller), measured=measured, delay_samples=delay,
+            longest_delay_s=find_longest_delay(plant, [values]),
+        )  # fmt: skip
         start = at_rest(loop, 1, PUSH * np.array(cycle.state))
         run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
     except SimulationError as error:

@@ -64,7 +64,7 @@ def predict_play_cycles(controller: Controller, plant: Plant, params: ParameterS
     """
     if plant.moves:
         return ()
-    values = plant.complete(params).drop_conditions()
+    values = plant.complete(controller.delay(params)).drop_conditions()
     sliding = take_sliding(plant, values)
     return tuple(
         cycle

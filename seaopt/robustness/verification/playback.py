@@ -11,10 +11,10 @@ from jaxtyping import Float
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
-from seaopt.control.loops.sampled_plant import find_rows, read_conditions
-from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
+from seaopt.control.loops.sampled_plant import DELAYS, find_rows
+from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
-from seaopt.control.running.sampled_loop import channel_names
+from seaopt.control.running.sampled_loop import channel_names, find_longest_delay
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
@@ -62,7 +62,7 @@ class Stage:
             plant=plant,
             law=runnable(self.controller),
             measured=self.controller.signals,
-            delay_samples=self.controller.delay_samples,
+            delay_samples=self.controller.compute_delay_samples,
             sensors=self.sensors,
             current_step_A=self.current_step_A,
             longest_delay_s=longest_delay_s,
@@ -196,9 +196,9 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
     if not params:
         raise ControlError("params is empty; give one ParameterSet per run")
-    placed = [stage.plant.complete(drawn) for drawn in params]
-    delays = [[drawn.given[DELAY]] if DELAY in drawn.given else [] for drawn in placed]
-    longest = max(read_conditions(stage.plant, drawn).get(DELAY, 0.0) for drawn in placed)
+    placed = [stage.plant.complete(stage.controller.delay(drawn)) for drawn in params]
+    delays = [[drawn.given[name] for name in DELAYS if name in drawn.given] for drawn in placed]
+    longest = find_longest_delay(stage.plant, placed)
     carried = [drawn.with_parameters(*delay) for drawn, delay in zip(placed, delays, strict=True)]
     rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), placed)
     now, grip = _start_state(stage, scenario, placed, longest) if rest is None else rest.state, None

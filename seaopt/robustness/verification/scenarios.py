@@ -13,6 +13,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_NAME, STEADY, STEADY_PERIODS
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
+from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -365,7 +366,8 @@ def find_step_limit(controller: Controller) -> float | None:
         plant=sliding,
         law=runnable(controller, current_limit_A=math.inf),
         measured=controller.signals,
-        delay_samples=controller.delay_samples,
+        delay_samples=controller.compute_delay_samples,
+        longest_delay_s=find_longest_delay(sliding, [params]),
     )
     tried = NOMINAL_EFFORT[controller.command.mechanics]
     run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), tried))
@@ -392,8 +394,9 @@ def _size_blow(controller: Controller, plant: Plant, force: float) -> float:
     assert link is not None
     params = plant.complete(_require_design(controller)[1]).drop_conditions()
     loop = SampledLoop(
-        plant=plant, law=runnable(controller), measured=controller.signals, delay_samples=controller.delay_samples
-    )
+        plant=plant, law=runnable(controller), measured=controller.signals,
+        delay_samples=controller.compute_delay_samples, longest_delay_s=find_longest_delay(plant, [params]),
+    )  # fmt: skip
 
     def measure_peak(blow: float) -> float:
         state = strike(plant, params, np.zeros(len(plant.states)), link, blow)

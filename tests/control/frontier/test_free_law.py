@@ -38,7 +38,11 @@ def test_one_sample_late_it_is_the_integral_of_bode_filled_like_water():
     """
     rate, ms, band = 200.0, 1.3, 30.0
     spec = so.ControllerSpec(
-        structure="pd", bandwidth_hz=band, sample_rate_hz=rate, delay_samples=0, **{**LIFTED, "max_sensitivity": ms}
+        structure="pd",
+        bandwidth_hz=band,
+        sample_rate_hz=rate,
+        compute_delay_samples=0,
+        **{**LIFTED, "max_sensitivity": ms},
     )
     f = np.linspace(0.1, band, 20_001)
 
@@ -64,7 +68,7 @@ def test_what_a_delay_rules_out_is_impossible(late):
             bandwidth_hz=80.0,
             bandwidth_range_hz=(15.0, 90.0),
             sample_rate_hz=rate,
-            delay_samples=0,
+            compute_delay_samples=0,
             **{**LIFTED, "max_sensitivity": ms, "min_sensitivity_bandwidth_hz": share * slow},
         )
         answers.append(bound_free_law(delayed_gain(late, rate), spec).status)

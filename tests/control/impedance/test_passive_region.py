@@ -128,9 +128,9 @@ def test_a_proportional_law_renders_up_to_the_spring_and_no_more(gain: float, co
 
 def test_no_causal_law_renders_more_than_the_spring_without_a_damper() -> None:
     values = KNEE.update(d_l=0.0)
-    slow = so.ControllerSpec(measured="tau_s", bandwidth_hz=15.0, delay_samples=1, sample_rate_hz=4000.0)
+    slow = so.ControllerSpec(measured="tau_s", bandwidth_hz=15.0, compute_delay_samples=1, sample_rate_hz=4000.0)
     quick = so.ControllerSpec(
-        measured="tau_s", structure="pd", bandwidth_hz=20.0, delay_samples=0, sample_rate_hz=4000.0
+        measured="tau_s", structure="pd", bandwidth_hz=20.0, compute_delay_samples=0, sample_rate_hz=4000.0
     )  # fmt: skip
     for spec in (slow, quick):
         force = so.tune(HELD, values, spec)

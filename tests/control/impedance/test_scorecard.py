@@ -14,7 +14,7 @@ PERIOD = 1e-3
 
 @pytest.fixture(scope="module")
 def controller() -> so.Controller:
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, delay_samples=1)
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, compute_delay_samples=1)
     return so.tune(STAND, THOR, spec)
 
 

@@ -220,7 +220,7 @@ def test_a_violation_between_grid_points_is_found(thor, stand):
 
 
 def test_rows_are_the_condition_for_any_gains(thor, stand):
-    spec = so.ControllerSpec(delay_samples=2)
+    spec = so.ControllerSpec(compute_delay_samples=2)
     q = np.exp(-S * TS)
     basis = np.column_stack([np.ones(F.size), TS / 2 * (1 + q) / (1 - q), (1 - q) / (2 * TS - TS * q)])
     rows, least = passivity_rows(stand, thor, spec, command_of(stand, thor, "F1").per_effort, basis, F)

@@ -174,7 +174,7 @@ def test_one_sample_late_is_bodes_integral(ms, f):
 def test_the_delays_bound_is_no_stricter_than_what_is_reached(stand, thor):
     """A design that exists is not called impossible, and one sample more never makes more possible."""
     for delay in (0, 3, 8):
-        spec = so.ControllerSpec(bandwidth_hz=20, delay_samples=delay, max_sensitivity=1.8)
+        spec = so.ControllerSpec(bandwidth_hz=20, compute_delay_samples=delay, max_sensitivity=1.8)
         controller = so.tune(stand, thor, spec)
         f = np.geomspace(1e-2, 400, 8000)
         s = np.abs(1 / (1 + independent(controller.close(stand, thor), f)[0]))

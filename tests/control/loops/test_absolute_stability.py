@@ -159,7 +159,7 @@ def test_a_loop_that_needs_friction_is_not_shown_stable():
     actuator = so.plants.thor().update(
         k=120e3, m_l=0.9, l=0.005, N_p=1, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, eta=0.86, f_c=25, v_s=0.004
     )
-    spec = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, delay_samples=2)
+    spec = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, compute_delay_samples=2)
     controller = so.tune(so.plants.high_impedance(), actuator.update(f_c=0.0), spec)
     swing = so.plants.moving_output()
     margin = find_friction_margin(controller, swing, actuator)

@@ -204,7 +204,7 @@ def test_a_loop_at_4_khz_that_multiplied_out_polynomials_hide_is_found(thor):
     stand, swing = so.plants.high_impedance(), so.plants.moving_output()
     spec = so.ControllerSpec(
         bandwidth_hz=73.0, bandwidth_range_hz=(15.0, 100.0), structure="pid_dob", sample_rate_hz=4000.0,
-        delay_samples=0, max_sensitivity=1.585, objective="noise",
+        compute_delay_samples=0, max_sensitivity=1.585, objective="noise",
     )  # fmt: skip
     controller = so.tune(stand, actuator, spec, {"swing": swing})
     assert controller.feasible

@@ -20,7 +20,7 @@ VALUES = {
     "f_c": 25.0, "v_s": 0.004,
 }  # fmt: skip
 SPEC = so.ControllerSpec(
-    bandwidth_hz=20, delay_samples=2, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=10.0
+    bandwidth_hz=20, compute_delay_samples=2, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=10.0
 )  # fmt: skip
 NEAR = replace(SPEC, bandwidth_range_hz=(19.0, 21.0))  # few bandwidths to look at besides
 STRIBECK_SLOPE = np.sqrt(2.0 / np.e)  # of (f_s - f_c)/v_st: the steepest fall of exp(-(v/v_st)^2)

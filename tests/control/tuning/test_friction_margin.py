@@ -20,7 +20,7 @@ RUBBING = {
     "k": lifted.STIFFNESS, "m_l": 0.9, "l": 0.005, "N_p": 1.0, "J": (lifted.MASS - 0.9) * RADIUS**2,
     "b_r": lifted.DAMPING * RADIUS**2, "eta": 0.86, "K_tau": 0.075, "f_c": 25.0, "v_s": 0.004,
 }  # fmt: skip
-SPEC = so.ControllerSpec(bandwidth_hz=20, delay_samples=lifted.DELAY, max_sensitivity=1.6, max_noise_gain=25)
+SPEC = so.ControllerSpec(bandwidth_hz=20, compute_delay_samples=lifted.DELAY, max_sensitivity=1.6, max_noise_gain=25)
 ASKED = 2e5  # N s/m; the best law without has 2.5e4, and the friction's own slope is 6.3e3
 # A slope at which scipy's differential evolution finds a law that keeps all limits, without any reserve, by the
 # equations of benchmarks/bench_friction_margin.py (Popov, 2 ms, 150 generations of 64 laws, seed 1). It may leave more

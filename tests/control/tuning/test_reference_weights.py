@@ -161,7 +161,7 @@ def test_the_limit_on_a_slow_integral_hides_no_law(stand, thor):
     """
     params = thor.update(m_l=0.66002, k=496805.0, J=4.8437580e-06, b_r=5.38105e-05, I_p=0.249429)
     spec = so.ControllerSpec(
-        bandwidth_hz=31.708939762846857, sample_rate_hz=2000, delay_samples=0, max_sensitivity=2.1443225,
+        bandwidth_hz=31.708939762846857, sample_rate_hz=2000, compute_delay_samples=0, max_sensitivity=2.1443225,
         max_noise_gain=45.385258, max_complementary=1.40447057, max_reference_peak=False, max_droop_db=False,
         min_filter_samples=False,
     )  # fmt: skip

@@ -107,7 +107,7 @@ def test_beside_a_limit_that_nothing_keeps_the_others_are_kept():
     values = plant.defaults.update(
         J_m=6.78e-5, b_r=3.48e-5, K_tau=0.0932, N=80.0, k_s=588.0, f_c=0.0287, v_s=1.94, sigma_0=141.0, sigma_1=0.0086
     )
-    spec = so.ControllerSpec(measured="tau_s", delay_samples=4, **{**LIMITS, "max_noise_gain": 25.0})
+    spec = so.ControllerSpec(measured="tau_s", compute_delay_samples=4, **{**LIMITS, "max_noise_gain": 25.0})
     controller = so.tune(plant, values, spec)
     assert not controller.feasible
     at_rest = 1.0 + 80.0**2 * 141.0 / 588.0
@@ -182,7 +182,7 @@ def test_json_round_trip(stand, swing, thor, tmp_path):
 
     controller = tuned(stand, swing, thor, bandwidth_hz=30)
     path = write_json(tmp_path / "controller.json", controller.to_dict())
-    again = Controller.from_dict(read_json(path, "seaopt/controller/2"), stand, thor)
+    again = Controller.from_dict(read_json(path, "seaopt/controller/3"), stand, thor)
     assert repr(again) == repr(controller)
     broken = controller.to_dict()
     broken["measurement"] = {"num": [1.0], "den": [2.0]}

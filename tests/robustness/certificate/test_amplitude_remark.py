@@ -18,7 +18,7 @@ def test_the_bandwidths_at_amplitudes_of_use_are_those_of_simulated_sines(stand)
         k=120e3, m_l=0.9, l=0.005, N_p=1.0, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, eta=0.86, f_c=25.0, v_s=0.004
     )
     spec = so.ControllerSpec(
-        bandwidth_hz=15, delay_samples=2, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=10.0
+        bandwidth_hz=15, compute_delay_samples=2, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=10.0
     )
     controller = so.tune(stand, rubbing, spec)
     note = next(

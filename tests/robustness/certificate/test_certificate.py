@@ -364,7 +364,7 @@ def rubbing():
 
 def test_a_plant_with_friction_is_certified_sliding_and_stuck(stand, rubbing):
     """Its figures are those of the loops with viscous friction of no slope, and of f_c/v_s, computed by hand."""
-    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25, delay_samples=2)
+    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25, compute_delay_samples=2)
     controller = so.tune(stand, rubbing.update(f_c=0.0), spec)
     certificate = so.certify(controller, {"stand": stand}, rubbing, samples=10, simulations=False)
     assert list(certificate.plants) == ["stand sliding", "stand stuck"]
@@ -472,7 +472,7 @@ def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
 @pytest.mark.slow
 def test_a_friction_margin_below_the_curves_own_slope_is_required_over_draws_too(stand, rubbing):
     """Of nearly Coulomb's jump nothing is shown, a flatter curve is; at draws as at the nominal parameters."""
-    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, delay_samples=2)
+    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, compute_delay_samples=2)
     controller, sharp = so.tune(stand, rubbing, spec), rubbing.update(v_s=1e-6)
     asked = {"ranges": {"eta": (0.4, 3.0)}, "samples": 3}
     certificate = so.certify(controller, {"stand": stand}, sharp, min_friction_margin=1e3, **asked, simulations=False)

@@ -131,7 +131,7 @@ def test_bad_input(stand, swing, thor):
 
 def test_a_friction_margin_is_certified_and_the_draw_that_lacks_it_goes_back_to_the_tuner(stand):
     rubbing = so.plants.thor().update(k=120e3, l=0.005, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, f_c=25.0, v_s=0.004)
-    spec = so.ControllerSpec(bandwidth_hz=20, delay_samples=2, min_friction_margin=4e4)
+    spec = so.ControllerSpec(bandwidth_hz=20, compute_delay_samples=2, min_friction_margin=4e4)
     done = tune_certified(stand, rubbing, spec, {"stand": stand}, ranges={"k": (1.1e5, 1.2e5)}, samples=10)
     (row,) = (row for row in done.certificate.requirements if row.name == "min_friction_margin")
     assert row.met and row.limit == 4e4 and row.value >= 4e4

@@ -60,7 +60,9 @@ def test_the_linear_region_is_certified_as_a_law(certificate, mpc, thor):
 def test_the_law_integrates_and_runs_whichever_side_of_the_unit_circle_rounding_leaves_its_pole(
     stand, thor, inertia, delay
 ):
-    mpc = force_mpc(stand, thor.update(J=inertia), MPCSpec(current_limit_A=9.0, bandwidth_hz=20, delay_samples=delay))
+    mpc = force_mpc(
+        stand, thor.update(J=inertia), MPCSpec(current_limit_A=9.0, bandwidth_hz=20, compute_delay_samples=delay)
+    )
     controller, f = linear_controller(mpc), np.geomspace(0.1, 499.0, 50)
     assert controller.law.integrators == 1 and runnable(controller).integrators == 1
     assert np.allclose(controller.law.responses(f), mpc.law.responses(f), rtol=1e-7)

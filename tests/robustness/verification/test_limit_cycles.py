@@ -29,7 +29,7 @@ def rubbing(thor):
 @pytest.fixture(scope="module")
 def blind(stand, rubbing):
     """Return a law of 25 Hz and Ms 1.59 where the friction sticks, as if it were a damper; sliding its Ms is 7."""
-    spec = so.ControllerSpec(bandwidth_hz=25, delay_samples=2)
+    spec = so.ControllerSpec(bandwidth_hz=25, compute_delay_samples=2)
     tuned = so.tune(stand, rubbing.update(f_c=0.0), replace(spec, bandwidth_range_hz=(24.5, 25.5)))
     ahead, back = laws.multiply_out("pid", 1e-3, k_p=4.1182, k_i=193.96, k_d=0.036216, T_f=1.2604e-3, k_r=5.1182)
     law = laws.law_of(back.num, back.den, (ahead.num, ahead.den))

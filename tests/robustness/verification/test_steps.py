@@ -20,7 +20,7 @@ from tests.laws import law_of, multiply_out, scaled
 from tests.stick_slip import Mass, simulate
 
 SPEC = so.ControllerSpec(
-    bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, max_reference_peak=1.3, delay_samples=2,
+    bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, max_reference_peak=1.3, compute_delay_samples=2,
     current_limit_A=10, max_complementary=False, max_droop_db=False, min_filter_samples=False,
     reference_weights="error",
 )  # fmt: skip
@@ -77,7 +77,7 @@ def test_what_overshoots_only_once_friction_lets_go_is_not_passed(stand, thor):
     params = thor.update(
         m_l=0.08, k=4.85e5, l=7.03e-3, N_p=1.32, K_tau=0.0302, J=1.48e-5, b_r=6.9e-4, eta=0.85, f_c=3.09, v_s=8.7e-3
     )  # fmt: skip
-    spec = so.ControllerSpec(bandwidth_hz=32.4, delay_samples=3, max_noise_gain=25, current_limit_A=13.5)
+    spec = so.ControllerSpec(bandwidth_hz=32.4, compute_delay_samples=3, max_noise_gain=25, current_limit_A=13.5)
     controller = so.tune(stand, params, spec)
     certificate = so.certify(controller, {"stand": stand}, params, simulations=False)
     rows = {row.scenario: row.overshoot for row in certificate.steps.rows}
