@@ -27,7 +27,7 @@ def judge(controller: so.Controller) -> dict[str, float]:
     """Return the figures of a law on the stand of Orekhov et al., from its equations."""
     r = 0.002 / (2 * np.pi * 3.0)
     mass, damping, k = 0.646 + 3.31e-6 / r**2, 1.31e-4 / r**2, 655e3
-    ts, late = controller.sample_time_s, controller.delay_samples
+    ts, late = controller.sample_time_s, controller.compute_delay_samples
     whole = np.zeros((3, 3))
     whole[:2] = [[0.0, 1.0, 0.0], [-k / mass, -damping / mass, k / mass]]
     step = expm(whole * ts)

@@ -40,7 +40,7 @@ class Scratch:
         gain, self.ts = controller.command.per_effort, controller.sample_time_s
         self.a, self.b = held(model.A, model.B[:, 0] * gain, self.ts)
         self.c, self.d = model.C[row], model.D[row, 0] * gain
-        self.delay, self.law = controller.delay_samples, controller
+        self.delay, self.law = controller.compute_delay_samples, controller
         z = np.exp(2j * np.pi * F * self.ts)
         values, vectors = np.linalg.eig(self.a)  # modal form: distinct poles here
         left, right = self.c @ vectors, np.linalg.solve(vectors, self.b)

@@ -102,7 +102,7 @@ def test_plants_controllers_and_loops_become_control_systems(named):
     z = np.exp(2j * np.pi * np.array([0.5, 5.0, 30.0, 200.0]) * period)
     effort = named.ctl.command.per_effort
     plant = control.StateSpace(*held[:4], period)
-    p = np.array([effort * plant(at) for at in z]) * z**-named.ctl.delay_samples
+    p = np.array([effort * plant(at) for at in z]) * z**-named.ctl.compute_delay_samples
     reference, measured = (np.array([law(at)[0, column] for at in z]) for column in (0, 1))
     loop = named.ctl.close(named.plant, values).to_control()
     found = np.array([loop(at)[0, 1] for at in z])

@@ -91,12 +91,12 @@ def test_it_is_fed_back_as_what_it_is():
     f = np.array([1.0, 10.0, 60.0])
     z = np.exp(2j * np.pi * f * 1e-3)
     np.testing.assert_allclose(
-        controller.plant(plant, params).response(f), held(z) * z**-controller.delay_samples, rtol=1e-8
+        controller.plant(plant, params).response(f), held(z) * z**-controller.compute_delay_samples, rtol=1e-8
     )
 
     a, b, _, _, _ = cont2discrete((model.A, model.B[:, :1], model.C, model.D), 1e-3)
     law, step, x = runnable(controller), 2 * np.pi / 1024, np.zeros(2)
-    inside, waiting, path = np.zeros(law.c.size), [0.0] * controller.delay_samples, []
+    inside, waiting, path = np.zeros(law.c.size), [0.0] * controller.compute_delay_samples, []
     for _ in range(400):
         path.append(320.0 / 50.0 * x[0])
         reading = 320.0 / 50.0 * step * np.floor(x[0] / step + 0.5)
@@ -105,13 +105,13 @@ def test_it_is_fed_back_as_what_it_is():
         waiting.append(effort * per_effort)
         x = a @ x + b[:, 0] * waiting.pop(0)
     loop = SampledLoop(
-        plant=plant, law=law, measured="tau_d", delay_samples=controller.delay_samples,
+        plant=plant, law=law, measured="tau_d", delay_samples=controller.compute_delay_samples,
         sensors=so.Sensors(quantisation={"theta_m": step}),
     )  # fmt: skip
     run = run_loop(loop, [params], np.full(400, 2.0))
     np.testing.assert_allclose(run.outputs["tau_d"][0], path, atol=1e-5)
-    ideal = run_loop(SampledLoop(plant=plant, law=law, measured="tau_d", delay_samples=controller.delay_samples),
-                     [params], np.full(400, 2.0))  # fmt: skip
+    exact = SampledLoop(plant=plant, law=law, measured="tau_d", delay_samples=controller.compute_delay_samples)
+    ideal = run_loop(exact, [params], np.full(400, 2.0))
     assert np.max(np.abs(ideal.outputs["tau_d"] - run.outputs["tau_d"])) > 1e-3
 
 
@@ -121,7 +121,7 @@ def test_noise_of_encoders_reaches_the_loop():
     runs = []
     for noise in ({"theta_m": 2e-3}, {"tau_d": 320.0 / 50.0 * 2e-3}):
         loop = SampledLoop(
-            plant=plant, law=runnable(controller), measured="tau_d", delay_samples=controller.delay_samples,
+            plant=plant, law=runnable(controller), measured="tau_d", delay_samples=controller.compute_delay_samples,
             sensors=so.Sensors(noise_std=noise),
         )  # fmt: skip
         runs.append(run_loop(loop, [params], np.ones(300)).outputs["tau_d"])
@@ -151,7 +151,7 @@ def test_offset_and_range_of_an_encoder_reach_the_loop():
 
     def rest(n=1500, **errors):
         loop = SampledLoop(
-            plant=plant, law=runnable(controller), measured="tau_d", delay_samples=controller.delay_samples,
+            plant=plant, law=runnable(controller), measured="tau_d", delay_samples=controller.compute_delay_samples,
             sensors=so.Sensors(**errors),
         )  # fmt: skip
         return run_loop(loop, [params], np.full(n, 2.0)).outputs["tau_d"][0, -1]

@@ -222,7 +222,7 @@ def test_the_impedance_is_that_of_the_papers_actuator(controller, thor, stand_lo
     value = {name: thor[name].value for name in ("m_l", "k", "J", "l", "N_p", "b_r")}
     r, s = value["l"] / (2 * np.pi * value["N_p"]), 2j * np.pi * f
     mass, damping = value["J"] / r**2, value["b_r"] / r**2
-    hold = -np.expm1(-s * PERIOD) / (s * PERIOD) * np.exp(-s * PERIOD * controller.delay_samples)
+    hold = -np.expm1(-s * PERIOD) / (s * PERIOD) * np.exp(-s * PERIOD * controller.compute_delay_samples)
     law = respond(stand_loop[4], f) * hold
     z = (value["m_l"] * s**2 + value["k"]) * (mass * s + damping)
     z /= (value["m_l"] + mass) * s**2 + damping * s + value["k"] * (1 + law)

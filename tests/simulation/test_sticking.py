@@ -177,7 +177,11 @@ def test_a_loop_on_a_joint_that_sticks_is_that_of_the_independent_simulator(
     monkeypatch.setenv("SEAOPT_COMPILER", compiler)
     stand = so.plants.high_impedance()  # a plant whose kernels are not loaded yet
     loop = SampledLoop(
-        plant=stand, law=runnable(controller), measured="F1", delay_samples=controller.delay_samples, sticks=True
+        plant=stand,
+        law=runnable(controller),
+        measured="F1",
+        delay_samples=controller.compute_delay_samples,
+        sticks=True,
     )
     steps = np.array([2.5, 30.0, 100.0])
     wanted = np.repeat(steps[:, None], 600, axis=1)

@@ -21,6 +21,7 @@ from seaopt.errors import ControlError
 from seaopt.estimation import Fit
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.formatting import format_count
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -116,6 +117,27 @@ def count_loop_samples(spec: DelayedSpec) -> int:
     """Return the whole samples that a controller waits: as given, or 1."""
     given = spec.compute_delay_samples if spec.delay_samples is None else spec.delay_samples
     return 1 if given is None else given
+
+
+def count_response_samples(spec: DelayedSpec, measured: MeasuredResponse) -> float:
+    """Return the samples that a measured response is turned by: the program's, for the drive's delay is in it.
+
+    Raises
+    ------
+    ControlError
+        The older key is given, the whole loop, and the log alone has more.
+
+    """
+    if spec.delay_samples is None:
+        return count_loop_samples(spec)
+    late = spec.delay_samples - measured.clock.delay_s * spec.sample_rate_hz
+    if late < -NEGLIGIBLE:
+        raise ControlError(
+            f"frf:{measured.name}: the log has a delay of {1e3 * measured.clock.delay_s:.4g} ms and delay_samples = "
+            f"{spec.delay_samples} is {1e3 * spec.delay_samples / spec.sample_rate_hz:.4g} ms; give "
+            "compute_delay_samples in its place"
+        )
+    return max(late, 0.0)
 
 
 def find_given_drive_delay(spec: DelayedSpec) -> float | None:

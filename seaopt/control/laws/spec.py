@@ -8,7 +8,7 @@ from dataclasses import asdict, fields
 from typing import Any, Literal
 
 from seaopt.control.laws.command import Command
-from seaopt.control.laws.delay import check_delays, count_loop_samples
+from seaopt.control.laws.delay import check_delays, count_loop_samples, count_response_samples
 from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, FIELDS, LIMITS, Limit, list_given_limits
 from seaopt.control.laws.structures import (
     CASCADE,
@@ -375,7 +375,8 @@ class ControllerSpec:
                     f"frf:{measured.name}: is measured at the {what} {own}, and the controller's is {other}; measure "
                     "that"
                 )
-        return sample_measured(measured, command.per_effort, self.sample_time_s, self.loop_delay_samples)
+        waits = count_response_samples(self, measured)
+        return sample_measured(measured, command.per_effort, self.sample_time_s, waits)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""

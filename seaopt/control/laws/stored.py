@@ -358,6 +358,9 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     ):  # fmt: skip
         if getattr(table, name) != expected:
             raise _contradict(name, f"is {getattr(table, name)!r} and spec.{name} {expected!r}")
+    both = table.compute_delay_samples + table.drive_delay_s / table.sample_time_s
+    if not abs(table.delay_samples - both) <= AGREES * max(both, 1.0):
+        raise _contradict("delay_samples", f"= {table.delay_samples:g}, and both delays together are {both:g}")
     if not abs(table.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
         stated = f"is {table.sample_time_s:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}"
         raise _contradict("sample_time_s", stated)

@@ -192,14 +192,14 @@ def test_files_say_the_same_law(tmp_path):
     np.testing.assert_allclose(
         given["drive"].to_effort(4e-3).responses(f), given["pid"].to_effort(4e-3).responses(f), rtol=1e-9
     )
-    assert {one.delay_samples for one in given.values()} == {2}
+    assert {one.delays["delay_samples"] for one in given.values()} == {2}
     assert given["space"].law.integrators == 1
 
 
 @pytest.mark.parametrize(
     ("head", "text", "words"),
     [
-        ("sample_rate_hz = 1000\n", LAW_FILES["pid"], "delay_samples is missing"),
+        ("sample_rate_hz = 1000\n", LAW_FILES["pid"], "should have compute_delay_samples"),
         ("delay_samples = 1\n", LAW_FILES["pid"], "sample_time_s"),
         ("sample_rate_hz = 1000\ndelay_sampels = 1\n", LAW_FILES["pid"], 'did you mean "delay_samples"'),
         (None, "", "pid"),

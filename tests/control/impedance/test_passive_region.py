@@ -81,14 +81,14 @@ def test_the_map_agrees_with_eigenvalues_against_environments(controller: so.Con
         passive = port.worst(impedance, 0.3, theta)[0] > 0.0
         counts[passive] += 1
         if passive:
-            radii = [find_radius(KNEE, controller.law, controller.delay_samples, per_effort, gains, load)
+            radii = [find_radius(KNEE, controller.law, controller.compute_delay_samples, per_effort, gains, load)
                      for load in loads]  # fmt: skip
             assert max(radii) <= 1.0 + 1e-9
             continue
         found = find_breaking(link, link.outer(impedance), port.find_failing_hz(impedance, 0.3))
         assert found is not None
         load = (0.25 + found.inertia, 0.3, found.stiffness)
-        radius = find_radius(KNEE, controller.law, controller.delay_samples, per_effort, gains, load)
+        radius = find_radius(KNEE, controller.law, controller.compute_delay_samples, per_effort, gains, load)
         assert radius == pytest.approx(found.spectral_radius, abs=1e-9)
         assert radius > 1.0
     assert min(counts.values()) > 3

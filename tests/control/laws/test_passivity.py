@@ -37,7 +37,9 @@ def tuned():
 
 def controller_of(sample_time_s=TS, delay_samples=1, **gains):
     law = Gains(**{"k_p": 3.0, "k_i": 1.0, "k_d": 0.03, "T_f": sample_time_s, "k_r": 4.0, **gains})
-    return replace(tuned(), law=law.law("pid", sample_time_s), sample_time_s=sample_time_s, delay_samples=delay_samples)
+    return replace(
+        tuned(), law=law.law("pid", sample_time_s), sample_time_s=sample_time_s, compute_delay_samples=delay_samples
+    )
 
 
 IMPEDANCES = {  # each from the equations of motion of design.md, link 1 at rest, F_m = -c F1
@@ -88,7 +90,12 @@ def power(controller, params, f_hz, periods, steps=20):
     a[0, 1], a[2, 3], a[3, 2] = 1.0, 1.0, -(w**2)
     a[1] = np.array([-k, -b, -k + m_l * w**2, 0.0, 1.0]) / (m + m_l)
     hop = expm(a * controller.sample_time_s / steps)
-    x, inputs, outputs, late = np.array([0.0, 0, 0, 1.0, 0]), np.zeros(3), np.zeros(3), [0.0] * controller.delay_samples
+    x, inputs, outputs, late = (
+        np.array([0.0, 0, 0, 1.0, 0]),
+        np.zeros(3),
+        np.zeros(3),
+        [0.0] * controller.compute_delay_samples,
+    )
     num, den = controller.measurement.num, controller.measurement.den
     samples = round(periods / f_hz / controller.sample_time_s)
     taken = []
@@ -151,7 +158,7 @@ def attached(controller, params, mass, stiffness, damping=0.0):
     a[2:4, 4] = np.linalg.solve(inertia, [1.0, 0.0])
     hop = expm(a * controller.sample_time_s)
     ac, bc, cc, dc = measurement_matrices(controller.law)
-    n, d = bc.size, controller.delay_samples
+    n, d = bc.size, controller.compute_delay_samples
     assert d == 1
     closed = np.zeros((4 + d + n, 4 + d + n))  # plant, the command on its way, law
     read = np.array([k, k, 0, 0])

@@ -84,7 +84,7 @@ def judged(controller, plants, params):
         rows.append((abs(s).max(), abs(open_loop * s).max(), 2 / abs(2 * s - 1).max(), abs(noise).max()))
         model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], TS)
         law = control.ss(control.tf(controller.measurement.num, controller.measurement.den, TS))
-        late = control.ss(control.tf([1], [1] + [0] * controller.delay_samples, TS))
+        late = control.ss(control.tf([1], [1] + [0] * controller.compute_delay_samples, TS))
         stable &= bool(np.abs(control.feedback(model * late * law, 1).poles()).max() < 1)
         if len(rows) == 1:
             below = f[np.flatnonzero(np.abs(tracking) < abs(tracking[0]) / np.sqrt(2))[0]]
@@ -188,7 +188,7 @@ def test_the_delays_bound_is_no_stricter_than_what_is_reached(stand, thor):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"delay_samples": 60, "bandwidth_hz": 60, "max_sensitivity": 1.6}, "delay allows at most"),
+        ({"compute_delay_samples": 60, "bandwidth_hz": 60, "max_sensitivity": 1.6}, "delay allows at most"),
         ({"current_limit_A": 1.0, "step_N": 1000.0}, "takes 4.161 A at rest"),
         ({"current_limit_A": 0.1, "f_c": 100.0}, "no more than the friction"),
     ],

@@ -271,7 +271,7 @@ def test_of_many_sets_of_parameters_each_has_its_own_margin(controller, stand, t
         if not f_c:
             assert margin is None
             continue
-        multiplier, late = read_multiplier(margin.multiplier), controller.delay_samples * PERIOD + delay
+        multiplier, late = read_multiplier(margin.multiplier), controller.compute_delay_samples * PERIOD + delay
         plant = tuple(float(v) for v in (J / radius**2, thor["b_r"].value / radius**2, thor["k"].value))
         least = {
             share: np.min(evaluate_circle(c_y, multiplier, share * margin.slopes[0], theta, plant, late, most))
@@ -289,7 +289,7 @@ def test_with_a_link_that_turns_the_margin_is_that_of_the_plant_linearised_at_re
     assert not find_friction_margin(controller, stand, rubbing).linearised
     law, radius = controller.law, rubbing["l"].value / (2 * np.pi * rubbing["N_p"].value)
     back = control.ss(law.a, -law.b[:, 1:], law.c[None], -law.d[1], PERIOD)
-    late = control.ss(control.tf([1.0], [1.0, *[0.0] * controller.delay_samples], PERIOD))
+    late = control.ss(control.tf([1.0], [1.0, *[0.0] * controller.compute_delay_samples], PERIOD))
     for slope in np.geomspace(1.0, margin.slopes[0], 20):
         viscous = thor.update(b_r=thor["b_r"].value + slope * radius**2)
         plant = control.c2d(swing.linearize(viscous)[0, 0] * controller.command.per_effort, PERIOD)

@@ -84,7 +84,7 @@ def exact(mpc, x0, u_last, reference, drift, samples):
 @pytest.mark.parametrize("slew", [500.0, pytest.param(2000.0, marks=pytest.mark.slow)])
 def test_with_limits_it_is_what_another_solver_finds(stand, thor, slew):
     """From 25 random states, every sample free, no delay."""
-    mpc = made(stand, thor, horizon_s=0.03, moves=30, current_slew_A_per_s=slew, delay_samples=0)
+    mpc = made(stand, thor, horizon_s=0.03, moves=30, current_slew_A_per_s=slew, compute_delay_samples=0)
     rng = np.random.default_rng(7)
     at_limit = 0
     for _ in range(25):
@@ -113,7 +113,7 @@ def test_few_free_currents_cost_little(stand, thor, mpc):
 @pytest.mark.parametrize("delay", [0, 1, 3])
 @pytest.mark.parametrize("bandwidth", [2, 15, 30, 60])
 def test_bandwidth_where_no_limit_is_felt(stand, thor, delay, bandwidth):
-    mpc = made(stand, thor, bandwidth_hz=bandwidth, delay_samples=delay, moves=20)
+    mpc = made(stand, thor, bandwidth_hz=bandwidth, compute_delay_samples=delay, moves=20)
     figures = mpc.close(stand, thor).figures()
     assert figures.stable
     assert figures.bandwidth_hz == pytest.approx(bandwidth, rel=0.02)
@@ -130,7 +130,7 @@ def test_a_plant_with_parts_is_designed_for(thor):
 
 @pytest.mark.parametrize("delay", [0, 2])
 def test_without_limits_it_is_its_transfer_functions(stand, thor, delay):
-    mpc = made(stand, thor, delay_samples=delay, current_limit_A=1000.0, current_slew_A_per_s=None)
+    mpc = made(stand, thor, compute_delay_samples=delay, current_limit_A=1000.0, current_slew_A_per_s=None)
     reference = np.repeat(np.random.default_rng(1).uniform(-300, 300, 6), 50)
     run = close_loop(mpc.command, mpc.start, stand, thor, reference, delay_samples=delay)
     c_r, c_y = mpc.unlimited().transfer_functions()
@@ -273,7 +273,7 @@ def test_knots_reach_from_end_to_end(samples, moves):
         ({"current_limit_A": 0.0}, "current_limit_A = 0.0 is not a number above zero"),
         ({"current_slew_A_per_s": -1.0}, "current_slew_A_per_s"),
         ({"bandwidth_hz": 300.0}, "sample more than four times as fast"),
-        ({"delay_samples": -1}, "delay_samples = -1"),
+        ({"compute_delay_samples": -1}, "compute_delay_samples = -1"),
         ({"bandwidth_hz": 1e-3}, "slower than any weight makes it"),
         ({"bandwidth_hz": 240.0}, "beyond what any weight gives"),
         ({"decay": 1.0}, "decay = 1.0 is not from 0 to below 1"),

@@ -76,7 +76,7 @@ def exact(mpc, x0, last, references, bounds):
 def test_it_is_what_another_solver_finds_with_hard_bounds(stand, thor, bounds, ahead):
     """Where hard bounds can be kept the soft ones are: the penalty is exact. Every sample is free, and held."""
     mpc = made(
-        stand, thor, horizon_s=0.012, moves=12, delay_samples=0, bounds=bounds, preview_samples=ahead,
+        stand, thor, horizon_s=0.012, moves=12, compute_delay_samples=0, bounds=bounds, preview_samples=ahead,
         current_slew_A_per_s=None,
     )  # fmt: skip
     rng = np.random.default_rng(11)
@@ -165,8 +165,8 @@ def test_references_known_ahead_are_tracked_better(stand, thor):
 def test_a_reference_known_for_the_delay_alone_is_one_that_comes_so_much_earlier(stand, thor, delay):
     reference = np.repeat(np.random.default_rng(1).uniform(-500, 500, 8), 30)
     early = np.append(reference[delay:], np.full(delay, reference[-1]))
-    known = made(stand, thor, delay_samples=delay, preview_samples=delay)
-    plain = made(stand, thor, delay_samples=delay)
+    known = made(stand, thor, compute_delay_samples=delay, preview_samples=delay)
+    plain = made(stand, thor, compute_delay_samples=delay)
     first, _ = run_on(known, stand, thor, reference, delay_samples=delay, preview_samples=delay)
     second, _ = run_on(plain, stand, thor, early, delay_samples=delay)
     assert first.current == pytest.approx(second.current, abs=1e-9)

@@ -17,6 +17,7 @@ import seaopt as so
 from seaopt.bench import Chirp, Noise
 from seaopt.control import Gains, Loop
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.delay import count_response_samples
 from seaopt.control.loops.measured.figures import measure_discs
 from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
 from seaopt.control.loops.measured.plant import sample_measured
@@ -137,10 +138,12 @@ def test_above_the_band_the_discs_hold_a_plant_that_falls():
 
 
 def test_a_delay_that_is_in_the_log_is_not_added_again():
-    plant = sample_measured(exact(1e-3, delay_s=1e-3), 1.0 / PER_AMPERE, 1e-3, 3)
+    plant = sample_measured(exact(1e-3, delay_s=1e-3), 1.0 / PER_AMPERE, 1e-3, 2)
     assert np.allclose(plant.centre, respond(plant.f, 1e-3, late=3), rtol=1e-9)
+    older = so.ControllerSpec(delay_samples=1)
+    assert count_response_samples(older, exact(1e-3, delay_s=4e-4)) == pytest.approx(0.6)
     with pytest.raises(ControlError, match="delay of 4 ms and delay_samples = 1"):
-        sample_measured(exact(1e-3, delay_s=4e-3), 1.0, 1e-3, 1)
+        count_response_samples(older, exact(1e-3, delay_s=4e-3))
 
 
 def test_a_response_that_has_not_come_to_rest_is_refused():

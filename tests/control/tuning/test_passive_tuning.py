@@ -29,7 +29,7 @@ def real_part(controller, thor, f):
     s = 2j * np.pi * f
     q = np.exp(-s * ts)
     law = np.polyval(controller.measurement.num[::-1], q) / np.polyval(controller.measurement.den[::-1], q)
-    law = law * q**controller.delay_samples * (1 - q) / (s * ts)
+    law = law * q**controller.compute_delay_samples * (1 - q) / (s * ts)
     return np.real((sprung * s**2 + k) * (mass * s + b) / ((mass + sprung) * s**2 + b * s + k * (1 + law)))
 
 
@@ -38,7 +38,7 @@ def real_part(controller, thor, f):
     [
         QUIET,
         pytest.param(
-            {"bandwidth_hz": 30, "max_sensitivity": 2.2, "delay_samples": 2, **LIFTED}, marks=pytest.mark.slow
+            {"bandwidth_hz": 30, "max_sensitivity": 2.2, "compute_delay_samples": 2, **LIFTED}, marks=pytest.mark.slow
         ),
         pytest.param({"bandwidth_hz": 15, "max_sensitivity": 2.5, "max_noise_gain": 10}, marks=pytest.mark.slow),
         pytest.param(
@@ -59,7 +59,7 @@ def test_what_was_not_passive_becomes_so(stand, thor, spec):
 
 def test_the_undelayed_integral_keeps_the_rule(stand, thor):
     """k_i <= b_m (1 + k_p)/M, which the law that is only to reject disturbances breaks by a factor above two."""
-    spec = {"bandwidth_hz": 15, "max_sensitivity": 2.0, "delay_samples": 0}
+    spec = {"bandwidth_hz": 15, "max_sensitivity": 2.0, "compute_delay_samples": 0}
     free, bound = (so.tune(stand, thor, so.ControllerSpec(**spec, passive_band_hz=band)) for band in (None, BAND))
     rule = thor["b_r"].value / thor["J"].value
     rates = [law.gains["k_i"] / (1 + law.gains["k_p"]) for law in (free, bound)]
@@ -110,6 +110,6 @@ def test_a_delay_of_the_motor_turns_the_port_as_the_controllers_does(stand, thor
     """A whole sample of delay_s is one more of delay_samples."""
     controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6))
     late = thor.with_parameters(so.Parameter(name="delay_s", value=controller.sample_time_s, unit="s"))
-    other = passivity(replace(controller, delay_samples=2), stand, thor)
+    other = passivity(replace(controller, compute_delay_samples=2), stand, thor)
     found = passivity(controller, stand, late)
     np.testing.assert_allclose(np.ravel(found.bands_hz), np.ravel(other.bands_hz), rtol=1e-6)

@@ -107,7 +107,7 @@ def first_order(controller, params):
         f=lambda t, x, u, p: {"x": (p.K * u.I - x.x) / p.tau}, h=lambda t, x, u, p: {"F1": x.x},
     )  # fmt: skip
     return plant, replace(
-        controller, law=law_of([3.0]), delay_samples=0,
+        controller, law=law_of([3.0]), compute_delay_samples=0,
         command=replace(controller.command, per_effort=1.0),
         spec=so.ControllerSpec(bandwidth_hz=30),
     )  # fmt: skip

@@ -192,7 +192,7 @@ def test_a_friction_margin_is_asked_beside_it() -> None:
 def test_the_fraction_is_lowered_for_a_friction_margin() -> None:
     """Of a pd at 20 Hz, of whose margin the whole feedforward takes three quarters."""
     params = RUBBING.update(k=1.05e5, m_l=0.9, l=0.005, N_p=1.0, J=1.14e-5, b_r=2.5e-4, f_c=25.0, v_s=0.004, d=0.5)
-    spec = replace(SPEC, structure="pd", bandwidth_hz=20, delay_samples=2)
+    spec = replace(SPEC, structure="pd", bandwidth_hz=20, compute_delay_samples=2)
     free, firm = (
         so.tune(STAND, params, replace(spec, min_friction_margin=one), {"swing": SWING}) for one in (None, 8e4)
     )

@@ -32,7 +32,9 @@ def test_a_loop_that_is_fine_at_rest_and_rings_once_it_slides_fails(thor):
     rest = Loop(plant=controller.plant(stand, params), law=controller.law).figures()
     assert rest.ms == pytest.approx(controller.achieved.ms, rel=1e-9)  # the linearisation at rest says no more
     assert rest.reference_peak <= 1.3
-    loop = SampledLoop(plant=stand, law=runnable(controller), measured="F1", delay_samples=controller.delay_samples)
+    loop = SampledLoop(
+        plant=stand, law=runnable(controller), measured="F1", delay_samples=controller.compute_delay_samples
+    )
     force = run_loop(loop, [params], np.full(400, 1500.0)).outputs["F1"][0]
     crossings = np.flatnonzero(np.diff(np.sign(force - 1500.0)))
     assert np.max(force) > 1.35 * 1500.0

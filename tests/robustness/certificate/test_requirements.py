@@ -24,7 +24,7 @@ def cosine_by_hand(controller, params, f):
     mass, b, s = p["J"] / radius**2, p["b_r"] / radius**2, 2j * np.pi * f
     q = np.exp(-s * ts)
     law = np.polyval(controller.measurement.num[::-1], q) / np.polyval(controller.measurement.den[::-1], q)
-    law = law * q**controller.delay_samples * (1 - q) / (s * ts)
+    law = law * q**controller.compute_delay_samples * (1 - q) / (s * ts)
     z = (p["m_l"] * s**2 + p["k"]) * (mass * s + b) / ((mass + p["m_l"]) * s**2 + b * s + p["k"] * (1 + law))
     return np.real(z) / np.abs(z)
 

@@ -47,7 +47,7 @@ def test_slopes_are_central_differences(controller, swing, thor, limits):
 
 def test_slopes_of_an_unstable_loop_are_its_poles(controller, swing, thor):
     """Twelve samples of delay too many: the fastest pole's radius."""
-    late = replace(controller, delay_samples=controller.delay_samples + 12)
+    late = replace(controller, compute_delay_samples=controller.compute_delay_samples + 12)
     unknown = combine_uncertainty(thor.prior(J=1e-7, b_r=1e-5), ParameterSet(), RANGES, {"swing": swing})
     points = unknown.draw(3, np.random.default_rng(4))
     draws = [{name: float(column[k]) for name, column in unknown.values(points).items()} for k in range(3)]

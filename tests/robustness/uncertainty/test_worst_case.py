@@ -92,7 +92,7 @@ def test_a_plant_that_is_not_finite_is_not_stable(value, controller, stand, thor
 
 def test_whole_samples_of_delay_are_the_controllers_own(controller, stand, thor):
     late = controller.close(stand, with_(thor, "delay_s", 2e-3, "s")).figures()
-    own = replace(controller, delay_samples=controller.delay_samples + 2).close(stand, thor).figures()
+    own = replace(controller, compute_delay_samples=controller.compute_delay_samples + 2).close(stand, thor).figures()
     assert late.ms == pytest.approx(own.ms, rel=1e-10)
     assert late.spectral_radius == pytest.approx(own.spectral_radius, rel=1e-9)
 

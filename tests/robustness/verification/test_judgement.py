@@ -109,9 +109,9 @@ def test_a_step_may_end_half_a_count_off_and_no_more(controller, stand, thor):
 @pytest.mark.parametrize(("factor", "late"), [(9.5, 0), (40.0, 0), (-0.05, 0), (1.0, 8)])
 def test_every_run_of_an_unstable_loop_fails_and_says_so(controller, stand, thor, cell, factor, late):
     """Radius and frequency from the eigenvalues of loop matrices written out here."""
-    wild = replace(controller, law=scaled(controller.law, factor), delay_samples=1 + late)
+    wild = replace(controller, law=scaled(controller.law, factor), compute_delay_samples=1 + late)
     plant, tf = wild.plant(stand, thor), wild.measurement
-    n, m, d = plant.b.size, tf.den.size - 1, wild.delay_samples
+    n, m, d = plant.b.size, tf.den.size - 1, wild.compute_delay_samples
     # States: plant, the last d commands (newest first), and the law's history of m measurements and m commands.
     size = n + max(d, m) + m
     a = np.zeros((size, size))

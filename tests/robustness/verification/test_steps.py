@@ -145,7 +145,7 @@ def test_a_step_that_ends_short_neither_settles_nor_passes(stand, rubbing):
 
 @pytest.mark.parametrize(("factor", "late"), [(40.0, 0), (1.0, 30)])
 def test_a_run_away_is_told_once_and_allows_nothing_absurd(blind, stand, rubbing, factor, late):
-    wild = replace(blind, law=scaled(blind.law, factor), delay_samples=2 + late)
+    wild = replace(blind, law=scaled(blind.law, factor), compute_delay_samples=2 + late)
     certificate = so.certify(wild, {"stand": stand}, rubbing, simulations=False)
     (told,) = [row for row in certificate.requirements if row.name == "simulation_failures"]
     assert (told.value, "unstable" in told.where) == (11.0, True)

@@ -8,7 +8,7 @@ staircase and whole samples more of delay, its plant is the same points times :m
     |a| \le \sum_{k \ne 0} |G(f + k/T)|\,|H(f + k/T)|
 
 with what folding adds, :math:`a_l` and :math:`a_c`, bounded by the assumption on G above the band, and added to the
-radius. :math:`\tau` is the controller's delay, `delay_samples` of it, less the delay that is known to be in the log.
+radius. :math:`\tau` is the controller's delay, `delay_samples` of it; the drive's is in the log already.
 
 **Between points** centre and radius are straight lines; the radius has an allowance for bends
 (`seaopt.frequency.measured`). **Below the band** the response is that of the lowest point, its phase in proportion to
@@ -93,7 +93,9 @@ class MeasuredPlant:
         return np.where(f > self.f[-1], above, np.interp(f, self.f, self.radius))
 
 
-def sample_measured(measured: MeasuredResponse, gain: float, sample_time_s: float, delay_samples: int) -> MeasuredPlant:
+def sample_measured(
+    measured: MeasuredResponse, gain: float, sample_time_s: float, delay_samples: float
+) -> MeasuredPlant:
     """Return what a controller sees of a measured response.
 
     Parameters
@@ -104,25 +106,18 @@ def sample_measured(measured: MeasuredResponse, gain: float, sample_time_s: floa
         The input for one unit of what the controller gives.
     sample_time_s : float
         Of the controller.
-    delay_samples : int
-        Whole samples from measurement to output, besides the hold: all of them, the delay that is known to be in the
-        log among them.
+    delay_samples : float
+        Samples from a reading to the command being put out, besides the hold. What is between a command and its effect
+        is in the log.
 
     Raises
     ------
     ControlError
-        The log has more delay than the controller, its band ends beyond the controller's Nyquist frequency, or its
-        lowest point is not at rest.
+        Its band ends beyond the controller's Nyquist frequency, or its lowest point is not at rest.
 
     """
     clock, f = measured.clock, measured.frequency_hz
-    late = delay_samples * sample_time_s - clock.delay_s
-    if late < -WHOLE * sample_time_s:
-        raise ControlError(
-            f"frf:{measured.name}: the log has a delay of {1e3 * clock.delay_s:.4g} ms and delay_samples = "
-            f"{delay_samples} is {1e3 * delay_samples * sample_time_s:.4g} ms; give more delay_samples, as the loop "
-            "will have"
-        )
+    late = delay_samples * sample_time_s
     nyquist = 0.5 / sample_time_s
     keep = f < 0.9 * nyquist
     f, centre, radius = f[keep], measured.response[keep] * gain, measured.radius[keep] * abs(gain)
@@ -142,7 +137,7 @@ def sample_measured(measured: MeasuredResponse, gain: float, sample_time_s: floa
         extra = _fold(f, Clock(period=sample_time_s), plain, f[-1])
         radius = (radius + _fold(f, clock, plain, f[-1])) * np.abs(ratio) + extra
         turned, end, folded = turned * ratio, plain, _fold_most(Clock(period=sample_time_s), plain, f[-1])
-    _check_rest(measured, f, turned, delay_samples * sample_time_s + 0.5 * sample_time_s)
+    _check_rest(measured, f, turned, late + clock.delay_s + 0.5 * sample_time_s)
     return MeasuredPlant(
         name=f"frf:{measured.name}", f=f, centre=turned, radius=radius, sample_time_s=sample_time_s, end=end,
         folded=folded, confidence=measured.confidence,
