@@ -32,7 +32,7 @@ from seaopt.control.loops.absolute_stability import FrictionMargin, friction_mar
 from seaopt.control.loops.compensation.link_feedforward import LinkPath, multiply_out
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.friction_loop import make_friction_loops
-from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
+from seaopt.control.loops.law import Law, count_filter_samples, describe_integrators, find_integral_rate
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.measured.loop import DiscLoop
@@ -569,7 +569,7 @@ class Controller:
 
     def _gain_lines(self) -> list[str]:
         if not self.gains:
-            return [f"  a law of order {self.law.c.size}, {format_count(self.law.integrators, 'integrator')} in it"]
+            return [f"  a law of order {self.law.c.size} with {describe_integrators(self.law)}"]
         law = {name: value for name, value in self.gains.items() if not name.startswith(("notch_", "prefilter_"))}
         units = name_gain_units(self.command)
         lines = [

@@ -42,7 +42,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, GateState, PlausibilityGate, is_number
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
-from seaopt.control.loops.law import Law
+from seaopt.control.loops.law import SLOW_LAG, Law
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.plants.motor.heat_guard import COLD, HeatGuard
 from seaopt.records import record
@@ -395,7 +395,12 @@ def realise(
     poles = law.poles[law.integrators :]
     radius = float(np.max(np.abs(poles), initial=0.0))
     if radius >= 1.0:
-        raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; tune a stable one")
+        near = float(np.min(np.abs(poles - 1.0)))
+        hidden = (
+            f"its pole {near:.2g} from 1 cannot be told from a slow lag; give the law as gains, or with fewer of them"
+        )
+        meant = hidden if near < SLOW_LAG else "tune a stable one"
+        raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; {meant}")
     m = law.integrators
     tracking = _compute_tracking_time(law) if tracking_time_s is None and m else tracking_time_s
     share = law.sample_time_s / (tracking + law.sample_time_s) if tracking is not None else 0.0

@@ -21,32 +21,40 @@ once, so that they keep their digits down to 0 Hz.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.loops.minimal import (
+    NEAR_ONE,
     RESPONSE_TOLERANCE,
     balance,
     build_chain,
-    check_same_response,
+    has_response,
+    read_companion,
     realise_rest,
     split,
     split_integrators,
 )
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
+from seaopt.formatting import format_count
 from seaopt.records import record
 
+SLOW_LAG = 1e-3  # distance from 1 of a pole that may have been meant to be an integrator
 SAME_POLE = 1e-3  # to which poles that are equal are computed
 NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
 if TYPE_CHECKING:
     import control
 
 TINY = 1e-300
+LOWEST = 1e-4  # of the sample rate: from here on a law with integrators set apart has the response it was given with
+ROUNDED = 1e-8  # of the largest response at higher frequencies: what is less at a zero is rounding
+SAME_AT_LOWEST = 1e-3  # as a share of it, and less in proportion above: a pole moved by 6e-7 does as much
 EQUAL_GAINS = 1e-9  # integrals of reference and measurement that differ by less are one of the error
 NEAREST_TO_ONE = 1e-17  # abs(z - 1) at least: an integrator's response at 0 Hz is large instead of infinite
 
@@ -127,7 +135,7 @@ class Law:
         return out + right.T @ x
 
     def balanced(self) -> Law:
-        """Return the same law with what does not integrate balanced and of least order; as it is if that is unstable.
+        """Return the same law with what does not integrate balanced and of least order; as it is if that hardly decays.
 
         Balanced, controllability and observability Gramians are equal and diagonal, which keeps rounding noise low, so
         that single precision can hold the states (`seaopt.control.loops.minimal`).
@@ -135,10 +143,11 @@ class Law:
         m, rest = self.integrators, self.rest
         if not rest[2].size or np.max(np.abs(np.linalg.eigvals(rest[0]))) >= 1.0:
             return self
-        return Law(
-            **build_chain(self.b[:m], *balance(*rest, float(np.max(np.abs(self.d))))), d=self.d,
-            sample_time_s=self.sample_time_s,
-        )  # fmt: skip
+        try:
+            balanced = balance(*rest, float(np.max(np.abs(self.d))))
+        except np.linalg.LinAlgError:  # so close to the unit circle that rounding makes a Gramian infinite
+            return self
+        return Law(**build_chain(self.b[:m], *balanced), d=self.d, sample_time_s=self.sample_time_s)
 
     def transfer_functions(self) -> tuple[TransferFunction, ...]:
         """Return C_r and each C_y multiplied out over one denominator, for reading: they say less than the law does."""
@@ -180,6 +189,10 @@ class Law:
     ) -> Law:  # fmt: skip
         """Return the balanced law of a state space in any coordinates, with what integrates set apart.
 
+        Poles nearer to 1 than 1e-6 are integrators, two at most, where the response from 1e-4 of the sample rate on
+        stays the same: to 1e-3 there, and in proportion less above. Of a companion form the coefficients are read. A
+        law without such poles has no integrators, and no anti-windup acts on it.
+
         Raises
         ------
         ControlError
@@ -203,15 +216,15 @@ class Law:
             )
         if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
             raise ControlError("law: A, B, C or D has a number that is not finite; correct it")
-        f = np.geomspace(1e-4, 0.49, 25) / sample_time_s
         as_given = cls(a=a, b=b, c=c, d=d, sample_time_s=sample_time_s)
-        wanted = as_given.responses(f)
-        for chain, *rest in split_integrators(a, b, c):
-            given = build_chain(_equalise(chain), rest[0], rest[1], rest[2])
-            law = cls(**given, d=d, sample_time_s=sample_time_s).balanced()
-            if np.all(np.abs(law.responses(f) - wanted) <= RESPONSE_TOLERANCE * np.abs(wanted) + TINY):
-                return law
-        return as_given
+        fractions = read_companion(a, b, c, d)
+        if fractions:  # whose coefficients tell a root at 1 from one next to it, where eigenvalues do not
+            reference, *measurements = fractions
+            with suppress(ControlError):
+                return cls.from_transfer_functions(
+                    reference, [replace(one, num=-one.num) for one in measurements], sample_time_s
+                )
+        return _set_apart(as_given)
 
     @classmethod
     def from_control(cls, system: Any) -> Law:
@@ -319,21 +332,65 @@ class Law:
         sign = np.array([1.0] + [-1.0] * len(measurements))
         through = sign * np.array([tf.num[0] for tf in given.values()], dtype=float)
         a, b, c = realise_rest(parts)
-        law = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s).balanced()
-        for column, (name, tf) in enumerate(given.items()):
-            check_same_response(
-                name, tf, lambda f, column=column: sign[column] * law.responses(f)[column], sample_time_s
+        made = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s)
+
+        def find_wrong(law: Law) -> str | None:
+            responses = lambda f, column: sign[column] * law.responses(f)[column]  # noqa: E731
+            checks = (
+                (name, has_response(tf, partial(responses, column=column), sample_time_s))
+                for column, (name, tf) in enumerate(given.items())
             )
-        return law
+            return next((name for name, same in checks if not same), None)
+
+        balanced = made.balanced()  # which loses the small states beside those of a pole next to 1
+        if find_wrong(balanced) is None:
+            made = balanced
+        elif (wrong := find_wrong(made)) is not None:
+            raise ControlError(
+                f"{wrong}: slow poles are too close together to tell from integrators in double precision; sample more "
+                "slowly, make them faster, or give the law as a state space"
+            )
+        near = np.any(np.abs(made.poles[m:] - 1.0) < NEAR_ONE)  # of coefficients with fewer digits
+        return _set_apart(made) if near else made
 
 
-def _equalise(chain: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
-    """Return the chain's gains with those of reference and regulated signal alike where only rounding parts them."""
+def _set_apart(given: Law) -> Law:
+    """Return a law balanced, with the poles next to 1 made integrators where its response stays the same."""
+    slowest = np.abs(given.responses(np.array([LOWEST / given.sample_time_s]))[:, 0])
+    for chain, a, b, c in split_integrators(given.a, given.b, given.c):
+        law = replace(given, **build_chain(_settle(chain, slowest), a, b, c))
+        for made in (law.balanced(), law):
+            if _is_same(made, given, SAME_AT_LOWEST):
+                return made
+    balanced = given.balanced()
+    return balanced if _is_same(balanced, given) else given
+
+
+def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -> Float[np.ndarray, "l k"]:
+    """Return a chain's gains without what rounding made: differences of two, and integrals of nothing.
+
+    Those of reference and regulated signal are alike, or that of the reference zero, where only rounding parts them; a
+    last integral is left out that is below rounding in the response at `LOWEST`, `slowest`.
+    """
     out = chain.copy()
+    while len(out) and np.all(np.abs(out[-1]) <= EQUAL_GAINS * slowest * (2 * np.pi * LOWEST) ** len(out)):
+        out = out[:-1]
     for row in out:
         if abs(row[0] + row[1]) <= EQUAL_GAINS * abs(row[0]):
             row[1] = -row[0]
+        elif abs(row[0]) <= EQUAL_GAINS * abs(row[1]):
+            row[0] = 0.0
     return out
+
+
+def _is_same(law: Law, given: Law, at_lowest: float = 0.0) -> bool:
+    """Tell whether two laws have the same responses from `LOWEST` on, there but for a share of them."""
+    per_sample = np.geomspace(LOWEST, 0.49, 25)
+    found, wanted = (one.responses(per_sample / law.sample_time_s) for one in (law, given))
+    size = np.abs(wanted)
+    above = np.maximum.accumulate(size[:, ::-1], axis=1)[:, ::-1]
+    allowed = (RESPONSE_TOLERANCE + at_lowest * LOWEST / per_sample) * size + ROUNDED * above + TINY
+    return bool(np.all(np.abs(found - wanted) <= allowed))
 
 
 def _in_delay(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " m"]) -> TransferFunction:
@@ -437,3 +494,13 @@ def find_integral_rate(law: Law) -> float:
     static = float(law.d[1] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, 1]))
     last, before = -law.b[m - 1, 1], 1.0 - static if m == 1 else -law.b[m - 2, 1]
     return float(last / (law.sample_time_s * (before - 0.5 * m * last)))
+
+
+def describe_integrators(law: Law) -> str:
+    """Return how many integrators a law has, or that it has none, with the lag that may have been meant to be one."""
+    if law.integrators:
+        return f"{format_count(law.integrators, 'integrator')}, on which anti-windup acts"
+    slowest = float(np.max(law.poles.real, initial=0.0))
+    lag = law.sample_time_s / (1.0 - slowest) if 1.0 - SLOW_LAG < slowest < 1.0 else None
+    wound = "" if lag is None else f"; its lag of {lag:.3g} s is no integrator, and no anti-windup acts on it"
+    return f"no integral: a constant disturbance leaves an error{wound}"

@@ -33,7 +33,7 @@ ZERO_AT_ONE = 4 * EPS  # stricter for a numerator: a weak integral is to be kept
 NEGLIGIBLE_HANKEL = 1e-13  # Hankel singular values below this share of the law's gain are rounding
 RESPONSE_TOLERANCE = 1e-6  # how well a state space must have the response of its transfer function
 MOST_INTEGRATORS = 2  # of a law given as matrices: three poles at 1 lie too far apart to tell from slow lags
-ROUNDED_POLES = 1e4  # of the rounding unit, by which matrices may be off that somebody wrote down
+NEAR_ONE = 1e-6  # a pole of matrices that is nearer to 1 is an integrator, where the response stays the same
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
@@ -82,7 +82,8 @@ def realise_rest(
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
     """Return Y/R of all in observer form, each of its input: on shared states where R is the same, else side by side.
 
-    The direct terms, Y at q = 0, are left out.
+    The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles have digits
+    that they do not have in z, with its states scaled.
     """
     groups: list[list[tuple[int, SplitLaw]]] = []
     for numbered in enumerate(parts):
@@ -94,17 +95,20 @@ def realise_rest(
             group.append(numbered)
     blocks: list[Float[np.ndarray, "_ _"]] = []
     drives: list[Float[np.ndarray, "_ k"]] = []
+    rows: list[Float[np.ndarray, " _"]] = []
     for group in groups:
         den = group[0][1].den
         n = max(p.size for _, part in group for p in (part.rest, den)) - 1
-        column = np.pad(den, (0, n + 1 - den.size))[1:]
+        whole = np.pad(den, (0, n + 1 - den.size))
         a, b = np.eye(n, k=1), np.zeros((n, len(parts)))
-        a[:, :1] -= column[:, None]
+        a[:, :1] -= _shift(whole)[1:, None]
         for input_number, part in group:
-            b[:, input_number] = np.pad(part.rest, (0, n + 1 - part.rest.size))[1:] - part.rest[0] * column
-        blocks.append(a)
-        drives.append(b)
-    c = np.concatenate([np.eye(1, len(block))[0] for block in blocks])
+            b[:, input_number] = _shift((np.pad(part.rest, (0, n + 1 - part.rest.size)) - part.rest[0] * whole)[1:])
+        a, scale = _scale(a)
+        blocks.append(np.eye(n) + a)
+        drives.append(b / scale[:, None])
+        rows.append(np.eye(1, n)[0] * scale)
+    c = np.concatenate(rows)
     return np.asarray(block_diag(*blocks)).reshape(c.size, c.size), np.vstack(drives), c
 
 
@@ -119,29 +123,17 @@ def build_chain(
     return {"a": whole, "b": np.vstack([chain, b]), "c": np.concatenate([np.eye(1, m)[0], c])}
 
 
-def check_same_response(
-    name: str, tf: TransferFunction, response: Callable[[Float[np.ndarray, " k"]], Complex[np.ndarray, " k"]],
-    sample_time_s: float,
-) -> None:  # fmt: skip
-    """Refuse a state space whose response is not that of its transfer function, but for its coefficients' rounding.
-
-    Raises
-    ------
-    ControlError
-        It is not.
-
-    """
+def has_response(
+    tf: TransferFunction, response: Callable[[Float[np.ndarray, " k"]], Complex[np.ndarray, " k"]], sample_time_s: float
+) -> bool:
+    """Tell whether a state space has the response of its transfer function, but for its coefficients' rounding."""
     f = np.geomspace(1e-4, 0.49, 25) / sample_time_s
     q = np.exp(-2j * np.pi * f * sample_time_s)
     bottom = np.polynomial.polynomial.polyval(q, tf.den)
     wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
     rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
     allowed = RESPONSE_TOLERANCE * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
-    if not np.all(np.abs(response(f) - wanted) <= allowed):
-        raise ControlError(
-            f"{name}: slow poles are too close together to tell from integrators in double precision; sample more "
-            "slowly, make them faster, or give the law as a state space"
-        )
+    return bool(np.all(np.abs(response(f) - wanted) <= allowed))
 
 
 def split_integrators(
@@ -149,21 +141,24 @@ def split_integrators(
 ) -> Iterator[
     tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]
 ]:
-    r"""Yield a state space as chain and rest, with ever fewer of the poles about 1 taken for integrators, none at last.
+    r"""Yield a state space as chain and rest, with ever fewer of the poles next to 1 taken for integrators.
 
-    Rounding moves an eigenvalue of multiplicity k by its k-th root, so that which poles are integrators is to be
-    checked on the response. An invariant subspace each (ordered Schur form and Sylvester's equation) takes the two
-    apart: with N = A_1 - I the first is :math:`\sum_j c_1 N^{j-1} b_1 w^j`.
+    Rounding moves an eigenvalue of multiplicity m by its m-th root, but the mean of the m by no more than a single one:
+    the mean decides whether they are tried, and the caller's comparison of responses whether they are integrators. An
+    invariant subspace each (ordered Schur form and Sylvester's equation) takes the two apart: with N = A_1 - I the
+    first is :math:`\sum_j c_1 N^{j-1} b_1 w^j`, and what is left of :math:`N^m` is rounding.
     """
-    distance = np.sort(np.abs(np.linalg.eigvals(a) - 1.0))
     # States of very different units would leave the Schur form's poles less exact than these, which are of scaled ones.
-    scaled, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    scaled, scale = _scale(a)
     b_scaled, c_scaled = b / scale[:, None], c * scale
+    offsets = np.linalg.eigvals(scaled) - 1.0
+    offsets = offsets[np.argsort(np.abs(offsets))]
+    distance = np.append(np.abs(offsets), np.inf)
     for m in range(min(c.size, MOST_INTEGRATORS), 0, -1):
-        reach = (ROUNDED_POLES * EPS) ** (1.0 / m)
-        if np.count_nonzero(distance < reach) != m:
+        if abs(np.mean(offsets[:m])) > NEAR_ONE or distance[m] <= distance[m - 1]:
             continue
-        parts: tuple[Any, ...] = schur(scaled, sort=lambda re, im, reach=reach: np.hypot(re - 1.0, im) < reach)
+        between = min(0.5 * (distance[m - 1] + distance[m]), 1.0)
+        parts: tuple[Any, ...] = schur(scaled, sort=lambda re, im, reach=between: np.hypot(re - 1.0, im) < reach)
         triangle, basis, first = parts
         if first != m:
             continue
@@ -176,11 +171,45 @@ def split_integrators(
             chain[j] = read @ power @ drive
             power = power @ (one - np.eye(m))
         yield chain, rest, into[m:], out[m:] + read @ link
-    yield np.zeros((0, b.shape[1])), a, b, c
+
+
+def read_companion(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"], d: Float[np.ndarray, " k"]
+) -> list[TransferFunction]:
+    """Return the transfer function of each input of a companion form, whose entries are coefficients; of others none.
+
+    The coefficients may stand in the first or last row (controllable) or column (observable).
+    """
+    if not c.size:
+        return []
+    turned = [(a, b, c[:, None]), (a.T, c[:, None], b)]
+    for matrix, drive, read in turned + [(x[::-1, ::-1], y[::-1], z[::-1]) for x, y, z in turned]:
+        if not np.array_equal(matrix[:, 1:], np.eye(c.size, k=1)[:, 1:]) or np.any(read[1:]):
+            continue
+        den = np.concatenate([[1.0], -matrix[:, 0]])
+        top = drive * read[:1]  # one of the two has a column for each input
+        return [TransferFunction(num=np.concatenate([[0.0], num]) + d[i] * den, den=den) for i, num in enumerate(top.T)]
+    return []
+
+
+def _scale(a: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    """Return a matrix with rows and columns of like norms, and each state's factor."""
+    if not a.size:
+        return a, np.zeros(0)
+    scaled, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    return scaled, scale
 
 
 def _has_root_at_one(polynomial: Float[np.ndarray, " n"], share: float) -> bool:
     return bool(abs(np.sum(polynomial)) <= share * np.sum(np.abs(polynomial)))
+
+
+def _shift(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return the coefficients in z - 1 of a polynomial in z, descending powers."""
+    out = polynomial.copy()
+    for count in range(out.size, 0, -1):  # Horner's rule: what is left at z = 1 is the lowest coefficient
+        out[:count] = np.cumsum(out[:count])
+    return out
 
 
 def _flip(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -207,6 +236,12 @@ def balance(
     """Return a stable system balanced and of least order.
 
     What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the largest Hankel singular value, is rounding.
+
+    Raises
+    ------
+    LinAlgError
+        A pole is so close to the unit circle that a Gramian is not finite.
+
     """
     a, turn = (np.asarray(part) for part in schur(a))  # powers of a triangle keep its poles, of a companion form not
     b, c = turn.T @ b, c @ turn
@@ -225,6 +260,9 @@ def _factor(a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n _"]) -> Float[n
         return np.asarray(np.linalg.qr(wide.T, mode="r")).T
 
     g = triangle(np.hstack([b, np.zeros(a.shape)]))
-    while np.linalg.norm(a) > VANISHED:
-        g, a = triangle(np.hstack([g, a @ g])), a @ a
+    with np.errstate(over="ignore", invalid="ignore"):
+        while np.linalg.norm(a) > VANISHED:
+            g, a = triangle(np.hstack([g, a @ g])), a @ a
+    if not np.all(np.isfinite(g)):
+        raise np.linalg.LinAlgError("a Gramian is not finite")
     return g

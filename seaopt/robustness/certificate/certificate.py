@@ -14,8 +14,10 @@ from jaxtyping import Float
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import BY_NAME, BY_REQUIREMENT
+from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
+from seaopt.control.loops.law import describe_integrators
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
 from seaopt.executors import Shared, map_ordered
@@ -451,10 +453,16 @@ class Certificate:
         )
         constrained = () if self.constrained is None else self.constrained.notes
         return (
-            *constrained, *self.remarks, *warn_unidentified(self.parameters, used), *friction,
+            *constrained, *self._law_notes(), *self.remarks, *warn_unidentified(self.parameters, used), *friction,
             *describe_compensation(self.controller, self.compensation, self.compensation_draws),
             *self._ideal_notes(), *outside, *little, *lifted,
         )  # fmt: skip
+
+    def _law_notes(self) -> tuple[str, ...]:
+        """Say how many integrators a law of one's own has, which nothing else of it tells."""
+        if self.controller.structure != CUSTOM or self.constrained is not None:
+            return ()
+        return (f"a law of one's own with {describe_integrators(self.controller.law)}",)
 
     def _ideal_notes(self) -> tuple[str, ...]:
         """Say that friction that sticks was simulated with a sensor without noise, where nothing else was."""
