@@ -14,6 +14,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+MOST_GB = 4.0  # of numbers that one call keeps in memory at a time
+
 
 class SeaoptError(Exception):
     """Bad input, or a question that has no answer; the message is one line and says what to do.
@@ -149,3 +151,19 @@ def require_number(value: Any, argument: str, error: type[SeaoptError] = SeaoptE
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise error(f"{argument} = {repr(value)[:60]} is a {type(value).__name__}; give a real number")
     return float(value)
+
+
+def require_memory(numbers: float, argument: str, error: type[SeaoptError] = SeaoptError) -> None:
+    """Refuse what would keep so many numbers in memory that they take more than `MOST_GB`.
+
+    Examples
+    --------
+    >>> require_memory(1e10, "duration_s = 1e+07")
+    Traceback (most recent call last):
+    ...
+    seaopt.errors.SeaoptError: duration_s = 1e+07 takes about 80 GB of memory, and 4 GB is the most; give less
+
+    """
+    size_GB = 8e-9 * numbers
+    if not size_GB <= MOST_GB:
+        raise error(f"{argument} takes about {size_GB:.2g} GB of memory, and {MOST_GB:g} GB is the most; give less")

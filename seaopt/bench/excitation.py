@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import SimulationError
+from seaopt.errors import SimulationError, require_memory
 from seaopt.records import record
 
 
@@ -115,8 +115,6 @@ class Multisine:
         return out
 
 
-MOST_SAMPLES = 100_000_000  # 0.8 GB a channel
-
 Excitation = tuple[Chirp | Noise | Multisine, ...]
 
 # The paper's two experiments: chirp of 480.6 N (2 A) with noise of 240.3 N (1 A); noise of 841 N, which is 3.5 A
@@ -157,14 +155,10 @@ def excite(
     65600
 
     """
+    require_memory(4.0 * duration_s * rate_hz, f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g}", SimulationError)
     n = round(duration_s * rate_hz)
     if n < 2:
         raise SimulationError(f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g} gives {n} samples; lengthen it")
-    if n > MOST_SAMPLES:
-        raise SimulationError(
-            f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g} gives {n} samples, more than {MOST_SAMPLES}"
-            "; shorten it"
-        )
     if not parts:
         raise SimulationError("excitation is empty; give a chirp, a noise, a multisine, or several")
     time = np.arange(n) / rate_hz

@@ -5,7 +5,8 @@ import pytest
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Multisine, Noise, excite, scale
-from seaopt.errors import SimulationError
+from seaopt.errors import EstimationError, SimulationError
+from seaopt.estimation.experiment_design.excitation_search import Limits
 
 
 def test_the_papers_stand_experiment():
@@ -97,3 +98,14 @@ def test_swing_angles_stay_small(swing, thor):
 def test_bad_settings(stand, thor, excitation, options, words):
     with pytest.raises(SimulationError, match=words):
         so.virtual_log(stand, thor, excitation, **{"duration_s": 1, "rate_hz": 400, "seed": 1, **options})
+
+
+@pytest.mark.parametrize("duration_s", [2.5e5, 1e300])
+def test_what_does_not_fit_in_memory_is_refused_before_it_is_made(thor, stand, duration_s):
+    """100 million samples took 10 GB of a machine that may not have them."""
+    with pytest.raises(SimulationError, match=r"duration_s = .* takes about .* GB of memory, and 4 GB is the most"):
+        so.virtual_log(stand, thor, PAPER_STAND, duration_s=duration_s, rate_hz=400, seed=1)
+    with pytest.raises(SimulationError, match="GB of memory"):
+        excite(PAPER_STAND, duration_s=10 * duration_s, rate_hz=400, rng=np.random.default_rng(0))
+    with pytest.raises(EstimationError, match="GB of memory"):
+        Limits(duration_s=duration_s, rate_hz=400, rms=1.0)

@@ -87,7 +87,7 @@ PROBLEMS = {
     "scale": (BASE + EXPERIMENT.replace('"N"', '"N", scale = 1e300'), "scale"),
     "scale and offset": (BASE + EXPERIMENT.replace('"N"', '"N", scale = 1e308, offset = 1e308'), "scale"),
     "rate": (BASE + EXPERIMENT + "resample = { rate_hz = 1e9 }\n", "rate_hz"),
-    "virtual": (BASE + VIRTUAL, "samples"),
+    "virtual": (BASE + VIRTUAL, "GB of memory"),
     "unit": (BASE + EXPERIMENT.replace('"A"', '"A^9^9^9^9"'), "unit"),
     "nul": (BASE + EXPERIMENT.replace("ok.csv", "a\\u0000b"), "cannot be read"),
     "long": (BASE + EXPERIMENT.replace("ok.csv", "n" * 300), "cannot be read"),

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from seaopt.bench import Sensors
 from seaopt.control.loops.compensation.terms import CompensationShape, compensate
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_names
+from seaopt.errors import SimulationError, require_memory
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
 from seaopt.plants.sensors.deflection import weigh_encoders
@@ -242,6 +243,7 @@ def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: c
 def _allocate(loop: SampledLoop, job: Job) -> LoopArrays:
     runs, n = job.reference.shape
     nx, ny = len(loop.plant.states), len(channel_names(loop.plant))
+    require_memory(runs * n * (nx + ny + 1), f"{runs} runs of {n} samples", SimulationError)
     return LoopArrays(
         x=np.array(job.start.x, dtype=float, order="C"), z=np.array(job.start.z, dtype=float, order="C"),
         peak=np.zeros((runs, ny)), error=np.zeros((runs, nx)), size=np.zeros((runs, nx)),

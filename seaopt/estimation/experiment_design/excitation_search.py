@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from seaopt.bench import Chirp, Excitation, Multisine, scale
-from seaopt.errors import EstimationError, suggestion
+from seaopt.errors import EstimationError, require_memory, suggestion
 from seaopt.estimation.experiment_design.information import Bench, Trial
 from seaopt.estimation.experiment_design.spectrum import (
     Spectrum,
@@ -69,6 +69,8 @@ class Limits:
                 raise EstimationError(f"limits: {name} = {value} is not a limit; give a positive number")
         if self.rms is None and self.peak is None and not self.peaks:
             raise EstimationError("limits: nothing bounds the excitation; give rms, peak, or peaks = {output: value}")
+        argument = f"limits: duration_s = {self.duration_s:g} at rate_hz = {self.rate_hz:g}"
+        require_memory(20.0 * self.duration_s * self.rate_hz, argument, EstimationError)
         if round(self.duration_s * self.rate_hz) < 8:
             raise EstimationError(
                 f"limits: {self.duration_s:g} s at {self.rate_hz:g} Hz are fewer than 8 samples; lengthen duration_s"

@@ -15,7 +15,7 @@ from seaopt.control.loops.sampled_plant import DELAYS, find_rows
 from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.control.running.sampled_loop import channel_names, find_longest_delay
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_memory
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
 from seaopt.plants.friction import can_stick
@@ -255,7 +255,9 @@ def apply_load(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet
 
 
 def _build_reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
-    n = max(1, round(phase.duration_s / sample_time_s))
+    samples = phase.duration_s / sample_time_s
+    require_memory(20.0 * samples, f"phase: duration_s = {phase.duration_s:g}", ControlError)
+    n = max(1, round(samples))
     if not phase.excitation:
         return np.full(n, phase.force_N)
     return phase.force_N + excite(phase.excitation, duration_s=n * sample_time_s, rate_hz=1 / sample_time_s, rng=rng)[1]

@@ -16,7 +16,7 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.oscillation import find_oscillation
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Stage, _build_reference, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, find_step_limit, list_left_out
 from seaopt.robustness.verification.verification import verify
 
@@ -276,3 +276,8 @@ def test_a_chirp_needs_its_phase(controller, stand, thor):
     rise = np.log(4.0) / 0.5
     expected = 7 + 3 * np.sin(2 * np.pi * 5.0 / rise * np.expm1(rise * trace.time))
     np.testing.assert_allclose(trace.reference[0], expected, atol=1e-9)
+
+
+def test_a_phase_that_does_not_fit_in_memory_is_refused():
+    with pytest.raises(ControlError, match=r"phase: duration_s = 1e\+09 takes about .* GB of memory"):
+        _build_reference(Phase(duration_s=1e9, force_N=1.0), 1e-3, np.random.default_rng(0))
