@@ -1,5 +1,27 @@
-"""Run the command line as `python -m seaopt`."""
+"""The command `seaopt`, also as `python -m seaopt`: Ctrl-C is one line and exit code 130 from the first import on."""
 
-from seaopt.cli.main import main
+from __future__ import annotations
 
-main()
+import os
+import signal
+from typing import NoReturn
+
+
+def main() -> None:
+    """Run the command line."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # else nobody may interrupt it, as below nohup
+        signal.signal(signal.SIGINT, _leave)  # an import that is interrupted may raise anything, anywhere
+    from seaopt.cli.main import main as run
+
+    signal.signal(signal.SIGINT, before)
+    run()
+
+
+def _leave(*_: object) -> NoReturn:
+    os.write(2, b"\nseaopt: interrupted\n")
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -150,7 +150,10 @@ def require_number(value: Any, argument: str, error: type[SeaoptError] = SeaoptE
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise error(f"{argument} = {repr(value)[:60]} is a {type(value).__name__}; give a real number")
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:
+        raise error(f"{argument} is larger than 1e308; give a number that a computer has") from None
 
 
 def require_memory(numbers: float, argument: str, error: type[SeaoptError] = SeaoptError) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from seaopt.errors import FileError, SeaoptError
 
 MOST_BYTES = 64 << 20  # of a file that is read as one text: problems, laws, results
+MOST_LEVELS = 100  # of tables and lists in it
 # What JSON may hold raw and a terminal would obey, and halves of characters, which are in names that are no text.
 _ESCAPED = re.compile(r"[\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
@@ -170,9 +171,32 @@ def parse_file(
     except ValueError as problem:  # bytes that are no text, or a path that no system has
         raise error(f"{source}: cannot be read as UTF-8 text ({problem}); {remedy}") from problem
     try:
-        return parse(text)
+        content = parse(text)
+        check_content(content)
     except (ValueError, RecursionError) as problem:  # also a number of more digits than Python reads
         raise error(f"{source}: is not valid {form} ({problem}); correct that place, or {remedy}") from problem
+    return content
+
+
+def check_content(content: Any) -> None:
+    """Refuse what Python can read but not always print: deep nesting, and integers of any size.
+
+    Raises
+    ------
+    ValueError
+        It is nested deeper than `MOST_LEVELS`, or an integer has more than 64 bits.
+
+    """
+    level, depth = [content], 0
+    while level:
+        if depth > MOST_LEVELS:
+            raise ValueError(f"it is nested more than {MOST_LEVELS} deep")
+        inner: list[Any] = []
+        for value in level:
+            if isinstance(value, int) and value.bit_length() > 63:
+                raise ValueError(f"an integer has {value.bit_length()} bits, and 64 are the most")
+            inner += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+        level, depth = inner, depth + 1
 
 
 def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage again") -> dict[str, Any]:

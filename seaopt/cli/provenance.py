@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt.errors import ProblemError
-from seaopt.files import check_regular, plain
+from seaopt.files import check_content, check_regular, plain
 from seaopt.problem import Problem
 from seaopt.problem.schema import ControllerTable
 from seaopt.robustness.uncertainty.draws import find_modes
@@ -41,6 +41,7 @@ def digest(path: Path) -> str:
     raw = path.read_bytes()
     try:
         content = json.loads(raw)
+        check_content(content)
     except (ValueError, RecursionError):
         content = None
     return digest_content(content) if isinstance(content, dict) else hashlib.sha256(raw).hexdigest()

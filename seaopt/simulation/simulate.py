@@ -111,7 +111,8 @@ def simulate(
     """
     require_type(plant, Plant, "plant", "give a Plant", SimulationError)
     require_type(log, Log, "log", "give a Log", SimulationError)
-    require_number(delay_s, "delay_s", SimulationError)
+    if require_number(delay_s, "delay_s", SimulationError) > log.duration_s:
+        raise SimulationError(f"delay_s = {delay_s:g} is longer than the log of {log.duration_s:.4g} s; give less")
     model = make_model(plant, params)
     if len(log.segments) > 1:
         raise LogError(f"{log.source}: has {len(log.segments)} stretches with gaps between; simulate them one by one")

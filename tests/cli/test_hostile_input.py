@@ -83,6 +83,10 @@ def check_refused(result, *words):
 PROBLEMS = {
     "digits": (BASE + "x = " + "9" * 5000, "TOML"),
     "nested": (BASE + "x = " + "[" * 100_000, "TOML"),
+    "nested less": (BASE + "x = " + "[" * 200 + "]" * 200, "nested"),
+    "many bits": (BASE + "[robustness]\nsamples = 0x" + "F" * 4000, "16000 bits"),
+    "many bits in a unit": (BASE + EXPERIMENT.replace('"N"', '"N", scale = 0x' + "F" * 4000), "16000 bits"),
+    "late": (BASE + EXPERIMENT + "delay_s = 1e300\n", "delay_s"),
     "control": (BASE.replace("J =", '"J\\u001b]0;x\\u0007" ='), "\\x1b]0;x"),
     "scale": (BASE + EXPERIMENT.replace('"N"', '"N", scale = 1e300'), "scale"),
     "scale and offset": (BASE + EXPERIMENT.replace('"N"', '"N", scale = 1e308, offset = 1e308'), "scale"),
@@ -158,6 +162,16 @@ def test_json_of_any_depth_is_refused(seaopt, bad, folder, content):
     (folder / "out").mkdir()
     (folder / "out" / "fit.json").write_text('{"schema": "seaopt/fit/1", "a": ' + content, encoding="utf-8")
     check_refused(seaopt("tune", "p.toml"), "fit.json")
+
+
+@pytest.mark.parametrize("inner", ["[" * 900 + "]" * 900, '{"a":' * 900 + "1" + "}" * 900, "9" * 4000])
+def test_results_of_any_depth_are_refused(copied, seaopt, inner):
+    """A controller.json that Python reads, but whose digest it could not make."""
+    path = copied / "all" / "controller.json"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("{", '{"a": ' + inner + ", ", 1), encoding="utf-8")
+    for command in ("export all --c c", "certify short.toml -o all", "report short.toml -o all"):
+        check_refused(seaopt(*command.split()), "controller.json", "not valid JSON")
 
 
 def test_a_log_that_a_link_puts_elsewhere_is_refused_and_not_quoted(seaopt, bad, folder, tmp_path_factory):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 
@@ -14,6 +16,23 @@ from seaopt.cli.session import Session
 def test_the_package_runs_as_the_command():
     out = subprocess.run([sys.executable, "-m", "seaopt", "--version"], capture_output=True, text=True, check=False)
     assert (out.returncode, out.stdout[:7]) == (0, "seaopt ")
+
+
+@pytest.mark.parametrize("module", ["seaopt.errors", "typer", "seaopt.cli.main"])
+def test_ctrl_c_among_the_imports_is_one_line_too(module):
+    """It came out as a traceback, or as an error of the import that it hit."""
+    options = [sys.executable, "-X", "importtime", "-m", "seaopt", "inspect", "none.csv"]
+    with subprocess.Popen(options, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        lines = []
+        for line in process.stderr:
+            lines.append(line)
+            if line.split("|")[-1].strip() == module:
+                os.kill(process.pid, signal.SIGSTOP)  # it is where it is, however slow this process is
+                process.send_signal(signal.SIGINT)
+                os.kill(process.pid, signal.SIGCONT)
+    said = [line for line in lines if not line.startswith("import time:") and line.strip()]
+    assert (process.returncode, said) == (130, ["seaopt: interrupted\n"])
 
 
 def test_ctrl_c_is_one_line_and_exits_130(tmp_path, monkeypatch, capsys, design):

@@ -129,3 +129,22 @@ def test_a_window_cuts_and_refuses_nonsense(files):
         read_table(files[0], window_s=(5, 6))
     with pytest.raises(LogError, match="start before stop"):
         read_table(files[0], window_s=(1, 0))
+
+
+@pytest.mark.parametrize("extreme", [1e308, -1e308, np.inf, -np.inf, np.nan, 2.0**53, 0.5])
+def test_what_cannot_be_counted_is_no_counter(extreme):
+    """And no difference of it overflows, which was a warning on the terminal."""
+    values = np.repeat(np.arange(30.0), 2)
+    values[40] = extreme
+    assert Counter.suspect(values) == 0
+    with pytest.raises(LogError, match="whole number that only rises"):
+        Counter(column="n").open_gaps(np.arange(60.0), values, "log.csv")
+
+
+def test_a_counter_that_leaps_is_counted():
+    values = np.repeat(np.r_[np.arange(29.0), 1e15], 2)
+    assert Counter.suspect(values) == 2 * (10**15 - 29)
+    with pytest.raises(LogError, match="samples_per_count"):
+        Counter(column="n", samples_per_count=10**5000)
+    moved, note = Counter(column="n", samples_per_count=2).open_gaps(np.arange(60.0), values, "log.csv")
+    assert moved[-1] == 59.0 + 2 * (1e15 - 29) and "lost samples" in note

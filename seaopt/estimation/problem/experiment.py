@@ -301,6 +301,11 @@ class Experiment:
         delay = self.delay_s.value if isinstance(self.delay_s, Parameter) else self.delay_s
         if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
             raise EstimationError(f"experiment {self.name}: delay_s = {delay!r} is not a time; give seconds, 0 or more")
+        if delay > self.log.duration_s:
+            raise EstimationError(
+                f"experiment {self.name}: delay_s = {delay:g} is longer than its log of {self.log.duration_s:.4g} s; "
+                "give fewer seconds"
+            )
         if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
             raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
         if self.gaps not in ("split", "error"):

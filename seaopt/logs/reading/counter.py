@@ -13,6 +13,8 @@ from seaopt.errors import LogError
 from seaopt.formatting import format_count
 from seaopt.records import record
 
+LARGEST = 2**53  # below which a float is every whole number
+MOST_PER_COUNT = 1_000_000
 PROBE_SAMPLES = 1000  # samples that must look like a counter before all are looked at
 
 
@@ -39,8 +41,9 @@ class Counter:
     samples_per_count: int = 1
 
     def __post_init__(self) -> None:
-        if self.samples_per_count < 1:
-            raise LogError(f"Counter: samples_per_count = {self.samples_per_count}; give a whole number from 1")
+        if not 1 <= self.samples_per_count <= MOST_PER_COUNT:
+            shown = self.samples_per_count if abs(self.samples_per_count) < LARGEST else "a number of many digits"
+            raise LogError(f"Counter: samples_per_count = {shown}; give a whole number from 1 to {MOST_PER_COUNT}")
 
     def open_gaps(
         self, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], place: str
@@ -53,7 +56,7 @@ class Counter:
             The column is not a counter: not whole, or falling.
 
         """
-        if not np.all(np.isfinite(values)) or np.any(values != np.floor(values)) or np.any(np.diff(values) < 0):
+        if not _is_whole(values) or np.any(np.diff(values) < 0):
             raise LogError(
                 f'{place}: counter "{self.column}" is not a whole number that only rises; choose another column'
             )
@@ -75,8 +78,7 @@ class Counter:
     def suspect(values: Float[np.ndarray, " n"]) -> int:
         """Return how many samples a column seems to miss, if it looks like a counter; 0 otherwise."""
         for part in (values[:PROBE_SAMPLES], values):
-            step = np.diff(part)
-            if part.size < 10 or not np.all((step >= 0) & (part[1:] == np.floor(part[1:]))):
+            if part.size < 10 or not _is_whole(part) or np.any(np.diff(part) < 0):
                 return 0
         runs = np.diff(np.flatnonzero(np.diff(values)))
         if runs.size < 5:
@@ -88,10 +90,15 @@ class Counter:
         return int(_count_losses(values, usual)[1].sum())
 
 
-def _count_losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+def _is_whole(values: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether values are whole numbers that differences are exact of."""
+    return bool(np.all((np.abs(values) < LARGEST) & (values == np.floor(values))))
+
+
+def _count_losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Return where each count but the first begins, and how many samples are missing before it."""
     starts = np.flatnonzero(np.diff(values)) + 1
-    skipped = (np.diff(values)[starts - 1].astype(int) - 1) * each
+    skipped = (np.diff(values)[starts - 1] - 1.0) * each  # of integers the product could overflow
     # A count that was held for fewer samples than usual lost the others.
     lengths = np.diff(np.concatenate([[0], starts]))
     missing = np.maximum(each - lengths, 0)
