@@ -77,10 +77,11 @@ def render(template: str, context: Mapping[str, Any]) -> str:
 def describe_timing(stored: Mapping[str, Any]) -> dict[str, Any]:
     """Return what files say of the delays of a stored controller."""
     computing, drive, period = stored["compute_delay_samples"], stored["drive_delay_s"], stored["sample_time_s"]
+    older = stored["spec"].delay_samples is not None
     return {
         "compute_delay_samples": computing,
         "drive_delay_s": repr(float(drive)),
         "drive_delay_ms": f"{1e3 * drive:.4g}" if drive else "",
-        "older": stored["spec"].delay_samples is not None,
-        "delays": describe_delays(computing, drive, period),
+        "older": older,
+        "delays": describe_delays(computing, drive, period, older=older),
     }

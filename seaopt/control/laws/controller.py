@@ -163,7 +163,8 @@ class Controller:
     @property
     def delays(self) -> str:
         """Both delays and their sum, in words."""
-        return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s)
+        older = self.spec.delay_samples is not None
+        return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s, older=older)
 
     def delay(self, params: ParameterSet) -> ParameterSet:
         """Return parameters with the delay of this controller's drive, where they have none of their own."""

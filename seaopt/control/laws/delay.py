@@ -212,8 +212,10 @@ def _answers_at_once(plant: Plant, spec: DelayedSpec) -> bool:
     return any(ca.depends_on(row, plant.u[0]) for row in rows)
 
 
-def describe_delays(compute_delay_samples: int, drive_delay_s: float, sample_time_s: float) -> str:
-    """Return both delays and their sum, in the words of terminal, page and header.
+def describe_delays(
+    compute_delay_samples: int, drive_delay_s: float, sample_time_s: float, *, older: bool = False
+) -> str:
+    """Return both delays and their sum, in the words of terminal, page and header; of an `older` key the sum alone.
 
     Examples
     --------
@@ -223,6 +225,8 @@ def describe_delays(compute_delay_samples: int, drive_delay_s: float, sample_tim
     'compute delay 1 sample, no drive delay'
 
     """
+    if older:
+        return f"delay {format_count(compute_delay_samples, 'sample')} in all, the drive's among them"
     computing = f"compute delay {format_count(compute_delay_samples, 'sample')}"
     if not drive_delay_s:
         return f"{computing}, no drive delay"

@@ -208,10 +208,20 @@ def _describe_controller(
     why = "that of the log" if rate >= LEAST_RATE_HZ else "a usual one"
     sampled = interview.number("sample_rate_hz", "Rate at which the controller will run, in Hz", usual, why)
     rows.append((f"sample_rate_hz = {sampled:.10g}", interview.mark("sample_rate_hz")))
+    rows.append(_describe_compute_delay(logs))
     rows.append(_describe_limit(logs, interview))
     if actuator.robust_to:
         rows.append((f"robust_to = {_value(list(actuator.robust_to))}", "Ms and Mt hold there too"))
     return rows
+
+
+def _describe_compute_delay(logs: Sequence[DescribedLog]) -> tuple[str, str]:
+    """Return the line of the program's delay, to be taken in where the program is not the one that logged."""
+    shown = "0: as the program that logged" if any(log.traits.delay_s for log in logs) else "1"
+    return (
+        "# compute_delay_samples = 1",
+        f"from a reading to the command being put out; left out {shown}. The drive's delay is the fit's",
+    )
 
 
 def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple[str, str]:

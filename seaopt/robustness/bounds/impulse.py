@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.drift import leave_out_drift
-from seaopt.control.loops.sampled_plant import DELAY, find_rows
+from seaopt.control.loops.sampled_plant import DELAYS, find_rows
 from seaopt.plants import Plant, jacobians
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
@@ -73,7 +73,9 @@ def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: B
     conditions: dict[str, Entry] = {
         name: entry for name, entry in (within.fixed | uncertain).items() if name not in plant.parameters
     }
-    delay = conditions.pop(DELAY, 0.0)
+    delay: Entry = plant.drive_offset_s
+    for name in DELAYS:
+        delay = conditions.pop(name, 0.0) + delay
     x, u = enclose_equilibrium(plant, p, conditions, count, over)
     n, outputs = len(plant.states), len(plant.outputs)
     blocks = enclose(jacobians(plant), [x, u, p])

@@ -7,10 +7,12 @@ fractions of its half axes, so that it is the unit ball; those of the ranges run
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.control.loops.sampled_plant import DELAY, conditions, read_conditions
+from seaopt.control.loops.sampled_plant import DELAY, DELAYS, DRIVE_DELAY, conditions, read_conditions
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_linear
@@ -57,6 +59,8 @@ class Region:
         Conditions that are not uncertain.
     nominal : CompletedParameters
         What the plant has where nothing is uncertain.
+    lead_s : float
+        The delay besides the one that is uncertain, s.
 
     """
 
@@ -68,6 +72,7 @@ class Region:
     ball: int
     fixed: dict[str, float]
     nominal: CompletedParameters
+    lead_s: float = 0.0
 
     @property
     def size(self) -> int:
@@ -82,11 +87,12 @@ class Region:
         """
         size = self.size
         boxes = Boxes(centre=np.zeros((1, size)), radius=np.ones((1, size)))
-        if DELAY not in self.names:
+        rows = [row for row, name in enumerate(self.names) if name in DELAYS]
+        if not rows:
             return self.cut(boxes)[0]
-        row = self.names.index(DELAY)
+        (row,) = rows
         axis = int(np.flatnonzero(self.slopes[row])[0])
-        middle, half = self.centre[row], self.slopes[row, axis]
+        middle, half = self.centre[row] + self.lead_s, self.slopes[row, axis]
         first, last = (middle - half) / sample_time_s, (middle + half) / sample_time_s
         inner = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1)
         edges = np.unique(np.concatenate([[first], inner[(inner > first) & (inner < last)], [last]]))
@@ -149,6 +155,7 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     half_axes = (left * axes)[:, uncertain] * size
     ends = dict(_convert_range(unknown, name, pair) for name, pair in unknown.ranges.items())
     ends = {name: pair for name, pair in ends.items() if name in plant.parameters or name in extra}
+    ends = _merge_delays(plant, unknown, ends)
     pinned = {name: pair[0] for name, pair in ends.items() if pair[0] == pair[1]}
     wide = {name: pair for name, pair in ends.items() if name not in pinned}
     count, ball = len(names), half_axes.shape[1]
@@ -158,12 +165,33 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     middle = [0.5 * (low + high) for low, high in wide.values()]
     nominal = plant.complete(unknown.nominal)
     held = {name: value for name, value in read_conditions(plant, nominal).items() if name not in ends}
+    certain = held | pinned
     return Region(
         names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
         slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
         high=np.array([*(unknown.nominal[n].max for n in names), *[np.inf] * len(wide)], dtype=float), ball=ball,
-        fixed=pinned | held, nominal=nominal,
+        fixed=certain, nominal=nominal,
+        lead_s=sum(certain.get(name, 0.0) for name in DELAYS) + plant.drive_offset_s,
     )  # fmt: skip
+
+
+def _merge_delays(
+    plant: Plant, unknown: Uncertainty, ends: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Return the ranges with one of the delay in all, where a fit's of the drive is uncertain: a range of its own.
+
+    That holds what the joint distribution does, as boxes are to be cut where the delay is a whole number of samples.
+    """
+    if DRIVE_DELAY in ends:
+        first, last = ends[DRIVE_DELAY]
+    elif DRIVE_DELAY in unknown.names:
+        row, nominal = unknown.names.index(DRIVE_DELAY), unknown.nominal[DRIVE_DELAY].value
+        reach = confidence_radius(len(unknown.names)) * float(np.sqrt(unknown.covariance[row, row]))
+        first, last = max(nominal - reach, -plant.drive_offset_s, 0.0), nominal + reach
+    else:
+        return dict(ends)
+    low, high = ends.get(DELAY, (0.0, 0.0))
+    return {name: pair for name, pair in ends.items() if name != DELAY} | {DRIVE_DELAY: (first + low, last + high)}
 
 
 def _convert_range(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[str, tuple[float, float]]:

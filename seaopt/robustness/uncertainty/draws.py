@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.control.laws.delay import Drive
-from seaopt.control.loops.sampled_plant import DRIVE_DELAY, add_drive_delay, conditions
+from seaopt.control.loops.sampled_plant import DRIVE_DELAY, conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import Parameter, ParameterSet
@@ -274,7 +274,7 @@ def combine_uncertainty(
     used = [i for i, name in enumerate(uncertain) if name not in ranges and name in known and np.isfinite(whole[i, i])]
     nominal = nominal.with_parameters(*others.values())
     if drive is not None:
-        nominal = add_drive_delay(ParameterSet(p for n, p in nominal.items() if n != DRIVE_DELAY), drive.delay_s)
+        nominal = nominal.with_parameters(Parameter(name=DRIVE_DELAY, value=drive.delay_s, unit="s", min=0.0))
     nominal, scale = _in_plant_units(nominal, plants)
     factors = np.array([scale.get(name, 1.0) for name in uncertain])
     whole *= factors[:, None] * factors

@@ -151,6 +151,18 @@ def test_a_jump_at_a_whole_sample_of_delay_is_covered(controller, stand, thor):
     assert figures.ms[0] <= bounds.ms_upper <= 1.001 * figures.ms[0]
 
 
+def test_a_range_of_delay_begins_where_the_drives_ends(controller, stand, thor):
+    """The same set of loops: 0.7 to 1.3 ms, all of it a range, or the last 0.6 ms beyond a drive's, given or ranged."""
+    whole = bracket(controller, stand, of(stand, thor, {"delay_s": (0.7e-3, 1.3e-3)}))
+    late = thor.with_parameters(Parameter(name="drive_delay_s", value=0.7e-3, unit="s"))
+    for params, ranges in (
+        (late, {"delay_s": (0.0, 0.6e-3)}), (thor, {"drive_delay_s": (0.7e-3, 1.0e-3), "delay_s": (0.0, 0.3e-3)}),
+    ):  # fmt: skip
+        parts = bracket(controller, stand, of(stand, params, ranges))
+        assert parts.ms_upper == pytest.approx(whole.ms_upper, rel=1e-9)
+        assert parts.bounded_stable
+
+
 @pytest.mark.parametrize(
     ("name", "ranges"),
     [("swing", {"delay_s": (0.0, 1e-2)}), ("stand", {"eta": (0.01, 20.0)}), ("swing", {"delay_s": (6.6e-3, 6.7e-3)})],
