@@ -27,7 +27,7 @@ from seaopt.cli.responses import estimate_responses
 from seaopt.cli.show import show_all, show_figures, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
-from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
+from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, warn_delays
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
@@ -506,7 +506,9 @@ class Session:
         if self.problem.schedule is not None:
             self.results["certify"] = certify_schedule_problem(self.problem, self.schedule(), source, tell)
             return
-        plants = self.problem.certified_plants()
+        asked, design = self.problem.spec or self.problem.mpc, self.problem.design_plant
+        assert asked is not None
+        plants = split_delayed(asked, design, self.problem.certified_plants(), source)
         self.results["certify"] = Certificate.from_dict(content, self.controller(), plants, self.values())
 
     def met(self, stages: list[str]) -> bool:

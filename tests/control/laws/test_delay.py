@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 
@@ -11,8 +12,17 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import MPCSpec, force_mpc
-from seaopt.control.laws.delay import settle_delays, warn_delays
+from seaopt.control.laws.delay import find_drive, settle_delays, split_delayed, warn_delays
+from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.passivity import passivity
+from seaopt.control.loops.sampled_plant import add_drive_delay
 from seaopt.errors import ControlError
+from seaopt.files import to_json
+from seaopt.robustness import batch_figures, combine_uncertainty
+from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
+from seaopt.robustness.verification.large_signal import large_signal
+from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.scenarios import Phase, Scenario
 
 DELAY_S = 2.04e-3
 SUBSTEPS, STEPS_LATE = 25, 51  # of 1 ms: 2.04 ms are 51 steps of 40 us
@@ -139,3 +149,83 @@ def test_the_fit_read_again_has_the_delay(fit, stand, swing):
     again = so.estimation.Fit.from_dict(fit.to_dict())
     assert again.delay_s(stand) == fit.delay_s(stand)
     assert again.delay_s(swing) == fit.delay_s(stand)  # no experiment of its own: that of the same electronics
+
+
+@pytest.fixture(scope="module")
+def pair(stand, thor):
+    """The same law behind two samples of the program's, and behind one of them and a drive that takes the other."""
+    spec = so.ControllerSpec(
+        bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, compute_delay_samples=2, current_limit_A=9.0
+    )
+    one = so.tune(stand, thor.update(f_c=5.0), spec)
+    halved = replace(spec, compute_delay_samples=1, drive_delay_s=1e-3)
+    values = add_drive_delay(one.design[1], 1e-3)
+    return one, replace(one, spec=halved, compute_delay_samples=1, drive_delay_s=1e-3, design=(one.design[0], values))
+
+
+STEP = Scenario(name="step", phases=(Phase(duration_s=0.12, force_N=30.0),))
+MEASURES = {
+    "figures": lambda law, plant, values: law.close(plant, values).figures().ms,
+    "passivity": lambda law, plant, values: passivity(law, plant, values).least_cosine,
+    "friction": lambda law, plant, values: find_friction_margin(law, plant, values).least_slope,
+    "delay margin": lambda law, plant, values: sampled_delay_margin(law, plant, values, 0.05),
+    "draws": lambda law, plant, values: batch_figures(law, plant, values, {"J": np.array([2e-6, 4e-6])}).ms,
+    "amplitudes": lambda law, plant, values: (
+        large_signal(law, plant, values, amplitudes_N=(500.0,), frequencies_hz=(15.0,)).gain
+    ),
+    "steps": lambda law, plant, values: play(Stage(controller=law, plant=plant), STEP, [values]).outputs["F1"][0],
+}
+
+
+@pytest.mark.parametrize("name", MEASURES)
+def test_a_whole_sample_of_the_drive_is_as_one_of_the_program(name, pair, stand, thor):
+    """Of a law that brings its drive's delay with it: what is given are values without one."""
+    program, drive = (MEASURES[name](one, stand, thor.update(f_c=5.0)) for one in pair)
+    np.testing.assert_allclose(drive, program, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("structure", ["pid_dob", "cascade"])
+def test_what_is_tuned_is_the_same(structure, thor):
+    knee = so.plants.rotary("locked")
+    values = knee.defaults.update(N=50.0, k_s=300.0)
+    spec = so.ControllerSpec(
+        measured=("tau_s", "thetad_m") if structure == "cascade" else "tau_s", structure=structure, bandwidth_hz=20
+    )
+    program = so.tune(knee, values, replace(spec, compute_delay_samples=2))
+    drive = so.tune(knee, values, replace(spec, compute_delay_samples=1, drive_delay_s=1e-3))
+    assert drive.achieved.ms == pytest.approx(program.achieved.ms, rel=1e-4)
+    assert dict(drive.gains) == pytest.approx(dict(program.gains), rel=1e-2)
+
+
+def test_a_fitted_delay_is_drawn_with_the_parameters(fit, stand):
+    """Its std is the fit's, and so is its correlation with friction, which makes the force late too."""
+    controller = so.tune(stand, fit, SPEC)
+    drive = find_drive(SPEC, stand, fit)
+    unknown = combine_uncertainty(fit, so.ParameterSet(), {}, {"stand": stand}, drive)
+    assert unknown.names == ("b_r", "drive_delay_s")
+    drawn = unknown.values(unknown.draw(4000, np.random.default_rng(1)))
+    own = fit.nuisance["experiment"]
+    assert np.std(drawn["drive_delay_s"]) == pytest.approx(own.std["delay_s"], rel=0.05)
+    assert np.mean(drawn["drive_delay_s"]) == pytest.approx(own.delay_s, abs=0.1 * own.std["delay_s"])
+    joint = fit.delay_covariance.matrix
+    correlation = joint[0, 1] / np.sqrt(joint[0, 0] * joint[1, 1])
+    assert np.corrcoef(drawn["b_r"], drawn["drive_delay_s"])[0, 1] == pytest.approx(correlation, abs=0.05)
+    certificate = so.certify(controller, {"stand": stand}, fit, samples=20, simulations=False)
+    assert [row.name for row in certificate.varied] == ["b_r", "drive_delay_s"]
+    again = so.estimation.Fit.from_dict(json.loads(to_json(fit.to_dict())))
+    np.testing.assert_array_equal(again.delay_covariance.matrix, joint)
+
+
+def test_experiments_whose_delays_differ_are_two_plants_of_the_certificate(fit, stand):
+    own = fit.nuisance["experiment"]
+    other = replace(own, delay_s=1e-3)
+    two = replace(fit, nuisance={"experiment": own, "second": other})
+    controller = so.tune(stand, two, SPEC)
+    assert controller.drive_delay_s == own.delay_s  # the longest
+    certificate = so.certify(controller, {"stand": stand}, two, samples=5, simulations=False)
+    assert list(certificate.plants) == ["stand", "stand, shortest delay"]
+    shortest = certificate.plants["stand, shortest delay"].ms
+    assert shortest == pytest.approx(_true_ms(controller, stand, fit.parameters, 1e-3), rel=2e-3)
+    alike = replace(fit, nuisance={"experiment": own, "second": replace(own, delay_s=own.delay_s - 1e-7)})
+    assert list(split_delayed(SPEC, stand, {"stand": stand}, alike)) == ["stand"]
