@@ -81,6 +81,39 @@ class LoadedMPC:
         return np.array([line.split() for line in said.stdout.splitlines()], dtype=float)
 
 
+class CompiledSchedule:
+    """An exported schedule through ctypes."""
+
+    def __init__(self, compiler, folder, schedule, precision="double", **options):
+        export(schedule, folder, precision=precision, name="law", **options)
+        library = folder / "law.so"
+        # No fused operations, so that every product is rounded as NumPy's.
+        flags = [*STRICT, "-O2", "-ffp-contract=off", "-shared", "-fPIC"]
+        done = subprocess.run(
+            [*compiler, *flags, str(folder / "law.c"), "-o", str(library)], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        real = ctypes.c_double if precision == "double" else ctypes.c_float
+
+        class Law(ctypes.Structure):
+            _fields_ = (
+                *((name, real) for name in ("integral", "reference", "measurement", "place", "current_A")),
+                ("held", ctypes.c_ulong), ("misplaced", ctypes.c_ulong), ("status", ctypes.c_int),
+            )  # fmt: skip
+
+        self.law, self.library = Law(), ctypes.CDLL(str(library))
+        self.library.law_step.argtypes = [ctypes.POINTER(Law), *[real] * 3]
+        self.library.law_step.restype = real
+        self.library.law_reset.argtypes = [ctypes.POINTER(Law), *[real] * 4]
+        self.library.law_init(ctypes.byref(self.law))
+
+    def step(self, *values):
+        return self.library.law_step(ctypes.byref(self.law), *values)
+
+    def reset(self, *values):
+        self.library.law_reset(ctypes.byref(self.law), *values)
+
+
 class CompiledMPC(LoadedMPC):
     """A `ForceMPC`, exported and compiled."""
 

@@ -43,7 +43,6 @@ from seaopt.estimation import warn_unidentified
 from seaopt.formatting import (
     MISSING,
     format_band,
-    format_count,
     format_figure,
     format_number,
     html_list,

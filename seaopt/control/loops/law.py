@@ -500,7 +500,7 @@ def describe_integrators(law: Law) -> str:
     """Return how many integrators a law has, or that it has none, with the lag that may have been meant to be one."""
     if law.integrators:
         return f"{format_count(law.integrators, 'integrator')}, on which anti-windup acts"
-    slowest = float(np.max(law.poles.real, initial=0.0))
+    slowest = float(np.max(np.real(law.poles), initial=0.0))
     lag = law.sample_time_s / (1.0 - slowest) if 1.0 - SLOW_LAG < slowest < 1.0 else None
     wound = "" if lag is None else f"; its lag of {lag:.3g} s is no integrator, and no anti-windup acts on it"
     return f"no integral: a constant disturbance leaves an error{wound}"

@@ -1,9 +1,7 @@
 """The C code of a scheduled law against the law in NumPy, sample by sample."""
 
-import ctypes
 import json
 import math
-import subprocess
 
 import numpy as np
 import pytest
@@ -12,41 +10,8 @@ import seaopt as so
 from seaopt.control.deploy.schedule_export import read_runnable
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
-from tests.c_code import STRICT
+from tests.c_code import CompiledSchedule
 from tests.schedules import tune_knee
-
-
-class CompiledSchedule:
-    """An exported schedule through ctypes."""
-
-    def __init__(self, compiler, folder, schedule, precision="double", **options):
-        so.export(schedule, folder, precision=precision, name="law", **options)
-        library = folder / "law.so"
-        # No fused operations, so that every product is rounded as NumPy's.
-        flags = [*STRICT, "-O2", "-ffp-contract=off", "-shared", "-fPIC"]
-        done = subprocess.run(
-            [*compiler, *flags, str(folder / "law.c"), "-o", str(library)], capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        real = ctypes.c_double if precision == "double" else ctypes.c_float
-
-        class Law(ctypes.Structure):
-            _fields_ = (
-                *((name, real) for name in ("integral", "reference", "measurement", "place", "current_A")),
-                ("held", ctypes.c_ulong), ("misplaced", ctypes.c_ulong), ("status", ctypes.c_int),
-            )  # fmt: skip
-
-        self.law, self.library = Law(), ctypes.CDLL(str(library))
-        self.library.law_step.argtypes = [ctypes.POINTER(Law), *[real] * 3]
-        self.library.law_step.restype = real
-        self.library.law_reset.argtypes = [ctypes.POINTER(Law), *[real] * 4]
-        self.library.law_init(ctypes.byref(self.law))
-
-    def step(self, *values):
-        return self.library.law_step(ctypes.byref(self.law), *values)
-
-    def reset(self, *values):
-        self.library.law_reset(ctypes.byref(self.law), *values)
 
 
 @pytest.fixture(scope="module")
