@@ -16,6 +16,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationError, WithJsonSchema
 
 from seaopt.errors import FileError, SeaoptError, suggestion
+from seaopt.files import check_seal, plain
 
 EXAMPLES = {
     "float": "1.0",
@@ -93,6 +94,20 @@ def check_table(
         return model.model_validate(content)
     except ValidationError as problem:
         raise error(f"{source}: {_describe(model, problem, remedy)}") from problem
+
+
+def check_result(model: type[Document], content: Mapping[str, Any], source: str, *, remedy: str) -> Document:
+    """Return a result as a model, as `check_table` does; one that carries a digest was not edited since.
+
+    Raises
+    ------
+    FileError
+        A key is missing, a value is of the wrong kind, or the digest is not that of the content.
+
+    """
+    if "made_from" in content:
+        check_seal(content, source, remedy)
+    return check_table(model, plain(content), source, remedy=remedy)
 
 
 def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> str:

@@ -1,14 +1,20 @@
-"""Files that are either whole or absent: written to a temporary name, then moved into place."""
+"""Files that are either whole or absent, and results that carry a digest of themselves.
+
+A file is written to a temporary name, then moved into place. A result, a JSON file with a "schema", has in `made_from`
+the SHA-256 of its content: it tells that somebody edited it. It is no signature: whoever wants to deceive can compute a
+new one.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
 import re
 import secrets
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +22,7 @@ import numpy as np
 
 from seaopt.errors import FileError, SeaoptError
 
+CONTENT = "content"  # the key of a result's own digest in made_from
 MOST_BYTES = 64 << 20  # of a file that is read as one text: problems, laws, results
 MOST_LEVELS = 100  # of tables and lists in it
 # What JSON may hold raw and a terminal would obey, and halves of characters, which are in names that are no text.
@@ -129,9 +136,57 @@ def to_json(content: dict[str, Any]) -> str:
     return _ESCAPED.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
 
 
+def digest_content(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a result and of what it says that it was made from; clock and machine have no part in it.
+
+    Examples
+    --------
+    >>> digest_content({"met": True, "provenance": {"wall_s": 1.0}}) == digest_content({"met": True})
+    True
+
+    """
+    counted = {name: value for name, value in content.items() if name not in ("made_from", "provenance")}
+    made_from = content.get("made_from") or {}
+    if isinstance(made_from, Mapping) and (sources := {k: v for k, v in made_from.items() if k != CONTENT}):
+        counted["made_from"] = sources
+    return digest_plain(counted)
+
+
+def digest_plain(content: Any) -> str:
+    """Return the SHA-256 of what JSON can hold, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode()).hexdigest()
+
+
+def seal(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result with its digest in `made_from`, beside what it was made from."""
+    return {**content, "made_from": {**(content.get("made_from") or {}), CONTENT: digest_content(content)}}
+
+
+def check_seal(content: Mapping[str, Any], source: Path | str, remedy: str) -> None:
+    """Refuse a result without a digest, which somebody wrote by hand, and one that was edited since.
+
+    Raises
+    ------
+    FileError
+        The digest is missing or damaged, or another one than the content has.
+
+    """
+    made_from = content.get("made_from")
+    if not isinstance(made_from, Mapping) or CONTENT not in made_from:
+        raise FileError(
+            f"{source}: has no made_from with a digest of its content: it was written by hand, and is no result of "
+            f"seaopt; {remedy}"
+        )
+    if made_from[CONTENT] != digest_content(content):
+        raise FileError(
+            f"{source}: was edited after it was written, or is of an older seaopt, so that it is no longer what was "
+            f"found; {remedy}"
+        )
+
+
 def write_json(path: Path | str, content: dict[str, Any]) -> Path:
-    """Write `content` as strict JSON, as `write_bytes` does."""
-    return write_text(path, to_json(content))
+    """Write a result as strict JSON with its digest, as `write_bytes` does."""
+    return write_text(path, to_json(seal(content)))
 
 
 def parse_file(
@@ -200,12 +255,12 @@ def check_content(content: Any) -> None:
 
 
 def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage again") -> dict[str, Any]:
-    """Read a result file and check its "schema" field.
+    """Read a result file; check its "schema" field and its digest.
 
     Raises
     ------
     FileError
-        The file is missing, is not JSON, or carries another schema.
+        The file is missing, is not JSON, carries another schema, was edited, or was written by hand.
 
     """
     source = Path(path)
@@ -213,4 +268,5 @@ def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage aga
     found = content.get("schema") if isinstance(content, dict) else None
     if found != schema:
         raise FileError(f'{source}: schema is {found!r}, expected "{schema}"; {remedy}')
+    check_seal(content, source, remedy)
     return content

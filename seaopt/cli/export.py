@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from seaopt.cli.provenance import FILES, SCHEDULE_FILES, check_unedited, digest
-from seaopt.cli.session import SCHEDULE_SCHEMAS, SCHEMAS
+from seaopt.cli.provenance import FILES, SCHEDULE_FILES, digest
+from seaopt.cli.session import OWN_LAW, SCHEDULE_SCHEMAS, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.deploy.schedule_export import is_schedule
@@ -55,18 +55,18 @@ def export_controller(
         raise ProblemError(
             f"{path}: no such file; give the folder of results, or make them: seaopt run PROBLEM -o {results}"
         )
-    content = read_json(path, schema, remedy=f"run seaopt tune PROBLEM -o {results}")
-    fitted, made_from = results / FILES["fit"], content.get("made_from")
-    check_unedited(path, content, "run seaopt tune again")
-    expected = None if made_from is None else made_from.get(fitted.name)
+    content = read_json(path, schema, remedy=f"run seaopt tune PROBLEM -o {results}{OWN_LAW}")
+    fitted = results / FILES["fit"]
+    expected = content["made_from"].get(fitted.name)
     if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
         options["derate"] = read_guard(content, derate_margin_K) or True
     options["gate"] = _choose_gate(content, gate or GateOptions(), options)
+    broken = _list_broken_requirements(path, certificate)
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
-    met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, certificate)
+    met = content.get("fit_met", True) is True
     certified = broken is not None
     if raised_from := _find_raised_limit(content, options):
         what, says = ("certified", "certificate says") if certified else ("designed", "figures say")
@@ -77,7 +77,7 @@ def export_controller(
     if json:
         result = {
             "schema": "seaopt/export/1", "feasible": content["feasible"], "fit_met": met,
-            "certified": certified, "certificate_failed": broken or [], "files": written,
+            "certified": broken == [], "certificate_failed": broken or [], "files": written,
         }  # fmt: skip
         sys.stdout.write(to_json(result))
     else:
@@ -207,12 +207,22 @@ def _find_law(results: Path) -> tuple[Path, str, Path]:
 
 
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
-    """Return the requirements that the certificate of this very controller says are not met; None without one."""
+    """Return the requirements that the certificate of this controller says are not met; None without a certificate.
+
+    Raises
+    ------
+    SeaoptError
+        The certificate was edited or written by hand, or is of another controller.
+
+    """
+    from seaopt.robustness.certificate.stored import list_requirements  # deferred: pydantic
+
     if not certificate.is_file():
         return None
     scheduled = certificate.name == SCHEDULE_FILES["certify"]
-    content = read_json(certificate, (SCHEDULE_SCHEMAS if scheduled else SCHEMAS)["certify"])
-    made_from = content.get("made_from")
-    if made_from is not None and made_from.get(controller.name) != digest(controller):
-        return None  # of another controller, and says nothing of this one
-    return list(dict.fromkeys(row["name"] for row in content["requirements"] if not row["met"]))
+    again = f"run seaopt certify PROBLEM -o {shlex.quote(str(certificate.parent))}, or delete it"
+    content = read_json(certificate, (SCHEDULE_SCHEMAS if scheduled else SCHEMAS)["certify"], remedy=again)
+    if content["made_from"].get(controller.name) != digest(controller):
+        raise ProblemError(f"{certificate}: is not of {controller.name} beside it; {again}")
+    rows = list_requirements(content, str(certificate))
+    return list(dict.fromkeys(row.name for row in rows if not row.met))

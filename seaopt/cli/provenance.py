@@ -13,8 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from seaopt.errors import ProblemError
-from seaopt.files import check_content, check_regular, plain
+from seaopt.files import check_content, check_regular, digest_content, digest_plain
 from seaopt.problem import Problem
 from seaopt.problem.schema import ControllerTable
 from seaopt.robustness.uncertainty.draws import find_modes
@@ -47,37 +46,6 @@ def digest(path: Path) -> str:
     return digest_content(content) if isinstance(content, dict) else hashlib.sha256(raw).hexdigest()
 
 
-def digest_content(content: dict[str, Any]) -> str:
-    """Return the SHA-256 of a result, without where it is from, and how long that took by which versions."""
-    return _hash({name: value for name, value in content.items() if name not in ("made_from", "provenance")})
-
-
-def check_unedited(path: Path, content: dict[str, Any], again: str) -> None:
-    """Refuse a result that was edited since it was written; one without `made_from` was written by hand, and may be.
-
-    Raises
-    ------
-    ProblemError
-        The content is not the one that was written, or `made_from` is damaged.
-
-    """
-    made_from = content.get("made_from")
-    if made_from is None:
-        return
-    if not (isinstance(made_from, dict) and all(isinstance(value, str) for value in made_from.values())):
-        raise ProblemError(f"{path}: made_from is damaged; {again}")
-    if "problem" not in made_from or "content" not in made_from:
-        raise ProblemError(f"{path}: made_from does not say of which problem file, or of which content; {again}")
-    if made_from["content"] != digest_content(content):
-        raise ProblemError(
-            f"{path}: was edited after it was written, so that it is no longer what was tuned or certified; {again}"
-        )
-
-
-def _hash(content: Any) -> str:
-    return hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode()).hexdigest()
-
-
 def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]:
     """Return digests of what a stage reads: of the problem, and of the results before it in the folder, by file.
 
@@ -94,9 +62,11 @@ def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]
 
     """
     read, earlier = _READ_BY_STAGE[stage]
-    out = {"problem": _hash(read(problem))}
+    out = {"problem": digest_plain(read(problem))}
     if stage in ("tune", "sweep"):
-        out[ROBUSTNESS] = _hash(_shape_by_robustness(problem, problem.robustness.retune if stage == "tune" else 0))
+        out[ROBUSTNESS] = digest_plain(
+            _shape_by_robustness(problem, problem.robustness.retune if stage == "tune" else 0)
+        )
     for before in earlier:
         path = folder / name_file(problem, before)
         if path.exists() and (before != "fit" or problem.table.experiment):

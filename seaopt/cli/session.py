@@ -18,8 +18,6 @@ from seaopt.cli.progress import LEAST_SHARE, show_progress
 from seaopt.cli.provenance import (
     FILES,
     ROBUSTNESS,
-    check_unedited,
-    digest_content,
     digest_sources,
     name_file,
 )
@@ -35,7 +33,7 @@ from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentifie
 from seaopt.estimation.judgement.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.executors import Processes
-from seaopt.files import check_folder, read_json, to_json, write_json
+from seaopt.files import CONTENT, check_folder, read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -90,6 +88,7 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
+OWN_LAW = "; as a law of your own it is taken by seaopt certify PROBLEM --controller FILE -o DIR"
 READING, SIMULATING = 0.1, 0.3  # of the time of a fit, and of a report of earlier results
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 FILTERS = ("notch", "prefilter", "link_feedforward")
@@ -273,7 +272,10 @@ class Session:
         given = read_law(path)
         controller = assess_problem(self.problem, given, self.parameters())
         target = self.folder / FILES["tune"]
-        before = read_json(target, SCHEMAS["tune"]) if target.exists() else {"structure": CUSTOM}
+        known = (
+            read_json(target, SCHEMAS["tune"], remedy="give the law another folder: -o DIR") if target.exists() else {}
+        )
+        before = {"structure": CUSTOM} | known
         if before.get("structure") != CUSTOM or "mpc" in before:
             raise ProblemError(f"{target}: is a controller that was tuned; give the law another folder: -o DIR")
         self._keep(controller)
@@ -326,30 +328,25 @@ class Session:
         return isinstance(source, ParameterSet) or source.met
 
     def _write(self, stage: str, content: dict[str, Any]) -> None:
-        """Write a result with the digests of what it was made from and of itself, and whether its fit is met."""
+        """Write a result with the digests of what it was made from, and whether its fit is met."""
         versions = {"seaopt": __version__, "python": platform.python_version(), "machine": platform.machine()}
         content = content | {"provenance": content.get("provenance", {}) | versions}
         if stage not in ("fit", "frf"):
             content = content | {"fit_met": self.fit_met(), "guessed": self.problem.table.guessed}
-        made_from = digest_sources(self.problem, stage, self.folder) | {"content": digest_content(content)}
+        made_from = digest_sources(self.problem, stage, self.folder)
         self.written.append(write_json(self._path(stage), content | {"made_from": made_from}))
 
     def _read(self, stage: str) -> dict[str, Any]:
         """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused.
 
-        A file that does not say what it was made from (written by hand) is taken as it is; and a controller made for
-        another [robustness], which a certificate may ask about.
+        A controller made for another [robustness] is taken, as a certificate may ask about it.
         """
         path, again = self._path(stage), f"run {self._spell(stage)}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
-        content = read_json(path, self._schema(stage), remedy=again)
-        check_unedited(path, content, f"{again} again")
-        made_from = content.get("made_from")
-        if made_from is None:
-            return content
-        expected = digest_sources(self.problem, stage, self.folder)
-        changed = {name for name in {*expected, *made_from} - {"content"} if expected.get(name) != made_from.get(name)}
+        content = read_json(path, self._schema(stage), remedy=f"{again} again{OWN_LAW if stage == 'tune' else ''}")
+        made_from, expected = content["made_from"], digest_sources(self.problem, stage, self.folder)
+        changed = {name for name in {*expected, *made_from} - {CONTENT} if expected.get(name) != made_from.get(name)}
         if changed - {ROBUSTNESS}:
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         if changed:

@@ -184,7 +184,10 @@ def _keep_summary(path: Path, content: dict[str, Any], fleet: Fleet) -> dict[str
     """Return what fleet.json has besides, drift and population, where it is of the same results."""
     if fleet.unchanged < len(fleet.rows) or not path.exists():
         return {}
-    before, now = read_json(path, FLEET_SCHEMA, remedy="delete it"), json.loads(to_json(content))
+    try:
+        before, now = read_json(path, FLEET_SCHEMA), json.loads(to_json(content))
+    except FileError:  # edited, or of an older seaopt: it is written anew
+        return {}
     return before if all(before.get(key) == value for key, value in now.items()) else {}
 
 

@@ -6,6 +6,8 @@ import json
 
 import pytest
 
+from seaopt.files import write_json
+
 
 def test_it_writes_the_law_and_the_gains(folder, done, seaopt):
     out = seaopt("export", done.results, "--c", "firmware/knee", "--name", "knee", "--precision", "float")
@@ -75,7 +77,7 @@ def test_without_a_target_it_is_a_usage_error(done, seaopt):
         ("seaopt/controller/3", "seaopt/controller/1", "schema is"),
         ('"den": [', '"den": [2.0,', "was edited"),
         ('"reference"', '"referense"', "was edited"),
-        ('"made_from": {', '"made_from": {}, "before": {', "made_from does not say of which problem file"),
+        ('"made_from": {', '"made_from": {}, "before": {', "written by hand"),
         ('"feasible": true', '"feasible": false', "was edited"),
         ("{", "", "not valid JSON"),
     ],
@@ -89,8 +91,7 @@ def test_a_stale_or_broken_controller_is_refused(done, seaopt, tmp_path, old, ne
 def test_an_infeasible_controller_is_written_only_when_asked_and_exits_1(done, seaopt, tmp_path):
     content = json.loads((done.results / "controller.json").read_text(encoding="utf-8"))
     content |= {"feasible": False, "active_constraints": ["max_noise_gain"]}
-    del content["made_from"]  # by hand
-    (tmp_path / "controller.json").write_text(json.dumps(content), encoding="utf-8")
+    write_json(tmp_path / "controller.json", content)
     assert "misses max_noise_gain" in one_line(seaopt("export", tmp_path, "--c", tmp_path / "out"))
     out = seaopt("export", tmp_path, "--c", tmp_path / "out", "--allow-infeasible")
     assert out.returncode == 1
@@ -103,10 +104,12 @@ def test_a_controller_whose_certificate_failed_exits_1(done, seaopt, tmp_path):
         content = json.loads((done.results / name).read_text(encoding="utf-8"))
         if name == "robustness.json":
             content["requirements"][0]["met"] = False
-        (tmp_path / name).write_text(json.dumps(content), encoding="utf-8")
+        write_json(tmp_path / name, content)
     out = seaopt("export", tmp_path, "--c", tmp_path / "out")
     assert out.returncode == 1
     assert "certificate" in out.stdout and "FAILED" in out.stdout
+    content = json.loads(seaopt("export", tmp_path, "--c", tmp_path / "out", "--json").stdout)
+    assert content["certified"] is False and content["certificate_failed"]
     assert len(list((tmp_path / "out").iterdir())) == 4
 
 

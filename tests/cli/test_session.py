@@ -18,6 +18,7 @@ from seaopt.cli.main import run
 from seaopt.cli.provenance import digest_sources
 from seaopt.cli.session import Session
 from seaopt.cli.terminal import Terminal
+from seaopt.files import seal
 from seaopt.logs import write_log
 
 BENCH = """
@@ -182,13 +183,12 @@ def tuned(tuned_once, tmp_path):
     return text, shutil.copytree(folder, tmp_path / "out")
 
 
-def edit(folder, changes, *, by_hand):
-    """Change entries of controller.json, with or without what says where it is from."""
+def edit(folder, changes, *, sealed):
+    """Change entries of controller.json; `sealed` gives it the digest of what it is then."""
     content = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
     for key, value in changes.items():
         content[key] = {**content[key], **value} if isinstance(value, dict) else value
-    if by_hand:
-        content.pop("made_from", None)
+    content = seal(content) if sealed else content
     (folder / "controller.json").write_text(json.dumps(content), encoding="utf-8")
     return content
 
@@ -204,18 +204,18 @@ def test_a_controller_that_ranges_shaped_answers_for_others(write, tuned, capsys
 @pytest.mark.parametrize("changes", [{"spec": {"max_sensitivity": 99.0}}, {"feasible": False}, {"gains": {"k_p": 9.0}}])
 def test_an_edited_controller_is_refused(write, tuned, tmp_path, changes):
     text, folder = tuned
-    edit(folder, changes, by_hand=False)
+    edit(folder, changes, sealed=False)
     with pytest.raises(so.SeaoptError, match=r"was edited.*run seaopt tune"):
         Session(write(text), folder).controller()
     with pytest.raises(so.SeaoptError, match=r"was edited.*run seaopt tune"):
         export_controller(folder, tmp_path / "c", json=False)
 
 
-def test_a_controller_by_hand_is_judged_by_the_problems_limits(write, tuned):
+def test_a_controller_is_judged_by_the_problems_limits(write, tuned):
     text, folder = tuned
-    held = edit(folder, {}, by_hand=True)
+    held = edit(folder, {}, sealed=True)
     assert Session(write(text), folder).controller().gains == held["gains"]
-    edit(folder, {"spec": {"max_sensitivity": 99.0}}, by_hand=True)
+    edit(folder, {"spec": {"max_sensitivity": 99.0}}, sealed=True)
     with pytest.raises(so.SeaoptError, match=r"spec.max_sensitivity is 99.0, and .*asks for 1.6"):
         Session(write(text), folder).controller()
 
@@ -223,8 +223,9 @@ def test_a_controller_by_hand_is_judged_by_the_problems_limits(write, tuned):
 def test_feasible_is_found_out_again(write, tuned):
     """The loop of this law has Ms 1.3 or so, by the tests of the tuner; asked for 1.05, it is not feasible."""
     text, folder = tuned
-    edit(folder, {"feasible": True, "spec": {"max_sensitivity": 1.05}}, by_hand=True)
-    controller = Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.05")), folder).controller()
+    content = edit(folder, {"feasible": True, "spec": {"max_sensitivity": 1.05}}, sealed=True)
+    problem = so.read_problem(write(text))
+    controller = so.Controller.from_dict(content, problem.design_plant, problem.parameters)
     assert not controller.feasible
     assert "max_sensitivity (design plant)" in controller.active_constraints
 

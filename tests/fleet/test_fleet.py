@@ -10,6 +10,7 @@ import pytest
 
 import seaopt as so
 from seaopt.errors import FileError, LogError, ProblemError, SeaoptError
+from seaopt.files import write_json
 from seaopt.fleet import FleetLog, read_fleet, read_manifest
 from seaopt.fleet.plan import make_plan
 from seaopt.fleet.table import Table
@@ -96,7 +97,7 @@ def test_a_second_run_fits_what_is_new_failed_or_changed(stand, threads):
 def test_drift_stays_in_fleet_json_until_a_log_changes(stand, threads):
     so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_*.csv"], stand / "out", executor=threads)
     path = stand / "out" / "fleet.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"drift": {"alarms": []}}))
+    write_json(path, json.loads(path.read_text()) | {"drift": {"alarms": []}})
     so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_*.csv"], stand / "out", executor=threads)
     assert json.loads(path.read_text())["drift"] == {"alarms": []}
     so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_j0.csv"], stand / "out", executor=threads)
@@ -227,11 +228,11 @@ def test_a_folder_is_read_back(stand, threads):
     so.fit_fleet(problem, [logs / "r0_j0.csv"], out, executor=threads, identity=IDENTITY)
     fleet = so.fit_fleet(problem, [logs / "r1_j[01].csv"], out, executor=threads, identity=IDENTITY)
     path = out / "fleet.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"drift": {"alarms": []}}))
+    write_json(path, json.loads(path.read_text()) | {"drift": {"alarms": []}})
     again = read_fleet(out)
     assert again.rows.equals(fleet.rows) and again.to_dict() == fleet.to_dict() and again.drift == {"alarms": []}
     assert (again.fitted, again.free, again.identity) == (fleet.fitted, fleet.free, fleet.identity)
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"other_logs": []}))
+    write_json(path, json.loads(path.read_text()) | {"other_logs": []})
     with pytest.raises(FileError, match="has changed"):
         read_fleet(out)
 

@@ -153,6 +153,7 @@ class LawFile(_Strict):
     fit_met: Any = None
     guessed: Any = None
     made_from: Any = None
+    guards: Any = None
 
     @model_validator(mode="after")
     def _check_law(self) -> LawFile:

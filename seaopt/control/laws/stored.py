@@ -36,9 +36,8 @@ from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.documents import Flag, ResultTable, Whole, check_table
+from seaopt.documents import Flag, ResultTable, Whole, check_result
 from seaopt.errors import ControlError, FileError
-from seaopt.files import plain
 from seaopt.plants import Plant
 
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
@@ -351,7 +350,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         A field is missing or malformed, or two contradict each other: the gains must give the coefficients.
 
     """
-    table = check_table(StoredController, plain(content), "controller.json", remedy=TUNE_AGAIN)
+    table = check_result(StoredController, content, "controller.json", remedy=TUNE_AGAIN)
     spec, robust_to = _build_spec(table.spec)
     for name, expected in (
         ("structure", spec.structure), ("compute_delay_samples", spec.loop_delay_samples)

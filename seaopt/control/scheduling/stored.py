@@ -11,9 +11,8 @@ from pydantic import Field
 from seaopt.control.laws.stored import TUNE_AGAIN, Finite, StoredController
 from seaopt.control.laws.structures import AGREES, LAW_GAINS
 from seaopt.control.scheduling.gain_table import check_points
-from seaopt.documents import Flag, ResultTable, check_table
+from seaopt.documents import Flag, ResultTable, check_result
 from seaopt.errors import ControlError, FileError
-from seaopt.files import plain
 
 
 class StoredPlace(ResultTable):
@@ -53,7 +52,7 @@ def read_schedule(content: Mapping[str, Any]) -> StoredSchedule:
         A field is missing or malformed, or the gains are not those of the controllers.
 
     """
-    table = check_table(StoredSchedule, plain(content), "schedule.json", remedy=TUNE_AGAIN)
+    table = check_result(StoredSchedule, content, "schedule.json", remedy=TUNE_AGAIN)
     try:
         check_points(table.over, np.array(table.points))
     except ControlError as error:

@@ -20,13 +20,12 @@ from seaopt.documents import (
     Number,
     ResultTable,
     Whole,
-    check_table,
+    check_result,
 )
 from seaopt.errors import FileError
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import DerivedFigure, FitFinding, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
-from seaopt.files import plain
 from seaopt.parameters import Parameter, ParameterSet
 
 FIT_AGAIN = "run the fit again"
@@ -198,7 +197,7 @@ def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
         A field is missing or malformed, or the covariance is not that of the free parameters.
 
     """
-    stored = check_table(StoredFit, plain(content), "fit.json", remedy=FIT_AGAIN)
+    stored = check_result(StoredFit, content, "fit.json", remedy=FIT_AGAIN)
     parameters = ParameterSet(parameter.restore(name) for name, parameter in stored.parameters.items())
     covariance = stored.covariance.restore("covariance")
     if set(covariance.names) != set(parameters.free_names):

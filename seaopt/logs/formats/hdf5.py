@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from seaopt.errors import LogError
 from seaopt.logs.formats.simulink import assign_clocks, make_object_field
 from seaopt.logs.formats.source import (
@@ -21,6 +23,7 @@ from seaopt.logs.formats.source import (
     spread,
 )
 
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")
 
 
@@ -36,6 +39,7 @@ def open_mat73(path: Path) -> Source:
 
 def _open(path: Path, form: str, walk: Any) -> Source:
     h5py = import_optional("h5py", "hdf5", path, form)
+    _check_length(path)
     places: dict[str, tuple[Place, str | None]] = {}
     fields: list[Field] = []
     with h5py.File(path, "r") as file:
@@ -46,6 +50,32 @@ def _open(path: Path, form: str, walk: Any) -> Source:
                 break
     kept = assign_clocks(fields) if form == "MAT 7.3" else fields
     return Source(path=path, format=form, fields=tuple(kept), load=make_row_loader(partial(_load, path, form, places)))
+
+
+def _check_length(path: Path) -> None:
+    """Refuse a file that is longer or shorter than it says of itself: the library looks at shorter ones alone.
+
+    A superblock (HDF5 File Format Specification, II.A) stands at 0, 512, 1024, ...: it has the address of the file's
+    end as the third of the addresses that begin at byte 24 (version 0), 28 (1) or 12 (2 and 3).
+    """
+    size, at = path.stat().st_size, 0
+    with path.open("rb") as stream:
+        while at < size:
+            stream.seek(at)
+            head = stream.read(96)
+            if head.startswith(SIGNATURE):
+                break
+            at = 2 * at or 512
+        else:
+            return  # the library says what it is
+    version = head[8]
+    width, begin = (head[9], 12) if version >= 2 else (head[13], 24 + 4 * version)
+    end = int.from_bytes(head[begin + 2 * width : begin + 3 * width], "little")
+    if size != end:
+        raise LogError(
+            f"{path}: has {size} bytes and says that it has {end}: it is cut off, damaged, or something was added; "
+            "copy it again, or write it anew with h5repack"
+        )
 
 
 Fields = Iterator[tuple[Field, Place, str | None]]
@@ -79,12 +109,28 @@ def _list_dataset(node: Any, name: str) -> Fields:
             yield field, Place(array=node.name), part
         return
     unit = next((_decode_text(node.attrs[key]) for key in _UNIT_ATTRIBUTES if key in node.attrs), None)
-    for field, place in spread(name, node.shape or (), _name_kind(dtype), unit=unit):
+    for field, place in spread(name, node.shape or (), _name_kind(node), unit=unit):
         yield field, Place(array=node.name, index=place.index, axis=place.axis), None
 
 
-def _name_kind(dtype: Any) -> str:
+def _name_kind(node: Any) -> str:
+    dtype = node.dtype
+    if dtype.kind in "fiu" and not _is_standard(node.id.get_type()):
+        return f"{dtype.name} of no standard form, or damaged"
     return dtype.name if dtype.kind in "fiub" else ("text" if dtype.kind in "SO" else str(dtype))
+
+
+def _is_standard(stored: Any) -> bool:
+    """Tell whether a number is stored as IEEE 754 or as a whole number has it; any other form is converted on reading.
+
+    A type's description has no checksum in most files, and one of another exponent would be read as other numbers.
+    """
+    from h5py import h5t
+
+    if isinstance(stored, h5t.TypeIntegerID):
+        return stored.get_precision() == 8 * stored.get_size() and not stored.get_offset()
+    forms = ("IEEE_F16LE", "IEEE_F16BE", "IEEE_F32LE", "IEEE_F32BE", "IEEE_F64LE", "IEEE_F64BE", "NATIVE_LDOUBLE")
+    return not isinstance(stored, h5t.TypeFloatID) or any(stored.equal(getattr(h5t, form)) for form in forms)
 
 
 def _decode_text(value: Any) -> str | None:
@@ -120,7 +166,7 @@ def _walk_variable(file: Any, node: Any, path: Path, name: str, depth: int) -> F
         yield field, Place(array=node.name), None
         return
     shape = tuple(reversed(node.shape or ()))
-    for field, place in spread(name, shape, _name_kind(node.dtype), matlab=True):
+    for field, place in spread(name, shape, _name_kind(node), matlab=True):
         yield field, Place(array=node.name, index=place.index, axis=1 - place.axis), None
 
 
@@ -132,12 +178,22 @@ def _is_struct_array(node: Any) -> bool:
     )
 
 
+def _check_chunks(path: Path, name: str, node: Any) -> None:
+    """Refuse chunks that no filter is said to pack, and that take another size than their numbers do."""
+    if node.chunks is None or node.id.get_create_plist().get_nfilters():
+        return
+    whole = node.id.get_num_chunks() * int(np.prod(node.chunks)) * node.dtype.itemsize
+    if node.id.get_storage_size() != whole:
+        raise LogError(f'{path}: "{name}" is stored in another size than it says; the file is damaged, copy it again')
+
+
 def _load(path: Path, form: str, places: dict[str, tuple[Place, str | None]], name: str, rows: slice) -> Any:
     h5py = import_optional("h5py", "hdf5", path, form)
     place, part = places[name]
     with h5py.File(path, "r") as file:
         node = file[place.array]
         check_size(path, int(node.size) * 8, f'"{name}"')
+        _check_chunks(path, name, node)
         if node.shape == ():
             return node[()]
         return node.fields(part)[place.index_rows(rows)] if part is not None else node[place.index_rows(rows)]

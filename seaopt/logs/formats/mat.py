@@ -125,16 +125,21 @@ def _walk_variables(path: Path) -> Iterator[tuple[StoredVariable, bytes]]:
                 check_size(path, total, "the file")
                 yield StoredVariable(start=at + 8, size=size, unpacked=unpacked, packed=packed, order=order), head
             at += 8 + size
+        if at != end:
+            raise LogError(f"{path}: has {end - at} bytes behind its last variable; copy or save the file again")
 
 
 def _read_body(path: Path, variable: StoredVariable) -> bytes:
-    """Return the bytes of a matrix, unpacked, and no more than it said."""
+    """Return the bytes of a matrix, unpacked to the end, where the checksum is, and as many as it said."""
     with path.open("rb") as stream:
         stream.seek(variable.start)
         body = stream.read(variable.size)
     if variable.packed:
-        body = zlib.decompressobj().decompress(body, variable.unpacked + 8)[8:]
-    if len(body) < variable.unpacked:
+        stream = zlib.decompressobj()
+        body = stream.decompress(body, variable.unpacked + 9)[8:]  # one more, so that the checksum is looked at
+        if not stream.eof or stream.unused_data:
+            raise LogError(f"{path}: a compressed variable does not end where it says; copy or save the file again")
+    if len(body) != variable.unpacked:
         raise LogError(f"{path}: a variable is cut off; copy or save the file again")
     return body
 
@@ -199,7 +204,9 @@ def _read_numbers(body: bytes, leaf: MatrixHeader, order: str) -> Shaped[np.ndar
     kind, start, size, _ = _read_element(body, leaf.data, order)
     if kind not in STORED_TYPES:
         raise ValueError(f'"{leaf.name}" is stored as type {kind}, which is not a number')
-    stored = np.dtype(order + STORED_TYPES[kind])
+    stored, own = np.dtype(order + STORED_TYPES[kind]), np.dtype(NUMBER_CLASSES[leaf.kind])
+    if stored.newbyteorder("=") != own and not (stored.itemsize < own.itemsize and stored.kind in "iu"):
+        raise ValueError(f'"{leaf.name}" is of {own} and stored as {stored}, which is no smaller whole number')
     if start + size > len(body) or size // stored.itemsize != np.prod(leaf.dims, dtype=float):
         raise ValueError(f'"{leaf.name}" claims {"x".join(map(str, leaf.dims))} elements and holds {size} bytes')
     return np.frombuffer(body, stored, count=size // stored.itemsize, offset=start).reshape(leaf.dims, order="F")

@@ -1,26 +1,42 @@
-"""ASAM MDF 4 files (asammdf): the master of each group is its clock; formulas in the file are not evaluated."""
+"""ASAM MDF 4 files (asammdf): the master of each group is its clock; formulas in the file are not evaluated.
+
+The blocks are looked at before they are read (ASAM MDF 4.1, chapter 4). A block has a mark, its length, and links to
+others. The header (HD) leads to data groups (DG), these to channel groups (CG), which count their records, and to data:
+one block (DT), a list of them (DL), or compressed ones (DZ, zlib with its checksum). asammdf takes lengths and counts
+as they come: one that does not fit would be read as other samples, or end the interpreter.
+"""
 
 from __future__ import annotations
 
 import gc
+import struct
 import sys
 import traceback
+import zlib
 from collections import Counter
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.formats.source import Field, Source, Window, check_size, find_rows, import_optional
+from seaopt.records import record
 
 NUMERIC_CONVERSIONS = frozenset({0, 1, 2, 4, 5, 6})  # conversions: none, linear, rational, tables of numbers
 INTEGER_TYPES, FLOAT_TYPES = frozenset({0, 1, 2, 3}), frozenset({4, 5})
 TIME_MASTER = 1
+HEADER = struct.Struct("<4s4xQQ")  # mark, length, count of links
+FIRST = 64  # where the header block is, behind the identification
+MAX_BLOCKS = 1_000_000
+VARIABLE_LENGTH = 1  # of the flags of a channel group: its records have none of fixed length
+PACKED = struct.Struct("<2sBxIQQ")  # of a DZ: what was packed, how, a parameter, its length, the packed length
+DEFLATE = (0, 1)  # plain, and transposed before
+WHOLE = "the file is damaged; copy or record it again"
 ChannelPlaces = Mapping[str, tuple[int, int]]
 
 
@@ -28,7 +44,7 @@ def open_mdf(path: Path) -> Source:
     """List the channels of an MDF 4 file; a name that several groups have carries the group's number."""
     fields: list[Field] = []
     places: dict[str, tuple[int, int]] = {}
-    with _open_file(path) as file:
+    with _open_file(path, check=True) as file:
         groups = list(file.groups)
         check_size(path, sum(g.channel_group.cycles_nr * g.channel_group.samples_byte_nr for g in groups), "the file")
         names = Counter(channel.name for group in groups for channel in group.channels)
@@ -49,11 +65,14 @@ def open_mdf(path: Path) -> Source:
 
 
 @contextmanager
-def _open_file(path: Path) -> Generator[Any]:
+def _open_file(path: Path, *, check: bool = False) -> Generator[Any]:
+    """Open a file, of which the first opening looks at every block: asammdf takes lengths and counts as they come."""
     asammdf = import_optional("asammdf", "mdf", path, "MDF")
     with path.open("rb") as stream:
         if stream.read(68)[64:] != b"##HD":
             raise LogError(f"{path}: is not an MDF 4 file, or is cut off; convert an older one to MDF 4")
+    if check:
+        check_blocks(path)
     hook = sys.unraisablehook
     try:
         with path.open("rb") as stream, asammdf.MDF(stream) as file:
@@ -112,3 +131,120 @@ def _load(
         if rows.stop is not None and rows.stop <= (rows.start or 0):
             return {name: np.empty(0) for name in names}
         return {name: load_column(name, rows) for name in names}
+
+
+@record
+class Block:
+    """One block: its mark, its links, and where its data lie."""
+
+    mark: bytes
+    links: tuple[int, ...]
+    start: int
+    end: int
+
+
+def check_blocks(path: Path) -> None:
+    """Refuse a finished MDF file of which a data group holds other samples than its channel groups count.
+
+    Raises
+    ------
+    LogError
+        It does, or a block lies outside the file, or does not unpack to what it says.
+
+    """
+    with path.open("rb") as stream:
+        size, visited = path.stat().st_size, set[int]()
+        stream.seek(0)
+        if stream.read(8) != b"MDF     ":  # one that its recorder did not finish has no counts yet
+            return
+        for group in _walk_chain(path, stream, _read_block(path, stream, FIRST, size, visited).links[0], size, visited):
+            counted = _count_bytes(path, stream, group, size, visited)
+            held = sum(_measure_data(path, stream, group.links[2], size, visited))
+            if counted is not None and counted != held:
+                raise LogError(f"{path}: its records take {counted} bytes and {held} are there, {WHOLE}")
+
+
+def _read_block(path: Path, stream: IO[bytes], at: int, size: int, visited: set[int]) -> Block:
+    stream.seek(at)
+    head = stream.read(HEADER.size)
+    if len(head) < HEADER.size:
+        raise LogError(f"{path}: a block is to begin at byte {at} of {size}, {WHOLE}")
+    mark, length, count = HEADER.unpack(head)
+    if not mark.startswith(b"##") or at + length > size or HEADER.size + 8 * count > length:
+        raise LogError(f"{path}: the block at byte {at} is cut off or damaged; copy or record the file again")
+    if at in visited or len(visited) > MAX_BLOCKS:
+        raise LogError(f"{path}: its blocks lead back to byte {at}, {WHOLE}")
+    visited.add(at)
+    links = struct.unpack(f"<{count}Q", stream.read(8 * count))
+    return Block(mark=mark[2:], links=links, start=at + HEADER.size + 8 * count, end=at + length)
+
+
+def _walk_chain(path: Path, stream: IO[bytes], at: int, size: int, visited: set[int]) -> Iterator[Block]:
+    """Walk blocks of which each one's first link is the next."""
+    while at:
+        block = _read_block(path, stream, at, size, visited)
+        yield block
+        at = block.links[0]
+
+
+def _count_bytes(path: Path, stream: IO[bytes], group: Block, size: int, visited: set[int]) -> int | None:
+    """Return the bytes that the channel groups' records take; None where some have no fixed length."""
+    stream.seek(group.start)
+    numbered = stream.read(1)[0]  # bytes of the number of its group before each record
+    total, fixed = 0, True
+    for one in _walk_chain(path, stream, group.links[1], size, visited):
+        stream.seek(one.start)
+        _, records, flags, _, data, invalid = struct.unpack("<QQHH4xII", stream.read(32))
+        fixed = fixed and not flags & VARIABLE_LENGTH
+        total += records * (numbered + data + invalid)
+        _check_channels(path, stream, one, data + invalid, size, visited)
+    return total if fixed else None
+
+
+def _check_channels(path: Path, stream: IO[bytes], group: Block, width: int, size: int, visited: set[int]) -> None:
+    """Refuse channels that reach beyond their record, in which the reader would look elsewhere."""
+    for channel in _walk_chain(path, stream, group.links[1], size, visited):
+        stream.seek(channel.start)
+        _, _, _, first_bit, first_byte, bits = struct.unpack("<BBBBII", stream.read(12))
+        if 8 * first_byte + first_bit + bits > 8 * width and bits < 1 << 31 and width:
+            raise LogError(f"{path}: a channel lies outside its record of {width} bytes, {WHOLE}")
+
+
+def _measure_data(path: Path, stream: IO[bytes], at: int, size: int, visited: set[int]) -> Iterator[int]:
+    """Walk the data of a group, and return the bytes of each block, unpacked."""
+    if not at:
+        return
+    block = _read_block(path, stream, at, size, visited)
+    if block.mark == b"DZ":
+        yield _unpack(path, stream, block)
+    elif block.mark == b"HL":
+        yield from _measure_data(path, stream, block.links[0], size, visited)
+    elif block.mark in (b"DL", b"LD"):
+        listed, count = block, 0
+        while True:
+            stream.seek(listed.start)
+            flags = stream.read(4)
+            count = struct.unpack("<I", stream.read(4))[0]
+            invalid = listed.mark == b"LD" and flags[3] & 0x80
+            for link in listed.links[1 : 1 + count * (2 if invalid else 1)]:
+                yield from _measure_data(path, stream, link, size, visited)
+            if not listed.links[0]:
+                return
+            listed = _read_block(path, stream, listed.links[0], size, visited)
+    else:
+        yield block.end - block.start
+
+
+def _unpack(path: Path, stream: IO[bytes], block: Block) -> int:
+    """Return the length of a compressed block unpacked, where that and its checksum are right."""
+    stream.seek(block.start)
+    _, how, columns, length, packed = PACKED.unpack(stream.read(PACKED.size))
+    if block.start + PACKED.size + packed > block.end or (how == 1 and not 0 < columns <= length):
+        raise LogError(f"{path}: a compressed block is cut off, {WHOLE}")
+    check_size(path, length, "a block")
+    if how in DEFLATE:
+        unpacker = zlib.decompressobj()
+        found = len(unpacker.decompress(stream.read(packed), length + 1))
+        if found != length or not unpacker.eof or unpacker.unused_data:
+            raise LogError(f"{path}: a compressed block does not unpack to the {length} bytes that it says, {WHOLE}")
+    return length

@@ -49,4 +49,6 @@ def _load(path: Path, places: dict[str, Place], name: str, rows: slice) -> Any:
     place = places[name]
     with zipfile.ZipFile(path) as archive, archive.open(f"{place.array}.npy") as stream:
         array = np.lib.format.read_array(stream, allow_pickle=False)
+        if stream.read(1):  # to the end, where the checksum is looked at
+            raise LogError(f"{path}: array {place.array} is longer than it says; save the archive again")
     return np.atleast_1d(array)[place.index_rows(rows)]

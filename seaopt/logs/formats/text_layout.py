@@ -20,6 +20,7 @@ from seaopt.units import bare_name, header_unit, is_unit
 
 MAX_LINE = 1 << 20
 HEAD_BYTES = 2 * MAX_LINE  # bytes in which the data must begin
+TAIL_BYTES, MAX_SHOWN = 4096, 40  # of the end of a file that are looked at, and characters of it that are shown
 HEAD_LINES = 2000  # lines in which the data must begin
 SAMPLE_LINES = 200  # lines that decide on delimiter and decimal sign
 COMMENTS = ("#", "%", "//")
@@ -98,6 +99,11 @@ def find_layout(path: Path) -> TextLayout:
     numeric = tuple(_is_numeric(rows, index, comma) for index in range(len(headers)))
     if comma:
         notes.append("the decimal sign is a comma")
+    if (unended := _read_unended(path, encoding)) is not None:
+        notes.append(
+            f'its last line does not end: "{unended}"; where the file was cut, its last number lacks digits: record it '
+            "again, or complete that line"
+        )
     if encoding == WINDOWS:
         signs = sorted({sign for line in lines[:first] for sign in line if not sign.isascii()})
         notes.append(f"its header is no UTF-8 text and was read as Windows-1252: {' '.join(signs)}")
@@ -106,6 +112,16 @@ def find_layout(path: Path) -> TextLayout:
         numeric=numeric, first=first, notes=tuple(notes),
         constants=_find_constants(lines[:first], delimiter, comma),
     )  # fmt: skip
+
+
+def _read_unended(path: Path, encoding: str) -> str | None:
+    """Return the end of the last line where nothing ends it: it may have been cut anywhere, a number too."""
+    with path.open("rb") as stream:
+        order = "be" if stream.read(2) == codecs.BOM_UTF16_BE else "le"
+        stream.seek(max(stream.seek(0, 2) - TAIL_BYTES, 0))
+        tail = stream.read().decode(f"utf-16-{order}" if encoding == "utf-16" else encoding, errors="replace")
+    lines = re.split(r"[\r\n]", tail.rstrip("\x1a\x00 \t"))
+    return lines[-1].strip()[-MAX_SHOWN:] or None
 
 
 def _find_constants(above: list[str], delimiter: str, comma: bool) -> dict[str, tuple[float, str | None]]:

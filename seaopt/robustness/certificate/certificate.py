@@ -21,6 +21,7 @@ from seaopt.control.loops.law import describe_integrators
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
 from seaopt.executors import Shared, map_ordered
+from seaopt.files import seal
 from seaopt.formatting import (
     MISSING,
     format_band,
@@ -64,6 +65,7 @@ from seaopt.robustness.verification.verification import Verification
 
 ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
 MIN_FRICTION_MARGIN = "min_friction_margin"
+KEPT_TO = 1e-3  # share of a limit by which a row that is read may be beyond it: figures are known to less
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 LIMIT_CYCLE = "limit_cycle"
 NO_MODEL = "nothing drawn or simulated: measured points alone, without a model"
@@ -91,6 +93,17 @@ class Requirement:
         if self.name in BY_REQUIREMENT:
             return BY_REQUIREMENT[self.name].symbol
         return "≥" if self.name == FRICTION_COMPENSATION or self.name.startswith("min_") else "≤"
+
+    @property
+    def keeps(self) -> bool:
+        """Whether the value keeps the limit but for rounding; what is met may need more, as a stable loop.
+
+        Where it is to be equal, a law of the user's own may have more, and less by its tolerance, of up to a half.
+        """
+        slack = KEPT_TO * (abs(self.limit) or 1.0)
+        if self.sense == "=":
+            return self.value >= 0.5 * self.limit
+        return self.value >= self.limit - slack if self.sense == "≥" else self.value <= self.limit + slack
 
 
 @record(eq=False)
@@ -324,12 +337,14 @@ class Certificate:
         Raises
         ------
         FileError
-            A field is missing or malformed.
+            A field is missing or malformed, it was edited or written by hand, or nothing is required in it.
 
         """
-        from seaopt.robustness.certificate.stored import CERTIFY_AGAIN, read_certificate  # deferred: pydantic
+        # Deferred, as pydantic takes long to import.
+        from seaopt.robustness.certificate.stored import CERTIFY_AGAIN, read_certificate, read_requirements
 
         stored = read_certificate(content)
+        requirements = read_requirements(stored.requirements)
         if controller.design is not None:  # certified too where nobody listed it
             models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
         varied = tuple(Varied(**row.model_dump()) for row in stored.varied)
@@ -347,7 +362,6 @@ class Certificate:
         drawn = None if stored.impedance is None else stored.impedance.draws
         try:
             linear = {name: known[name] for name in stored.plants}
-            requirements = tuple(Requirement(**row.model_dump()) for row in stored.requirements)
             bounds = {name: plant.worst.bounds for name, plant in stored.plants.items()}
             certificate = cls(
                 passed=all(row.met for row in requirements),
@@ -402,8 +416,8 @@ class Certificate:
             raise FileError(f"robustness.json: {error}; {CERTIFY_AGAIN}") from error
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of robustness.json (schema seaopt/robustness/2)."""
-        return {
+        """Return the content of robustness.json (schema seaopt/robustness/2), with its digest."""
+        return seal({
             "schema": ROBUSTNESS_SCHEMA,
             "passed": self.passed,
             "requirements": [_list_fields(row) for row in self.requirements],
@@ -424,7 +438,7 @@ class Certificate:
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
-        }
+        })  # fmt: skip
 
     @property
     def notes(self) -> tuple[str, ...]:

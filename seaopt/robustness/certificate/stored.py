@@ -6,12 +6,14 @@ Null stands for what is infinite: the value of a requirement that an unstable pl
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from seaopt.bench import Sensors
 from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
-from seaopt.files import plain
+from seaopt.errors import FileError
+from seaopt.files import check_seal, plain
+from seaopt.robustness.certificate.certificate import Requirement
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.units import LINEAR
 
@@ -200,13 +202,47 @@ class StoredCertificate(ResultTable):
         return ConstrainedRuns(**self.constrained.model_dump(exclude={"sensors"}), sensors=sensors)
 
 
+class StoredRequirements(ResultTable):
+    """The rows of a robustness.json, or of a schedule_robustness.json."""
+
+    requirements: list[StoredRequirement]
+
+
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
     """Return what a certificate needs of a robustness.json.
 
     Raises
     ------
     FileError
-        A field is missing or malformed.
+        A field is missing or malformed, or it was edited or written by hand.
 
     """
+    check_seal(content, "robustness.json", CERTIFY_AGAIN)
     return check_table(StoredCertificate, plain(content), "robustness.json", remedy=CERTIFY_AGAIN)
+
+
+def list_requirements(content: Mapping[str, Any], source: str) -> tuple[Requirement, ...]:
+    """Return the rows of a certificate as it was read from a file, judged again as `read_requirements` does."""
+    stored = check_table(StoredRequirements, plain(content), source, remedy=CERTIFY_AGAIN)
+    return read_requirements(stored.requirements, source)
+
+
+def read_requirements(stored: Sequence[StoredRequirement], source: str = "robustness.json") -> tuple[Requirement, ...]:
+    """Return the rows of a certificate.
+
+    Raises
+    ------
+    FileError
+        There are none, which would pass whatever it is of; or a row is called met and its value breaks its limit.
+
+    """
+    if not stored:
+        raise FileError(f"{source}: requirements is empty, and a certificate requires something; {CERTIFY_AGAIN}")
+    rows = tuple(Requirement(**row.model_dump()) for row in stored)
+    for row in rows:
+        if row.met and not row.keeps:
+            raise FileError(
+                f"{source}: requirements: {row.name} is called met, and its value {row.value:g} is not {row.sense} "
+                f"{row.limit:g}; {CERTIFY_AGAIN}"
+            )
+    return rows

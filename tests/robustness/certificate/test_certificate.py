@@ -14,7 +14,7 @@ from scipy.stats import beta, binomtest
 import seaopt as so
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.errors import ControlError
-from seaopt.files import to_json
+from seaopt.files import seal, to_json
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
 from seaopt.robustness.certificate.certify import _digest
@@ -287,7 +287,10 @@ def test_an_edited_verdict_is_not_believed(certificate, controller, stand, swing
     content = certificate.to_dict()
     content["requirements"][0]["met"] = False
     plants = {"stand": stand, "swing": swing}
-    assert not so.robustness.Certificate.from_dict(content, controller, plants, certificate.parameters).passed
+    with pytest.raises(so.SeaoptError, match="was edited"):
+        so.robustness.Certificate.from_dict(content, controller, plants, certificate.parameters)
+    again = so.robustness.Certificate.from_dict(seal(content), controller, plants, certificate.parameters)
+    assert not again.passed
 
 
 def test_a_nominal_value_outside_its_range_is_noted(controller, swing, thor):

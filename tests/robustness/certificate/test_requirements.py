@@ -118,9 +118,9 @@ samples = 1
 
 def test_the_command_exits_1(loud, tmp_path):
     (tmp_path / "problem.toml").write_text(PROBLEM, encoding="utf-8")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "controller.json").write_text(to_json(loud.to_dict()), encoding="utf-8")
+    (tmp_path / "loud.json").write_text(to_json(loud.to_dict()), encoding="utf-8")
     command = [sys.executable, "-W", "error", "-m", "seaopt.cli", "certify", "problem.toml", "-o", "out"]
+    command += ["--controller", "loud.json"]
     out = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert out.returncode == 1, out.stderr
     assert "not met" in out.stdout and "passive_band_hz -0." in out.stdout
