@@ -25,7 +25,7 @@ def main() -> None:
     bench = so.Experiment(plant=stand, log=log, outputs=("F1", "F2"))
     fit = so.fit([bench], guess)
     spec = so.ControllerSpec(measured="F1", bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25)
-    controller = so.tune(stand, fit.parameters, spec, robust_to={"swing": swing})
+    controller = so.tune(stand, fit, spec, robust_to={"swing": swing})
 
     figure = Figure(figsize=(9.0, 2.7), layout="constrained", facecolor="white")
     axes = figure.subplots(1, 3)

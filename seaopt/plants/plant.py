@@ -281,6 +281,11 @@ class Plant:
     _repr_html_ = html_text
 
 
+def share_drive(made: Plant, plant: Plant) -> Plant:
+    """Return a plant that was made of another, behind the same drive."""
+    return replace(made, drive_offset_s=plant.drive_offset_s) if plant.drive_offset_s else made
+
+
 def _restore_plant(content: Mapping[str, Any]) -> Plant:
     return Plant(**content)
 
@@ -290,7 +295,7 @@ class CompletedParameters(ParameterSet):
     """A plant's own parameters, all of them, in its units and order, as `Plant.complete` makes them.
 
     A function that takes these relies on its caller for completion. A change gives a plain `ParameterSet`, which is to
-    be completed again.
+    be completed again; of what else was given it has the drive's delay alone.
 
     Attributes
     ----------
@@ -312,8 +317,12 @@ class CompletedParameters(ParameterSet):
 
     def drop_conditions(self) -> CompletedParameters:
         """Return the same parameters, and of what else is given only the drive's delay, which is there everywhere."""
+        return self.plant.complete(self.with_parameters())
+
+    def with_parameters(self, *parameters: Parameter) -> ParameterSet:
+        """Return a plain set, the drive's delay kept, in which `parameters` replace those of the same name."""
         late = [self.given[DRIVE_DELAY]] if DRIVE_DELAY in self.given else []
-        return self.plant.complete(ParameterSet([*self.values(), *late]))
+        return super().with_parameters(*late, *parameters)
 
     @property
     def by_attribute(self) -> SimpleNamespace:

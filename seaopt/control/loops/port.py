@@ -10,6 +10,7 @@ from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 from seaopt.plants.motor.thermal import freeze_heat
+from seaopt.plants.plant import share_drive
 from seaopt.records import record
 from seaopt.units import LINEAR
 
@@ -167,7 +168,7 @@ def probe_of(plant: Plant) -> Plant:
             f"the port of plant {plant.name} states no probe, by which its impedance is known; give Port(probe=...), "
             "or use high_impedance, moving_output, two_link or rotary"
         )
-    return freeze_heat(plant.port.probe())
+    return share_drive(freeze_heat(plant.port.probe()), plant)
 
 
 def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: float) -> PortModel:

@@ -409,5 +409,5 @@ def _design_requirements(controller: Controller, nominal: ParameterSet, varied: 
     """Return what is required of the design plant at the nominal parameters, computed from the law again."""
     assert controller.design is not None
     plant, values = controller.design
-    named = values.with_parameters(*(nominal[name] for name in nominal if name in plant.parameters))
+    named = values.with_parameters(*(nominal[name] for name in nominal if name in {*plant.parameters, DRIVE_DELAY}))
     return design_requirements(controller, split_friction({DESIGN_PLANT: plant}, named, varied), named)

@@ -184,6 +184,7 @@ def attach_environment(plant: Plant) -> Plant:
         h=lambda t, x, u, p: probe.h(t, x, pull(x, u, p), p),
         friction=probe.friction,
         ports=(replace(probe.ports[0], effort=None),),
+        drive_offset_s=plant.drive_offset_s,
     )
 
 

@@ -313,6 +313,7 @@ def make_swept_plant(plant: Plant, over: str) -> Plant:
     return Plant(
         name=f"{plant.name}, {over} swept", states=kept, inputs=plant.inputs, outputs=plant.outputs,
         parameters={**plant.parameters, **dict(zip(SWEEP, (unit, unit, "rad/s"), strict=True))}, f=f, h=h,
+        drive_offset_s=plant.drive_offset_s,
     )  # fmt: skip
 
 

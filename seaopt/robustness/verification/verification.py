@@ -19,6 +19,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.impacts import check_held
+from seaopt.plants.plant import share_drive
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
@@ -417,8 +418,10 @@ def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
     """Return the plant with the port held: as given, else as the port makes it; None where it makes none."""
     if partner is not None:
         check_held(plant, partner)
-        return partner
-    return plant.port.held() if plant.port is not None and plant.port.held is not None else None
+        return share_drive(partner, plant)
+    if plant.port is None or plant.port.held is None:
+        return None
+    return share_drive(plant.port.held(), plant)
 
 
 def _to_plain(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -15,11 +16,14 @@ from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.laws.delay import find_drive, settle_delays, split_delayed, warn_delays
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.passivity import passivity
-from seaopt.control.loops.sampled_plant import add_drive_delay
+from seaopt.control.loops.port import probe_of
+from seaopt.control.loops.sampled_plant import add_drive_delay, read_conditions
 from seaopt.errors import ControlError
 from seaopt.files import to_json
+from seaopt.plants.friction import split_friction
 from seaopt.robustness import batch_figures, combine_uncertainty
 from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
+from seaopt.robustness.verification.environments import attach_environment
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario
@@ -217,6 +221,14 @@ def test_a_fitted_delay_is_drawn_with_the_parameters(fit, stand):
     np.testing.assert_array_equal(again.delay_covariance.matrix, joint)
 
 
+def test_values_that_change_keep_the_drives_delay(stand, swing, thor):
+    late = add_drive_delay(thor, 1e-3)
+    for plant in (stand, swing):
+        values = plant.complete(late)
+        changed = (values.update(J=3e-6), values.drop_conditions(), values.with_parameters(values["k"]))
+        assert all(read_conditions(plant, one) == {"drive_delay_s": 1e-3} for one in changed)
+
+
 def test_experiments_whose_delays_differ_are_two_plants_of_the_certificate(fit, stand):
     own = fit.nuisance["experiment"]
     other = replace(own, delay_s=1e-3)
@@ -227,5 +239,9 @@ def test_experiments_whose_delays_differ_are_two_plants_of_the_certificate(fit, 
     assert list(certificate.plants) == ["stand", "stand, shortest delay"]
     shortest = certificate.plants["stand, shortest delay"].ms
     assert shortest == pytest.approx(_true_ms(controller, stand, fit.parameters, 1e-3), rel=2e-3)
+    shorter = split_delayed(SPEC, stand, {"stand": stand}, two)["stand, shortest delay"]
+    states = split_friction({"": shorter}, fit.parameters.update(f_c=5.0)).values()
+    for plant in (*states, probe_of(shorter), attach_environment(shorter), pickle.loads(pickle.dumps(shorter))):
+        assert plant.drive_offset_s == shorter.drive_offset_s == pytest.approx(-1.04e-3, abs=2e-5)
     alike = replace(fit, nuisance={"experiment": own, "second": replace(own, delay_s=own.delay_s - 1e-7)})
     assert list(split_delayed(SPEC, stand, {"stand": stand}, alike)) == ["stand"]
