@@ -279,13 +279,13 @@ def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tup
     return warn_delays(controller.spec, plant, parameters)
 
 
-def find_own_drive(controller: Controller, source: Fit | ParameterSet) -> Drive:
+def find_own_drive(controller: Controller, source: Fit | ParameterSet) -> Drive | None:
     """Return a certificate's delay of the drive: the fit's or the parameters', or else what the law counts on."""
     assert controller.design is not None
+    counted = Drive(delay_s=controller.drive_delay_s)
     stated = isinstance(source, Fit) or DRIVE_DELAY in source or find_given_drive_delay(controller.spec) is not None
-    if not stated:
-        return Drive(delay_s=controller.drive_delay_s)
-    return find_drive(controller.spec, controller.design[0], source)
+    found = find_drive(controller.spec, controller.design[0], source) if stated else counted
+    return found if found.delay_s or counted.delay_s else None
 
 
 def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nominal: ParameterSet) -> tuple[str, ...]:
