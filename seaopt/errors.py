@@ -170,3 +170,19 @@ def require_memory(numbers: float, argument: str, error: type[SeaoptError] = Sea
     size_GB = 8e-9 * numbers
     if not size_GB <= MOST_GB:
         raise error(f"{argument} takes about {size_GB:.2g} GB of memory, and {MOST_GB:g} GB is the most; give less")
+
+
+def require_seed(seed: Any, error: type[SeaoptError] = SeaoptError) -> int:
+    """Return the seed of random numbers; what numpy would not take is refused.
+
+    Examples
+    --------
+    >>> require_seed(-1)
+    Traceback (most recent call last):
+    ...
+    seaopt.errors.SeaoptError: seed = -1 is not a seed; give a whole number, 0 or more
+
+    """
+    if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or seed < 0:
+        raise error(f"seed = {repr(seed)[:60]} is not a seed; give a whole number, 0 or more")
+    return int(seed)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench.excitation import Excitation, excite
-from seaopt.errors import SeaoptError, SimulationError, require_memory, suggestion
+from seaopt.errors import SeaoptError, SimulationError, require_memory, require_seed, suggestion
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
@@ -155,7 +155,7 @@ def virtual_log(
     per_sample = 4.0 * (len(plant.states) + len(plant.outputs))  # of numbers, as measured, where all is at its largest
     argument = f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g}"
     require_memory(per_sample * duration_s * rate_hz, argument, SimulationError)
-    streams = np.random.default_rng(seed).spawn(1 + len(plant.outputs))
+    streams = np.random.default_rng(require_seed(seed, SimulationError)).spawn(1 + len(plant.outputs))
     time, drive = excite(excitation, duration_s=duration_s, rate_hz=rate_hz, rng=streams[0])
     inputs = {name: drive if name == excited else np.zeros(time.size) for name in plant.inputs}
     commanded = Log(

@@ -312,7 +312,7 @@ class SensorsTable(StrictTable):
 class VirtualTable(SensorsTable):
     """A virtual experiment in place of a log."""
 
-    seed: Whole
+    seed: Annotated[Whole, Field(ge=0)]
     duration_s: Annotated[Number, Field(gt=0, le=1e6)]
     rate_hz: Annotated[Number, Field(gt=0, le=1e6)]
     truth: dict[str, Number] = {}

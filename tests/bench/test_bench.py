@@ -5,7 +5,8 @@ import pytest
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Multisine, Noise, excite, scale
-from seaopt.errors import EstimationError, SimulationError
+from seaopt.control.tuning.corners import draw
+from seaopt.errors import ControlError, EstimationError, SimulationError
 from seaopt.estimation.experiment_design.excitation_search import Limits
 
 
@@ -109,3 +110,11 @@ def test_what_does_not_fit_in_memory_is_refused_before_it_is_made(thor, stand, d
         excite(PAPER_STAND, duration_s=10 * duration_s, rate_hz=400, rng=np.random.default_rng(0))
     with pytest.raises(EstimationError, match="GB of memory"):
         Limits(duration_s=duration_s, rate_hz=400, rms=1.0)
+
+
+@pytest.mark.parametrize("seed", [-1, True])
+def test_what_is_no_seed_is_refused_wherever_one_is_given(thor, stand, seed):
+    with pytest.raises(SimulationError, match="not a seed; give a whole number"):
+        so.virtual_log(stand, thor, PAPER_STAND, duration_s=1, rate_hz=400, seed=seed)
+    with pytest.raises(ControlError, match="not a seed; give a whole number"):
+        draw(thor.prior(k=3000.0), 2, seed)

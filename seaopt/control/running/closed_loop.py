@@ -37,7 +37,7 @@ from jaxtyping import Bool, Float, Int
 from seaopt.control.loops.sampled_plant import find_delay, read_conditions
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names, whole_samples
-from seaopt.errors import SimulationError, StepSizeError, suggestion
+from seaopt.errors import SimulationError, StepSizeError, require_seed, suggestion
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
@@ -299,7 +299,7 @@ def _noise(
         noise[:, :, loop.signals.index(name)] = place[:, None]
     if not np.any(std):
         return noise
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(require_seed(seed, SimulationError))
     return noise + std[:, None, :] * np.column_stack([rng.normal(size=n) for _ in loop.signals])
 
 

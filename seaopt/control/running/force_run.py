@@ -23,7 +23,7 @@ from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditio
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
 from seaopt.control.running.sampled_loop import largest_current, whole_samples
-from seaopt.errors import ControlError, SimulationError, suggestion
+from seaopt.errors import ControlError, SimulationError, require_seed, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
@@ -178,7 +178,7 @@ def close_loop(
     output, integrator = output_function(plant), _Integrator(plant=plant, rtol=rtol)
     others = [0.0] * (len(plant.inputs) - 1)
     reading = _place_sensor(sensors or Sensors(), plant, values, measured)
-    noise = reading.noise_std * np.random.default_rng(seed).normal(size=n)
+    noise = reading.noise_std * np.random.default_rng(require_seed(seed, ControlError)).normal(size=n)
     if not current_step_A >= 0.0:
         raise ControlError(f"current_step_A = {current_step_A:g} is negative; give the amplifier's step, 0 for none")
     most = largest_current(current_limit_A, current_step_A)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_seed
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 
@@ -72,7 +72,7 @@ def draw(
     [['I_p', 'k'], ['I_p', 'k']]
 
     """
-    rng, uniform = np.random.default_rng(seed), dict(ranges or {})
+    rng, uniform = np.random.default_rng(require_seed(seed, ControlError)), dict(ranges or {})
     values = parameters.parameters if isinstance(parameters, Fit) else parameters
     if isinstance(parameters, Fit):
         names, matrix = list(parameters.covariance.names), np.asarray(parameters.covariance.matrix)

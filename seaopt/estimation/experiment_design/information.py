@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Excitation, excite
-from seaopt.errors import EstimationError, suggestion
+from seaopt.errors import EstimationError, require_seed, suggestion
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.result.covariance import mark_unseen
 from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, STEP_ERROR_SIGMA
@@ -99,7 +99,7 @@ class Bench:
     def samples(self, excitation: Excitation, seed: int = 0) -> Float[np.ndarray, " n"]:
         """Return an excitation on the bench's clock."""
         rate = 1.0 / self.clock.period
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(require_seed(seed, EstimationError))
         return excite(excitation, duration_s=self.n / rate, rate_hz=rate, rng=rng)[1]
 
     def run(self, u: Float[np.ndarray, " n"]) -> Trial:

@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.errors import EstimationError, require_seed
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.solver.first_guess import guess_from_responses
@@ -162,7 +163,7 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Fl
     """
     if not method.search or not problem.unknowns.shared:
         return problem.evaluate(problem.unknowns.start), []
-    rng = np.random.default_rng(method.seed)
+    rng = np.random.default_rng(require_seed(method.seed, EstimationError))
     guesses, matched = guess_from_responses(problem, rng)
     guessed = problem.evaluate(guesses[0]) if guesses else None
     if guessed is not None and matched and not explains_little(problem, guessed.power):

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.errors import EstimationError
+from seaopt.errors import EstimationError, require_seed
 from seaopt.estimation.problem.correlation import autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
@@ -162,7 +162,7 @@ def bootstrap(
     problem = minimum.problem
     _check(fit, problem, draws, refit, block)
     residuals = minimum.residuals()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(require_seed(seed, EstimationError))
     names = problem.unknowns.names[: problem.unknowns.shared]
     lengths = {name: _choose_length(own, block) for name, own in residuals.items()}
     if refit:

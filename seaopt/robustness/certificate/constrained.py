@@ -28,7 +28,7 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller, ForceMPC, ForceRun, MPCStep, close_loop
 from seaopt.control.loops.sampled_plant import DELAY, conditions
 from seaopt.control.mpc.active_set import UNFINISHED
-from seaopt.errors import SeaoptError
+from seaopt.errors import ControlError, SeaoptError, require_seed
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count, format_values
 from seaopt.parameters import ParameterSet
@@ -208,7 +208,7 @@ def run_constrained(
         As in `certify_mpc`.
 
     """
-    rng = np.random.default_rng([seed, CONSTRAINED_STREAM])
+    rng = np.random.default_rng([require_seed(seed, ControlError), CONSTRAINED_STREAM])
     drawn = unknown.values(unknown.draw(runs, rng))
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name != DELAY}
     parts = [

@@ -33,7 +33,7 @@ from seaopt.control.laws.delay import split_delayed
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
-from seaopt.errors import ControlError, require_number, require_type
+from seaopt.errors import ControlError, require_number, require_seed, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor, map_ordered
 from seaopt.formatting import format_count, html_text, join_words
@@ -338,7 +338,7 @@ def certify_schedule(
         progress, POINT * len(schedule.points), BOUND * len(values) * len(models), SWEEP * len(models) * simulations
     )
     count = -(-samples // len(values))
-    rng = np.random.default_rng([seed, *_digest(schedule)])
+    rng = np.random.default_rng([require_seed(seed, ControlError), *_digest(schedule)])
     sources = [_place_source(schedule, parameters, others, value) for value in values]
     drive = find_own_drive(schedule.controllers[0], parameters)
     unknowns = [combine_uncertainty(source, rest, ranges, models, drive) for source, rest in sources]

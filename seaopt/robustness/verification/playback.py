@@ -15,7 +15,7 @@ from seaopt.control.loops.sampled_plant import DELAYS, find_rows
 from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.control.running.sampled_loop import channel_names, find_longest_delay
-from seaopt.errors import ControlError, require_memory
+from seaopt.errors import ControlError, require_memory, require_seed
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
 from seaopt.plants.friction import can_stick
@@ -219,7 +219,9 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             blows = [strike(stage.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
         loop = stage.loop(phase.held, longest, sticks=scenario.friction == "sticking")
-        reference = offset + _build_reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
+        reference = offset + _build_reference(
+            phase, loop.law.sample_time_s, np.random.default_rng([require_seed(seed, ControlError), number])
+        )
         run = run_loop(
             loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s,
             standing=0.0 if grip is None else _read_standing(stage, values, grip, loop.standing),
