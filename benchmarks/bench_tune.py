@@ -188,7 +188,7 @@ def ranges(case: Case, judge: Judge):
     return names, [tuple(np.log(every[name])) for name in names]
 
 
-def search(case: Case, judge: Judge, seconds: float, seed: int):
+def search(case: Case, judge: Judge, seconds: float, seed: int, generations: int = 100_000):
     """Return the best numbers of a differential evolution, and how many laws it looked at."""
     names, bounds = ranges(case, judge)
     started, looked, allowed = time.process_time(), 0, 1.0 - case.spec.reserve
@@ -208,7 +208,7 @@ def search(case: Case, judge: Judge, seconds: float, seed: int):
         return out
 
     found = differential_evolution(
-        cost, bounds, seed=seed, maxiter=100_000, popsize=12, tol=1e-9, polish=False, vectorized=True, init="sobol",
+        cost, bounds, seed=seed, maxiter=generations, popsize=12, tol=1e-9, polish=False, vectorized=True, init="sobol",
         updating="deferred", callback=lambda intermediate_result: time.process_time() - started > seconds,
     )  # fmt: skip
     numbers = {name: np.exp(np.array([[found.x[i]]])) for i, name in enumerate(names)}

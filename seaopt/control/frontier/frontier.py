@@ -17,7 +17,7 @@ from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
-from seaopt.control.tuning.solution import solve
+from seaopt.control.tuning.solution import search, solve
 from seaopt.control.tuning.tuner import (
     RobustTo,
     aim_task,
@@ -299,6 +299,7 @@ def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progr
         whole, sliding_alone = divide(prefix(part, f"{one.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
         task = aim_task(swept.task, one)
         task, x, loops = lower_fraction(task, *solve(task, warm, whole))
+        x, loops = search(task, x, loops)
         sliding = feed_link(replace(swept.sliding, spec=one), task.link)
         alone = _tune_sliding(sliding, x, sliding_alone) if swept.sticks else None
         free = None

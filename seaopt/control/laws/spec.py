@@ -52,7 +52,7 @@ class ControllerSpec:
     bandwidth_hz : float
         Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
     bandwidth_range_hz : (low, high)
-        Allowed range of bandwidth_hz; 15 to 60 if left out.
+        Allowed range of bandwidth_hz, 15 to 60 if left out; it has no say in what is found, or named as possible.
     structure : {"pd", "pid", "pid_dob", "cascade", "custom"}
         A pid_dob has a disturbance observer whose nominal plant is the design plant; a cascade closes a loop on the
         motor's speed, the second of `measured`, inside the force loop; custom is a law that is given

@@ -70,7 +70,7 @@ class Verdict:
 
 @record
 class PossibleBandwidths:
-    """The bandwidths in the specification's range at which the tuner keeps all limits.
+    """The bandwidths at which the tuner keeps all limits, from a quarter to twice the one asked.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from dataclasses import replace
 from seaopt.control.laws.limits import BY_NAME, MeasuredLoop
 from seaopt.control.laws.verdict import judge_all
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
-from seaopt.control.tuning.solution import Solution, solve
+from seaopt.control.tuning.solution import Solution, search
 from seaopt.progress import Progress, ignore
 
 ROUNDS = 3
@@ -47,7 +47,7 @@ def ease_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop], progress: 
         progress("keeping what can be kept", number / ROUNDS)
         worst = max(left.values())
         factors |= {name: ROOM * used for name, used in left.items() if used * ALIKE >= worst}
-        tried = solve(replace(task, eased=factors), (best[0],))
+        tried = search(replace(task, eased=factors), *best, again=False)
         if _total(_measure_missed(task, tried[1])) < _total(missed):
             best = tried
     return best

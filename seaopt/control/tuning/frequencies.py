@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -30,6 +32,7 @@ def find_light_modes(plant: DigitalPlant | MeasuredPlant) -> list[tuple[float, f
     return [(float(f), float(max(zeta, 1e-9))) for f, zeta in modes if zeta < LIGHT_DAMPING]
 
 
+@lru_cache(maxsize=256)
 def count_growing(plant: DigitalPlant | MeasuredPlant) -> int:
     """Return how many of a plant's poles grow without control; none of a measured one, whose log is bounded."""
     return (

@@ -103,12 +103,15 @@ class Grid:
 
 @record(eq=False)
 class LawResponse:
-    """Laws at a grid's frequencies: C_y and C_r of one or of n, C_v of a speed loop, and B on the grid's plants."""
+    """Laws at a grid's frequencies: C_y and C_r of one or of n, C_v of a speed loop, and B on the grid's plants.
+
+    Of n laws C_v and B have a row each, or are the same of all.
+    """
 
     c_y: Complex[np.ndarray, "*n m"]
     c_r: Complex[np.ndarray, "*n m"]
-    c_v: Complex[np.ndarray, " m"]
-    rest: Complex[np.ndarray, "k m"]
+    c_v: Complex[np.ndarray, "*v m"]
+    rest: Complex[np.ndarray, "k *v m"]
 
 
 def use_disc(

@@ -110,6 +110,7 @@ MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hund
 
 # k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
 LawNumbers = Float[np.ndarray, " 14"]
+LawsNumbers = Float[np.ndarray, "14 *n"]  # of one law, or of n: then of the shape (14, n, 1)
 K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH, PREFILTER_W, DAMPING = range(14)
 
 
@@ -414,7 +415,7 @@ class Task:
         plants[:, asked], weights[:, :, asked] = limit.plants, limit.weights
         return plants, weights
 
-    def terms(self, grid: Grid, x: LawNumbers) -> LawTerms:
+    def terms(self, grid: Grid, x: LawsNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
         observer = None if self.nominal is None else (x[T_Q], grid.kept, grid.inverse)
         notch = None if self.spec.notch is None else (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH])
@@ -422,25 +423,29 @@ class Task:
         prefilter = None if low_pass is None else (x[PREFILTER_W], x[DAMPING] if low_pass.is_second_order else None)
         return evaluate_terms(grid.q, self.spec.sample_time_s, x[T_F], observer, notch, x[SPEED_RATE], prefilter)
 
-    def law(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
+    def law(self, grid: Grid, x: LawsNumbers) -> tuple[Complex[np.ndarray, "*w m"], Complex[np.ndarray, "*w m"]]:
         """Return C_r and C_y on a grid."""
         series, integral, rate, observer, ahead, prefilter = self.terms(grid, x)
         both = x[K_P] + x[K_I] * integral
         c_r = prefilter * (ahead * self.k_ff + series * (both - x[W_R] + (x[K_D] - x[W_C]) * rate))
         return c_r, series * (both + x[K_D] * rate + observer)
 
-    def respond(self, grid: Grid, x: LawNumbers) -> LawResponse:
+    def respond(self, grid: Grid, x: LawsNumbers) -> LawResponse:
         """Return the law on a grid, with what its further signals do on every plant of it."""
         c_r, c_y = self.law(grid, x)
         c_v, rest = self.feed_speed(grid, x)
         return LawResponse(c_y=c_y, c_r=c_r, c_v=c_v, rest=rest)
 
-    def feed_speed(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, "n m"]]:
+    def feed_speed(
+        self, grid: Grid, x: LawsNumbers
+    ) -> tuple[Complex[np.ndarray, "*w m"], Complex[np.ndarray, "k *w m"]]:
         """Return C_v, from what a speed loop reads to effort, and B on every plant of a grid."""
         if self.speed_loop is None:
             return np.zeros_like(grid.q), grid.fixed
         through = x[K_V] * self.terms(grid, x).series
-        return through * self.speed_loop.sense(grid.q, self.spec.sample_time_s), grid.fixed + through * grid.speed
+        plants = (slice(None), *(None,) * (np.ndim(through) - 1))  # of many laws, a row each on every plant
+        rest = grid.fixed[plants] + through * grid.speed[plants]
+        return through * self.speed_loop.sense(grid.q, self.spec.sample_time_s), rest
 
     def usage(self, grid: Grid, law: LawResponse) -> dict[str, Float[np.ndarray, "k m"]]:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
@@ -502,9 +507,9 @@ class Task:
         """Return the usage of the friction margins aimed at, of each law one row per plant, where there are any."""
         if not grid.friction.y.size:
             return {}
-        c_y = law.c_y[..., None, :]
-        size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], law.c_v), axis=-2)
-        return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, law.c_v)), 1e-300)}
+        c_y, c_v = law.c_y[..., None, :], law.c_v[..., None, :]
+        size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], c_v[..., None, :]), axis=-2)
+        return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, c_v)), 1e-300)}
 
     def aim_multipliers(self, x: LawNumbers, multiplier: str = "") -> Task:
         """Return the task with one multiplier per plant with friction: that named, or the one that shows most of x."""

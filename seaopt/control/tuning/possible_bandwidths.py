@@ -1,8 +1,9 @@
 """Find the bandwidths that keep the limits where the one asked does not, for the tuner's answer.
 
 What is possible is not always an interval that begins at the lowest: below a resonance a law may need more feedback
-than above it. So the range is probed outwards from the bandwidth asked, in steps of a sixth, down and up; the ends of
-what is possible next to it are found by bisection, and the largest of all from the top of the range down.
+than above it. So bandwidths are probed outwards from the one asked, in steps of a fifth, down to a quarter and up to
+twice it, at each a short evolution; the ends of what is possible next to it are found by bisection, and the largest of
+all from the top down.
 """
 
 from __future__ import annotations
@@ -14,19 +15,20 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_limits
-from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.evolution import ENCIRCLES, Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task
 from seaopt.control.tuning.solution import recheck
-from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, ignore
 
-PROBE_RATIO = 7.0 / 6.0  # of a probe to the next
+FARTHEST_BELOW, FARTHEST_ABOVE = 4.0, 2.0  # of the bandwidth asked: where others are looked for
+PROBE_RATIO = 1.2  # of a probe to the next
 RESOLUTION = 0.01  # to which the end of what is possible is found
 BISECTIONS = math.ceil(math.log2(math.log(PROBE_RATIO) / RESOLUTION))  # that find such an end
-STARTS_TRIED = 2
-PROMISING_USAGE = 1.5  # after the quadratic programs; what misses by more is not refined
+MEMBERS, GENERATIONS = 30, 40  # of the evolution at every bandwidth
+STARTS_TRIED = 4
+PROMISING_USAGE = 1.1  # of the evolution; what misses by more is not refined
 REFINEMENTS = 3  # solutions of the interior-point method
 HIGHEST_BANDWIDTH = 0.249  # of the sample rate
 FAR = 1e3  # how much further away a law counts that does not keep the limits
@@ -36,7 +38,7 @@ HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more 
 def find_possible_bandwidths(
     task: Task, x: LawNumbers, progress: Progress = ignore
 ) -> tuple[PossibleBandwidths, list[LawNumbers]]:
-    """Return the bandwidths in range that keep the limits, and the numbers of the laws at those next to the one asked.
+    """Return the bandwidths nearby that keep the limits, and the numbers of the laws at those next to the one asked.
 
     Parameters
     ----------
@@ -85,8 +87,8 @@ class _Probes:
     def find(self) -> tuple[PossibleBandwidths, list[LawNumbers]]:
         """Return what `find_possible_bandwidths` does."""
         spec = self.task.spec
-        lowest = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
-        highest = min(spec.bandwidth_range_hz[1], HIGHEST_BANDWIDTH * spec.sample_rate_hz)
+        lowest = max(self.asked / FARTHEST_BELOW, 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
+        highest = min(self.asked * FARTHEST_ABOVE, HIGHEST_BANDWIDTH * spec.sample_rate_hz)
         down, up = (list_steps(self.asked, end) for end in (lowest, highest))
         self.expected = len(down) + len(up) + BISECTIONS
         below, above = (find_end(self._keeps, steps, self.asked) for steps in (down, up))
@@ -124,7 +126,10 @@ class _Probes:
         return (0.0 if keeps(x) else NEARLY_KEPT), x
 
     def _aim(self, bandwidth_hz: float) -> Task:
-        return replace(self.task, spec=replace(self.task.spec, bandwidth_hz=bandwidth_hz))
+        low, high = self.task.spec.bandwidth_range_hz  # what may be asked, not what may be looked at
+        around = min(low, bandwidth_hz), max(high, bandwidth_hz)
+        spec = replace(self.task.spec, bandwidth_hz=bandwidth_hz, bandwidth_range_hz=around)
+        return replace(self.task, spec=spec)
 
     def _tune(self, bandwidth_hz: float) -> tuple[float, LawNumbers]:
         """Return usage and numbers: from the nearest bandwidth's law first, one that keeps the limits if there is any.
@@ -143,10 +148,12 @@ class _Probes:
             usage, _ = task.rank(grid, x)
             if usage == 0.0 or (apart < np.log(PROBE_RATIO) and usage > HOPELESS_USAGE):
                 return usage, x
-        starts = [one for one in (x, *find_starts(task, grid, STARTS_TRIED)) if task.is_stable(one)]
+        search = Evolution.of(task, grid, [x])
+        usages, laws = search.run([x], members=MEMBERS, generations=GENERATIONS)
+        starts = [one for one in map(task.tidy, laws[usages < ENCIRCLES][:STARTS_TRIED]) if task.is_stable(one)]
         if not starts:
             return np.inf, x
-        x = min((improve(task, grid, one) for one in starts), key=lambda pair: pair[0])[1]
+        x = min(starts, key=lambda one: task.rank(grid, one))
         usage, _ = task.rank(grid, x)
         if usage > PROMISING_USAGE:
             return usage, x

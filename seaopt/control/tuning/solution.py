@@ -8,6 +8,7 @@
 5. a recheck on frequencies that resolve every pole of plants and closed loops; where a limit is broken between the
    frequencies, those are added and step 3 is repeated.
 
+Where no law keeps the limits, an evolution looks for one (`search`), from which steps 2 to 5 are repeated.
 A friction margin is asked for afterwards, of the law that is best without, and everything repeated with it as a limit.
 """
 
@@ -24,6 +25,7 @@ from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.absolute_stability import SIMPLEST
 from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.grid import Grid
 from seaopt.control.tuning.interior_point import refine
@@ -126,6 +128,48 @@ def _solve_once(task: Task, warm: Sequence[LawNumbers], progress: Progress) -> S
     finding, checking = divide(progress, SCAN + IMPROVEMENT + REFINEMENT, RECHECK)
     grid = task.grid(place_frequencies(task))
     x = find_best(replace(task, settles=False), grid, warm, finding)
+    return _finish(task, grid, x, checking)
+
+
+def search(task: Task, x: LawNumbers, loops: list[MeasuredLoop], *, again: bool = True) -> Solution:
+    """Return a law that misses limits, or a better one that an evolution finds; what misses none is returned as it is.
+
+    Parameters
+    ----------
+    task : Task
+        What is to be tuned.
+    x : array, shape (14,)
+        The law that keeps the limits, or misses them least so far.
+    loops : list of MeasuredLoop
+        Its loops.
+    again : bool
+        Whether a second population is tried where the first has no law that keeps them.
+
+    """
+    if not list_broken_limits(task.spec, loops, task.design_states) - {FRICTION}:
+        return x, loops
+    grid = task.grid(place_frequencies(task))
+    return retry(task, x, loops, Evolution.of(task, grid, [x]).find([x], again=again))
+
+
+def retry(task: Task, x: LawNumbers, loops: list[MeasuredLoop], starts: Sequence[LawNumbers]) -> Solution:
+    """Return a better law than the one that misses limits, from other starts; else that one."""
+    grid = task.grid(place_frequencies(task))
+    best, rank = (x, loops), task.rank(grid, x)
+    for start in map(task.tidy, starts):
+        if not task.is_stable(start):
+            continue
+        tried = _finish(task, grid, refine(task, grid, improve(task, grid, start)[1], _count_rounds(task)), ignore)
+        missed = list_broken_limits(task.spec, tried[1], task.design_states)
+        if not missed - {FRICTION}:
+            return _meet_friction_margin(task, *tried, ignore) if missed else tried
+        if task.rank(grid, tried[0]) < rank:
+            best, rank = tried, task.rank(grid, tried[0])
+    return best
+
+
+def _finish(task: Task, grid: Grid, x: LawNumbers, checking: Progress) -> Solution:
+    """Return numbers that leave as much to their integral as is allowed, rechecked, with their loops."""
     settling = task.tidy(x)
     if settling[W_R] < x[W_R]:
         x = refine(task, grid, improve(task, grid, settling)[1], _count_rounds(task))

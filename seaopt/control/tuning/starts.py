@@ -25,11 +25,12 @@ is always valid. A speed loop's gain and time are scanned as filters are.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control.laws.limits import INTEGRAL_RAD_S
 from seaopt.control.laws.spec import HIGHEST_CORNER
@@ -65,6 +66,7 @@ INTEGRAL_RATES = 4  # values of k_i/(1 + k_p) then
 HOPELESS_MERIT = 10.0  # loops whose merit is worse than the best one's by this are given no weights
 WEIGHTS = (0.0, 0.5, 1.0)  # of w_c/k_d
 COARSE_FREQUENCIES = 90
+MOST_SHAPES = 48  # with one optional part at most, and a third as many with several
 SCANNED_PLANTS = 4
 PASSIVE_FREQUENCIES = 20  # of the passive band
 SPEED_GAINS = (0.3, 1.0, 3.0)  # of k_v, over the speed per command at the bandwidth
@@ -90,7 +92,7 @@ def find_starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
         How many.
 
     """
-    coarse = _thin_grid(task, grid)
+    coarse = thin_grid(task, grid)
     shapes = list(_list_shapes(task, coarse))
     merits, scanned = zip(*(_rank_shape(task, coarse, shape) for shape in shapes), strict=True)
     merit, gains = np.concatenate(merits), np.concatenate(scanned)
@@ -131,25 +133,20 @@ def _are_alike(task: Task, x: LawNumbers, other: LawNumbers) -> bool:
     return bool(np.max(apart) < 0.4)
 
 
-def _thin_grid(task: Task, grid: Grid) -> Grid:
-    """Return some of the grid's frequencies, the bandwidth and the plants' light modes among them."""
-    wanted = [
-        task.spec.bandwidth_hz,
-        *(f for plant in task.plants[:SCANNED_PLANTS] for f, _ in find_light_modes(plant)),
-    ]
-    wanted += (
-        [*np.geomspace(*task.spec.passive_band_hz, PASSIVE_FREQUENCIES)]
-        if task.spec.passive_band_hz is not None
-        else []
-    )
+def thin_grid(task: Task, grid: Grid, plants: Sequence[int] = range(SCANNED_PLANTS)) -> Grid:
+    """Return some of the grid's frequencies, the bandwidth and light modes among them, and some of its plants."""
+    some = [k for k in plants if k < len(grid.rows)]
+    wanted = [task.spec.bandwidth_hz]
+    wanted += [f for k in some for f, _ in find_light_modes(task.plants[grid.rows[k]])]
+    if task.spec.passive_band_hz is not None:
+        wanted += [*np.geomspace(*task.spec.passive_band_hz, PASSIVE_FREQUENCIES)]
     near = [int(np.argmin(np.abs(grid.f - f))) for f in wanted]
     even = np.searchsorted(grid.f, np.geomspace(OBJECTIVE_HZ, grid.f[-1], COARSE_FREQUENCIES))
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
-    some = slice(SCANNED_PLANTS)
     return replace(
         coarse, p=coarse.p[some], discs=coarse.discs[some], fixed=coarse.fixed[some], speed=coarse.speed[some],
-        rows=coarse.rows[some],
+        rows=tuple(coarse.rows[k] for k in some),
     )  # fmt: skip
 
 
@@ -163,11 +160,21 @@ def _list_shapes(task: Task, grid: Grid) -> Iterator[Shape]:
     # An output that swings at a few tenths of a hertz bears only a slow observer.
     lags = [0.5 * unit, 2.0 * unit, 8.0 * unit, 0.5, 3.0] if task.nominal is not None else [1.0]
     notches = _list_notches(task) if spec.notch is not None else [tuple(low[NOTCH_W:PREFILTER_W])]
-    every = itertools.product(filters, lags, _list_speed_loops(task, grid), notches, _list_prefilters(task))
-    for t_f, t_q, (k_v, speed_rate), notch, prefilter in every:
+    parts = [_list_speed_loops(task, grid), notches, _list_prefilters(task)[::-1]]  # the first of each is none
+    every = list(itertools.product(filters, lags, *map(enumerate, parts)))
+    every.sort(key=lambda shape: sum(number > 0 for number, _ in shape[2:]) > 1)  # one part at a time comes first
+    alone = sum(sum(number > 0 for number, _ in shape[2:]) <= 1 for shape in every)
+    for t_f, t_q, (_, (k_v, speed_rate)), (_, notch), (_, prefilter) in (
+        *_thin_out(every[:alone], MOST_SHAPES), *_thin_out(every[alone:], MOST_SHAPES // 3)
+    ):  # fmt: skip
         shape = np.clip((k_v, t_f, t_q, 0.0, *notch, *prefilter), low[K_V:], high[K_V:])
         shape[SPEED_RATE - K_V] = speed_rate
         yield (*shape,)
+
+
+def _thin_out(shapes: list[Any], most: int) -> list[Any]:
+    """Return as many of a list at even distances, or all."""
+    return shapes if len(shapes) <= most else [shapes[k] for k in np.linspace(0, len(shapes) - 1, most).astype(int)]
 
 
 def _list_speed_loops(task: Task, grid: Grid) -> list[tuple[float, float]]:
@@ -278,8 +285,8 @@ def _scan_fixed_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.n
     k_d, k_i, weight = (values.ravel() for values in grids)
     gains = np.column_stack([0.0 * k_d, k_i, k_d, 0.0 * k_d, weight * k_d])[(k_d > 0.0) | (weight == weight[0])]
     back = complex(scan.rest[0, scan.at]) + scan.through * scan.measurement(gains)[:, scan.at]
-    low_pass = complex(scan.terms.prefilter[scan.at])
-    k_p = _solve_bandwidth(scan.through, low_pass, scan.reference(gains)[:, scan.at], back)
+    ahead = scan.through * complex(scan.terms.prefilter[scan.at])
+    k_p = solve_bandwidth(scan.through, ahead, ahead * scan.reference(gains)[:, scan.at], back)
     gains = np.tile(gains, (2, 1))
     gains[:, K_P] = k_p
     gains = gains[np.isfinite(k_p) & (k_p >= 0.0)]
@@ -343,15 +350,15 @@ def _price_missing_integral(scan: _Scan, gains: Float[np.ndarray, "n 5"]) -> Flo
     return np.maximum(0.0, np.log(least / np.maximum(gains[:, K_I], 1e-12)))
 
 
-def _solve_bandwidth(
-    a: complex, low_pass: complex, slope: Complex[np.ndarray, " n"], one: Complex[np.ndarray, " n"]
+def solve_bandwidth(
+    by_y: Any, by_r: Any, slope: Complex[np.ndarray, " n"], one: Complex[np.ndarray, " n"]
 ) -> Float[np.ndarray, " two_n"]:
-    """Return both roots k_p of the bandwidth equation, `one` being B + aY; not a number where there is none."""
-    size, passed = abs(a) ** 2, 2.0 * abs(a * low_pass) ** 2
-    half = np.real(passed * slope - a * np.conj(one))
-    rest = passed * np.abs(slope) ** 2 - np.abs(one) ** 2
+    """Return both roots k_p of 2 |by_r k_p + slope|^2 = |by_y k_p + one|^2; not a number where there is none."""
+    size, passed = np.abs(by_y) ** 2, 2.0 * np.abs(by_r) ** 2
+    half = np.real(2.0 * slope * np.conj(by_r) - one * np.conj(by_y))
+    rest = 2.0 * np.abs(slope) ** 2 - np.abs(one) ** 2
     lead = passed - size
-    lead = lead if abs(lead) > LEAST_LEAD * size else LEAST_LEAD * size  # at |F|^2 = 1/2 it is linear
+    lead = np.where(np.abs(lead) > LEAST_LEAD * size, lead, LEAST_LEAD * size)  # at |F|^2 = 1/2 it is linear
     with np.errstate(invalid="ignore"):
         root = np.sqrt(half**2 - lead * rest)
     return np.concatenate([(-half + root) / lead, (-half - root) / lead])
@@ -359,38 +366,50 @@ def _solve_bandwidth(
 
 def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
     """Return the logarithm of the objective, and what is worse than any where a limit on the loop is broken."""
-    task, grid = scan.task, scan.grid
-    weights, worst = task.weights(grid.f), np.zeros(c_y.shape[0])
-    value, turned = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
-    for margins in task.friction_usage(grid, scan.respond(c_y, c_y)).values():
+    value, worst, encircles = judge_loops(scan.task, scan.grid, scan.respond(c_y, c_y))
+    return np.log(np.maximum(value, NEXT_TO_NO_NOISE)) + _price(worst) + np.where(encircles, 50.0, 0.0)
+
+
+def judge_loops(
+    task: Task, grid: Grid, laws: LawResponse
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return the objective of n laws, their worst usage of a limit on the loop, and whether 1 + L encircles zero."""
+    count = laws.c_y.shape[0]
+    weights, worst, value, turned = task.weights(grid.f), np.zeros(count), np.zeros(count), np.zeros(count)
+    for margins in task.friction_usage(grid, laws).values():
         worst = np.max(margins, axis=(1, 2))
     for row, p in enumerate(grid.p):
-        own = tuple(name for name in task.design_limits(row) if name not in TRACKING)
-        usage = task.curves(SCOPES["every plant"] + own, grid, row, scan.respond(c_y, c_y))
-        usage |= task.port_usage(grid, scan.respond(c_y, c_y)) if row == 0 else {}
+        own = tuple(name for name in task.design_limits(grid.rows[row]) if name not in TRACKING)
+        usage = task.curves(SCOPES["every plant"] + own, grid, row, laws)
+        usage |= task.port_usage(grid, laws) if grid.rows[row] == 0 else {}
         for curve in usage.values():
-            worst = np.maximum(worst, np.max(curve, axis=1))
-        distance = scan.rest[row] + p * c_y
+            worst = np.maximum(worst, np.max(curve, axis=-1))
+        distance = laws.rest[row] + p * laws.c_y
         turn = np.sum(np.angle(distance[:, 1:] * np.conj(distance[:, :-1])), axis=1)
         # A stable loop turns by half a circle more for every pole of the plant that grows.
         turned = np.minimum(turned, turn - np.pi * count_growing(task.plants[grid.rows[row]]))
         if task.spec.objective == "disturbance":
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
-        elif row < task.design_states:
-            value = np.maximum(value, np.max(np.abs(c_y / distance), axis=1))
-    return np.log(np.maximum(value, NEXT_TO_NO_NOISE)) + _price(worst) + np.where(turned < LEAST_TURN, 50.0, 0.0)
+        elif grid.rows[row] < task.design_states:
+            value = np.maximum(value, np.max(np.abs(laws.c_y / distance), axis=1))
+    return value, worst, turned < LEAST_TURN
 
 
 def _judge_tracking(
     scan: _Scan, c_y: Complex[np.ndarray, "n m"], c_r: Complex[np.ndarray, "n m"]
 ) -> Float[np.ndarray, " n"]:
     """Return what limits on the reference's path count that are broken."""
-    task, grid, worst = scan.task, scan.grid, np.zeros(c_y.shape[0])
-    for row in range(task.design_states):
-        names = tuple(name for name in task.design_limits(row) if name in TRACKING)
-        for curve in task.curves(names, grid, row, scan.respond(c_y, c_r)).values():
-            worst = np.maximum(worst, np.max(curve, axis=1))
-    return _price(worst)
+    return _price(use_tracking(scan.task, scan.grid, scan.respond(c_y, c_r)))
+
+
+def use_tracking(task: Task, grid: Grid, laws: LawResponse) -> Float[np.ndarray, " n"]:
+    """Return the worst usage of a limit on the reference's path, of n laws."""
+    worst = np.zeros(laws.c_y.shape[0])
+    for row, plant in enumerate(grid.rows):
+        names = tuple(name for name in task.design_limits(plant) if name in TRACKING)
+        for curve in task.curves(names, grid, row, laws).values():
+            worst = np.maximum(worst, np.max(curve, axis=-1))
+    return worst
 
 
 def _price(worst: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -6,7 +6,8 @@ limit is a curve over frequency on every plant (`seaopt.control.tuning.optimisat
 bandwidth an equality. That is solved by `seaopt.control.tuning.solution`.
 
 The result is then measured by `Loop.figures`, which uses none of these frequencies. What is returned as feasible has
-been measured to be so. Where limits cannot all be kept, the result misses them by one common factor, the least
+been measured to be so. Where no law is found that keeps them all, an evolution looks for one
+(`seaopt.control.tuning.evolution`); where that has none either, the result misses them by one common factor, the least
 found, and the bandwidths at which they can be kept are looked for (`seaopt.control.tuning.possible_bandwidths`).
 """
 
@@ -70,7 +71,7 @@ from seaopt.control.tuning.optimisation_problem import (
     close_plant,
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
-from seaopt.control.tuning.solution import solve
+from seaopt.control.tuning.solution import retry, search, solve
 from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
@@ -212,9 +213,11 @@ def _tune(
     if at_rest is not None and allowed is not None:  # no law keeps it, at any bandwidth: the others are looked after
         task = replace(task, eased={"max_noise_gain": ROOM * at_rest / allowed})
     first = SOLUTION * (8.0 if task.asks_margin else 1.0)
-    solving, seeking, again, easing = divide(progress, first, BANDWIDTHS, SOLUTION, EASING)
+    solving, seeking, easing = divide(progress, first, BANDWIDTHS, EASING)
     x, loops = solve(task, progress=solving)
     task, x, loops = lower_fraction(task, x, loops)
+    if not task.eased:
+        x, loops = search(task, x, loops)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
     if broken - {FRICTION}:  # of a margin alone it is known what can be had
         near: list[LawNumbers] = []
@@ -222,7 +225,7 @@ def _tune(
             possible, near = _find_possible(task, x, seeking, stable="stability" not in broken)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
-            x, loops = solve(task, (x, *near), again)
+            x, loops = retry(task, x, loops, near)
         if list_broken_limits(spec, loops, task.design_states):
             x, loops = ease_limits(task, x, loops, easing)
     controller = make_controller(task, x, loops, (plant, params), possible)
