@@ -15,6 +15,7 @@ from seaopt.control.tuning.tuner import disturbance
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.problem import read_problem
+from seaopt.robustness.uncertainty.batch import batch_figures
 
 TS = 1e-3
 FIRST = Prefilter(corner_hz=35.0)
@@ -46,6 +47,49 @@ def test_the_law_is_that_of_the_filtered_reference(prefilter):
         x = law.a @ x + law.b @ inputs
     np.testing.assert_allclose(out, expected, atol=1e-11 * np.max(np.abs(expected)))
     assert law.integrators == 1 and law.b[0, 0] == -law.b[0, 1]
+
+
+SLOW = [Prefilter(corner_hz=2.0), Prefilter(order="second_order", corner_hz=3.0, damping=0.5)]
+
+
+@pytest.mark.parametrize("prefilter", SLOW, ids=["first", "second"])
+def test_its_poles_are_among_those_of_every_stated_radius(stand, thor, prefilter):
+    """Of the whole loop, filter, pid, delay and plant by hand, stepped from each state alone."""
+    g = {"k_p": 2.0, "k_i": 60.0, "k_d": 0.03, "T_f": 2e-3, "k_r": 2.6, "c": 0.4}
+    num, den = by_scipy(prefilter)
+    model = stand.linearize(thor)
+    row = list(stand.outputs).index("F1")
+    a, b, c, *_ = cont2discrete((model.A, model.B[:, :1], model.C[[row]], model.D[[row], :1]), TS, "zoh")
+    n, per_effort, share = len(a), so.control.command_of(stand, thor, "F1").per_effort, TS / (g["T_f"] + TS)
+    order = len(den) - 1
+
+    def step(x):
+        """Return the next state, of plant, waiting command, sum, two filters of the difference and prefilter."""
+        plant, waiting, total, slow_r, slow_y, low_pass = (*np.split(x, [n, n + 1, n + 2, n + 3, n + 4]),)
+        force, seen = (c @ plant)[0], low_pass[0]  # transposed direct form, the reference zero
+        rate = (g["c"] * (seen - slow_r[0]) - (force - slow_y[0])) * share / TS
+        half = g["k_i"] * TS / 2 * (seen - force)
+        effort = g["k_r"] * seen - g["k_p"] * force + total[0] + half + g["k_d"] * rate
+        return np.concatenate([
+            a @ plant + b[:, 0] * waiting, [effort * per_effort, total[0] + 2 * half],
+            slow_r + share * (seen - slow_r), slow_y + share * (force - slow_y),
+            np.append(low_pass[1:], 0.0) - den[1:] * seen,
+        ])  # fmt: skip
+
+    radius = np.max(np.abs(np.linalg.eigvals(np.column_stack([step(x) for x in np.eye(n + 4 + order)]))))
+    assert radius == pytest.approx(np.max(np.abs(np.roots(den))), rel=1e-9) and num.size  # it is the slowest of all
+    spec = so.ControllerSpec(bandwidth_hz=5, bandwidth_range_hz=(0.5, 60), compute_delay_samples=1)
+    law = Gains(**g, prefilter=prefilter).law("pid", TS).balanced()
+    controller = so.assess(stand, thor, law, spec)
+    certificate = so.certify(
+        controller, {"stand": stand}, thor, ranges={"k": (6.4e5, 6.6e5)}, samples=10, simulations=False
+    )
+    stored = so.Controller.from_dict(json.loads(to_json(controller.to_dict())), stand, thor)
+    stated = (
+        controller.achieved, stored.close(stand, thor).figures(), certificate.plants["stand"],
+        certificate.worst["stand"].witness, batch_figures(controller, stand, thor, {}),
+    )  # fmt: skip
+    assert [float(np.max(one.spectral_radius)) for one in stated] == pytest.approx([radius] * 5, rel=1e-8)
 
 
 def evaluate(controller, plant, params, f):
