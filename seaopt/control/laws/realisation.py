@@ -396,9 +396,7 @@ def realise(
     radius = float(np.max(np.abs(poles), initial=0.0))
     if radius >= 1.0:
         near = float(np.min(np.abs(poles - 1.0)))
-        hidden = (
-            f"its pole {near:.2g} from 1 cannot be told from a slow lag; give the law as gains, or with fewer of them"
-        )
+        hidden = f"its pole {near:.2g} from 1 is not told from a slow lag; give the law as gains, or fewer slow poles"
         meant = hidden if near < SLOW_LAG else "tune a stable one"
         raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; {meant}")
     m = law.integrators

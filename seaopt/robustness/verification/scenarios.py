@@ -31,7 +31,6 @@ UNSATURATED = 0.9  # of the step that just reaches the current limit
 FRICTION_STEPS = (0.2, 1.0, 5.0, 25.0)  # times the dry friction, where there is no limit
 STUCK_STEPS = (0.1, 0.3, 0.7)  # times the friction that holds a joint at rest
 PEAK_GRACE = 1.1  # of the reference peak allowed, for the overshoot of a step
-INTEGRAL_ROUNDING = 1e-9  # of an eigenvalue that is 1
 SETTLING_PERIODS = 40.0  # of the bandwidth, until a step is within `SETTLED`
 WAITING_PERIODS = 20.0  # of the bandwidth, until friction that sticks lets go of a step of its own size
 SETTLED = 0.1  # of a step: how far the force may be off once it has settled
@@ -269,18 +268,13 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
     tail = _size_last_phase(controller, plant)
     steps = [_step(controller, plant, name, force, tail) for name, force in sizes.items()]
     if stuck:
-        if not plant.moves and _integrates(controller):
+        if not plant.moves and controller.law.integrators:
             least = LEAST_STEP * (controller.force_limit(0.0) or 0.0)
             small = {f"step of {share:g} times the friction": share * stuck for share in STUCK_STEPS}
             sizes |= {name: force for name, force in small.items() if force > least}
         sticking = (_step(controller, plant, name, force, tail) for name, force in sizes.items())
         steps = [*(steps if can_stick(plant) else []), *(_stick(controller, step, stuck) for step in sticking)]
     return tuple(steps)
-
-
-def _integrates(controller: Controller) -> bool:
-    """Tell whether the law has an integral, an eigenvalue of 1."""
-    return bool(np.any(np.abs(np.linalg.eigvals(controller.law.a) - 1.0) < INTEGRAL_ROUNDING))
 
 
 def make_sticking(scenario: Scenario) -> Scenario:

@@ -12,6 +12,7 @@ import seaopt as so
 from seaopt.control import Gains, Law, TransferFunction, parallel_pid, realise
 from seaopt.control.given.assessment import assess
 from seaopt.control.laws.structures import Notch
+from seaopt.errors import ControlError
 from tests.laws import multiply_out
 
 TS = 1e-3
@@ -240,3 +241,19 @@ def test_a_law_without_an_integral_is_said_to_have_none(stand, thor, tmp_path):
         header = (tmp_path / "force_law.h").read_text()
         assert ("no integral that could wind up" in header) == bool(leak)
         assert ("the integral follows it" in header) == (not leak)
+
+
+def test_poles_that_rounding_puts_outside_the_circle_are_refused_with_the_reason():
+    """Three integrators, one more than are told from matrices."""
+    rng = np.random.default_rng(0)
+    a, b, turn = (
+        np.diag([1.0, 1.0, 1.0, 0.5]) + np.diag([1.0, 1.0, 0.0], 1),
+        rng.normal(size=(4, 1)),
+        rng.normal(size=(4, 4)),
+    )
+    b, back = np.hstack([b, -b]), np.linalg.inv(turn)
+    law = Law.from_state_space(
+        turn @ a @ back, turn @ b, np.array([1.0, 0.0, 0.0, 1.0]) @ back, np.array([1.0, -1.0]), TS
+    )
+    with pytest.raises(ControlError, match="from 1 is not told from a slow lag; give the law as gains"):
+        realise(law)
