@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -16,7 +17,8 @@ from seaopt.cli.terminal import Amount, prepare_streams
 from seaopt.errors import ControlError, FileError, InternalError, LogError, SeaoptError, UnitError
 from seaopt.formatting import printable
 
-INTERRUPTED = 130  # exit code, as a shell's
+INTERRUPTED = 130  # exit codes, as a shell's
+PIPE_CLOSED = 141
 DEFECT = 70  # exit code: EX_SOFTWARE of sysexits.h
 # A command, a line of TOML, an option or the word that was meant stands in it.
 TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]|did you mean \"")
@@ -45,6 +47,8 @@ class _Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
+        except BrokenPipeError:  # Typer would leave with 1, which says that something is not met
+            _leave_pipe()
         except KeyboardInterrupt as stop:
             sys.stderr.write("\nseaopt: interrupted" + (f"; {stop}" if stop.args else "") + "\n")
         raise SystemExit(INTERRUPTED)
@@ -490,12 +494,18 @@ def main() -> None:
     except InternalError as error:
         _end(str(error), _list_notes(error), DEFECT)
     except BrokenPipeError:
-        raise SystemExit(0) from None
+        _leave_pipe()
     except MemoryError:
         _end("does not fit in memory; take a shorter log, fewer columns, or fewer samples")
     except OSError as error:  # files are written with errors of our own: this is stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more
         _end(f"stdout: cannot be written ({error.strerror or error}); free its disk, or write elsewhere")
+
+
+def _leave_pipe() -> NoReturn:
+    """Leave without a word, as what reads stdout has; the exit code is that of no verdict."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more
+    raise SystemExit(PIPE_CLOSED) from None
 
 
 def _add_remedy(error: SeaoptError) -> str:
@@ -521,6 +531,7 @@ def _list_notes(error: BaseException | None) -> list[str]:
 
 def _end(text: str, notes: Iterable[str] = (), exit_code: int = 2) -> NoReturn:
     """Write one line on stderr, as a terminal may see it, with notes below; leave, with the exit code of bad input."""
-    for line in (f"seaopt: {' '.join(text.split())}", *notes):
-        sys.stderr.write(f"{printable(line)}\n")
+    with suppress(OSError):  # the exit code tells it where stderr cannot be written
+        for line in (f"seaopt: {' '.join(text.split())}", *notes):
+            sys.stderr.write(f"{printable(line)}\n")
     raise SystemExit(exit_code)

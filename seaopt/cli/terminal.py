@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import zip_longest
+from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console
@@ -85,7 +88,26 @@ class Terminal(Console):
 
 
 def prepare_streams() -> None:
-    """Let stdout and stderr write a character that their encoding lacks as its escape."""
+    """Let stdout and stderr write a character that their encoding lacks as its escape; open what a shell has closed.
+
+    The next file that is opened would have the number of a closed stream, and get what libraries print.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            mode = "w" if number else "r"
+            nowhere = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 - as long as the process
+            with suppress(OSError):
+                if nowhere.fileno() != number and not _is_open(number):
+                    os.dup2(nowhere.fileno(), number)
+            setattr(sys, name, nowhere)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def _is_open(number: int) -> bool:
+    try:
+        os.fstat(number)
+    except OSError:
+        return False
+    return True
