@@ -149,7 +149,7 @@ def connect_dask(address: str, timeout_s: float = 30.0) -> Generator[Executor]:
     try:
         import distributed
     except ImportError as error:
-        raise SeaoptError("a Dask scheduler needs the package distributed: pip install seaopt[dask]") from error
+        raise SeaoptError("a Dask scheduler needs the package distributed: pip install 'seaopt[dask]'") from error
     try:
         executor = _Cluster(lambda: distributed.Client(address, timeout=timeout_s, set_as_default=False))
     except (OSError, TimeoutError, ValueError, TypeError) as error:

@@ -188,7 +188,7 @@ def _open_filesystem(address: str) -> Any:
     try:
         import fsspec
     except ImportError as error:
-        raise FileError(f"{address}: an address needs the package fsspec: pip install seaopt[remote]") from error
+        raise FileError(f"{address}: an address needs the package fsspec: pip install 'seaopt[remote]'") from error
     try:
         return fsspec.core.url_to_fs(address)[0]
     except (ImportError, ValueError) as error:  # a protocol that is not known, or whose package is missing

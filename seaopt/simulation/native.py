@@ -175,7 +175,7 @@ def _compile(compiler: list[str], source: str, name: str, library: Path) -> bool
     hung = _hung_marker(compiler, library.parent)
     _sweep(library.parent)
     try:
-        if hung.exists() and time.time() - hung.lstat().st_mtime < HUNG_S:
+        if hung.exists() and abs(time.time() - hung.lstat().st_mtime) < HUNG_S:
             trouble = f"did not end less than {HUNG_S / 60:g} minutes ago, and is not asked again so soon"
         elif any(
             _run_compiler([*compiler, *FLAGS, *extra], source, name, library)

@@ -403,3 +403,10 @@ def test_a_library_too_old_is_no_damaged_file(tmp_path):
 
     with pytest.raises(LogError, match="not at fault"), translate_errors(tmp_path / "log.csv", "CSV"):
         pl.read_csv(b"a", an_option_of_the_future=True)
+
+
+def test_a_library_that_does_not_fit_into_memory_is_no_damaged_file(tmp_path):
+    from seaopt.logs.formats.source import translate_errors
+
+    with pytest.raises(LogError, match=r"cannot be loaded.*ulimit"), translate_errors(tmp_path / "log.csv", "CSV"):
+        raise NameError("name 'PyLazyFrame' is not defined")

@@ -249,6 +249,11 @@ def translate_errors(path: Path, form: str) -> Generator[None]:
                 f"{path}: the library that reads {form} is not one that seaopt works with ({summarise_error(error)}); "
                 "the file is not at fault, run pip install --upgrade seaopt"
             ) from error
+        if isinstance(error, ImportError | NameError):  # of Polars, whose runtime did not fit into the address space
+            raise LogError(
+                f"{path}: the library that reads {form} cannot be loaded ({summarise_error(error)}); "
+                "give it more memory (ulimit -v), or install seaopt again"
+            ) from error
         raise LogError(
             f"{path}: cannot be read as {form} ({summarise_error(error)}); the file may be cut off or damaged, "
             "copy or record it again"
