@@ -160,8 +160,8 @@ def export(
             "commanded a current"
         )
     limit = command_limit if current_limit_A is None else current_limit_A
-    gate = stored["gate"] if gate is None else gate or None
-    law = _law(stored, limit, tracking_time_s, gate, heat if derate else None)
+    believed: PlausibilityGate | None = stored["gate"] if gate is None else (gate or None)
+    law = _law(stored, limit, tracking_time_s, believed, heat if derate else None)
     context = _describe(stored, law) | {
         "achieved": figures,
         "precision": precision,
