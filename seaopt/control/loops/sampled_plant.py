@@ -16,6 +16,7 @@ a state of the plant (``phi``)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -231,6 +232,13 @@ def find_delay(plant: Plant, at: Mapping[str, Any]) -> Any:
     """
     late = at.get(DELAY, 0.0) + at.get(DRIVE_DELAY, 0.0)
     return np.maximum(late + plant.drive_offset_s, 0.0) if plant.drive_offset_s else late
+
+
+def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:
+    """Return a delay as whole samples and the rest in seconds."""
+    whole = math.floor(delay_s / sample_time_s + 1e-9)
+    rest = delay_s - whole * sample_time_s
+    return whole, rest if rest > 1e-9 * sample_time_s else 0.0
 
 
 def add_drive_delay(params: ParameterSet, drive_delay_s: float) -> ParameterSet:

@@ -4,10 +4,12 @@ The plant is linearised at rest and sampled through a zero-order hold; white noi
 (see `noise`) are states beside its own, so that :math:`z = [x, w, d]` and
 
 .. math::
-    z_{k+1} = A z_k + B u_{k-n} + v_k, \quad y_k = C z_k + D u_{k-n} + e_k, \qquad
-    \hat z_{k|k} = \hat z_k + L \epsilon_k, \quad \hat z_{k+1} = A \hat z_{k|k} + B u_{k-n}
+    z_{k+1} = A z_k + B u_{k-n} + B' u_{k-n-1} + v_k, \quad y_k = C z_k + D \bar u_k + e_k, \qquad
+    \hat z_{k|k} = \hat z_k + L \epsilon_k, \quad \hat z_{k+1} = A \hat z_{k|k} + B u_{k-n} + B' u_{k-n-1}
 
-with n whole samples of delay, innovations :math:`\epsilon_k = y_k - C \hat z_k - D u_{k-n}` and the steady-state gain
+with n whole samples of delay, B' what the command before adds where a part of a sample is left besides (the drive's
+delay, a condition of the parameters: `seaopt.control.loops.sampled_plant`), :math:`\bar u_k` the input in force as y is
+read, innovations :math:`\epsilon_k = y_k - C \hat z_k - D \bar u_k` and the steady-state gain
 :math:`L = P C^T S^{-1}`, :math:`S = C P C^T + R`, where P solves the discrete algebraic Riccati equation. If plant and
 noise are right the innovations are white with covariance S: `run` tests that on a log (Ljung and Box, Biometrika 65,
 1978).
@@ -23,6 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.loops.sampled_plant import find_delay, read_conditions, whole_samples
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
@@ -52,9 +55,9 @@ class EstimatorState:
     corrected : array, shape (n,)
         z of this sample, with its measurement.
     applied : array, shape (nu,)
-        What reached the plant's inputs at this sample.
-    past : array, shape (delay_samples, nu)
-        Delayed inputs, oldest first.
+        What was in force at the plant's inputs as this sample was read.
+    past : array, shape (delay_samples + 1, nu)
+        The inputs before this sample's, oldest first.
     innovation : array, shape (ny,)
         Measured less predicted, in the outputs' units; NaN where nothing was measured.
 
@@ -112,10 +115,12 @@ class Estimator:
         Measured, in the order of y.
     sample_time_s : float
     delay_samples : int
-        Whole samples from an input to the plant.
+        Whole samples from an input to the plant, those of the drive's delay among them.
     noise : NoiseModel
     A, B, C, D : arrays
         The sampled plant with its disturbances, shapes (n, n), (n, nu), (ny, n), (ny, nu).
+    late : array, shape (n, nu)
+        B', which the input before has in a sample; zero where the delay is of whole samples.
     gain : array, shape (n, ny)
         L, from innovation to correction.
     covariance : array, shape (n, n)
@@ -141,6 +146,7 @@ class Estimator:
     B: Float[np.ndarray, "n nu"]
     C: Float[np.ndarray, "ny n"]
     D: Float[np.ndarray, "ny nu"]
+    late: Float[np.ndarray, "n nu"]
     gain: Float[np.ndarray, "n ny"]
     covariance: Float[np.ndarray, "n n"]
     innovation_covariance: Float[np.ndarray, "ny ny"]
@@ -162,8 +168,16 @@ class Estimator:
         n, nu = self.B.shape
         return EstimatorState(
             predicted=np.zeros(n), corrected=np.zeros(n), applied=np.zeros(nu),
-            past=np.zeros((self.delay_samples, nu)), innovation=np.full(len(self.outputs), np.nan),
+            past=np.zeros((self.delay_samples + 1, nu)), innovation=np.full(len(self.outputs), np.nan),
         )  # fmt: skip
+
+    def list_acting(self, past: Float[np.ndarray, "m nu"]) -> Float[np.ndarray, " nu"]:
+        """Return the input in force as a sample is read, of those before it and its own."""
+        return past[0 if np.any(self.late) else 1]
+
+    def advance(self, z: Float[np.ndarray, " n"], older: Any, newer: Any) -> Float[np.ndarray, " n"]:
+        """Return z a sample later, in which one input stops acting and the next one begins to."""
+        return self.A @ z + self.B @ newer + self.late @ older
 
     def correct(
         self, state: EstimatorState, y: Float[np.ndarray, " ny"], applied: Float[np.ndarray, " nu"]
@@ -175,10 +189,10 @@ class Estimator:
     def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
         """Process one sample: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
         line = np.vstack([state.past, u])
-        applied = line[0]
+        applied = self.list_acting(line)
         corrected, innovation = self.correct(state, y, applied)
         return EstimatorState(
-            predicted=self.A @ corrected + self.B @ applied, corrected=corrected, applied=applied, past=line[1:],
+            predicted=self.advance(corrected, line[0], line[1]), corrected=corrected, applied=applied, past=line[1:],
             innovation=innovation,
         )  # fmt: skip
 
@@ -200,12 +214,15 @@ class Estimator:
         """
         u, y = self._samples(log)
         settled = min(self._count_settling(), len(log) // 2)
-        delayed = np.vstack([np.zeros((self.delay_samples, u.shape[1])), u])[: len(log)]
+        queue = np.vstack([np.zeros((self.delay_samples + 1, u.shape[1])), u])
+        older, delayed = queue[: len(log)], queue[1 : len(log) + 1]
+        acting = older if np.any(self.late) else delayed
         closed = self.A @ (np.eye(len(self.A)) - self.gain @ self.C)
-        drive = delayed @ (self.B - self.A @ self.gain @ self.D).T + (y - self.offset) @ (self.A @ self.gain).T
+        read = y - self.offset - acting @ self.D.T
+        drive = delayed @ self.B.T + older @ self.late.T + read @ (self.A @ self.gain).T
         predicted = np.vstack([np.zeros(len(closed)), run_recursion(closed, drive)[:-1]])
-        innovations = y - self.offset - predicted @ self.C.T - delayed @ self.D.T
-        estimates = (predicted + innovations @ self.gain.T) @ self.G.T + delayed @ self.H.T
+        innovations = read - predicted @ self.C.T
+        estimates = (predicted + innovations @ self.gain.T) @ self.G.T + acting @ self.H.T
         return EstimatorRun(
             time=log.time,
             values=dict(zip(self.names, estimates.T.copy(), strict=True)),
@@ -266,7 +283,7 @@ def estimator(
     plant : Plant
         Linearised at rest at zero; its dry friction must be zero, for dry friction has no linearisation there.
     params : ParameterSet or Fit
-        Its parameters.
+        Its parameters; `drive_delay_s` among them is the drive's delay, exact in fractions of a sample.
     noise : NoiseModel
         Of the measured outputs and of the inputs.
     outputs : tuple of str
@@ -274,7 +291,7 @@ def estimator(
     sample_time_s : float
         Seconds.
     delay_samples : int
-        Whole samples from a commanded input to the plant.
+        Whole samples from a commanded input to the drive.
 
     Raises
     ------
@@ -292,16 +309,22 @@ def estimator(
     (True, 'm/s')
 
     """
-    values = plant.complete(params.parameters if isinstance(params, Fit) else params)
+    given = params.parameters if isinstance(params, Fit) else params
+    values = plant.complete(given)
     chosen = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     _check(plant, values, noise, chosen, sample_time_s, delay_samples)
     a, b, c, d = state_space(plant, values)
     nx, nu = b.shape
     block = np.zeros((nx + nu, nx + nu))
     block[:nx, :nx], block[:nx, nx:] = a, b
-    whole, _ = expm_with_derivatives(block * sample_time_s, np.zeros((0, nx + nu, nx + nu)))
+    waits, rest_s = whole_samples(float(find_delay(plant, read_conditions(plant, given))), sample_time_s)
+    whole, part = (
+        expm_with_derivatives(block * seconds, np.zeros((0, nx + nu, nx + nu)))[0]
+        for seconds in (sample_time_s, sample_time_s - rest_s)
+    )
     disturbances = _disturbances_of(plant, noise, sample_time_s)
-    A, B, Q = _augment(whole[:nx, :nx], whole[:nx, nx:], disturbances)
+    A, total, Q = _augment(whole[:nx, :nx], whole[:nx, nx:], disturbances)
+    B = np.vstack([part[:nx, nx:], np.zeros((len(disturbances), nu))])  # acts from when it has arrived
     columns = [column for column, _, _ in disturbances]
     rows = [list(plant.outputs).index(name) for name in chosen]
     C, D = np.hstack([c, d[:, columns]])[rows], d[rows]
@@ -312,8 +335,9 @@ def estimator(
     keep = np.eye(len(A)) - gain @ C
     names, units, G, H = _list_estimates(plant, values, (a, b, c, d), disturbances)
     return Estimator(
-        plant=plant, outputs=chosen, sample_time_s=sample_time_s, delay_samples=delay_samples, noise=noise,
-        A=A, B=B, C=C, D=D, gain=gain, covariance=keep @ P @ keep.T + gain @ R @ gain.T, innovation_covariance=S,
+        plant=plant, outputs=chosen, sample_time_s=sample_time_s, delay_samples=delay_samples + waits,
+        noise=noise, A=A, B=B, C=C, D=D, late=total - B, gain=gain,
+        covariance=keep @ P @ keep.T + gain @ R @ gain.T, innovation_covariance=S,
         offset=np.array([noise.offset.get(name, 0.0) for name in chosen]), names=names, units=units, G=G, H=H,
     )  # fmt: skip
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.laws.delay import describe_delays
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
@@ -93,7 +94,8 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
     """Return the numbers of a controller's C code."""
     kalman, prediction, spec, outputs = mpc.kalman, mpc.prediction, mpc.spec, mpc.prediction.outputs
     sizes = {
-        "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": mpc.delay_samples,
+        "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": kalman.delay_samples,
+        "COMPUTE_DELAY_SAMPLES": mpc.compute_delay_samples,
         "KNOTS": prediction.knots.size, "ROWS": len(prediction.rows), "SLEWS": len(prediction.M),
         "SIGNALS": len(outputs.names), "SAMPLES": outputs.samples, "PREVIEW": spec.preview_samples,
         "HORIZON": spec.samples, "MAX_ITERATIONS": spec.max_iterations,
@@ -104,7 +106,8 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "slack_unit": SLACK_UNIT, "lag": spec.lag_s / spec.sample_time_s,
     }  # fmt: skip
     arrays = {
-        "A": kalman.A, "B": kalman.B[:, 0], "C": kalman.C[0], "gain": kalman.gain[:, 0], "rest": mpc.rest,
+        "A": kalman.A, "B": kalman.B[:, 0], "late": kalman.late[:, 0], "C": kalman.C[0],
+        "gain": kalman.gain[:, 0], "rest": mpc.rest,
         "F": prediction.F, "M": prediction.M, "R": prediction.R, "shift": mpc.shift, "free": outputs.free,
         "forced": outputs.forced, "static": outputs.static, "centre": outputs.middle / outputs.half,
     }  # fmt: skip
@@ -112,6 +115,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "COMMAND": mpc.actuation.word,
         "COMMAND_UNIT": mpc.actuation.unit,
         "UNIT": mpc.design[0].outputs[mpc.measured],
+        "DELAYS": describe_delays(mpc.compute_delay_samples, mpc.drive_delay_s, mpc.sample_time_s),
     }
     code = MPCCode(
         sizes=sizes, numbers={name: value for name, value in numbers.items() if np.isfinite(value)}, units=units,

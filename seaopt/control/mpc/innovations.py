@@ -53,7 +53,7 @@ def estimate_noise(
     outputs : tuple of str
         What was measured.
     delay_samples : int
-        Whole samples from the logged input to the plant.
+        Whole samples from the logged input to the drive; `drive_delay_s` among the parameters is the drive's own.
 
     Raises
     ------

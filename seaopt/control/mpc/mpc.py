@@ -21,10 +21,10 @@ and the step says so.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 from dataclasses import field, replace
+from itertools import pairwise
 from types import NoneType
 from typing import Any
 
@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import Command, command_of, limit_notes
-from seaopt.control.laws.delay import NEGLIGIBLE, settle_delays, warn_delays
+from seaopt.control.laws.delay import describe_delays, settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.spec import describe_lifted
@@ -41,7 +41,7 @@ from seaopt.control.loops.absolute_stability import FrictionMargin, friction_mar
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
-from seaopt.control.loops.sampled_plant import DRIVE_DELAY, DigitalPlant, sample
+from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, read_conditions, sample
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.knots import interpolate_knots, spread_knots
@@ -61,7 +61,7 @@ from seaopt.control.mpc.step import MPCState, MPCStep
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
-from seaopt.formatting import format_count, format_number, html_text
+from seaopt.formatting import format_number, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import split_friction, take_sliding
@@ -158,7 +158,8 @@ class ForceMPC:
     def friction(self) -> FrictionMargin | None:
         """How much steeper friction may be with stability shown while no limit is active; None without friction."""
         plant, values = self.design
-        (loop,) = make_friction_loops(plant, [values], self.measured, self.per_effort, self.delay_samples, self.law)
+        waits = self.compute_delay_samples
+        (loop,) = make_friction_loops(plant, [values], self.measured, self.per_effort, waits, self.law)
         return None if loop is None else friction_margin(loop)
 
     @property
@@ -172,9 +173,20 @@ class ForceMPC:
         return self.spec.sample_time_s
 
     @property
-    def delay_samples(self) -> int:
-        """Whole samples from measurement to output, besides the hold."""
+    def compute_delay_samples(self) -> int:
+        """Whole samples from a reading to the command being put out, besides the hold."""
         return self.spec.loop_delay_samples
+
+    @property
+    def drive_delay_s(self) -> float:
+        """Seconds from the command to its effect on the design plant."""
+        plant, values = self.design
+        return float(find_delay(plant, read_conditions(plant, values)))
+
+    @property
+    def delay_samples(self) -> float:
+        """Both together, in samples."""
+        return self.compute_delay_samples + self.drive_delay_s / self.sample_time_s
 
     @property
     @memo
@@ -328,7 +340,7 @@ class ForceMPC:
         lag = self.spec.lag_s / self.spec.sample_time_s
         delta = targets[:-1] - targets[-1] + lag * np.diff(targets)
         gradient = prediction.F @ np.append(xi, last_A - u_s) + prediction.R @ delta
-        under, over = prediction.outputs.limits(xi, u_s + drift, WIDE)
+        under, over = prediction.outputs.limits(np.append(xi, last_A - u_s), u_s + drift, WIDE)
         q = np.concatenate([gradient, np.full(len(prediction.outputs.names), PENALTY)])
         low = np.concatenate([(-1.0 - u_s / limit) * one, slopes - 1.0, under])
         high = np.concatenate([(1.0 - u_s / limit) * one, slopes + 1.0, over])
@@ -350,12 +362,11 @@ class ForceMPC:
         self, kalman: EstimatorState, measurement: float
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " 1"], Float[np.ndarray, " n"]]:
         """Return z with the measurement, the innovation, and z when a current commanded now arrives."""
-        line = kalman.past
-        applied = line[0] if len(line) else np.zeros(self.kalman.B.shape[1])  # D = 0: it does not matter
-        corrected, innovation = self.kalman.correct(kalman, np.array([measurement]), applied)
+        line = kalman.past  # D = 0: which of them acts does not matter to the innovation
+        corrected, innovation = self.kalman.correct(kalman, np.array([measurement]), line[0])
         ahead = corrected
-        for u in line:
-            ahead = self.kalman.A @ ahead + self.kalman.B @ u
+        for older, newer in pairwise(line):
+            ahead = self.kalman.advance(ahead, older, newer)
         return corrected, innovation, ahead
 
     def _targets(
@@ -364,7 +375,7 @@ class ForceMPC:
         """Return the current at rest for the last reference, and the nearest forces to all that the limits can hold."""
         ends = self.prediction.outputs.admissible_rest(drift, self.command_limit)
         currents = np.clip(references / self.static_gain - drift, *ends)
-        first = min(self.delay_samples, references.size - 1)
+        first = min(self.kalman.delay_samples, references.size - 1)
         return float(currents[-1]), self.static_gain * (currents[first:] + drift)
 
     def _fault(self, solution: Solution, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> str:
@@ -386,28 +397,28 @@ class ForceMPC:
         u[0] = current
         line = np.vstack([kalman.past, u])
         return EstimatorState(
-            predicted=self.kalman.A @ corrected + self.kalman.B @ line[0], corrected=corrected, applied=line[0],
-            past=line[1:], innovation=innovation,
+            predicted=self.kalman.advance(corrected, line[0], line[1]), corrected=corrected,
+            applied=self.kalman.list_acting(line), past=line[1:], innovation=innovation,
         )  # fmt: skip
 
     def unlimited(self) -> Law:
         """Return what the controller is as long as no limit is active: from reference and measurement to current."""
         gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.command_limit
-        n, delay = len(self.kalman.A), self.delay_samples
-        past = max(delay, 1)  # of which the last command is one
+        n, delay, b, late = len(self.kalman.A), self.kalman.delay_samples, self.kalman.B[:, 0], self.kalman.late[:, 0]
+        past = max(delay + bool(np.any(late)), 1)  # commands that still act, of which the last is one
 
         def respond(s: Float[np.ndarray, " k"], r: float, y: float) -> Float[np.ndarray, " k1"]:
-            z, line = s[:n], s[n:]
+            z, line = s[:n], np.concatenate([np.zeros(delay + 1 - past), s[n:]])
             corrected = z + self.kalman.gain[:, 0] * (y - self.kalman.C[0] @ z)
-            ahead, b = corrected, self.kalman.B[:, 0]
-            for u in line[past - delay :]:
-                ahead = self.kalman.A @ ahead + b * u
+            ahead = corrected
+            for older, newer in pairwise(line):
+                ahead = self.kalman.A @ ahead + b * newer + late * older
             u_s = r / self.static_gain - ahead[-1]
             xi = ahead[: self.rest.size] - self.rest * r / self.static_gain
             current = u_s + gains @ np.append(xi, line[-1] - u_s)
             queue = np.append(line, current)
-            after = self.kalman.A @ corrected + b * queue[past - delay]
-            return np.concatenate([after, queue[1:], [current]])
+            after = self.kalman.A @ corrected + b * queue[1] + late * queue[0]
+            return np.concatenate([after, queue[-past:], [current]])
 
         size = n + past
         whole = np.column_stack(
@@ -423,7 +434,9 @@ class ForceMPC:
         A plant with friction slides, as in `Controller.close`.
         """
         sliding = take_sliding(plant, params)
-        digital = sample(sliding, params, self.measured, self.per_effort, self.sample_time_s, self.delay_samples)
+        digital = sample(
+            sliding, params, self.measured, self.per_effort, self.sample_time_s, self.compute_delay_samples
+        )
         return Loop(plant=digital, law=self.law)
 
     @property
@@ -452,7 +465,7 @@ class ForceMPC:
         verdict = "every limit met" if self.feasible else f"NOT FEASIBLE: {join_labels(self.broken)}"
         lines = [
             f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
-            f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
+            f"{describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s)}: {verdict}",
             f"  within {self.describe_limits()}, which hold {self.static_gain * self.command_limit:.4g} {unit}",
             f"  bandwidth {format_number(self.achieved.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}) "
             f"while no limit of the {self.actuation.word} is active; horizon {1e3 * s.horizon_s:g} ms, "
@@ -511,19 +524,7 @@ def force_mpc(
         )
     warnings = warn_delays(spec, plant, params)
     spec, values = settle_delays(spec, plant, params, plans=True)
-    spec, values = _round_up_delay(spec, values)
     return _design(plant, values, spec, gate, warnings)
-
-
-def _round_up_delay(spec: MPCSpec, values: ParameterSet) -> tuple[MPCSpec, ParameterSet]:
-    """Return a specification that counts the drive's delay in whole samples, and values without it."""
-    if DRIVE_DELAY not in values:
-        return spec, values
-    late = math.ceil(values[DRIVE_DELAY].value * spec.sample_rate_hz - NEGLIGIBLE)
-    counted = replace(
-        spec, compute_delay_samples=spec.loop_delay_samples + late, drive_delay_s=0.0, delay_samples=None
-    )  # fmt: skip
-    return counted, ParameterSet(one for name, one in values.items() if name != DRIVE_DELAY)
 
 
 def _find_possible(mpc: ForceMPC) -> float | None:
@@ -546,7 +547,7 @@ def _design(
     """Return the controller of a specification whose delay is settled; friction slides in its model."""
     design = (plant, values)
     plant = freeze_heat(take_sliding(plant, values))
-    completed = plant.complete(values)
+    completed = plant.complete(ParameterSet(one for name, one in values.items() if name not in DELAYS))
     digital = sample(plant, completed, spec.measured, 1.0, spec.sample_time_s, 0)
     limit = limit_command(spec, plant, completed)
     gain = _static_gain(plant, digital, spec, limit)
@@ -559,20 +560,21 @@ def _design(
             f"noise: input_drift must be of {_drive(plant)} alone and above zero, for it takes the force's offset away"
         )
     kalman = estimator(
-        plant, completed, noise, outputs=(spec.measured,), sample_time_s=spec.sample_time_s,
+        plant, values, noise, outputs=(spec.measured,), sample_time_s=spec.sample_time_s,
         delay_samples=spec.loop_delay_samples,
     )  # fmt: skip
-    a, b, c = digital.a, digital.b, digital.c
+    a, c, nx = digital.a, digital.c, digital.b.size
+    b, late = kalman.B[:nx, 0], kalman.late[:nx, 0]
     weighted = c + spec.lag_s * _rate(plant, completed, spec.measured)
-    regulator = tune_regulator(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
+    regulator = tune_regulator(a, b, late, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
     knots = spread_knots(spec.samples, spec.moves)
-    outputs = bound_outputs(spec.bounds, kalman, a, b, interpolate_knots(knots), limit)
-    known = max(spec.preview_samples - spec.loop_delay_samples, 0)
-    prediction = condense(a, b, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A, known, outputs)
+    outputs = bound_outputs(spec.bounds, kalman, a, b, late, interpolate_knots(knots), limit)
+    known = max(spec.preview_samples - kalman.delay_samples, 0)
+    prediction = condense(a, b, late, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A, known, outputs)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
         spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
-        rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift,
+        rest=np.linalg.solve(np.eye(nx) - a, digital.b), shift=shift,
         solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate, warnings=warnings,
     )  # fmt: skip

@@ -3,7 +3,7 @@ r"""Bounds of a plant's outputs and states over the horizon: rows of the quadrat
 With :math:`\xi`, :math:`\mu` counted from the target (see `prediction`), a bounded signal of the sampled plant is
 
 .. math:: y_{ij} = g_i (u_s + \hat d) + c_i \xi_j + d_i \mu_j, \qquad
-          \xi_j = A^j \xi_0 + \sum_{l<j} A^{j-1-l} b\, W_l\, \theta
+          \xi_j = A^j \xi_0 + \sum_{l<j} A^{j-1-l} (b\, W_l + b'\, W_{l-1})\, \theta
 
 with g its static gain. It is held within :math:`[l_i, h_i]` at some samples j of the horizon, close together where it
 begins: what comes between two of them comes to a closer one as the horizon moves. Over half the width of the bounds,
@@ -44,8 +44,8 @@ class OutputBounds:
         Centre and half width of the bounds, in the signals' units.
     static : array, shape (k,)
         Value at rest per unit of command, over `half`.
-    free : array, shape (k m, nx)
-        From the state's distance to its target to the signal at m samples, signal by signal.
+    free : array, shape (k m, nx + 1)
+        From the state's distance to its target, and the last command's, to the signal at m samples, signal by signal.
     forced : array, shape (k m, n)
         The same of the knots, in units of the limit of the command.
 
@@ -55,7 +55,7 @@ class OutputBounds:
     middle: Float[np.ndarray, " k"]
     half: Float[np.ndarray, " k"]
     static: Float[np.ndarray, " k"]
-    free: Float[np.ndarray, "km nx"]
+    free: Float[np.ndarray, "km nx1"]
     forced: Float[np.ndarray, "km n"]
 
     @property
@@ -75,14 +75,14 @@ class OutputBounds:
         return np.block([[self.forced, -slack], [self.forced, slack], [np.zeros((k, n)), np.eye(k)]])
 
     def limits(
-        self, xi: Float[np.ndarray, " nx"], rest: float, wide: float
+        self, start: Float[np.ndarray, " nx1"], rest: float, wide: float
     ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
         """Return lower and upper ends of these rows.
 
         Parameters
         ----------
-        xi : array, shape (nx,)
-            The state's distance from its target.
+        start : array, shape (nx + 1,)
+            The state's distance from its target, and the last command's.
         rest : float
             The command that reaches the plant at rest, with its disturbance.
         wide : float
@@ -90,7 +90,7 @@ class OutputBounds:
 
         """
         k = len(self.names)
-        base = np.repeat(self.static * rest - self.middle / self.half, self.samples) + self.free @ xi
+        base = np.repeat(self.static * rest - self.middle / self.half, self.samples) + self.free @ start
         none = np.full(base.size, wide)
         return (
             np.concatenate([-none, -1.0 - base, np.zeros(k)]),
@@ -110,11 +110,26 @@ class OutputBounds:
         return (low, high) if low <= high else (middle, middle)
 
 
+def go_on(
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
+    free: Float[np.ndarray, "nx nx1"], forced: Float[np.ndarray, "nx samples"], j: int,
+) -> tuple[Float[np.ndarray, "nx nx1"], Float[np.ndarray, "nx samples"]]:  # fmt: skip
+    """Return the state at sample j + 1, as shares of the start (state, last command) and of the commands, from j's."""
+    free, forced = a @ free, a @ forced
+    forced[:, j] += b
+    if j:
+        forced[:, j - 1] += late
+    else:
+        free[:, -1] += late
+    return free, forced
+
+
 def bound_outputs(
     bounds: Mapping[str, tuple[float, float]],
     kalman: Estimator,
     a: Float[np.ndarray, "nx nx"],
     b: Float[np.ndarray, " nx"],
+    late: Float[np.ndarray, " nx"],
     W: Float[np.ndarray, "samples n"],
     limit: float,
 ) -> OutputBounds:
@@ -126,8 +141,8 @@ def bound_outputs(
         Of outputs and states of the plant, deflection and rate of its spring, in their units.
     kalman : Estimator
         Whose estimates they are.
-    a, b
-        The sampled plant.
+    a, b, late
+        The sampled plant, and what the command before adds.
     W : array, shape (samples, n)
         From the knots to the command at each sample of the horizon.
     limit : float
@@ -151,14 +166,13 @@ def bound_outputs(
     ends = np.array(list(bounds.values()), dtype=float).reshape(-1, 2)
     half = 0.5 * (ends[:, 1] - ends[:, 0])
     at = set(spread_knots(N, min(BOUND_SAMPLES, N)).tolist())
-    free, forced = np.eye(nx), np.zeros((nx, N))
-    frees: list[Float[np.ndarray, "k nx"]] = []
+    free, forced = np.eye(nx, nx + 1), np.zeros((nx, N))
+    frees: list[Float[np.ndarray, "k nx1"]] = []
     forces: list[Float[np.ndarray, "k n"]] = []
     for j in range(N):  # a signal that the command reaches at once is held at j, with mu_j; another one sample later
         now = C @ forced + np.outer(D, np.eye(N)[j])
         free_now = C @ free
-        free, forced = a @ free, a @ forced
-        forced[:, j] += b
+        free, forced = go_on(a, b, late, free, forced, j)
         direct = (D != 0.0)[:, None]
         if j in at:
             frees.append(np.where(direct, free_now, C @ free))
@@ -166,7 +180,7 @@ def bound_outputs(
     scale = half[:, None, None]
     return OutputBounds(
         names=tuple(bounds), middle=ends.mean(axis=1), half=half,
-        static=(C @ np.linalg.solve(np.eye(nx) - a, b) + D) / half,
-        free=(np.stack(frees, axis=1) / scale).reshape(-1, nx),
+        static=(C @ np.linalg.solve(np.eye(nx) - a, b + late) + D) / half,
+        free=(np.stack(frees, axis=1) / scale).reshape(-1, nx + 1),
         forced=(np.stack(forces, axis=1) / scale).reshape(-1, W.shape[1]),
     )  # fmt: skip

@@ -5,8 +5,9 @@ From targets x_s, u_s that hold the reference, :math:`\xi = x - x_s`, :math:`\mu
 .. math::
     J = \sum_{j=0}^{N-1} \Big[ (w\,\xi_j / g)^2 + \rho\,(\mu_j - \mu_{j-1})^2 \Big]
         + \begin{bmatrix} \xi_N \\ \mu_{N-1} \end{bmatrix}^T \Pi \begin{bmatrix} \xi_N \\ \mu_{N-1} \end{bmatrix},
-    \qquad \xi_{j+1} = A \xi_j + b \mu_j
+    \qquad \xi_{j+1} = A \xi_j + b \mu_j + b' \mu_{j-1}
 
+where b' is not zero if a drive's delay leaves a part of a sample in which the command before still acts, and
 with :math:`w\,\xi = F - F_\mathrm{ref} + \tau \dot F`, so that an error which dies out with the time constant
 :math:`\tau` costs nothing and overshoot does; g the static gain in N/A, and :math:`\Pi` the cost of going on for ever
 without limits (the Riccati solution of the plant with its last current as a state): with every sample free and no limit
@@ -30,7 +31,7 @@ from jaxtyping import Float, Int
 
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.mpc.knots import interpolate_knots
-from seaopt.control.mpc.output_bounds import OutputBounds
+from seaopt.control.mpc.output_bounds import OutputBounds, go_on
 from seaopt.errors import ControlError
 from seaopt.records import record
 
@@ -92,14 +93,15 @@ class HorizonProgram:
 
 
 def solve_regulator(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float, rho: float
-) -> Regulator:
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
+    w: Float[np.ndarray, " nx"], gain: float, rho: float,
+) -> Regulator:  # fmt: skip
     """Return the linear-quadratic regulator of w xi over `gain` and current increments."""
     from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
 
     nx = b.size
     A, B = np.eye(nx + 1), np.append(b, 1.0)[:, None]
-    A[:nx, :nx], A[:nx, nx] = a, b
+    A[:nx, :nx], A[:nx, nx] = a, b + late
     row = np.append(w / gain, 0.0)
     try:
         Pi = np.asarray(solve_discrete_are(A, B, np.outer(row, row), np.array([[rho]])))
@@ -112,20 +114,20 @@ def solve_regulator(
 
 
 def tune_regulator(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"],
-    w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
+    c: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
 ) -> Regulator:  # fmt: skip
     """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by a search for rho."""
     from scipy.optimize import brentq  # deferred: scipy is slow to load
 
     nx = b.size
-    rest = np.linalg.solve(np.eye(nx) - a, b) / gain  # x_s per newton
-    A = np.block([[a, b[:, None]], [np.zeros((1, nx)), np.eye(1)]])
+    rest = np.linalg.solve(np.eye(nx) - a, b + late) / gain  # x_s per newton
+    A = np.block([[a, (b + late)[:, None]], [np.zeros((1, nx)), np.eye(1)]])
     B, row = np.append(b, 1.0), np.append(c, 0.0)
     below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
 
     def tracking(candidate: Regulator, f: Float[np.ndarray, " m"] = below[-1:]) -> Float[np.ndarray, " m"]:
-        """Return abs(F/F_ref); the delay, which does not change it, is left out."""
+        """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
         z = np.exp(2j * np.pi * f * sample_time_s)[:, None, None]
         drive = (B * (candidate.K_x @ rest + candidate.K_u / gain)).astype(complex)[:, None]
         closed = A - np.outer(B, np.append(candidate.K_x, candidate.K_u))
@@ -133,7 +135,7 @@ def tune_regulator(
 
     def excess(log_rho: float) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth; it falls with the weight."""
-        return float(np.log(tracking(solve_regulator(a, b, w, gain, float(np.exp(log_rho))))[0] / HALF_POWER))
+        return float(np.log(tracking(solve_regulator(a, b, late, w, gain, float(np.exp(log_rho))))[0] / HALF_POWER))
 
     low, high = (float(np.log(w)) for w in WEIGHTS)
     if excess(low) < 0.0:
@@ -143,7 +145,7 @@ def tune_regulator(
     if excess(high) > 0.0:
         raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
     root: Any = brentq(excess, low, high, xtol=1e-12)
-    regulator = solve_regulator(a, b, w, gain, float(np.exp(root)))
+    regulator = solve_regulator(a, b, late, w, gain, float(np.exp(root)))
     dips = np.flatnonzero(tracking(regulator, below) < 0.99 * HALF_POWER)
     if dips.size:
         raise ControlError(
@@ -154,9 +156,9 @@ def tune_regulator(
 
 
 def condense(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float,
-    regulator: Regulator, knots: Int[np.ndarray, " n"], limit: float, slew_per_sample: float, known: int,
-    outputs: OutputBounds,
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
+    w: Float[np.ndarray, " nx"], gain: float, regulator: Regulator, knots: Int[np.ndarray, " n"], limit: float,
+    slew_per_sample: float, known: int, outputs: OutputBounds,
 ) -> HorizonProgram:  # fmt: skip
     """Return the quadratic program of a horizon.
 
@@ -165,21 +167,20 @@ def condense(
     """
     W = interpolate_knots(knots)
     N, nx = len(W), b.size
-    free, forced = np.eye(nx), np.zeros((nx, N))  # xi_j = free xi_0 + forced mu
+    free, forced = np.eye(nx, nx + 1), np.zeros((nx, N))  # xi_j = free [xi_0, mu_-1] + forced mu
     hessian, cross, ahead = np.zeros((N, N)), np.zeros((N, nx + 1)), np.zeros((N, N))
     for j in range(N):
         row, start = w @ forced / gain, w @ free / gain
         hessian += np.outer(row, row)
-        cross[:, :nx] += np.outer(row, start)
+        cross += np.outer(row, start)
         ahead[:, j] = -row / gain
-        free, forced = a @ free, a @ forced
-        forced[:, j] += b
+        free, forced = go_on(a, b, late, free, forced, j)
     step = np.eye(N) - np.eye(N, k=-1)  # mu_j - mu_{j-1}, of which the first has mu_-1
     hessian += regulator.rho * step.T @ step
     cross[0, nx] -= regulator.rho
     end = np.vstack([forced, np.eye(N)[-1]])
     begin = np.zeros((nx + 1, nx + 1))
-    begin[:nx, :nx] = free
+    begin[:nx] = free
     hessian += end.T @ regulator.Pi @ end
     cross += end.T @ regulator.Pi @ begin
     H, F, R = limit**2 * W.T @ hessian @ W, limit * W.T @ cross, limit * W.T @ ahead[:, :known]

@@ -34,9 +34,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.control.loops.sampled_plant import find_delay, read_conditions
+from seaopt.control.loops.sampled_plant import find_delay, read_conditions, whole_samples
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
-from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names, whole_samples
+from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names
 from seaopt.errors import SimulationError, StepSizeError, require_seed, suggestion
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet

@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
-from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditions
+from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditions, whole_samples
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
-from seaopt.control.running.sampled_loop import largest_current, whole_samples
+from seaopt.control.running.sampled_loop import largest_current
 from seaopt.errors import ControlError, SimulationError, require_seed, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control.laws.realisation import RunnableLaw
-from seaopt.control.loops.sampled_plant import Measured, find_delay, read_conditions
+from seaopt.control.loops.sampled_plant import Measured, find_delay, read_conditions, whole_samples
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -186,13 +186,6 @@ def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None
     """Return `runs` loops whose law is at zero and whose plant is in state x, zero if left out."""
     start = np.zeros(len(loop.plant.states)) if x is None else x
     return LoopState(x=np.tile(start, (runs, 1)), z=np.zeros((runs, loop.law_states + loop.waiting)))
-
-
-def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:
-    """Return a delay as whole samples and the rest in seconds."""
-    whole = math.floor(delay_s / sample_time_s + 1e-9)
-    rest = delay_s - whole * sample_time_s
-    return whole, rest if rest > 1e-9 * sample_time_s else 0.0
 
 
 def largest_current(limit_A: float, step_A: float) -> float:

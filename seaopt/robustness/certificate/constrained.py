@@ -26,7 +26,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, ForceMPC, ForceRun, MPCStep, close_loop
-from seaopt.control.loops.sampled_plant import DELAY, conditions
+from seaopt.control.loops.sampled_plant import DELAYS, conditions, find_delay, read_conditions, whole_samples
 from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.errors import ControlError, SeaoptError, require_seed
 from seaopt.executors import Shared, map_ordered
@@ -210,7 +210,7 @@ def run_constrained(
     """
     rng = np.random.default_rng([require_seed(seed, ControlError), CONSTRAINED_STREAM])
     drawn = unknown.values(unknown.draw(runs, rng))
-    placed = {name for plant in plants.values() for name in conditions((plant,)) if name != DELAY}
+    placed = {name for plant in plants.values() for name in conditions((plant,)) if name not in DELAYS}
     parts = [
         _Run(
             draw={name: float(column[k]) for name, column in drawn.items() if name not in placed}, seed=seed + k,
@@ -320,7 +320,7 @@ def _simulate(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run, st
 
     return close_loop(
         law, mpc.start, plant, values, reference, measured=mpc.measured, sample_time_s=mpc.sample_time_s,
-        delay_samples=mpc.delay_samples, preview_samples=mpc.spec.preview_samples, sensors=bench.sensors,
+        delay_samples=mpc.compute_delay_samples, preview_samples=mpc.spec.preview_samples, sensors=bench.sensors,
         current_step_A=bench.current_step_A, current_limit_A=mpc.command_limit, disturbance_A=disturbance,
         seed=drawn.seed,
     )  # fmt: skip
@@ -433,7 +433,9 @@ def _find_violation(
     """Return by how much a bounded signal of a run leaves its bounds at most, over half their width, and which."""
     worst, signal = 0.0, ""
     completed = plant.complete(values)
-    applied = np.append(np.zeros(mpc.delay_samples), run.current)[: run.time.size] + disturbance
+    whole, rest_s = whole_samples(float(find_delay(plant, read_conditions(plant, values))), mpc.sample_time_s)
+    late = mpc.compute_delay_samples + whole + (rest_s > 0.0)  # of what acts as a sample is read
+    applied = np.append(np.zeros(late), run.current)[: run.time.size] + disturbance
     inputs = np.zeros((run.time.size, len(plant.inputs)))
     inputs[:, 0] = applied
     whole = output_function(plant).map(run.time.size)

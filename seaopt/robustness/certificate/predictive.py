@@ -26,7 +26,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
 from seaopt.robustness.certificate.certificate import Certificate, Requirement
-from seaopt.robustness.certificate.certify import CONFIDENCE, STEPS, certify
+from seaopt.robustness.certificate.certify import CONFIDENCE, STEPS, certify, find_own_drive
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, run_constrained
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
 from seaopt.robustness.verification.verification import check_sensors
@@ -157,9 +157,10 @@ def certify_mpc(
         )
     models, (_, values), known = certificate.models, mpc.design, others or ParameterSet()
     known = known.with_parameters(*(values[name] for name in values if name not in known))
+    drive = find_own_drive(law, parameters)
     constrained = run_constrained(
-        mpc, law, models, combine_uncertainty(parameters, known, dict(ranges or {}), models), runs=runs, seed=seed,
-        confidence=confidence, tolerance=bound_tolerance, sensors=sensors or Sensors(),
+        mpc, law, models, combine_uncertainty(parameters, known, dict(ranges or {}), models, drive), runs=runs,
+        seed=seed, confidence=confidence, tolerance=bound_tolerance, sensors=sensors or Sensors(),
         current_step_A=current_step_A, executor=executor, progress=simulating,
     )  # fmt: skip
     requirements = (*certificate.requirements, *_require_runs(constrained, max_failure_probability))

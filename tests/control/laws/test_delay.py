@@ -137,7 +137,7 @@ def test_a_drives_delay_is_in_seconds(value):
 def test_predictive_control_has_the_fits_delay(fit, stand, thor):
     """Left out it is the fit's, and a sample for planning; a shorter one is warned of."""
     mpc = force_mpc(stand, fit, MPCSpec(current_limit_A=9.0, bandwidth_hz=15))
-    assert mpc.warnings == () and mpc.delay_samples == 4
+    assert mpc.warnings == () and mpc.delay_samples == pytest.approx(1 + 1e3 * fit.delay_s(stand))
     given = MPCSpec(current_limit_A=9.0, bandwidth_hz=15, compute_delay_samples=1, drive_delay_s=0.0)
     short = force_mpc(stand, fit, given)
     assert short.delay_samples == 1 and "drive_delay_s = 0, but" in short.warnings[0]

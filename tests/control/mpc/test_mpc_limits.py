@@ -47,7 +47,7 @@ def state_spaces(mpc, params, damping):
     a, b, c = stand_with(params, damping)
     law = mpc.law
     plant = control.ss(a, b, c, 0, TS)
-    late = control.ss(control.tf([1.0], [1.0, *[0.0] * mpc.delay_samples], TS))
+    late = control.ss(control.tf([1.0], [1.0, *[0.0] * mpc.compute_delay_samples], TS))
     back = control.ss(law.a, -law.b[:, 1:], law.c[None], -law.d[1], TS)
     ahead = control.ss(law.a, law.b[:, :1], law.c[None], law.d[0], TS)
     return plant * late, back, ahead

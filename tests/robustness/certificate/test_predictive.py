@@ -93,6 +93,19 @@ def test_a_motor_much_stronger_than_its_model_fails_and_its_run_can_be_played_ag
     assert np.max(np.abs(run.state[:, 1])) > 1.05 * SPEED_LIMIT["qd"][1]
 
 
+@pytest.mark.slow
+def test_a_drives_delay_is_in_the_linear_region_in_the_runs_and_in_the_draws(stand, thor):
+    """1.32 samples of it: the figures are those of the plan, and runs fail where they are drawn with ten."""
+    spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=20.0, drive_delay_s=1.32e-3)
+    mpc = force_mpc(stand, thor, spec)
+    near = certify_mpc(mpc, {"stand": stand}, thor, ranges={"drive_delay_s": (1.3e-3, 1.34e-3)}, samples=50, runs=1)
+    assert near.passed
+    assert near.plants["stand"].ms == pytest.approx(mpc.achieved.ms, rel=1e-9)
+    assert not any("drive_delay_s is not drawn" in note for note in near.constrained.left_out)
+    far = certify_mpc(mpc, {"stand": stand}, thor, ranges={"drive_delay_s": (0.01, 0.011)}, samples=1, runs=1)
+    assert far.constrained.failures == 1 and "drive_delay_s" in far.constrained.where
+
+
 def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, stand, thor):
     late = certify_mpc(mpc, {"stand": stand}, thor, ranges={"delay_s": (9e-3, 10e-3)}, samples=1, runs=1)
     assert late.constrained.failures == 1 and not late.passed

@@ -36,10 +36,10 @@ static real dot(const real *a, const real *b, int n) {
   return sum;
 }
 
-/* z := A z + B u */
-static void advance(real *z, real u) {
+/* z := A z + B newer + B' older: where a drive's delay is no whole number of samples, the older command still acts */
+static void advance(real *z, real older, real newer) {
   real next[STATES];
-  for (int i = 0; i < STATES; i++) next[i] = dot(mpc_A[i], z, STATES) + mpc_B[i] * u;
+  for (int i = 0; i < STATES; i++) next[i] = dot(mpc_A[i], z, STATES) + mpc_B[i] * newer + mpc_late[i] * older;
   memcpy(z, next, sizeof next);
 }
 
@@ -97,7 +97,7 @@ static void limit_rows(const force_mpc *s, const real *error, real rest, real dr
 #endif
 #if SIGNALS
   for (int k = 0; k < SIGNALS * SAMPLES; k++) {
-    real base = mpc_static[k / SAMPLES] * (rest + drift) - mpc_centre[k / SAMPLES] + dot(mpc_free[k], error, PLANT);
+    real base = mpc_static[k / SAMPLES] * (rest + drift) - mpc_centre[k / SAMPLES] + dot(mpc_free[k], error, PLANT + 1);
     low[LIMITS + k] = -mpc_wide;
     high[LIMITS + k] = 1 - base;
     low[LIMITS + SIGNALS * SAMPLES + k] = -1 - base;
@@ -176,7 +176,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   s->estimate = dot(mpc_C, s->z, STATES);
 
   memcpy(ahead, s->z, sizeof ahead);
-  for (int i = 0; i < DELAY; i++) advance(ahead, s->past[i]);
+  for (int i = 0; i < DELAY; i++) advance(ahead, s->past[i], s->past[i + 1]);
   real drift = ahead[STATES - 1];
   admissible_rest(drift, &least, &most);
   real last = s->reference, rest = 0;
@@ -215,8 +215,8 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   command = clip(command, s->command - mpc_slew, s->command + mpc_slew);
 #endif
   s->command = clip(command, -mpc_limit, mpc_limit);
-  s->past[DELAY] = s->command;
-  advance(s->z, s->past[0]);
-  memmove(s->past, s->past + 1, DELAY * sizeof *s->past);
+  s->past[DELAY + 1] = s->command;
+  advance(s->z, s->past[0], s->past[1]);
+  memmove(s->past, s->past + 1, (DELAY + 1) * sizeof *s->past);
   return s->command;
 }

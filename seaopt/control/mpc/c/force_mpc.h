@@ -10,7 +10,7 @@
 
 typedef struct {
   force_mpc_real z[FORCE_MPC_STATES];  /* predicted state, last its disturbance, in the command's unit */
-  force_mpc_real past[FORCE_MPC_DELAY + 1]; /* commands on their way, oldest first; the last entry is scratch */
+  force_mpc_real past[FORCE_MPC_DELAY + 2]; /* commands that still act, oldest first; the last entry is scratch */
   force_mpc_real command;              /* the last, a FORCE_MPC_COMMAND in FORCE_MPC_COMMAND_UNIT */
   force_mpc_real reference;            /* the last that was finite, in FORCE_MPC_UNIT as what is measured */
   force_mpc_real estimate;             /* of what is measured */
@@ -33,7 +33,9 @@ enum { FORCE_MPC_OK, FORCE_MPC_HELD, FORCE_MPC_FAULT };
 void force_mpc_reset(force_mpc *s);
 
 /* What to command (FORCE_MPC_COMMAND, in FORCE_MPC_COMMAND_UNIT) for a reference and a measurement, both in
- * FORCE_MPC_UNIT; it is within limits whatever the input.
+ * FORCE_MPC_UNIT; it is within limits whatever the input. Put it out FORCE_MPC_COMPUTE_DELAY_SAMPLES samples after the
+ * reading (1: at the next sample); it stands until the next. From then on the drive takes its own time, which is counted
+ * (FORCE_MPC_DELAYS has both), so do not wait for it.
  * A measurement that is not finite or beyond +-1e15 is predicted; such a reference leaves the last one. */
 force_mpc_real force_mpc_step(force_mpc *s, force_mpc_real reference, force_mpc_real measurement);
 
