@@ -16,6 +16,7 @@ from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, require_type
 from seaopt.records import record
 
+NO_SLEW_LIMIT = 1e12  # A/s, far above which the plan's rows for it vanish in rounding
 MAX_HORIZON_SAMPLES = 500  # of a horizon
 MAX_MPC_DELAY_SAMPLES = 100
 MAX_MPC_ITERATIONS = 10_000
@@ -125,6 +126,8 @@ class MPCSpec:
         for name in ("current_limit_A", "command_limit", "current_slew_A_per_s", "largest_force_N"):
             if getattr(self, name) is not None:
                 self._positive(name)
+        if self.current_slew_A_per_s is not None and self.current_slew_A_per_s > NO_SLEW_LIMIT:
+            raise ControlError(f"current_slew_A_per_s = {self.current_slew_A_per_s:g} limits nothing; leave it out")
         require_type(self.noise, (NoiseModel, NoneType), "noise", "give a NoiseModel", ControlError)
         if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
             raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")

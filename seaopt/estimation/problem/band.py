@@ -50,4 +50,8 @@ def design_filter(band_hz: tuple[float, float] | None, period: float) -> tuple[F
     sections = np.ascontiguousarray(np.asarray(sos)[:, [0, 1, 2, 4, 5]])
     sections.setflags(write=False)
     slowest = max(float(np.max(np.abs(np.roots([1.0, a1, a2])))) for a1, a2 in sections[:, 3:])
+    if not slowest < 1.0:  # a pole at 1 to rounding, which never settles
+        raise EstimationError(
+            f"band_hz = [{low:g}, {high:g}] is too slow at {1 / period:g} Hz; give 0 or a higher start"
+        )
     return sections, int(np.ceil(np.log(1e-4) / np.log(slowest)))
