@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 TINY = 1e-300
 LOWEST = 1e-4  # of the sample rate: from here on a law with integrators set apart has the response it was given with
 ROUNDED = 1e-8  # of the largest response at higher frequencies: what is less at a zero is rounding
-SAME_AT_LOWEST = 1e-3  # as a share of it, and less in proportion above: a pole moved by 6e-7 does as much
+SAME_RESPONSE = 1e-3  # as a share of it: at `LOWEST` a pole moved by 6e-7 does as much
 EQUAL_GAINS = 1e-9  # integrals of reference and measurement that differ by less are one of the error
 NEAREST_TO_ONE = 1e-17  # abs(z - 1) at least: an integrator's response at 0 Hz is large instead of infinite
 
@@ -190,7 +190,7 @@ class Law:
         """Return the balanced law of a state space in any coordinates, with what integrates set apart.
 
         Poles nearer to 1 than 1e-6 are integrators, two at most, where the response from 1e-4 of the sample rate on
-        stays the same: to 1e-3 there, and in proportion less above. Of a companion form the coefficients are read. A
+        stays the same, to 0.1 %. Of a companion form the coefficients are read. A
         law without such poles has no integrators, and no anti-windup acts on it.
 
         Raises
@@ -360,7 +360,7 @@ def _set_apart(given: Law) -> Law:
     for chain, a, b, c in split_integrators(given.a, given.b, given.c):
         law = replace(given, **build_chain(_settle(chain, slowest), a, b, c))
         for made in (law.balanced(), law):
-            if _is_same(made, given, SAME_AT_LOWEST):
+            if _is_same(made, given, SAME_RESPONSE):
                 return made
     balanced = given.balanced()
     return balanced if _is_same(balanced, given) else given
@@ -383,13 +383,13 @@ def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -
     return out
 
 
-def _is_same(law: Law, given: Law, at_lowest: float = 0.0) -> bool:
-    """Tell whether two laws have the same responses from `LOWEST` on, there but for a share of them."""
+def _is_same(law: Law, given: Law, share: float = RESPONSE_TOLERANCE) -> bool:
+    """Tell whether two laws have the same responses from `LOWEST` on, but for a share of them."""
     per_sample = np.geomspace(LOWEST, 0.49, 25)
     found, wanted = (one.responses(per_sample / law.sample_time_s) for one in (law, given))
     size = np.abs(wanted)
     above = np.maximum.accumulate(size[:, ::-1], axis=1)[:, ::-1]
-    allowed = (RESPONSE_TOLERANCE + at_lowest * LOWEST / per_sample) * size + ROUNDED * above + TINY
+    allowed = share * size + ROUNDED * above + TINY
     return bool(np.all(np.abs(found - wanted) <= allowed))
 
 
