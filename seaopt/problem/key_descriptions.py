@@ -267,7 +267,7 @@ KEYS: dict[str, dict[str, str]] = {
         "prefilter": "A low-pass of the reference alone, of this order, or which; the bandwidth is placed with it.",
         "compensate": 'What is added because the plant is known, ["friction", "gravity"]; or a table: how much.',
         "reference_weights": '"tuned": of how the reference enters; "error", "measurement": fixed.',
-        "bandwidth_range_hz": "Between which a bandwidth may be asked; 15 to 60 where left out. It has no say in what is found.",
+        "bandwidth_range_hz": "Within which a bandwidth may be asked; 15 to 60 where left out. It has no other effect.",
         "sample_rate_hz": "At which it runs.",
         "compute_delay_samples": "Whole samples from a reading to the command being put out, besides the hold: the "
         "user's program. Left out: 0 where the log shows a delay behind a held command, else 1.",
