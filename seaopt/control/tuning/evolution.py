@@ -69,6 +69,7 @@ HANDED_ON = 4  # laws of one population to the next
 BEST_SHARE = 0.15  # of the population: what members are drawn to
 NEUTRAL_SHARE = 0.3  # of the population: begin without the optional parts
 KEPT = 0.99  # worst usage at which the search ends
+HOPELESS = 1.05  # worst usage beyond which one law is handed on, for what it misses least
 ENCIRCLES = 1e3  # factor of the usage of a loop whose turns say that it is unstable
 NO_ROOT = 1e9  # usage where no k_p makes the bandwidth
 HIGHEST_RATE = 3.0  # of the bandwidth's rad/s: rho
@@ -226,8 +227,8 @@ class Evolution:
         order = np.argsort(usage, kind="stable")
         return usage[order], laws[order]
 
-    def find(self, known: Sequence[LawNumbers] = (), *, again: bool = True, count: int = 2) -> list[LawNumbers]:
-        """Return up to `count` of the laws found, stable ones, the best first.
+    def find(self, known: Sequence[LawNumbers] = (), *, again: bool = True) -> list[LawNumbers]:
+        """Return the best stable law found; where limits are nearly kept, the two best.
 
         Where the first population keeps no limits another one may begin `again`, with its best, and with the best of
         one without the optional parts.
@@ -239,6 +240,7 @@ class Evolution:
                 handed += [*bare.run(known, seed=1)[1][:HANDED_ON]]
             usage, laws = self.run([*known, *handed], seed=2)
         found: list[LawNumbers] = []
+        count = 1 if usage[0] > HOPELESS else 2
         for x in laws[usage < ENCIRCLES]:
             x = self.task.tidy(x)
             if len(found) < count and not any(np.allclose(x, one, rtol=0.1, atol=1e-6) for one in found):

@@ -28,7 +28,7 @@ RESOLUTION = 0.01  # to which the end of what is possible is found
 BISECTIONS = math.ceil(math.log2(math.log(PROBE_RATIO) / RESOLUTION))  # that find such an end
 MEMBERS, GENERATIONS = 30, 40  # of the evolution at every bandwidth
 STARTS_TRIED = 4
-PROMISING_USAGE = 1.1  # of the evolution; what misses by more is not refined
+PROMISING_USAGE = 1.03  # of the evolution; what misses by more is not refined
 REFINEMENTS = 3  # solutions of the interior-point method
 HIGHEST_BANDWIDTH = 0.249  # of the sample rate
 FAR = 1e3  # how much further away a law counts that does not keep the limits
@@ -144,7 +144,7 @@ class _Probes:
         )
         x = task.tidy(self.tried[start][1])
         if kept and task.is_stable(x):
-            x = refine(task, grid, x)
+            x = refine(task, grid, x, REFINEMENTS)
             usage, _ = task.rank(grid, x)
             if usage == 0.0 or (apart < np.log(PROBE_RATIO) and usage > HOPELESS_USAGE):
                 return usage, x
