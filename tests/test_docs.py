@@ -296,7 +296,7 @@ def test_the_problem_file_of_the_docs_is_valid(tmp_path, stand, thor, short_log)
     assert abs(fit.nuisance["chirp"].delay_s - 1.2e-3) < 1e-4
     assert abs(fit.parameters["J"].value / thor["J"].value - 1) < 0.02
     law = so.tune(problem.design_plant, fit, problem.spec, robust_to=problem.robust_to(fit.parameters))
-    assert law.feasible and law.compute_delay_samples == 2
+    assert law.feasible and law.compute_delay_samples == 0 and 1.1 < law.delay_samples < 1.3
 
 
 def test_the_plant_of_the_how_to_as_data_gives_the_same_fit(tmp_path, simulated, monkeypatch):
