@@ -368,7 +368,8 @@ def test_fit_json_round_trip(stand, short_log, thor, tmp_path):
     write_json(path, overflown.to_dict())
     stored = so.Fit.from_dict(read_json(path, "seaopt/fit/2"))
     assert stored.step_error_sigma == stored.step_error_parameter == np.inf
-    path.write_text(path.read_text().replace('"covariance"', '"covarience"'))
+    content = overflown.to_dict()
+    write_json(path, content | {"covarience": content.pop("covariance")})
     with pytest.raises(FileError, match="covariance"):
         so.Fit.from_dict(read_json(path, "seaopt/fit/2"))
 
