@@ -107,7 +107,8 @@ def _live_with_parent() -> None:
 def check_executor(executor: Any, error: type[SeaoptError] = SeaoptError) -> None:
     """Refuse what is no executor, or None, and one whose processes would be forked, in which polars waits for ever."""
     require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor", error)
-    if isinstance(executor, ProcessPoolExecutor) and executor._mp_context.get_start_method() == "fork":
+    context: Any = getattr(executor, "_mp_context", None)  # of a ProcessPoolExecutor, which has no public name for it
+    if isinstance(executor, ProcessPoolExecutor) and context.get_start_method() == "fork":
         raise error(
             "executor: its processes are forked, with locks that threads here hold, and could wait for ever; give "
             'seaopt.executors.Processes(), or ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'

@@ -367,5 +367,5 @@ def _look_again(
     if disk is not None:
         usage.append(np.abs(2.0 * s - 1.0) * disk / 2.0)
     noise = spec.objective == "noise"
-    value = np.max(np.abs(every)) if noise else np.sum(integral.add_up(np.abs(integral.terms.s(x)) + 0j).real)
+    value = np.max(np.abs(every)) if noise else np.sum(integral.weights.ravel() * np.abs(integral.terms.s(x)))
     return float(value), max(0.0, max(float(np.max(one)) for one in usage) - 1.0)
