@@ -140,7 +140,13 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     words = "should be a table" if first["type"] == "model_type" else words
     if first["loc"] and isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
         return f"{place} = {_shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
-    correct = f"correct it: {own} = {EXAMPLES.get(first['type'].partition('_')[0], '...')}"
+    kind = first["type"].partition("_")[0]
+    if kind in ("float", "int") and isinstance(
+        first["input"], str
+    ):  # with its unit, as a rule: a number may be another
+        correct = "give the number alone, without quotes, in the key's own unit"
+    else:
+        correct = f"correct it: {own} = {EXAMPLES.get(kind, '...')}"
     return f"{place} = {_shorten(first['input'])}: {words}; {remedy or correct}"
 
 

@@ -281,6 +281,15 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     }
 
 
+def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Callable[[float], str]) -> dict[str, str]:
+    """Return a gate's numbers, exact for the code and rounded for what is read."""
+    low, high = gate.range_N
+    exact = {"low": low, "high": high, "step": gate.max_step_N, "ramp": gate.ramp_A_per_s * sample_time_s}
+    return {name: number(value) for name, value in exact.items()} | {
+        f"shown_{name}": f"{value:.6g}" for name, value in exact.items()
+    }
+
+
 def _list_signals(stored: Mapping[str, Any]) -> tuple[str, ...]:
     return stored["reads"] or list_names(stored["spec"].measured)
 
@@ -330,14 +339,7 @@ def _numbers(
         "per_effort": number(law.per_effort),
         "per_effort_unit": stored["command"].per_effort_unit,
         "sample_time_s": number(law.sample_time_s),
-        "gate": {}
-        if law.gate is None
-        else {
-            "low": number(law.gate.range_N[0]),
-            "high": number(law.gate.range_N[1]),
-            "step": number(law.gate.max_step_N),
-            "ramp": number(law.gate.ramp_A_per_s * law.sample_time_s),
-        },
+        "gate": {} if law.gate is None else _write_gate(law.gate, law.sample_time_s, number),
         "heat": {} if law.heat is None else {name: repr(value) for name, value in asdict(law.heat).items()},
         "hottest": "" if law.heat is None else f"{law.heat.ambient + law.heat.allowed_rise:g}",
         "ambient": "" if law.heat is None else f"{law.heat.ambient:g}",

@@ -39,6 +39,7 @@ OPTIONAL = ("current_limit_A", "command_limit", "step_N")
 MAX_DELAY_SAMPLES = 1000
 HIGHEST_CORNER = 0.45  # of the sample rate: of a filter that is part of the law
 LOWEST_HZ = 1e-3  # limits are kept from here
+FASTEST_HZ = 1e6  # of sampling
 
 
 @record
@@ -191,6 +192,8 @@ class ControllerSpec:
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
                 f"sample more than four times as fast: sample_rate_hz = {10.0 * self.bandwidth_hz:g}"
             )
+        if self.sample_rate_hz > FASTEST_HZ:
+            raise ControlError(f"sample_rate_hz = {self.sample_rate_hz:g} is above {FASTEST_HZ:g} Hz; give it in Hz")
         check_delays(self, MAX_DELAY_SAMPLES)
         self._check_limits()
 

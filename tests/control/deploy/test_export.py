@@ -15,7 +15,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 import seaopt as so
-from seaopt.control import Gains, Loop
+from seaopt.control import Gains, Loop, PlausibilityGate
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.laws.stored import read_controller
@@ -231,6 +231,22 @@ def test_a_controller_json_gives_the_same_files(tuned, tmp_path):
         again = "As stated by controller.json, not computed again", "Achieved on the design plant"
         assert one.read_text() == other.read_text().replace(*again)
         assert one.stat().st_size > 300
+
+
+def test_a_gate_answers_by_status_and_begins_at_zero_where_a_reset_cannot_be_believed(compiler, tuned, tmp_path):
+    gate = PlausibilityGate(range_N=(-800.0, 800.0), max_step_N=36.638953, max_held=3, ramp_A_per_s=90.0)
+    law = CompiledLaw(compiler, tmp_path, tuned, "double", gate=gate)
+    header = (tmp_path / "law.h").read_text()
+    assert "answers in `status`, not in `held`" in header and "36.639\n" in header
+    law.step(10.0, 10.0)
+    for expected in (1, 1, 1, 2):  # three readings are replaced, one more is a fault
+        law.step(10.0, np.nan)
+        assert (law.law.status, law.law.held) == (expected, 0)
+    first = []
+    for measurement in (0.0, 1e3, np.nan):
+        law.reset(10.0, measurement, 0.0)
+        first.append((law.step(10.0, 900.0), law.law.measurement_N))
+    assert first[0] == first[1] == first[2] and first[0][1] == 0.0
 
 
 def test_an_infeasible_controller_is_refused_unless_asked(tuned, tmp_path):

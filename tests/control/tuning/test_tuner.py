@@ -205,6 +205,7 @@ def test_json_round_trip(stand, swing, thor, tmp_path):
         ({"objective": "speed"}, "objective"),
         ({"compute_delay_samples": 100_000}, "delay_samples"),
         ({"sample_rate_hz": float("inf")}, "sample_rate_hz"),
+        ({"sample_rate_hz": 1e300}, "above 1e\\+06 Hz"),
     ],
 )
 def test_bad_specifications(changes, words):
