@@ -18,13 +18,17 @@ from seaopt.errors import PlantError
 from seaopt.files import write_bytes
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import can_stick, list_smoothing
-from seaopt.plants.plant import CompletedParameters, Plant, refuse_samples
+from seaopt.plants.plant import DRIVE_DELAY, CompletedParameters, Plant, refuse_samples
+from seaopt.units import factor
 
 DESCRIPTION = "modelDescription.xml"
 
 
 def to_control(plant: Plant, params: ParameterSet) -> Any:
-    """Return the plant as a continuous-time `control.NonlinearIOSystem` with named signals, at fixed parameters."""
+    """Return the plant as a continuous-time `control.NonlinearIOSystem` with named signals, at fixed parameters.
+
+    It cannot carry a delay: that of the drive is left out, and the system's name ends in ``_without_drive_delay``.
+    """
     import control  # deferred: it imports matplotlib
 
     refuse_samples(plant)
@@ -40,7 +44,7 @@ def to_control(plant: Plant, params: ParameterSet) -> Any:
 
     return control.NonlinearIOSystem(
         update, output, states=list(plant.states), inputs=list(plant.inputs), outputs=list(plant.outputs),
-        name=plant.name.replace(" ", "_"), dt=0,
+        name=plant.name.replace(" ", "_") + ("_without_drive_delay" if _find_drive_delay(params) else ""), dt=0,
     )  # fmt: skip
 
 
@@ -71,7 +75,8 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     Notes
     -----
     States start at zero. An output with the name of a state is called NAME_out. Friction is its smoothed curve: of a
-    plant that sticks the model's description says so, for there the FMU creeps.
+    plant that sticks the model's description says so, for there the FMU creeps, and so it does of a drive's delay,
+    which an FMU of a continuous plant cannot carry.
 
     """
     refuse_samples(plant)
@@ -94,7 +99,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
             ) from error
         described = next(Path(source) for source in content if Path(source).name == DESCRIPTION)
         text = described.read_text(encoding="utf-8")
-        remark = f"<fmiModelDescription description={quoteattr(_describe(plant))} "
+        remark = f"<fmiModelDescription description={quoteattr(_describe(plant, _find_drive_delay(params)))} "
         described.write_text(text.replace("<fmiModelDescription ", remark, 1), encoding="utf-8")
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
             for source, place in content.items():
@@ -102,15 +107,26 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     return write_bytes(target, archive.getvalue())
 
 
-def _describe(plant: Plant) -> str:
+def _find_drive_delay(params: ParameterSet) -> float:
+    """Return the drive's delay among what is given, s."""
+    given = params.given if isinstance(params, CompletedParameters) else params
+    return given[DRIVE_DELAY].value * factor(given[DRIVE_DELAY].unit, "s") if DRIVE_DELAY in given else 0.0
+
+
+def _describe(plant: Plant, drive_delay_s: float) -> str:
     """Return what the model is, and what it leaves out of the plant."""
-    if not (plant.sticks and can_stick(plant)):
-        return plant.name
-    over = " and ".join(list_smoothing(plant))
-    return (
-        f"{plant.name}. Friction that sticks is not in this FMU: it is smoothed over {over}, so that a joint that "
-        "stands still in seaopt creeps here"
-    )
+    left_out: list[str] = []
+    if plant.sticks and can_stick(plant):
+        over = " and ".join(list_smoothing(plant))
+        left_out.append(
+            f"Friction that sticks is not in this FMU: it is smoothed over {over}, so that a joint that stands still "
+            "in seaopt creeps here"
+        )
+    if drive_delay_s:
+        left_out.append(
+            f"The drive's delay of {1e3 * drive_delay_s:.4g} ms is not in this FMU: delay its input by that long"
+        )
+    return ". ".join([plant.name, *left_out])
 
 
 def _builder(plant: Plant, params: CompletedParameters, name: str) -> Any:

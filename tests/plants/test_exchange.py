@@ -103,12 +103,12 @@ def test_a_free_mass_has_no_static_gain():
     assert np.isinf(found["q", "I"])
 
 
-def test_an_fmu_says_that_it_does_not_stick(stand, thor, tmp_path):
+def test_what_an_export_leaves_out_is_said(stand, thor, tmp_path):
     import xml.etree.ElementTree as ElementTree
     import zipfile
 
-    def describe(plant):
-        path = export_fmu(plant, thor.update(f_c=300.0), tmp_path / "plant.fmu")
+    def describe(plant, *more):
+        path = export_fmu(plant, thor.update(f_c=300.0).with_parameters(*more), tmp_path / "plant.fmu")
         with zipfile.ZipFile(path) as packed:
             return ElementTree.fromstring(packed.read("modelDescription.xml")).attrib["description"]
 
@@ -116,3 +116,7 @@ def test_an_fmu_says_that_it_does_not_stick(stand, thor, tmp_path):
     said = describe(so.plants.let_stick(stand))
     assert "creeps" in said
     assert "v_s" in said
+    late = so.Parameter(name="drive_delay_s", value=1.32, unit="ms")
+    assert "drive" not in said
+    assert "The drive's delay of 1.32 ms is not in this FMU" in describe(stand, late)
+    assert to_control(stand, thor.with_parameters(late)).name == f"{to_control(stand, thor).name}_without_drive_delay"
