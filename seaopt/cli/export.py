@@ -128,7 +128,7 @@ def _choose_gate(
             "--gate: is not exported with a schedule; leave it out, and check the reading before the step"
         )
     own = ((content.get("guards") or {}).get("gate") or {}).get("max_step_N")
-    step, limit = asked.max_step_N or own, _find_limit(content, options)
+    step, limit = own if asked.max_step_N is None else asked.max_step_N, _find_limit(content, options)
     if step is None:
         raise ProblemError(
             "--gate: controller.json does not say how far the plant moves in a sample; type --gate-max-step, or write "

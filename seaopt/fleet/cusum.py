@@ -228,7 +228,7 @@ def chart_runs(
         mean = mean + np.where(learns, gain * z * spread, 0.0)
         state = state + np.where(known, gain_state * z * spread, 0.0)
         of_mean = of_mean - np.where(learns, gain**2 * total, 0.0)
-        of_both = np.where(learns, of_both - gain * gain_state * total, 0.0)
+        of_both = np.where(learns, of_both - gain * gain_state * total, np.where(known, 0.0, of_both))
         of_state = of_state - np.where(known, gain_state**2 * total, 0.0)
         starts = present & ~begun & (run >= start - 1)
         if starts.any():

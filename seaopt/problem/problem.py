@@ -13,7 +13,7 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
-from seaopt.control.laws.delay import find_drive_delay
+from seaopt.control.laws.delay import DelayedSpec, find_drive_delay
 from seaopt.control.loops.sampled_plant import add_drive_delay, list_names
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
@@ -225,10 +225,13 @@ class Problem:
             *guess_remarks(self.table.guessed, self.ranges, plants, parameters),
         ]
 
-    def values(self, source: Fit | ParameterSet) -> ParameterSet:
-        """Return the values to design with: a fit's, the file's for what it does not have."""
+    def values(self, source: Fit | ParameterSet, asked: DelayedSpec | None = None) -> ParameterSet:
+        """Return the values to design with: a fit's, the file's for what it does not have.
+
+        The drive's delay is as the file's specification says, or another that is asked.
+        """
         values = self.parameters.with_parameters(*source.parameters.values()) if isinstance(source, Fit) else source
-        asked = self.mpc if self.spec is None else self.spec
+        asked = asked or self.spec or self.mpc
         return values if asked is None else add_drive_delay(values, find_drive_delay(asked, self.design_plant, source))
 
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:

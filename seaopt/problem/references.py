@@ -8,7 +8,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from seaopt.control.loops.sampled_plant import DELAY, find_signals, list_names
+from seaopt.control.loops.sampled_plant import DELAYS, find_signals, list_names
 from seaopt.control.scheduling.gain_table import check_points
 from seaopt.control.scheduling.scheduled_controller import find_unit
 from seaopt.errors import ControlError, ProblemError, SeaoptError, UnitError, suggestion
@@ -245,7 +245,7 @@ def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant], parameters: 
         place += f" = [{ends[0]:g}, {ends[1]:g}]"
         if name in parameters:
             _check_own_bounds(place, ends, parameters[name])
-        if name == DELAY and table.controller is not None:
+        if name in DELAYS and table.controller is not None:
             _check_delay(place, ends[1], table.controller.sample_rate_hz)
     try:
         check_ranges(ranges, plants)

@@ -354,7 +354,9 @@ def add_outer_loop(problem: Problem, controller: Controller, source: Fit | Param
     return add_impedance(controller, plant, values, asked, name=table.plant)
 
 
-def list_plants(problem: Problem, source: Fit | ParameterSet) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
+def list_plants(
+    problem: Problem, source: Fit | ParameterSet, asked: DelayedSpec | None = None
+) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
     """Return what the controller is designed on, and what it must be robust to, models and measured responses.
 
     Parameters
@@ -363,10 +365,12 @@ def list_plants(problem: Problem, source: Fit | ParameterSet) -> tuple[Plant | M
         With a [controller].
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
+    asked : ControllerSpec, optional
+        Whose delays count in place of the problem's.
 
     """
     measured = problem.measure_responses(source)
-    others: dict[str, Any] = problem.robust_to(problem.values(source))
+    others: dict[str, Any] = problem.robust_to(problem.values(source, asked))
     assert problem.table.controller is not None
     named = problem.table.controller.robust_to
     others |= {name: one for name, one in measured.items() if name in named}
@@ -413,8 +417,8 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
             f"{problem.source}: a law of one's own is measured on a model, and [controller] is designed on "
             f"{problem.response_names[0]}; name a plant there, and the response in robust_to"
         )
-    design, values = problem.design_plant, problem.values(source)
-    _, robust_to = list_plants(problem, source)
+    design, values = problem.design_plant, problem.values(source, spec)
+    _, robust_to = list_plants(problem, source, spec)
     law = given.to_effort(command_of(design, values, spec.regulated).per_effort)
     controller = assess(design, values, law, spec, robust_to, draws=problem.draws(source))
     return complete_controller(problem, controller, source)

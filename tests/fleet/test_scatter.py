@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.stats import poisson
 
 from seaopt.fleet import Drift, Fleet, find_drift
+from seaopt.fleet.cusum import chart_runs
 from seaopt.fleet.scatter import estimate_between_runs, estimate_tails
 
 Values = Float[np.ndarray, "actuators runs"]
@@ -137,3 +138,21 @@ def test_a_step_of_three_stds_is_found(kind: str) -> None:
     assert {str(unit) for unit in range(6)} <= set(found) and len(found) < 9
     assert np.median(list(found.values())) <= {"normal": 4, "AR(0.3)": 7, "t(3)": 6}[kind]
     assert drift.expected is not None
+
+
+@pytest.mark.parametrize("gaps", [[], [4], [3, 4, 7]])
+def test_innovations_are_those_of_least_squares_with_runs_missing(gaps: list[int]) -> None:
+    """Of the best predictor from all runs before, whose mean is unknown."""
+    rng, between, correlation, runs = np.random.default_rng(0), 1.0, 0.7, np.arange(12)
+    values, fits = rng.normal(size=runs.size), rng.uniform(0.1, 0.5, size=runs.size)
+    values[gaps] = np.nan
+    chart = chart_runs(values[None], fits[None], np.inf, between=between, correlation=correlation)
+    covariance = between * correlation ** np.abs(np.subtract.outer(runs, runs)) + np.diag(fits)
+    for run in runs[np.isfinite(values)][1:]:
+        before = runs[:run][np.isfinite(values[:run])]
+        to_each = np.linalg.solve(covariance[np.ix_(before, before)], covariance[before, run])
+        of_mean = np.linalg.solve(covariance[np.ix_(before, before)], np.ones(before.size))
+        mean = of_mean @ values[before] / of_mean.sum()
+        left = values[run] - mean - to_each @ (values[before] - mean)
+        variance = covariance[run, run] - to_each @ covariance[before, run] + (1 - to_each.sum()) ** 2 / of_mean.sum()
+        assert chart.ratios[0, run] == pytest.approx(left / np.sqrt(variance), rel=1e-9)

@@ -161,6 +161,11 @@ class LawFile(_Strict):
             raise ValueError("should have one of sample_time_s and sample_rate_hz")
         if self.compute_delay_samples is None and self.delay_samples is None:
             raise ValueError("should have compute_delay_samples, the samples from a reading to the command, such as 1")
+        newer = self.compute_delay_samples is not None or self.drive_delay_s is not None
+        if self.spec is None and self.delay_samples is not None and newer:
+            raise ValueError(
+                "should have compute_delay_samples and drive_delay_s, or delay_samples, the whole loop; not both"
+            )
         if (self.reference is None) != (self.measurement is None):
             raise ValueError("should have both of reference and measurement, each with num and den")
         if (self.pid is not None) == (self.law is not None or self.reference is not None):
@@ -177,8 +182,10 @@ class LawFile(_Strict):
         if self.compute_delay_samples is None:
             whole = float(self.delay_samples or 0.0).is_integer()
             return {"delay_samples": int(self.delay_samples or 0) if whole else self.delay_samples}
-        asked = self.spec.get("drive_delay_s") if isinstance(self.spec, dict) else self.drive_delay_s
-        return {"compute_delay_samples": self.compute_delay_samples, "drive_delay_s": asked}
+        asked = self.spec if isinstance(self.spec, dict) else {"drive_delay_s": self.drive_delay_s}
+        if asked.get("delay_samples") is not None:  # of a controller.json: its samples are the whole loop's
+            return {"delay_samples": self.compute_delay_samples}
+        return {"compute_delay_samples": self.compute_delay_samples, "drive_delay_s": asked.get("drive_delay_s")}
 
     def build(self, source: str) -> GivenLaw:
         """Return the law."""

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.laws.delay import describe_delays
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
@@ -115,7 +114,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "COMMAND": mpc.actuation.word,
         "COMMAND_UNIT": mpc.actuation.unit,
         "UNIT": mpc.design[0].outputs[mpc.measured],
-        "DELAYS": describe_delays(mpc.compute_delay_samples, mpc.drive_delay_s, mpc.sample_time_s),
+        "DELAYS": mpc.delays,
     }
     code = MPCCode(
         sizes=sizes, numbers={name: value for name, value in numbers.items() if np.isfinite(value)}, units=units,

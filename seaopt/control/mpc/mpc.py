@@ -41,7 +41,14 @@ from seaopt.control.loops.absolute_stability import FrictionMargin, friction_mar
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
-from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, read_conditions, sample
+from seaopt.control.loops.sampled_plant import (
+    DELAYS,
+    DigitalPlant,
+    add_drive_delay,
+    find_delay,
+    read_conditions,
+    sample,
+)
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.knots import interpolate_knots, spread_knots
@@ -187,6 +194,12 @@ class ForceMPC:
     def delay_samples(self) -> float:
         """Both together, in samples."""
         return self.compute_delay_samples + self.drive_delay_s / self.sample_time_s
+
+    @property
+    def delays(self) -> str:
+        """Both and their sum, in words."""
+        older = self.spec.delay_samples is not None
+        return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s, older=older)
 
     @property
     @memo
@@ -435,7 +448,12 @@ class ForceMPC:
         """
         sliding = take_sliding(plant, params)
         digital = sample(
-            sliding, params, self.measured, self.per_effort, self.sample_time_s, self.compute_delay_samples
+            sliding,
+            add_drive_delay(params, self.drive_delay_s),
+            self.measured,
+            self.per_effort,
+            self.sample_time_s,
+            self.compute_delay_samples,
         )
         return Loop(plant=digital, law=self.law)
 
@@ -464,8 +482,7 @@ class ForceMPC:
         unit = self.design[0].outputs[s.measured]
         verdict = "every limit met" if self.feasible else f"NOT FEASIBLE: {join_labels(self.broken)}"
         lines = [
-            f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
-            f"{describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s)}: {verdict}",
+            f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, {self.delays}: {verdict}",
             f"  within {self.describe_limits()}, which hold {self.static_gain * self.command_limit:.4g} {unit}",
             f"  bandwidth {format_number(self.achieved.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}) "
             f"while no limit of the {self.actuation.word} is active; horizon {1e3 * s.horizon_s:g} ms, "

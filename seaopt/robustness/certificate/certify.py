@@ -19,7 +19,7 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.delay import Drive, find_drive, find_given_drive_delay, split_delayed, warn_delays
 from seaopt.control.loops.measured.figures import measure_discs
-from seaopt.control.loops.sampled_plant import DELAY, DRIVE_DELAY
+from seaopt.control.loops.sampled_plant import DELAYS, DRIVE_DELAY
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor
@@ -285,7 +285,8 @@ def find_own_drive(controller: Controller, source: Fit | ParameterSet) -> Drive 
     counted = Drive(delay_s=controller.drive_delay_s)
     stated = isinstance(source, Fit) or DRIVE_DELAY in source or find_given_drive_delay(controller.spec) is not None
     found = find_drive(controller.spec, controller.design[0], source) if stated else counted
-    return found if found.delay_s or counted.delay_s else None
+    has_own = DRIVE_DELAY in (source.parameters if isinstance(source, Fit) else source)
+    return found if found.delay_s or counted.delay_s or has_own else None
 
 
 def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nominal: ParameterSet) -> tuple[str, ...]:
@@ -384,14 +385,14 @@ def _with_design(
 
 def _check_delay(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> None:
     """Refuse delays of so many samples that a plant with them is no plant to control."""
-    if DELAY not in ranges:
-        return
-    high, period = ranges[DELAY][1], controller.sample_time_s
-    if high > MOST_DELAY_SAMPLES * period:
-        raise ControlError(
-            f"range of {DELAY} reaches {high:g} s, {high / period:.0f} samples; delays are in seconds, and up to "
-            f"{MOST_DELAY_SAMPLES} samples ({MOST_DELAY_SAMPLES * period:g} s) are certified"
-        )
+    period = controller.sample_time_s
+    for name in DELAYS:
+        high = ranges[name][1] if name in ranges else 0.0
+        if high > MOST_DELAY_SAMPLES * period:
+            raise ControlError(
+                f"range of {name} reaches {high:g} s, {high / period:.0f} samples; delays are in seconds, and up to "
+                f"{MOST_DELAY_SAMPLES} samples ({MOST_DELAY_SAMPLES * period:g} s) are certified"
+            )
 
 
 def _digest(controller: Controller) -> int:

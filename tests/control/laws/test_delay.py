@@ -12,7 +12,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import MPCSpec, force_mpc
+from seaopt.control import MPCSpec, force_mpc, read_law
 from seaopt.control.laws.delay import find_drive, settle_delays, split_delayed, warn_delays
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.passivity import passivity
@@ -21,7 +21,10 @@ from seaopt.control.loops.sampled_plant import add_drive_delay, read_conditions
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.plants.friction import split_friction
+from seaopt.problem import read_problem
+from seaopt.problem.stages import assess_problem
 from seaopt.robustness import batch_figures, combine_uncertainty
+from seaopt.robustness.certificate.certify import find_own_drive
 from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
 from seaopt.robustness.verification.environments import attach_environment
 from seaopt.robustness.verification.large_signal import large_signal
@@ -143,6 +146,50 @@ def test_predictive_control_has_the_fits_delay(fit, stand, thor):
     assert short.delay_samples == 1 and "drive_delay_s = 0, but" in short.warnings[0]
     assert short.warnings[0] in repr(short)
     assert force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=15)).delay_samples == 1
+
+
+def test_a_law_of_ones_own_has_the_delays_of_its_file_and_of_the_fit(fit, stand, tmp_path):
+    """Whatever the problem's own law counts on; and of a tuned law with the older key they are the whole loop."""
+    (tmp_path / "p.toml").write_text(
+        'schema = 1\ntitle = "t"\n[plant.stand]\nkind = "high_impedance"\ndrive = "unlumped"\n'
+        '[controller]\nplant = "stand"\nbandwidth_hz = 25\ndelay_samples = 3\n',
+        encoding="utf-8",
+    )
+    problem, pid = read_problem(tmp_path / "p.toml"), "sample_rate_hz = 1000\npid = { k_p = 2.0, k_i = 30.0 }\n"
+    older = so.tune(stand, fit, replace(SPEC, delay_samples=3)).to_dict()
+    texts = {
+        "new.toml": (f"compute_delay_samples = 0\n{pid}", 1e3 * fit.delay_s(stand)),
+        "drive.toml": (f"compute_delay_samples = 1\ndrive_delay_s = 5e-4\n{pid}", 1.5),
+        "old.toml": (f"delay_samples = 2\n{pid}", 2.0),
+        "controller.json": (to_json(older), 3.0),
+    }
+    for name, (text, samples) in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        controller = assess_problem(problem, read_law(tmp_path / name), fit)
+        assert controller.delay_samples == pytest.approx(samples, rel=1e-9)
+        assert controller.compute_delay_samples + 1e3 * find_own_drive_s(controller, fit) == pytest.approx(samples)
+    (tmp_path / "both.toml").write_text(f"compute_delay_samples = 0\ndelay_samples = 2\n{pid}", encoding="utf-8")
+    with pytest.raises(so.SeaoptError, match="not both"):
+        read_law(tmp_path / "both.toml")
+
+
+def find_own_drive_s(controller, source):
+    """Return the drive's delay that a certificate has."""
+    drive = find_own_drive(controller, source)
+    return 0.0 if drive is None else drive.delay_s
+
+
+def test_under_the_older_key_a_certificate_adds_no_drive(stand, thor):
+    late = add_drive_delay(thor, 2e-3)
+    controller = so.tune(stand, late, replace(SPEC, delay_samples=3))
+    certificate = so.certify(controller, {"stand": stand}, late, samples=2, simulations=False)
+    assert certificate.plants["stand"].ms == pytest.approx(controller.achieved.ms, rel=1e-9)
+
+
+def test_a_drives_range_is_in_seconds(stand, thor):
+    controller = so.tune(stand, thor, SPEC)
+    with pytest.raises(ControlError, match=r"range of drive_delay_s reaches 5 s"):
+        so.certify(controller, {"stand": stand}, thor, samples=2, simulations=False, ranges={"drive_delay_s": (0, 5)})
 
 
 def test_without_a_fit_it_is_one_sample(stand, thor):

@@ -77,6 +77,12 @@ def test_what_it_predicts_is_what_comes(made, stand, thor):
     assert np.max(np.abs(wrong)) > 0.5
 
 
+def test_other_values_are_behind_the_drive_of_the_design(made, stand, thor):
+    mpc, _ = made
+    assert mpc.close(stand, thor).figures().ms == pytest.approx(mpc.achieved.ms, rel=1e-9)
+    assert f"compute delay {COMPUTE} sample + drive delay" in mpc.delays
+
+
 @pytest.mark.slow
 def test_the_sensitivity_that_it_states_is_the_simulated_one(made, stand, thor):
     """Of sines added to the reading near the peak of S, by their amplitude once the start has died out."""
