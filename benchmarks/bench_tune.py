@@ -107,7 +107,7 @@ class Judge:
         a, b, c = held
         values, vectors = np.linalg.eig(a)
         residues = (c @ vectors) * np.linalg.solve(vectors, b)
-        return (residues / (1 / self.q[:, None] - values)).sum(axis=1) * self.q**self.spec.delay_samples
+        return (residues / (1 / self.q[:, None] - values)).sum(axis=1) * self.q**self.spec.compute_delay_samples
 
     def law(self, numbers):
         """Return C_y and C_r for columns of named numbers, each of shape (n, 1)."""
@@ -276,7 +276,7 @@ def beside_mixsyn(bandwidth_hz: float = 30.0, ms: float = 1.6, noise_gain: float
     model, gain = plant.linearize(params), command_of(plant, params, "F1").per_effort
     row = list(plant.outputs).index(spec.measured)
     given = control.ss(model.A, gain * model.B[:, [0]], model.C[[row]], gain * model.D[[row], :1])
-    late = control.tf2ss(*control.pade((0.5 + spec.delay_samples) * spec.sample_time_s, 2))
+    late = control.tf2ss(*control.pade((0.5 + spec.compute_delay_samples) * spec.sample_time_s, 2))
     low, high = 0.1, 100.0
     started = time.process_time()
     while high / low > 1.01:
@@ -290,7 +290,7 @@ def beside_mixsyn(bandwidth_hz: float = 30.0, ms: float = 1.6, noise_gain: float
     made_s = time.process_time() - started
     f = np.geomspace(1e-3, 1e4, 20_000)
     s = 2j * np.pi * f
-    p = control.frequency_response(given, 2 * np.pi * f).complex * np.exp(-s * (0.5 + spec.delay_samples) / 1e3)
+    p = control.frequency_response(given, 2 * np.pi * f).complex * np.exp(-s * (0.5 + spec.compute_delay_samples) / 1e3)
     k = control.frequency_response(law, 2 * np.pi * f).complex
     sensitivity = 1 / (1 + p * k)
     t = np.abs(p * k * sensitivity)

@@ -23,7 +23,7 @@ from typing import Any, Generic, TypeVar
 
 from seaopt.errors import SeaoptError, require_type
 
-__all__ = ["Processes", "Shared", "check_executor", "connect_dask", "count_cores", "count_workers", "map_ordered"]
+__all__ = ["Processes", "Shared", "connect_dask", "count_cores", "count_workers", "map_ordered"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -85,7 +85,7 @@ def simulate(
     f_s = np.maximum(f_s, f_c)
     h = period / substeps
     steps = [_DifferenceEquations(laws, path) for path in ("reference", "measurement")]
-    delays = np.array([law["delay_samples"] for law in laws])
+    delays = np.array([round(law["delay_samples"], 9) for law in laws]).astype(int, casting="unsafe")
     effort, force = np.zeros((len(masses), n)), np.zeros((len(masses), n))
     q, largest = np.zeros(len(masses)), np.zeros(len(masses))
     v = np.zeros(len(masses)) if velocity is None else np.array(velocity, dtype=float)

@@ -83,22 +83,15 @@ def controller():
     return replace(so.tune(STAND, THOR, SPEC), design=(SWING, THOR))
 
 
-def drop_clock(content):
-    """Return what does not depend on the clock."""
-    if isinstance(content, dict):
-        return {name: drop_clock(value) for name, value in content.items() if name != "real_time_factor"}
-    return [drop_clock(one) for one in content] if isinstance(content, list) else content
-
-
 def certify(controller, executor):
-    """Return all that a certificate says, but for what the clock said."""
+    """Return all that a certificate says."""
     ranges = {"I_p": (0.3, 0.5), "k": (0.95 * THOR["k"].value, 1.05 * THOR["k"].value)}
     found = so.certify(
         controller, {"swing": SWING}, THOR, ranges=ranges, samples=40, bounds=Budget(boxes=1),
         sensors=so.Sensors(noise_std={"F1": 1.0}), executor=executor,
     )  # fmt: skip
     assert found.worst["swing"][0] is SWING  # a plant comes back as the caller's own
-    return to_json(drop_clock(found.to_dict())), {name: ms.tobytes() for name, ms in found.drawn_ms.items()}
+    return to_json(found.to_dict()), {name: ms.tobytes() for name, ms in found.drawn_ms.items()}
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +155,7 @@ def certify_plan(executor):
 
 @cache
 def certify_here(certify_one):
-    return to_json(drop_clock(certify_one(None).to_dict()))
+    return to_json(certify_one(None).to_dict())
 
 
 SLOW = (certify_friction, certify_link, certify_points)
@@ -173,7 +166,7 @@ OTHERS = [certify_plan, *(pytest.param(one, marks=pytest.mark.slow) for one in S
 @pytest.mark.parametrize("make", EXECUTORS)
 def test_other_certificates(certify_one, make):
     with make() as executor:
-        assert to_json(drop_clock(certify_one(executor).to_dict())) == certify_here(certify_one)
+        assert to_json(certify_one(executor).to_dict()) == certify_here(certify_one)
 
 
 @pytest.fixture(scope="module")

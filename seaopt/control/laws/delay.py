@@ -17,13 +17,14 @@ import casadi as ca
 import numpy as np
 
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY, Measured, add_drive_delay, list_names, read_conditions
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.formatting import format_count
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.plant import require_plant
 from seaopt.records import record
 
 
@@ -196,6 +197,8 @@ def settle_delays(
     one tick: a delay behind a command that is held. It takes an output without the present command in it, and a law
     that does not plan; else it is 1.
     """
+    require_plant(plant, "plant", ControlError)
+    require_type(source, (Fit, ParameterSet), "params", "give a Fit, or a ParameterSet", ControlError)
     values = source.parameters if isinstance(source, Fit) else source
     late = find_drive_delay(spec, plant, source)
     values = add_drive_delay(ParameterSet(one for name, one in values.items() if name != DRIVE_DELAY), late)

@@ -170,7 +170,6 @@ class Verification:
         return {
             "passed": self.passed,
             "seed": self.seed,
-            "real_time_factor": dict(self.real_time_factor),
             "integration_error": self.error,
             "follows_hz": {name: None if band is None else list(band) for name, band in self.follows_hz.items()},
             "rows": [{f.name: _to_plain(getattr(row, f.name)) for f in fields(Outcome)} for row in self.rows],

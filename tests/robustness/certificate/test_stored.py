@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from seaopt.errors import FileError
+from seaopt.files import seal
 from seaopt.robustness.certificate.stored import read_certificate
 
 CONTENT = {
@@ -25,7 +26,7 @@ CONTENT = {
 
 
 def test_null_is_infinite_and_bounds_are_there_where_they_were_asked_for():
-    stored = read_certificate(CONTENT)
+    stored = read_certificate(seal(CONTENT))
     assert stored.requirements[0].value == np.inf
     assert (stored.varied[0].low, stored.varied[0].high) == (-np.inf, np.inf)
     assert stored.plants["stand"].worst.bounds is None
@@ -55,7 +56,7 @@ def test_a_mistake_is_one_line_with_place_value_and_remedy(keys, value, words):
     else:
         table[keys[-1]] = value
     with pytest.raises(FileError) as raised:
-        read_certificate(content)
+        read_certificate(seal(content))
     message = str(raised.value)
     assert message.startswith("robustness.json: ") and words in message
     assert message.endswith("; certify again") and "\n" not in message
