@@ -290,7 +290,7 @@ class Session:
         """Return the schedule of this run or of the folder; one for other limits than the problem's is refused."""
         if "tune" not in self.results:
             schedule = ScheduledController.from_dict(
-                self._read("tune"), self.problem.design_plant, self.values(), self.problem.robust_to(self.values())
+                self._read("tune"), self.problem.design_plant, self.values(), self.problem.robust_to(self.parameters())
             )
             asked = self.problem.schedule
             if asked is None or (schedule.over, list(schedule.points)) != (asked.over, asked.points):
@@ -420,7 +420,7 @@ class Session:
             return None
 
     def _tune(self, tell: Progress) -> None:
-        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
+        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.parameters())
         self._design_values(design, *(plant for plant, _ in robust_to.values()))
         self._spec()
         if self.problem.schedule is not None:
@@ -442,7 +442,7 @@ class Session:
                 f"{self.problem.source}: a sweep is of one law, and [controller.schedule] asks for one at every point; "
                 "take it out"
             )
-        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
+        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.parameters())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
         design, robust_to = list_plants(self.problem, self.parameters())
         if self.free_law and self.problem.designs_on_response:

@@ -13,7 +13,7 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
-from seaopt.control.laws.delay import DelayedSpec, find_drive_delay
+from seaopt.control.laws.delay import DelayedSpec, find_drive_delay, take_own_delays
 from seaopt.control.loops.sampled_plant import add_drive_delay, list_names
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
@@ -234,13 +234,22 @@ class Problem:
         asked = asked or self.spec or self.mpc
         return values if asked is None else add_drive_delay(values, find_drive_delay(asked, self.design_plant, source))
 
-    def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
-        """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges."""
+    def robust_to(
+        self, source: Fit | ParameterSet, asked: DelayedSpec | None = None
+    ) -> dict[str, tuple[Plant, ParameterSet]]:
+        """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges.
+
+        Each is behind the drive of its own experiments; the delays are as in `values`.
+        """
         out: dict[str, tuple[Plant, ParameterSet]] = {}
+        parameters, spec = self.values(source, asked), asked or self.spec or self.mpc
+        if spec is None:
+            return out
+        plants = take_own_delays(spec, self.design_plant, self.plants, source)
         for name in self.table.controller.robust_to if self.table.controller else []:
             if name.startswith(RESPONSE):
                 continue
-            plant = self.plants[name]
+            plant = plants[name]
             values = plant.complete(parameters).drop_conditions()
             out[name] = (plant, values)
             for parameter, ends in self.ranges.items():

@@ -226,7 +226,7 @@ def tune_problem(
         )
     return tune_certified(
         problem.design_plant, source, spec, problem.certified_plants(), ranges=problem.ranges,
-        robust_to=problem.robust_to(problem.values(source)), draws=draws, others=problem.parameters,
+        robust_to=problem.robust_to(source), draws=draws, others=problem.parameters,
         samples=table.samples, seed=table.seed + 1, rounds=table.retune,
         complete=partial(complete_controller, problem, source=source), executor=executor, progress=progress,
     )  # fmt: skip
@@ -299,7 +299,7 @@ def tune_schedule_problem(
     (spec, _), asked = settle_delays(problem.spec, problem.design_plant, source), problem.schedule
     values = problem.values(source)
     return tune_schedule(
-        problem.design_plant, values, spec, asked.over, asked.points, problem.robust_to(values),
+        problem.design_plant, values, spec, asked.over, asked.points, problem.robust_to(source),
         bandwidths_hz=asked.bandwidth_hz, draws=problem.draws(source), progress=progress,
     )  # fmt: skip
 
@@ -370,7 +370,7 @@ def list_plants(
 
     """
     measured = problem.measure_responses(source)
-    others: dict[str, Any] = problem.robust_to(problem.values(source, asked))
+    others: dict[str, Any] = problem.robust_to(source, asked)
     assert problem.table.controller is not None
     named = problem.table.controller.robust_to
     others |= {name: one for name, one in measured.items() if name in named}

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delays
+from seaopt.control.laws.delay import settle_delays, take_own_delays
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
@@ -85,6 +85,7 @@ def assess(
             f"{spec.sample_rate_hz:g}; give sample_rate_hz = {1.0 / given.sample_time_s:g}, or sample the law again"
         )
     given = replace(given, sample_time_s=spec.sample_time_s)
+    robust_to = take_own_delays(spec, plant, robust_to or {}, params)
     spec, values = settle_delays(spec, plant, params)
     spec = replace(
         spec,
@@ -94,7 +95,7 @@ def assess(
         link_feedforward=None,
         reference_weights="tuned",
     )
-    task = make_task(plant, plant.complete(values), spec, robust_to or {}, draws)
+    task = make_task(plant, plant.complete(values), spec, robust_to, draws)
     loops = task.measure_law(
         given, filter_samples=count_filter_samples(given), integral_rad_s=find_integral_rate(given)
     )  # fmt: skip

@@ -188,6 +188,15 @@ def split_delayed(
     return out
 
 
+def take_own_delays(
+    spec: DelayedSpec, design: Plant, plants: Mapping[str, Any], source: Fit | ParameterSet
+) -> dict[str, Any]:
+    """Return plants with the longest delay of their own experiments; what comes with values of its own as it is."""
+    alone = {name: plant for name, plant in plants.items() if isinstance(plant, Plant)}
+    late = split_delayed(spec, design, alone, source)
+    return {name: late.get(name, plant) for name, plant in plants.items()}
+
+
 def settle_delays(
     spec: SpecT, plant: Plant, source: Fit | ParameterSet, *, plans: bool = False
 ) -> tuple[SpecT, ParameterSet]:

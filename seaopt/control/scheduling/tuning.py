@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delays
+from seaopt.control.laws.delay import settle_delays, take_own_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import list_broken_limits
@@ -110,8 +110,9 @@ def tune_schedule(
     _check_structure(spec)
     places = np.asarray(points, dtype=float)
     check_points(over, places)
+    own = take_own_delays(spec, plant, robust_to or {}, params)
     spec, values = settle_delays(spec, plant, params)
-    others = _pair_plants(robust_to or {}, values)
+    others = _pair_plants(own, values)
     if over in DELAYS:
         raise ControlError(f'over = "{over}": a delay cannot be read as the law runs; give a state or a parameter')
     if any(over in draw for draw in draws):

@@ -22,7 +22,7 @@ from jaxtyping import Complex
 
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delays
+from seaopt.control.laws.delay import settle_delays, take_own_delays
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
@@ -200,6 +200,7 @@ def _tune(
             f'measured = {list(spec.measured)}: structure = "{spec.structure}" feeds back one output; name one, or '
             'give structure = "cascade"'
         )
+    robust_to = take_own_delays(spec, model, robust_to, params)
     spec, params = settle_delays(spec, model, params)
     values = model.complete(params)
     if model.winding is not None:

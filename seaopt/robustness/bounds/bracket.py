@@ -11,7 +11,7 @@ Every bound is a theorem but for rounding, which is estimated at every step and 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -218,7 +218,7 @@ def _start(
     controller: Controller, plant: Plant, unknown: Uncertainty, tolerance: float, known: Float[np.ndarray, " 2"],
     severity: float,
 ) -> _BranchAndBound:  # fmt: skip
-    within = build_region(plant, unknown)
+    within = build_region(plant, replace(unknown, nominal=controller.delay(unknown.nominal)))
     boxes = within.cover(controller.sample_time_s)
     _check_digits(controller, plant, within, boxes)
     hardness = _measure_hardness(controller, plant, within, boxes)

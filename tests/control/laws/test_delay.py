@@ -22,8 +22,8 @@ from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.plants.friction import split_friction
 from seaopt.problem import read_problem
-from seaopt.problem.stages import assess_problem
-from seaopt.robustness import batch_figures, combine_uncertainty
+from seaopt.problem.stages import assess_problem, list_plants
+from seaopt.robustness import batch_figures, bracket, combine_uncertainty
 from seaopt.robustness.certificate.certify import find_own_drive
 from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
 from seaopt.robustness.verification.environments import attach_environment
@@ -214,6 +214,12 @@ def pair(stand, thor):
     return one, replace(one, spec=halved, compute_delay_samples=1, drive_delay_s=1e-3, design=(one.design[0], values))
 
 
+def bracket_ms(law, plant, values):
+    """Return what is proved of Ms over a range of inertia."""
+    unknown = combine_uncertainty(values, so.ParameterSet(), {"J": (3e-6, 3.1e-6)}, {"": plant})
+    return bracket(law, plant, unknown).ms_upper
+
+
 STEP = Scenario(name="step", phases=(Phase(duration_s=0.12, force_N=30.0),))
 MEASURES = {
     "figures": lambda law, plant, values: law.close(plant, values).figures().ms,
@@ -221,6 +227,7 @@ MEASURES = {
     "friction": lambda law, plant, values: find_friction_margin(law, plant, values).least_slope,
     "delay margin": lambda law, plant, values: sampled_delay_margin(law, plant, values, 0.05),
     "draws": lambda law, plant, values: batch_figures(law, plant, values, {"J": np.array([2e-6, 4e-6])}).ms,
+    "bounds": lambda law, plant, values: bracket_ms(law, plant, values.update(f_c=0.0)),
     "amplitudes": lambda law, plant, values: (
         large_signal(law, plant, values, amplitudes_N=(500.0,), frequencies_hz=(15.0,)).gain
     ),
@@ -266,6 +273,26 @@ def test_a_fitted_delay_is_drawn_with_the_parameters(fit, stand):
     assert [row.name for row in certificate.varied] == ["b_r", "drive_delay_s"]
     again = so.estimation.Fit.from_dict(json.loads(to_json(fit.to_dict())))
     np.testing.assert_array_equal(again.delay_covariance.matrix, joint)
+
+
+def test_a_plant_that_the_law_is_robust_to_has_the_delay_of_its_own_experiments(fit, stand, swing, tmp_path):
+    """As in the certificate, from Python and from a problem file."""
+    own = fit.nuisance["experiment"]
+    slower = replace(own, plant=swing.name, delay_s=own.delay_s + 2e-3)
+    two = replace(fit, nuisance={"experiment": replace(own, plant=stand.name), "swung": slower})
+    spec = so.ControllerSpec(bandwidth_hz=15, max_sensitivity=1.6, max_noise_gain=25)
+    controller = so.tune(stand, two, spec, robust_to={"swing": swing})
+    certificate = so.certify(controller, {"stand": stand, "swing": swing}, two, samples=2, simulations=False)
+    assert controller.feasible and certificate.plants["swing"].ms < 1.6
+    (tmp_path / "p.toml").write_text(
+        'schema = 1\ntitle = "t"\n[plant.stand]\nkind = "high_impedance"\ndrive = "unlumped"\n'
+        '[plant.swing]\nkind = "moving_output"\n'
+        '[controller]\nplant = "stand"\nbandwidth_hz = 15\nrobust_to = ["swing"]\n',
+        encoding="utf-8",
+    )
+    problem = read_problem(tmp_path / "p.toml")
+    named = replace(two, nuisance={**two.nuisance, "swung": replace(slower, plant=problem.plants["swing"].name)})
+    assert list_plants(problem, named)[1]["swing"][0].drive_offset_s == pytest.approx(2e-3)
 
 
 def test_values_that_change_keep_the_drives_delay(stand, swing, thor):
