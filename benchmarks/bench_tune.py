@@ -4,6 +4,7 @@ Each case draws a THOR-like actuator, a structure, limits, a rate and a delay, w
 robust to. scipy's differential evolution then searches the same numbers for about 50 times the tuner's time, with
 the bandwidth met in closed form. Both answers are judged by the same NumPy code, which shares nothing with the
 tuner but the plant's continuous matrices and the law's definition. Options: --cases 40 --seed 1 --times 50 --only N;
+--refusals N rechecks the first N refusals of another seed by such a search; --requests N answers those of the tests;
 --mixsyn 1 sets THOR's pid beside the H-infinity law of python-control's mixsyn (slycot) instead.
 """
 
@@ -11,8 +12,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.linalg import expm
@@ -21,6 +24,7 @@ from scipy.optimize import differential_evolution
 import seaopt as so
 from seaopt.control import Gains, Loop, command_of
 from seaopt.control.laws.structures import Notch
+from seaopt.errors import InternalError, SeaoptError
 
 LOWEST_HZ, RATE = 0.1, 2 * np.pi * 0.05
 FULL = {"pd": "dT", "pid": "idT", "pid_dob": "idTQ"}
@@ -259,6 +263,49 @@ def compare(case: Case, times: float, seed: int) -> dict:
     }  # fmt: skip
 
 
+def recheck_refusals(count: int):
+    """Yield of as many refusals whether another evolution finds a law that keeps the limits, which makes it wrong."""
+    refused, number = 0, 0
+    while refused < count:
+        case, number = draw(np.random.default_rng((11, number))), number + 1
+        plant, *others = case.plants
+        started = time.process_time()
+        controller = so.tune(plant, case.params, case.spec, dict(zip(["swing"], others, strict=False)))
+        tuned_s = time.process_time() - started
+        if controller.feasible:
+            continue
+        refused += 1
+        judge, allowed = Judge(case, controller), 1.0 - case.spec.reserve
+        answers, _ = search(case, judge, np.inf, number, generations=120)
+        kept = [a for a in answers if judge.judge(a)[0][0] <= allowed * (1.0 + 1e-6)]
+        wrong = any(stable(case, controller, answer) for answer in kept)
+        print(f"{number - 1:4d} {case.spec.structure} {tuned_s:6.2f} s {'WRONG' if wrong else ''}", flush=True)
+        yield wrong
+
+
+def answer_requests(count: int) -> None:
+    """Print how many of the tests' random requests end in a defect, and the processor time of the refusals."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from tests.control.tuning.drawn_requests import draw_request
+
+    defects, times = 0, []
+    for seed in range(count):
+        request, started, how = draw_request(np.random.default_rng(seed)), time.process_time(), "refused"
+        try:
+            controller = request.tune()
+        except SeaoptError:
+            how = "not possible"
+        except InternalError as error:
+            how, defects = f"DEFECT {error}", defects + 1
+        else:
+            how = "feasible" if controller.feasible else "refused"
+        spent = time.process_time() - started
+        times += [spent] * (how == "refused")
+        print(f"{seed:4d} {spent:6.2f} s {how}", flush=True)
+    print(f"{count} requests, {defects} defects; processor time of {len(times)} refusals: median "
+          f"{np.median(times):.2f} s, largest {max(times):.2f} s, {sum(t > 5.0 for t in times)} above 5 s")  # fmt: skip
+
+
 def beside_mixsyn(bandwidth_hz: float = 30.0, ms: float = 1.6, noise_gain: float = 60.0) -> None:
     """Print THOR's stand under a tuned pid and under mixed sensitivity synthesis.
 
@@ -310,11 +357,18 @@ def beside_mixsyn(bandwidth_hz: float = 30.0, ms: float = 1.6, noise_gain: float
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, default in (("cases", 40), ("seed", 1), ("times", 50.0), ("only", -1), ("mixsyn", 0)):
+    for name, default in (("cases", 40), ("seed", 1), ("times", 50.0), ("only", -1), ("mixsyn", 0), ("refusals", 0),
+                          ("requests", 0)):  # fmt: skip
         parser.add_argument(f"--{name}", type=type(default), default=default)
     args = parser.parse_args()
     if args.mixsyn:
         beside_mixsyn()
+        return
+    if args.requests:
+        answer_requests(args.requests)
+        return
+    if args.refusals:
+        print(f"{sum(recheck_refusals(args.refusals))} of {args.refusals} refused wrongly")
         return
     rng = np.random.default_rng(args.seed)
     cases = [draw(rng) for _ in range(args.cases)]

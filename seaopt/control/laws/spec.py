@@ -73,7 +73,7 @@ class ControllerSpec:
         k_r and c of `seaopt.control.laws.structures`: tuned with the gains; feedforward and feedback of the error,
         k_r = 1/P(0) + k_p and c = 1; or the derivative on the measurement alone, c = 0, with k_r tuned.
     sample_rate_hz : float
-        Of the controller.
+        Of the controller, at most 1e6.
     compute_delay_samples : int, optional
         Whole samples from a reading to the command being put out, besides the hold. Left out it is 0 where
         `seaopt.tune` is given a fit whose experiments on the design plant show a delay, else 1
@@ -397,12 +397,18 @@ class ControllerSpec:
 
 
 def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, float]) -> None:
-    """Refuse the numbers of a filter that are not above zero and up to the largest; what is None is tuned."""
+    """Refuse the numbers of a filter that are not above zero and up to the largest; what is None is tuned.
+
+    Frequencies are not below those that limits are kept from.
+    """
     for field, value in numbers.items():
         if value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= largest[field]:
-            raise ControlError(f"{name}.{field} = {value!r} is not above 0 and up to {largest[field]:g}")
+        least = LOWEST_HZ if field.endswith("_hz") else 0.0
+        known = not isinstance(value, bool) and isinstance(value, (int, float))
+        if not known or not 0.0 < value <= largest[field] or value < least:
+            lower = f"{least:g} to" if least else "above 0 and up to"
+            raise ControlError(f"{name}.{field} = {value!r} is not {lower} {largest[field]:g}")
 
 
 def check_command_limits(current_limit_A: float | None, command_limit: float | None) -> None:

@@ -60,6 +60,8 @@ WORST_PLANTS = 2  # plants whose objective is followed
 QUADRATURE_CHUNK = 64  # quadrature points come in multiples of this
 SLACK_PRICE = 1e3
 LEAST_SPEED_GAIN = 1e-2  # of the inverse of the speed per command at the bandwidth: k_v that makes a difference
+HOPELESS = 1.05  # worst usage beyond which solutions that bring next to nothing are not repeated
+STALLED, MOST_STALLED = 0.99, 2  # of the usage before: that is next to nothing; how often it may be
 UNUSED = 1e-6  # of a limit: outside its band, or not imposed
 SMOOTHING = 1e-12  # keeps magnitudes differentiable at zero
 
@@ -132,19 +134,20 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNum
 
     """
     x, chosen, factor = start, _choose_points(task, grid, start), LARGEST_FACTOR
-    rank = task.rank(grid, start)
+    rank, stalled = task.rank(grid, start), 0
     for _ in range(rounds):
         trial = _solve(task, grid, x, chosen, factor)
         if trial is None:
             break
         again = _add_missed(task, grid, trial, chosen)
         trial_rank = task.rank(grid, trial)
+        stalled = stalled + 1 if rank[0] > HOPELESS and trial_rank[0] > STALLED * rank[0] else 0
         if trial_rank < rank and task.is_stable(trial):
             again = again or _reached_end(trial, x, factor)
             x, rank, factor = trial, trial_rank, min(factor**2, LARGEST_FACTOR)
         elif task.speed_loop is not None:  # along its flat valleys other points matter at every step that is far
             factor = max(np.sqrt(factor), SMALLEST_FACTOR)
-        if not again:
+        if not again or stalled == MOST_STALLED:
             break
     return x
 

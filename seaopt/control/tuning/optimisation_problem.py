@@ -277,6 +277,7 @@ class Task:
         spec, ts, integrates = self.spec, self.spec.sample_time_s, self.integrates(x)
         fixed, free = (0.0, 0.0), (0.0, np.inf)
         notch = ((0.1, 0.1), (0.5, 0.5), (1.0, 1.0))
+        fastest = (spec.level("min_filter_samples") or 0.0) * ts
         if spec.notch is not None:
             centre = _range(spec.notch.frequency_hz, LOWEST_NOTCH * spec.bandwidth_hz, HIGHEST_CORNER / ts)
             notch = (
@@ -294,7 +295,7 @@ class Task:
             free if integrates and spec.reference_weights != "error" else fixed,
             free if spec.reference_weights != "error" else fixed,
             free if self.speed_loop is not None else fixed,
-            ((spec.level("min_filter_samples") or 0.0) * ts, 4.0 / (2 * np.pi * spec.bandwidth_hz)),
+            (fastest, max(fastest, 4.0 / (2 * np.pi * spec.bandwidth_hz))),
             (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0),
             (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed,
             *notch, *prefilter,

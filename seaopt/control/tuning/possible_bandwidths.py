@@ -122,7 +122,7 @@ class _Probes:
 
         if keeps(x):
             return 0.0, x
-        x = recheck(task, task.grid(place_frequencies(task)), x)
+        x = recheck(task, task.grid(place_frequencies(task)), x, REFINEMENTS)
         return (0.0 if keeps(x) else NEARLY_KEPT), x
 
     def _aim(self, bandwidth_hz: float) -> Task:

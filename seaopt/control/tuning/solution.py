@@ -28,13 +28,14 @@ from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.grid import Grid
-from seaopt.control.tuning.interior_point import refine
+from seaopt.control.tuning.interior_point import HOPELESS, refine
 from seaopt.control.tuning.optimisation_problem import FRICTION, K_I, W_R, LawNumbers, Task
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, count_off, divide, ignore
 
 STARTS_TRIED = 3  # two more where an observer, a notch, a prefilter or a speed loop makes more valleys
 STARTS_REFINED = 2  # one more with an observer, a prefilter or a speed loop, all with a notch
+FAR_OFF = 1.3  # worst usage of the best of two refined starts beyond which no other is refined; an evolution follows
 ROUNDS, LONG_ROUNDS = 5, 9  # of the interior point; integrals of a cascade move far
 QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
@@ -178,14 +179,17 @@ def _finish(task: Task, grid: Grid, x: LawNumbers, checking: Progress) -> Soluti
     return x, task.measure(x)
 
 
-def recheck(task: Task, grid: Grid, x: LawNumbers) -> LawNumbers:
-    """Refine numbers on a grid until no limit is broken between its frequencies, or no more than on them."""
-    for _ in range(RECHECKS):
+def recheck(task: Task, grid: Grid, x: LawNumbers, rounds: int = ROUNDS) -> LawNumbers:
+    """Refine numbers on a grid until no limit is broken between its frequencies, or no more than on them.
+
+    Of what misses limits clearly on them nothing is refined.
+    """
+    for _ in range(RECHECKS if task.rank(grid, x)[0] <= HOPELESS else 0):
         missed = _find_missed(task, x, grid)
         if not missed.size:
             break
         grid = task.grid(np.unique(np.concatenate([grid.f, missed])))
-        x = refine(task, grid, x)
+        x = refine(task, grid, x, rounds)
     return x
 
 
@@ -203,8 +207,12 @@ def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress:
     for _, x in ranked:
         if len(chosen) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
-    refined = (refine(task, grid, x, _count_rounds(task)) for x in count_off(chosen, "refining start", refining))
-    best = min(refined, key=lambda x: task.rank(grid, x))
+    rank, best = (math.inf, math.inf), chosen[0]
+    for number, start in enumerate(count_off(chosen, "refining start", refining), start=1):
+        x = refine(task, grid, start, _count_rounds(task))
+        rank, best = min((rank, best), (task.rank(grid, x), x), key=lambda pair: pair[0])
+        if number == STARTS_REFINED and rank[0] > FAR_OFF:
+            return best
     return best if task.speed_loop is None else _quicken_integral(task, grid, best)
 
 

@@ -62,6 +62,7 @@ from seaopt.control.tuning.easing import ROOM, ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.frequencies import count_growing
+from seaopt.control.tuning.link_fraction import feed_link, lower_fraction
 from seaopt.control.tuning.optimisation_problem import (
     FRICTION,
     OBJECTIVE_HZ,
@@ -92,7 +93,6 @@ from seaopt.progress import Progress, divide, ignore
 
 FRACTION_FREQUENCIES = 1500
 NO_FORCE = 0.02  # of the design plant's static gain: where the force answers less, the feedback does next to nothing
-LOWER_FRACTIONS = 4  # by a fifth each
 USUAL_MS = 1.7  # that the fraction of a feedforward is chosen for where no Ms is asked
 SOLUTION, BANDWIDTHS, EASING = 1.0, 2.0, 2.0  # of the time of a tune that is not possible as asked
 
@@ -423,42 +423,12 @@ def _limit_fraction(link: LinkPath, spec: ControllerSpec, plants: Sequence[Digit
     return replace(link, fraction=limit_fraction(link, motions, beyond, f, spec.sample_time_s, largest))
 
 
-def feed_link(task: Task, link: LinkPath | None) -> Task:
-    """Return a task whose link is fed forward by another path; the same where it is not fed forward."""
-    if link is None:
-        return task
-    return replace(task, link=link, further=(*task.further[:-1], link.feedback(task.spec.sample_time_s)))
-
-
 def aim_task(task: Task, spec: ControllerSpec) -> Task:
     """Return a task at another bandwidth, with the corners and the largest fraction of the link's path there."""
     task, asked = replace(task, spec=spec), spec.link_feedforward
     if asked is None or task.link is None:
         return task
     return feed_link(task, _limit_fraction(asked.place(task.link, spec.bandwidth_hz), spec, task.plants))
-
-
-def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tuple[Task, LawNumbers, list[MeasuredLoop]]:
-    """Return task, numbers and loops with as large a fraction of the link's feedforward as keeps the limits.
-
-    It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is that
-    which shows most of a friction margin that alone is missed, else zero, as nothing shows then which one misses least.
-    """
-    asked, link = task.spec.link_feedforward, task.link
-    if asked is None or asked.fraction is not None or link is None:
-        return task, x, loops
-    missing: list[tuple[float, tuple[Task, LawNumbers, list[MeasuredLoop]]]] = []
-    for power in range(LOWER_FRACTIONS + 2):
-        broken = list_broken_limits(task.spec, loops, task.design_states)
-        if not broken:
-            return task, x, loops
-        if broken == {FRICTION}:
-            missing.append((min(loop.friction_slope for loop in loops), (task, x, loops)))
-        if power <= LOWER_FRACTIONS:
-            share = 0.8 ** (power + 1) if power < LOWER_FRACTIONS else 0.0
-            task = feed_link(task, replace(link, fraction=round(share * link.fraction, 3)))
-            x, loops = solve(task)
-    return max(missing, key=lambda found: found[0])[1] if missing else (task, x, loops)
 
 
 def _check_measured_design(spec: ControllerSpec) -> None:

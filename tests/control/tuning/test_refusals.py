@@ -17,7 +17,7 @@ from seaopt.control.tuning.optimisation_problem import K_P
 from seaopt.control.tuning.tuner import make_task
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
-REFUSALS = 100
+REFUSALS = 4  # benchmarks/bench_tune.py --refusals 100 rechecks more
 STAND = so.plants.rotary(link="locked")
 F = np.unique(np.r_[np.geomspace(1e-3, 499.9, 6000), np.linspace(10.0, 40.0, 4000)])
 
@@ -55,6 +55,15 @@ def evaluate(controller: so.Controller, values: so.ParameterSet):
     return p * c_r / (1 + p * c_y), 1 / (1 + p * c_y), c_y / (1 + p * c_y)
 
 
+def test_the_evolution_finds_a_law_with_a_notch_that_the_scan_has_not():
+    """As many evaluations as a bandwidth nearby is given; the whole answer is in the slow tests."""
+    values, spec = draw_rotary(0)
+    task = make_task(STAND, values, spec, {})
+    usage, laws = Evolution.of(task, task.grid(place_frequencies(task))).run()
+    assert usage[0] <= 1.0 and task.is_stable(task.tidy(laws[0]))
+
+
+@pytest.mark.slow
 def test_a_notch_loses_no_law_that_there_is_without_it():
     """What was refused at 17 Hz with a notch, and had a law at 24 Hz without one."""
     values, spec = draw_rotary(0)
@@ -67,7 +76,7 @@ def test_a_notch_loses_no_law_that_there_is_without_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_part_loses_a_law_and_the_range_has_no_say(seed):
     values, spec = draw_rotary(seed)
     bare = so.tune(STAND, values, replace(spec, notch=None))
@@ -116,16 +125,7 @@ def test_nothing_is_refused_that_another_evolution_finds(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import bench_tune as bench
 
-    refused, number, wrongly = 0, 0, []
-    while refused < REFUSALS:
-        case, number = bench.draw(np.random.default_rng((11, number))), number + 1
-        plant, *others = case.plants
-        controller = so.tune(plant, case.params, case.spec, dict(zip(["swing"], others, strict=False)))
-        if controller.feasible:
-            continue
-        refused += 1
-        judge, allowed = bench.Judge(case, controller), 1.0 - case.spec.reserve
-        answers, _ = bench.search(case, judge, np.inf, number, generations=120)
-        kept = [a for a in answers if judge.judge(a)[0][0] <= allowed * (1.0 + 1e-6)]
-        wrongly += [number - 1] if any(bench.stable(case, controller, answer) for answer in kept) else []
-    assert not wrongly
+    refused = wrongly = 0
+    for wrong in bench.recheck_refusals(REFUSALS):
+        refused, wrongly = refused + 1, wrongly + wrong
+    assert refused == REFUSALS and wrongly == 0

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import Controller
+from seaopt.control import Controller, Notch, Prefilter
 from seaopt.control.tuning.convex_concave import solve_qp
+from seaopt.control.tuning.optimisation_problem import T_F
+from seaopt.control.tuning.starts import make_rest_start
+from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, FileError
 from seaopt.plants.friction import take_sliding
 from tests.control.loops.test_loop import independent
@@ -61,7 +64,7 @@ def test_it_is_as_good_as_a_long_global_search(stand, thor):
     """scipy's differential evolution over the same four numbers, penalised, a hundred times the time."""
     from scipy.optimize import differential_evolution
 
-    from seaopt.control.tuning.tuner import disturbance, make_task
+    from seaopt.control.tuning.tuner import disturbance
 
     spec = so.ControllerSpec(
         structure="pd", reference_weights="error", bandwidth_hz=30, **{**LIMITS, "max_noise_gain": 25}
@@ -123,6 +126,14 @@ def test_beside_a_limit_that_nothing_keeps_the_others_are_kept():
         below = f[np.flatnonzero(np.abs(tracking) < abs(tracking[0]) / np.sqrt(2))[0]]
         assert below == pytest.approx(30.0, rel=0.005)
         assert np.abs(1 / (1 + open_loop)).max() <= 1.6
+
+
+@pytest.mark.parametrize("samples", [3.0, 30.0, 1e9])
+def test_a_filter_may_be_asked_to_be_slower_than_the_bandwidth(samples, stand, thor):
+    """Then there is one filter to choose; the ends of its range had crossed."""
+    task = make_task(stand, thor, so.ControllerSpec(bandwidth_hz=60, min_filter_samples=samples), {})
+    low, high = task.bounds(make_rest_start(task))
+    assert np.all(low <= high) and low[T_F] == pytest.approx(samples * 1e-3)
 
 
 def test_noise_objective_is_quieter(stand, swing, thor):
@@ -206,6 +217,8 @@ def test_json_round_trip(stand, swing, thor, tmp_path):
         ({"compute_delay_samples": 100_000}, "delay_samples"),
         ({"sample_rate_hz": float("inf")}, "sample_rate_hz"),
         ({"sample_rate_hz": 1e300}, "above 1e\\+06 Hz"),
+        ({"prefilter": Prefilter(corner_hz=1e-300)}, r"prefilter.corner_hz = 1e-300 is not 0.001 to 450"),
+        ({"notch": Notch(frequency_hz=1e-300)}, r"notch.frequency_hz = 1e-300 is not 0.001 to 450"),
     ],
 )
 def test_bad_specifications(changes, words):
