@@ -10,6 +10,7 @@ from typing import Any, Literal
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.delay import check_delays, count_loop_samples, count_response_samples
 from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, FIELDS, LIMITS, Limit, list_given_limits
+from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.structures import (
     CASCADE,
     CUSTOM,
@@ -425,8 +426,9 @@ def check_command_limits(current_limit_A: float | None, command_limit: float | N
             f"current_limit_A = {current_limit_A:g} and command_limit = {command_limit:g} are both given; give one"
         )
     for name, value in (("current_limit_A", current_limit_A), ("command_limit", command_limit)):
-        if value is not None and not value > 0.0:
-            raise ControlError(f"{name} = {value:g} is not positive; give the motor's limit")
+        if value is not None and not 0.0 < value <= LARGEST:
+            kind = "not positive" if not value > 0.0 else f"above {LARGEST:g}"
+            raise ControlError(f"{name} = {value:g} is {kind}; give the motor's limit")
 
 
 def list_lifted(spec: object) -> tuple[str, ...]:

@@ -2,8 +2,8 @@
 
 What is possible is not always an interval that begins at the lowest: below a resonance a law may need more feedback
 than above it. So bandwidths are probed outwards from the one asked, in steps of a fifth, down to a quarter and up to
-twice it, at each a short evolution; the ends of what is possible next to it are found by bisection, and the largest of
-all from the top down.
+twice it, or 60 Hz, at each a short evolution; the ends of what is possible next to it are found by bisection, and the
+largest of all from the top down.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from seaopt.control.tuning.solution import recheck
 from seaopt.progress import Progress, ignore
 
 FARTHEST_BELOW, FARTHEST_ABOVE = 4.0, 2.0  # of the bandwidth asked: where others are looked for
+USUAL_HZ = 60.0  # and as far as force loops usually go: above a resonance a law may need less than below it
 PROBE_RATIO = 1.2  # of a probe to the next
 RESOLUTION = 0.01  # to which the end of what is possible is found
 BISECTIONS = math.ceil(math.log2(math.log(PROBE_RATIO) / RESOLUTION))  # that find such an end
@@ -88,7 +89,7 @@ class _Probes:
         """Return what `find_possible_bandwidths` does."""
         spec = self.task.spec
         lowest = max(self.asked / FARTHEST_BELOW, 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
-        highest = min(self.asked * FARTHEST_ABOVE, HIGHEST_BANDWIDTH * spec.sample_rate_hz)
+        highest = min(max(self.asked * FARTHEST_ABOVE, USUAL_HZ), HIGHEST_BANDWIDTH * spec.sample_rate_hz)
         down, up = (list_steps(self.asked, end) for end in (lowest, highest))
         self.expected = len(down) + len(up) + BISECTIONS
         below, above = (find_end(self._keeps, steps, self.asked) for steps in (down, up))
