@@ -16,9 +16,8 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.tuning.link_fraction import feed_link, lower_fraction
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
-from seaopt.control.tuning.solution import search, solve
+from seaopt.control.tuning.solution import feed_link, lower_fraction, search, solve
 from seaopt.control.tuning.tuner import (
     RobustTo,
     aim_task,

@@ -192,6 +192,8 @@ def take_own_delays(
     spec: DelayedSpec, design: Plant, plants: Mapping[str, Any], source: Fit | ParameterSet
 ) -> dict[str, Any]:
     """Return plants with the longest delay of their own experiments; what comes with values of its own as it is."""
+    if not isinstance(plants, Mapping):
+        raise ControlError(f"robust_to is a {type(plants).__name__}; give a mapping of name to plant")
     alone = {name: plant for name, plant in plants.items() if isinstance(plant, Plant)}
     late = split_delayed(spec, design, alone, source)
     return {name: late.get(name, plant) for name, plant in plants.items()}

@@ -9,7 +9,8 @@
    frequencies, those are added and step 3 is repeated.
 
 Where no law keeps the limits, an evolution looks for one (`search`), from which steps 2 to 5 are repeated.
-A friction margin is asked for afterwards, of the law that is best without, and everything repeated with it as a limit.
+A friction margin is asked for afterwards, of the law that is best without, and everything repeated with it as a limit;
+and less of a link's motion is fed forward where no law keeps the limits with all of it (`lower_fraction`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.absolute_stability import SIMPLEST
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
@@ -39,6 +41,7 @@ FAR_OFF = 1.3  # worst usage of the best of two refined starts beyond which no o
 ROUNDS, LONG_ROUNDS = 5, 9  # of the interior point; integrals of a cascade move far
 QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
+LOWER_FRACTIONS = 4  # of a link's feedforward, by a fifth each
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: of a law without any, less is not looked for
 SCAN, IMPROVEMENT, REFINEMENT, RECHECK = 1.0, 1.0, 3.0, 0.5  # of the time of a solution
@@ -243,3 +246,57 @@ def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
             if curve[0, top] > allowed[name] * (1.0 + max(0.4 * task.spec.reserve, 1e-6)):
                 out.append(float(f[top]))
     return np.array([f for f in out if np.min(np.abs(grid.f / f - 1.0)) > 1e-7])
+
+
+def feed_link(task: Task, link: LinkPath | None) -> Task:
+    """Return a task whose link is fed forward by another path; the same where it is not fed forward."""
+    if link is None:
+        return task
+    return replace(task, link=link, further=(*task.further[:-1], link.feedback(task.spec.sample_time_s)))
+
+
+def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tuple[Task, LawNumbers, list[MeasuredLoop]]:
+    """Return task, numbers and loops with as large a fraction of the link's feedforward as keeps the limits.
+
+    It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is that
+    which shows most of a friction margin that alone is missed, else zero, as nothing shows then which one misses least.
+    Where limits are missed clearly with all of it and without any, what lies between is solved only where a law near
+    one of these two comes close to keeping them.
+    """
+    asked, link = task.spec.link_feedforward, task.link
+    broken = list_broken_limits(task.spec, loops, task.design_states)
+    if asked is None or asked.fraction is not None or link is None or not broken:
+        return task, x, loops
+    shares = (*(0.8 ** (power + 1) for power in range(LOWER_FRACTIONS)), 0.0)
+    *lower, none = (feed_link(task, replace(link, fraction=round(share * link.fraction, 3))) for share in shares)
+    missing, without = [(task, x, loops)] if broken == {FRICTION} else [], None
+    if _measure_miss(task, x) > HOPELESS:
+        without = solve(none)
+        least = min(_measure_miss(task, x), _measure_miss(none, without[0]))
+        if least > FAR_OFF:
+            lower = []
+        elif least > HOPELESS:
+            lower = [one for one in lower if min(_follow(one, start) for start in (x, without[0])) <= HOPELESS]
+    found = (task, x, loops)
+    for one in (*lower, none):
+        found = (one, *(without if one is none and without else solve(one)))
+        broken = list_broken_limits(one.spec, found[2], one.design_states)
+        if not broken:
+            return found
+        if broken == {FRICTION}:
+            missing.append(found)
+    return max(missing, key=lambda one: min(loop.friction_slope for loop in one[2])) if missing else found
+
+
+def _measure_miss(task: Task, x: LawNumbers) -> float:
+    """Return the worst usage of a limit."""
+    return task.rank(task.grid(place_frequencies(task)), x)[0]
+
+
+def _follow(task: Task, x: LawNumbers) -> float:
+    """Return the worst usage of a limit near a law of another fraction."""
+    x = task.tidy(x)
+    if not task.is_stable(x):
+        return math.inf
+    grid = task.grid(place_frequencies(task))
+    return task.rank(grid, refine(task, grid, x, 2))[0]

@@ -62,7 +62,6 @@ from seaopt.control.tuning.easing import ROOM, ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.frequencies import count_growing
-from seaopt.control.tuning.link_fraction import feed_link, lower_fraction
 from seaopt.control.tuning.optimisation_problem import (
     FRICTION,
     OBJECTIVE_HZ,
@@ -72,7 +71,7 @@ from seaopt.control.tuning.optimisation_problem import (
     close_plant,
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
-from seaopt.control.tuning.solution import retry, search, solve
+from seaopt.control.tuning.solution import feed_link, lower_fraction, retry, search, solve
 from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
@@ -288,8 +287,6 @@ def make_task(
     if spec.structure == CASCADE:
         _check_cascade(spec, design)
     gain, signals = command.per_effort, find_signals(design, spec.measured)
-    if not isinstance(robust_to, Mapping):
-        raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
     require_type(draws, Sequence, "draws", "give a sequence of mappings of parameter to value", ControlError)
     for draw in draws:
         require_type(draw, Mapping, "one of draws", "give a mapping of parameter to value", ControlError)
