@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test slow check lint types contract notebooks docs floors bench bench-peers fuzz nocompiler clean setup
+.PHONY: demo test slow check lint types contract notebooks docs floors golden bench bench-peers fuzz nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
@@ -47,6 +47,10 @@ floors: $(READY)
 	$(BIN)/python tools/floors.py > $(CACHE)/floors.txt
 	@sh tools/setup.sh $(FLOORS) $(CACHE)/floors.txt formats,test
 	$(FLOORS)/bin/python -m pytest -n 2 --dist worksteal -q -m "not slow" -W default::DeprecationWarning $(FLOOR_TESTS)
+
+# Figures that a refactoring must keep, against tests/golden; SUBJECTS="draws schedule" for some of them.
+golden: $(READY)
+	$(BIN)/python tools/golden.py compare $(SUBJECTS)
 
 lint: $(READY)
 	$(BIN)/ruff check .
