@@ -50,6 +50,10 @@ def main() -> int:
             path.write_text(json.dumps(content, indent=0) + "\n")
             say(f"{name}: written ({took})")
             continue
+        if not path.is_file():
+            say(f"{name}: nothing is written down yet; python tools/golden.py write {name}")
+            changed = True
+            continue
         differences = list(compare(json.loads(path.read_text()), content, "", sentences=given.sentences))
         say(f"{name}: {len(differences) or 'no'} difference{'' if len(differences) == 1 else 's'} ({took})")
         for line in differences[:SHOWN]:
