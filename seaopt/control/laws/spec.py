@@ -413,7 +413,7 @@ def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, 
 
 
 def check_command_limits(current_limit_A: float | None, command_limit: float | None) -> None:
-    """Refuse two limits of the command, and one that is not positive.
+    """Refuse two limits of the command, and one that is not positive or too large to reckon with; infinity is none.
 
     Raises
     ------
@@ -426,7 +426,7 @@ def check_command_limits(current_limit_A: float | None, command_limit: float | N
             f"current_limit_A = {current_limit_A:g} and command_limit = {command_limit:g} are both given; give one"
         )
     for name, value in (("current_limit_A", current_limit_A), ("command_limit", command_limit)):
-        if value is not None and not 0.0 < value <= LARGEST:
+        if value is not None and not 0.0 < value <= LARGEST and value != math.inf:
             kind = "not positive" if not value > 0.0 else f"above {LARGEST:g}"
             raise ControlError(f"{name} = {value:g} is {kind}; give the motor's limit")
 
