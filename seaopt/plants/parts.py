@@ -299,6 +299,8 @@ _FILTERS = {
     "servo_delay": (_pade, "T_v", "input", 3),
 }
 
+_DEAD_TIMES = ("command_delay", "measurement_delay")  # from a command to what a log has of its effect
+
 _WRAPPERS: dict[str, Callable[[Plant, Sequence[str]], Plant]] = {
     "position_servo": drives.add_servo,
     "deflection_sensor": lambda plant, parts: read_deflection(plant),
@@ -369,6 +371,20 @@ def wrapped(
                 raise PlantError(f"plant {plant.name} has {reading} that {part} reads; name others")
         plant = _add_filter(plant, part, signals)
     return plant
+
+
+def list_dead_times(plant: Plant) -> tuple[str, ...]:
+    """Return the parameters of a plant that are delays of command and measurement.
+
+    Examples
+    --------
+    >>> from seaopt.plants import high_impedance
+    >>> list_dead_times(wrapped(high_impedance(), ["load_cell", "command_delay"]))
+    ('T_c',)
+
+    """
+    own = [parameter for part in _DEAD_TIMES for parameter in PARTS[part]]
+    return tuple(parameter.name for parameter in own if plant.parameters.get(parameter.name) == parameter)
 
 
 def _make_filtered(make: PlantMaker, part: str, signals: Sequence[str]) -> Plant:

@@ -30,7 +30,14 @@ from seaopt.control import (
     tune,
     tune_schedule,
 )
-from seaopt.control.laws.delay import DELAY_KEYS, DelayedSpec, settle_delays
+from seaopt.control.laws.delay import (
+    DELAY_KEYS,
+    NEGLIGIBLE,
+    DelayedSpec,
+    count_loop_samples,
+    find_drive_delay,
+    settle_delays,
+)
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.mpc.stored import check_described
@@ -408,15 +415,14 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
             f"the law measures {regulated}, and [controller] of {problem.source} {problem.spec.regulated}; "
             f'correct one of them: measured = "{regulated}"'
         )
-    spec = replace(
-        problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, measured=measured,
-        **_choose_delays(problem.spec, given),
-    )  # fmt: skip
     if problem.designs_on_response:
         raise ProblemError(
             f"{problem.source}: a law of one's own is measured on a model, and [controller] is designed on "
             f"{problem.response_names[0]}; name a plant there, and the response in robust_to"
         )
+    asked = replace(problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, measured=measured)
+    spec = replace(asked, **_choose_delays(problem.spec, given))
+    _check_drive_delay(problem, given, spec, source)
     design, values = problem.design_plant, problem.values(source, spec)
     _, robust_to = list_plants(problem, source, spec)
     law = given.to_effort(command_of(design, values, spec.regulated).per_effort)
@@ -430,6 +436,26 @@ def _choose_delays(spec: DelayedSpec, given: GivenLaw) -> dict[str, Any]:
     if stated["delay_samples"] is None and stated["drive_delay_s"] is None:
         stated["drive_delay_s"] = spec.drive_delay_s
     return stated
+
+
+def _check_drive_delay(problem: Problem, given: GivenLaw, spec: DelayedSpec, source: Fit | ParameterSet) -> None:
+    """Refuse a law whose loop is shorter than the problem says, and of which nobody tells how long the drive takes."""
+    assert problem.spec is not None
+    asked, drive = problem.spec, find_drive_delay(spec, problem.design_plant, source)
+    if given.delays.get("drive_delay_s") is not None or (asked.delay_samples is not None and drive):
+        return
+    counted = count_loop_samples(spec) / spec.sample_rate_hz + drive
+    if asked.delay_samples is not None and spec.delay_samples is None:
+        least = asked.delay_samples / asked.sample_rate_hz
+        said = f"delay_samples = {asked.delay_samples}, the whole loop"
+    else:
+        least = asked.drive_delay_s or 0.0
+        said = f"drive_delay_s = {least:g} of the drive alone"
+    if counted < least - NEGLIGIBLE / spec.sample_rate_hz:
+        raise ProblemError(
+            f"the law's file counts {1e3 * counted:.4g} ms of delay in all, and [controller] of {problem.source} has "
+            f"{said}, {1e3 * least:.4g} ms; give the law's file compute_delay_samples and drive_delay_s"
+        )
 
 
 def certify_problem(

@@ -16,7 +16,7 @@ from seaopt.control.laws.command import (
     name_gain_units,
     name_rates,
 )
-from seaopt.control.laws.delay import describe_delays
+from seaopt.control.laws.delay import LoopDelays, place_drive_delay
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
@@ -37,7 +37,7 @@ from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.loops.sampled_plant import DigitalPlant, add_drive_delay, list_names, sample
+from seaopt.control.loops.sampled_plant import DigitalPlant, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
 from seaopt.formatting import (
@@ -72,7 +72,7 @@ _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
 @record(eq=False)
-class Controller:
+class Controller(LoopDelays):
     """A law from reference and measured force to an effort, commanded as the input of the plant that makes that effort.
 
     Parameters
@@ -153,21 +153,6 @@ class Controller:
     reads: tuple[str, ...] = ()
     compensation: Compensation | None = None
     gate: PlausibilityGate | None = None
-
-    @property
-    def delay_samples(self) -> float:
-        """Both delays together, in samples; a fraction as the drive has it."""
-        return self.compute_delay_samples + self.drive_delay_s / self.sample_time_s
-
-    @property
-    def delays(self) -> str:
-        """Both delays and their sum, in words."""
-        older = self.spec.delay_samples is not None
-        return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s, older=older)
-
-    def delay(self, params: ParameterSet) -> ParameterSet:
-        """Return parameters with the delay of this controller's drive, where they have none of their own."""
-        return add_drive_delay(params, self.drive_delay_s)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -476,7 +461,7 @@ class Controller:
         gain, spec = stored["command"].per_effort, stored["spec"]
         sliding = take_sliding(plant, params)
         reads = stored["reads"] or list_names(spec.measured)
-        params = add_drive_delay(params, stored["drive_delay_s"])
+        params = place_drive_delay(spec, params, stored["drive_delay_s"])
         sampled = sample(sliding, params, reads, gain, stored["sample_time_s"], stored["compute_delay_samples"])
         achieved = Loop(plant=sampled, law=stored["law"]).figures()
         (loop,) = make_friction_loops(

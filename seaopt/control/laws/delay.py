@@ -16,14 +16,22 @@ from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from seaopt.control.loops.sampled_plant import DRIVE_DELAY, Measured, add_drive_delay, list_names, read_conditions
+from seaopt.control.loops.sampled_plant import (
+    DRIVE_DELAY,
+    Measured,
+    add_drive_delay,
+    drop_drive_delay,
+    list_names,
+    read_conditions,
+)
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.formatting import format_count
+from seaopt.formatting import format_count, join_words
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.parts import list_dead_times
 from seaopt.plants.plant import require_plant
 from seaopt.records import record
 
@@ -58,6 +66,52 @@ class DelayedSpec(Protocol):
     def measured(self) -> Measured:
         """What it reads."""
         ...
+
+
+@runtime_checkable
+class TimedController(Protocol):
+    """What a controller has whose delays `LoopDelays` adds up."""
+
+    @property
+    def spec(self) -> DelayedSpec:
+        """What was asked."""
+        ...
+
+    @property
+    def sample_time_s(self) -> float:
+        """Seconds."""
+        ...
+
+    @property
+    def compute_delay_samples(self) -> int:
+        """Whole samples from a reading to the command being put out."""
+        ...
+
+    @property
+    def drive_delay_s(self) -> float:
+        """Seconds from the command to its effect."""
+        ...
+
+
+class LoopDelays:
+    """Both delays of a controller together, for a law and a plan alike."""
+
+    __slots__ = ()
+
+    @property
+    def delay_samples(self: TimedController) -> float:
+        """Both delays together, in samples; a fraction as the drive has it."""
+        return self.compute_delay_samples + self.drive_delay_s / self.sample_time_s
+
+    @property
+    def delays(self: TimedController) -> str:
+        """Both delays and their sum, in words."""
+        older = self.spec.delay_samples is not None
+        return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s, older=older)
+
+    def delay(self: TimedController, params: ParameterSet) -> ParameterSet:
+        """Return parameters with the delay of this controller's drive, as `place_drive_delay`."""
+        return place_drive_delay(self.spec, params, self.drive_delay_s)
 
 
 @record
@@ -146,6 +200,11 @@ def find_given_drive_delay(spec: DelayedSpec) -> float | None:
     return spec.drive_delay_s if spec.delay_samples is None else 0.0
 
 
+def place_drive_delay(spec: DelayedSpec, params: ParameterSet, drive_delay_s: float) -> ParameterSet:
+    """Return parameters with a drive's delay where they have none of their own; without any where samples count it."""
+    return add_drive_delay(params, drive_delay_s) if spec.delay_samples is None else drop_drive_delay(params)
+
+
 def find_drive_delay(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> float:
     """Return the drive's delay: as the specification states it, or as the fit or the parameters have it."""
     return find_drive(spec, plant, source).delay_s
@@ -212,7 +271,7 @@ def settle_delays(
     require_type(source, (Fit, ParameterSet), "params", "give a Fit, or a ParameterSet", ControlError)
     values = source.parameters if isinstance(source, Fit) else source
     late = find_drive_delay(spec, plant, source)
-    values = add_drive_delay(ParameterSet(one for name, one in values.items() if name != DRIVE_DELAY), late)
+    values = add_drive_delay(drop_drive_delay(values), late)
     if spec.compute_delay_samples is not None or spec.delay_samples is not None:
         return spec, values
     at_once = isinstance(source, Fit) and source.shows_delay(plant) and not plans
@@ -249,15 +308,8 @@ def describe_delays(
 
 
 def warn_delays(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> tuple[str, ...]:
-    """Return warnings of an older key, and of less delay in the whole loop than the fit's experiments have."""
-    if spec.delay_samples is None:
-        older: tuple[str, ...] = ()
-    else:
-        older = (
-            f"delay_samples = {spec.delay_samples} is an older key, the whole loop in samples with the drive's delay "
-            "in it; give compute_delay_samples (from a reading to the command being put out), and drive_delay_s where "
-            "no log tells it",
-        )
+    """Return warnings of an older key, of a delay that counts twice, and of less in all than the experiments have."""
+    older = _warn_of_older_key(spec) + _warn_of_dead_times(spec, plant, source)
     if not isinstance(source, Fit):
         return older
     settled, _ = settle_delays(spec, plant, source)
@@ -272,4 +324,28 @@ def warn_delays(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> 
         f"{stated}, but the experiments have a delay of {1e3 * found:.4g} ms, {found * rate:.4g} samples at "
         f"{rate:g} Hz: a loop with that delay has smaller margins than stated for {counted:.4g} samples; leave {name} "
         "out, and the fit's delay is taken",
+    )
+
+
+def _warn_of_older_key(spec: DelayedSpec) -> tuple[str, ...]:
+    if spec.delay_samples is None:
+        return ()
+    return (
+        f"delay_samples = {spec.delay_samples} is an older key, the whole loop in samples with the drive's delay "
+        "in it; give compute_delay_samples (from a reading to the command being put out), and drive_delay_s where "
+        "no log tells it",
+    )
+
+
+def _warn_of_dead_times(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> tuple[str, ...]:
+    """Return a warning where the drive's delay is stated, and the plant has delays of its own as parts."""
+    stated = [f"{name} = {getattr(spec, name):g}" for name in ("delay_samples", "drive_delay_s") if getattr(spec, name)]
+    parts = list_dead_times(plant) if stated else ()
+    if not parts:
+        return ()
+    values = plant.complete(source.parameters if isinstance(source, Fit) else source)
+    own = join_words([f"{name} = {1e3 * values[name].value:.4g} ms" for name in parts])
+    return (
+        f"{own} of the plant counts besides {stated[0]}: if that is the same delay, it counts twice; leave out one of "
+        "them",
     )

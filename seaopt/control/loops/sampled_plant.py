@@ -243,9 +243,20 @@ def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:
 
 def add_drive_delay(params: ParameterSet, drive_delay_s: float) -> ParameterSet:
     """Return parameters with a drive's delay among their conditions, where they have none yet."""
-    if DRIVE_DELAY in params or not drive_delay_s:
+    if DRIVE_DELAY in _list_given(params) or not drive_delay_s:
         return params
     return params.with_parameters(Parameter(name=DRIVE_DELAY, value=drive_delay_s, unit="s", min=0.0))
+
+
+def drop_drive_delay(params: ParameterSet) -> ParameterSet:
+    """Return parameters without a drive's delay, where samples count it already."""
+    given = _list_given(params)
+    return ParameterSet(one for name, one in given.items() if name != DRIVE_DELAY) if DRIVE_DELAY in given else params
+
+
+def _list_given(params: ParameterSet) -> ParameterSet:
+    """Return all that was given, which completed parameters keep beside them."""
+    return params.given if isinstance(params, CompletedParameters) else params
 
 
 def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
@@ -264,8 +275,7 @@ def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
     {'delay_s': 0.0002}
 
     """
-    if isinstance(params, CompletedParameters):
-        params = params.given
+    params = _list_given(params)
     values: dict[str, float] = {}
     for name, condition in conditions((plant,)).items():
         if name not in params:

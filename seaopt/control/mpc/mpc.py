@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import Command, command_of, limit_notes
-from seaopt.control.laws.delay import describe_delays, settle_delays, warn_delays
+from seaopt.control.laws.delay import LoopDelays, settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.spec import describe_lifted
@@ -44,7 +44,6 @@ from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import (
     DELAYS,
     DigitalPlant,
-    add_drive_delay,
     find_delay,
     read_conditions,
     sample,
@@ -84,7 +83,7 @@ SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then
 
 
 @record(eq=False)
-class ForceMPC:
+class ForceMPC(LoopDelays):
     """A force controller within limits; `force_mpc` makes one.
 
     Parameters
@@ -189,17 +188,6 @@ class ForceMPC:
         """Seconds from the command to its effect on the design plant."""
         plant, values = self.design
         return float(find_delay(plant, read_conditions(plant, values)))
-
-    @property
-    def delay_samples(self) -> float:
-        """Both together, in samples."""
-        return self.compute_delay_samples + self.drive_delay_s / self.sample_time_s
-
-    @property
-    def delays(self) -> str:
-        """Both and their sum, in words."""
-        older = self.spec.delay_samples is not None
-        return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s, older=older)
 
     @property
     @memo
@@ -449,7 +437,7 @@ class ForceMPC:
         sliding = take_sliding(plant, params)
         digital = sample(
             sliding,
-            add_drive_delay(params, self.drive_delay_s),
+            self.delay(params),
             self.measured,
             self.per_effort,
             self.sample_time_s,

@@ -22,7 +22,7 @@ from jaxtyping import Complex
 
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delays, take_own_delays
+from seaopt.control.laws.delay import place_drive_delay, settle_delays, take_own_delays
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
@@ -51,7 +51,6 @@ from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import (
     DRIVE_DELAY,
     DigitalPlant,
-    add_drive_delay,
     find_signals,
     list_names,
     read_conditions,
@@ -307,7 +306,7 @@ def make_task(
         named["design plant"] = (plant, values)
     late = read_conditions(design, values).get(DRIVE_DELAY, 0.0)
     named |= {
-        str(name): (p[0], add_drive_delay(p[1], late)) if isinstance(p, tuple) else (p, values)
+        str(name): (p[0], place_drive_delay(spec, p[1], late)) if isinstance(p, tuple) else (p, values)
         for name, p in models_given.items()
     }
     link = _find_link(spec, named, bool(first), gain)

@@ -22,6 +22,7 @@ from seaopt.estimation.solver.methods import Method
 from seaopt.formatting import format_figure, format_number, html_list, html_paragraph, html_table
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.parts import list_dead_times
 from seaopt.records import PlotAccessor, record
 from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
@@ -173,8 +174,15 @@ class Fit:
         return max((one.delay_s for one in self.list_delayed(plant).values()), default=0.0)
 
     def shows_delay(self, plant: Plant) -> bool:
-        """Tell whether an experiment of the plant has a delay behind a command that is held until the next."""
-        return any(one.delay_s > 0.0 and one.hold == "zero" for one in self.list_delayed(plant).values())
+        """Tell whether an experiment of the plant has a delay behind a command that is held until the next.
+
+        It is the experiment's own, or one that the plant has as a part.
+        """
+        late = bool(list_dead_times(plant))
+        return any(
+            one.hold == "zero" and (one.delay_s > 0.0 or (late and one.plant in ("", plant.name)))
+            for one in self.list_delayed(plant).values()
+        )
 
     def list_delayed(self, plant: Plant) -> dict[str, Nuisance]:
         """Return those experiments of a plant, of all where it has none, whose delay is known."""

@@ -18,9 +18,10 @@ from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.passivity import passivity
 from seaopt.control.loops.port import probe_of
 from seaopt.control.loops.sampled_plant import add_drive_delay, read_conditions
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, ProblemError
 from seaopt.files import to_json
 from seaopt.plants.friction import split_friction
+from seaopt.plants.parts import wrapped
 from seaopt.problem import read_problem
 from seaopt.problem.stages import assess_problem, list_plants
 from seaopt.robustness import batch_figures, bracket, combine_uncertainty
@@ -319,3 +320,66 @@ def test_experiments_whose_delays_differ_are_two_plants_of_the_certificate(fit, 
         assert plant.drive_offset_s == shorter.drive_offset_s == pytest.approx(-1.04e-3, abs=2e-5)
     alike = replace(fit, nuisance={"experiment": own, "second": replace(own, delay_s=own.delay_s - 1e-7)})
     assert list(split_delayed(SPEC, stand, {"stand": stand}, alike)) == ["stand"]
+
+
+def test_under_the_older_key_no_drive_of_the_values_is_added(stand, thor):
+    """delay_samples is the whole loop, whatever the values that a plant is closed with say."""
+    late, spec = add_drive_delay(thor, 2e-3), replace(SPEC, delay_samples=3)
+    law = so.tune(stand, thor, spec, robust_to={"late": (stand, late)})
+    assert law.feasible
+    for values in (thor, late, stand.complete(late)):
+        assert law.close(stand, values).figures().ms == pytest.approx(law.achieved.ms, rel=1e-9)
+    again = so.Controller.from_dict(json.loads(to_json(law.to_dict())), stand, late)
+    assert again.achieved.ms == pytest.approx(law.achieved.ms, rel=1e-9)
+    plan = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=15, delay_samples=3))
+    assert plan.close(stand, late).figures().ms == pytest.approx(plan.achieved.ms, rel=1e-9)
+    assert "delay_samples = 3 is an older key, the whole loop" in plan.warnings[0]
+    assert plan.warnings[0] in repr(plan) and "delay 3 samples in all, the drive's among them" in repr(plan)
+
+
+def test_completed_values_keep_a_drive_of_their_own(stand, thor):
+    law, late = so.tune(stand, add_drive_delay(thor, 1e-3), SPEC), add_drive_delay(thor, 2e-3)
+    one, other = (law.close(stand, values).figures().ms for values in (late, stand.complete(late)))
+    assert one == other > 1.1 * law.achieved.ms
+
+
+@pytest.mark.parametrize(("asked", "stated", "words"), [
+    ("delay_samples = 3", "compute_delay_samples = 0", r"counts 0 ms .* delay_samples = 3, the whole loop, 3 ms"),
+    ("drive_delay_s = 2e-3", "delay_samples = 1", r"counts 1 ms .* drive_delay_s = 0.002 of the drive alone"),
+    ("delay_samples = 3", "compute_delay_samples = 3", ""),
+    ("delay_samples = 3", "compute_delay_samples = 0\ndrive_delay_s = 0.0", ""),
+    ("drive_delay_s = 2e-3", "compute_delay_samples = 0", ""),
+])  # fmt: skip
+def test_a_law_of_ones_own_is_no_sooner_than_the_problem_says(asked, stated, words, thor, tmp_path):
+    """Where no fit tells the drive's delay, and the law's file does not say it."""
+    (tmp_path / "p.toml").write_text(
+        'schema = 1\ntitle = "t"\n[plant.stand]\nkind = "high_impedance"\ndrive = "unlumped"\n'
+        f'[controller]\nplant = "stand"\nbandwidth_hz = 25\n{asked}\n',
+        encoding="utf-8",
+    )
+    pid = "sample_rate_hz = 1000\npid = { k_p = 2.0, k_i = 30.0 }\n"
+    (tmp_path / "law.toml").write_text(f"{stated}\n{pid}", encoding="utf-8")
+    problem, law = read_problem(tmp_path / "p.toml"), read_law(tmp_path / "law.toml")
+    if not words:
+        assert assess_problem(problem, law, thor).compute_delay_samples == law.delays["compute_delay_samples"]
+        return
+    with pytest.raises(ProblemError, match=words):
+        assess_problem(problem, law, thor)
+
+
+def test_a_delay_that_the_plant_has_as_a_part_counts_once(fit, stand):
+    """Of a log of one tick the program waits for nothing, and the loop has that delay and no other."""
+    late = wrapped(stand, ["command_delay"])
+    values = late.complete(fit.parameters).with_parameters(so.Parameter(name="T_c", value=DELAY_S, unit="s"))
+    own = replace(fit.nuisance["experiment"], plant=late.name, delay_s=0.0, std={})
+    known = replace(fit, parameters=values, nuisance={"experiment": own})
+    controller = so.tune(late, known, SPEC)
+    assert (controller.compute_delay_samples, controller.drive_delay_s) == (0, 0.0)
+    assert _true_ms(controller, stand, fit.parameters, DELAY_S) == pytest.approx(controller.achieved.ms, rel=2e-3)
+    measured = replace(known, nuisance={"experiment": replace(own, hold="first")})
+    assert settle_delays(SPEC, late, measured)[0].compute_delay_samples == 1
+    assert settle_delays(SPEC, stand, known)[0].compute_delay_samples == 1
+    assert warn_delays(SPEC, late, known) == ()
+    (warning,) = warn_delays(replace(SPEC, drive_delay_s=DELAY_S), late, known)
+    assert "T_c = 2.04 ms of the plant counts besides drive_delay_s = 0.00204" in warning
+    assert "counts besides delay_samples = 3" in warn_delays(replace(SPEC, delay_samples=3), late, known)[1]
