@@ -51,11 +51,10 @@ def export_controller(
 
     """
     path, schema, certificate = _find_law(results)
+    of_problem = f"PROBLEM -o {shlex.quote(str(results))}"
     if not path.is_file():
-        raise ProblemError(
-            f"{path}: no such file; give the folder of results, or make them: seaopt run PROBLEM -o {results}"
-        )
-    content = read_json(path, schema, remedy=f"run seaopt tune PROBLEM -o {results}{OWN_LAW}")
+        raise ProblemError(f"{path}: no such file; give the folder of results, or make them: seaopt run {of_problem}")
+    content = read_json(path, schema, remedy=f"run seaopt tune {of_problem}{OWN_LAW}")
     fitted = results / FILES["fit"]
     expected = content["made_from"].get(fitted.name)
     if expected is not None and fitted.exists() and digest(fitted) != expected:
@@ -90,7 +89,7 @@ def export_controller(
         if broken:
             console.wrap(f"not met: the certificate of this controller FAILED: {', '.join(broken)}")
         if not certified:
-            console.wrap(f"not certified: type seaopt certify PROBLEM -o {shlex.quote(str(results))}")
+            console.wrap(f"not certified: type seaopt certify {of_problem}")
         if amount != "quiet" or (met and content["feasible"] and not broken):
             console.list_files(written)
         for note in content.get("notes") or () if amount == "verbose" else ():

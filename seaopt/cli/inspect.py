@@ -33,8 +33,10 @@ def inspect_log(
     path: Path, *, time: str | None = None, channels: Sequence[str] = (), inputs: Sequence[str] = (),
     units: Sequence[str] = (), align: str | None = None, counter: str | None = None, rate_hz: float | None = None,
     folder: Path | None = None, json: bool = False, amount: Amount = "usual",
-) -> None:  # fmt: skip
+) -> bool:  # fmt: skip
     """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked.
+
+    Returns whether it has no error, with which a fit refuses it or is wrong.
 
     Raises
     ------
@@ -47,8 +49,9 @@ def inspect_log(
     headers, unit_of = _parse_pairs("--channel", channels), _parse_pairs("--unit", units)
     for name in unit_of:
         if name != "time" and name not in headers:
-            command = _spell_command(path, f"--channel {name}=COLUMN --unit {name}={unit_of[name]}")
-            raise SeaoptError(f"--unit {name}={unit_of[name]}: name its column too: {command}")
+            unit = f"{name}={unit_of[name]}"
+            command = _spell_command(path, shlex.join(["--channel", f"{name}=COLUMN", "--unit", unit]))
+            raise SeaoptError(f"--unit {unit}: name its column too: {command}")
     columns = {name: Column(column=header, unit=unit_of.get(name)) for name, header in headers.items()}
     read = partial(
         read_table, path, channels=columns or None, align=_parse_rule(align), counter=_parse_counter(counter),
@@ -69,8 +72,9 @@ def inspect_log(
             written += write_quality_figure(table, quality, folder / "quality")
     if json:
         sys.stdout.write(to_json(quality.to_dict()))
-        return
-    _print_report(quality, written, amount)
+    else:
+        _print_report(quality, written, amount)
+    return not any(finding.severity == "error" for finding in quality.findings)
 
 
 def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:

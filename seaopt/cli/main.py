@@ -219,11 +219,12 @@ def inspect(
 
         typer.echo(printable(repr(contents(log))))
         return
-    inspect_log(
+    if not inspect_log(
         log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
         counter=counter, rate_hz=rate_hz, folder=output, json=json,
         amount=_choose_amount(quiet, verbose),
-    )  # fmt: skip
+    ):  # fmt: skip
+        raise typer.Exit(1)
 
 
 @app.command()

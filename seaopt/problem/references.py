@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 
@@ -285,7 +286,7 @@ def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
         if not experiment.outputs or (driven and not experiment.inputs):
             raise ProblemError(
                 f"{place}: a log needs time, inputs and outputs; name their columns, as outputs = "
-                f'{{ NAME = "COLUMN" }} (seaopt inspect {_first_log(experiment)} --list lists them)'
+                f'{{ NAME = "COLUMN" }} (seaopt inspect {shlex.quote(_first_log(experiment))} --list lists them)'
             )
         check_inside(place, experiment)
     for kind, names, known in (

@@ -7,6 +7,7 @@ has a limit in [controller] is judged with that limit's tolerance, everything el
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, Literal
@@ -186,7 +187,8 @@ def _judge_parameter(
     unit, scale = (one.unit, 1.0) if unit is None else (unit, factor(one.unit, unit))
     value, std = one.value * scale, None if one.std is None else one.std * scale
     identified = std is None or math.isfinite(std)
-    remedy = f'"seaopt run {source}" reports what the fit rests on; widen the range if the actuator is as it should be'
+    again = f'"seaopt run {shlex.quote(source)}"'
+    remedy = f"{again} reports what the fit rests on; widen the range if the actuator is as it should be"
     if not identified:
         remedy = f"the logs do not identify {parameter}; excite it, or give its value"
     return Judgement(
@@ -211,7 +213,9 @@ def _judge_percent(results: Stages, experiment: str, output: str, ends: Ends, so
     scored = {} if fitted else {one.name: one.fit_percent for one in results.scores}
     percents = fitted or scored.get(experiment, {})
     values = {name: value for name, value in percents.items() if output in ("", name)}
-    remedy = f'"seaopt run {source}" shows the residuals of {experiment}, and what may be missing in the model'
+    remedy = (
+        f'"seaopt run {shlex.quote(source)}" shows the residuals of {experiment}, and what may be missing in the model'
+    )
     if not values:
         remedy = f"{experiment} measures {join_words(list(percents))}"
     return _judge_values(values, _span(ends, at_most=False), "%", remedy)

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -207,7 +208,7 @@ def test_the_largest_numbers_are_looked_at(seaopt, bad, folder, options):
     values[[5, 7], 1] = 1e308, -1e308
     rows = "\n".join(f"{k / 400},{a},{b}" for k, (a, b) in enumerate(values))
     (folder / "ok.csv").write_text(f"time [s],I,F1\n{rows}\n", encoding="utf-8")
-    assert seaopt("inspect", "ok.csv", *options).returncode == 0
+    assert seaopt("inspect", "ok.csv", *options).returncode == 1
     check_refused(seaopt("fit", bad(BASE + EXPERIMENT)), "F1")
 
 
@@ -287,6 +288,29 @@ REFUSALS = {
     "law that is missing": (("certify", "p.toml", "--controller", "gone.json"), "", ""),
     "sweep": (("tune", "p.toml", "--sweep", "15"), "", ""),
 }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("inspect", "my logs"), ["seaopt", "inspect", "my logs/NAME.csv"]),
+        (("inspect", "my logs/empty.csv"), ["seaopt", "inspect", "my logs/empty.csv"]),
+        (("inspect", "my logs/none.csv"), ["ls", "my logs"]),
+        (("inspect", "my logs/ok.csv", "--time", "zzz"), ["seaopt", "inspect", "my logs/ok.csv", "--list"]),
+        (("inspect", "my logs/ok.csv", "--unit", "a b=N"), ["--channel", "a b=COLUMN", "--unit", "a b=N"]),
+        (("new", "my logs/words.csv"), ["seaopt", "inspect", "my logs/words.csv", "--list"]),
+        (("export", "my logs", "--c", "c"), ["seaopt", "run", "PROBLEM", "-o", "my logs"]),
+    ],
+)
+def test_a_command_to_type_takes_names_with_blanks(seaopt, folder, arguments, words):
+    (folder / "my logs").mkdir()
+    write_csv(folder / "my logs" / "ok.csv", ["time [s]", "F1 [N]"])
+    (folder / "my logs" / "empty.csv").touch()
+    (folder / "my logs" / "words.csv").write_text("a,b\nx,y\nz,w\n", encoding="utf-8")
+    result = seaopt(*arguments)
+    check_refused(result)
+    typed = shlex.join(words)
+    assert typed in result.stderr, result.stderr
 
 
 @pytest.mark.parametrize("name", REFUSALS)

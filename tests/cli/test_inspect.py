@@ -43,7 +43,7 @@ def inspect(folder, monkeypatch, capsys):
     return run
 
 
-def test_faults_are_said_and_the_exit_code_is_0(seaopt):
+def test_what_is_to_be_looked_at_is_said_and_the_exit_code_is_0(seaopt):
     done = seaopt("inspect", "bad.csv")
     assert (done.returncode, done.stderr) == (0, "")
     for words in (
@@ -51,6 +51,14 @@ def test_faults_are_said_and_the_exit_code_is_0(seaopt):
         "I is answered to from",
     ):  # fmt: skip
         assert words in done.stdout
+
+
+@pytest.mark.parametrize("options", [(), ("--quiet",), ("--json",)])
+def test_errors_in_a_log_exit_1(seaopt, options):
+    done = seaopt("inspect", "twice.csv", *options)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert ('"error"' if options == ("--json",) else "3 errors") in done.stdout
+    assert seaopt("inspect", "twice.csv", "--list").returncode == 0
 
 
 def test_json_stands_alone_on_stdout(seaopt):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import stat
 from collections.abc import Callable
 from importlib import import_module
@@ -88,19 +89,20 @@ def sniff(path: Path) -> tuple[str, str, str]:
 
 
 def _first_bytes(path: Path) -> bytes:
+    look, folder = f"seaopt inspect {shlex.quote(str(path))}", shlex.quote(str(path.parent))
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
-            raise LogError(f"{path}: is a folder; give a file: seaopt inspect {path / 'NAME.csv'}")
+            raise LogError(f"{path}: is a folder; give a file: seaopt inspect {shlex.quote(str(path / 'NAME.csv'))}")
         if not stat.S_ISREG(mode):
             raise LogError(f"{path}: is a pipe, a device or a socket; give a regular file: seaopt inspect NAME.csv")
         with path.open("rb") as stream:
             head = stream.read(4096)
     except FileNotFoundError as error:
-        raise LogError(f"{path}: no such file; check the path: ls {path.parent}") from error
+        raise LogError(f"{path}: no such file; check the path: ls {folder}") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise LogError(f"{path}: cannot be read ({reason}); check the path: ls {path.parent}") from error
+        raise LogError(f"{path}: cannot be read ({reason}); check the path: ls {folder}") from error
     if not head.strip(b" \t\r\n"):
-        raise LogError(f"{path}: the file is empty; record the log again, then look at it: seaopt inspect {path}")
+        raise LogError(f"{path}: the file is empty; record the log again, then look at it: {look}")
     return head

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
 
@@ -124,11 +126,12 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
         return
     if len(channel.stuck):
         longest = int(np.max(channel.stuck.lengths))
+        typed = f"--input {shlex.quote(name)} (inputs=[{json.dumps(name, ensure_ascii=False)}])"
         text = (
             f"{name} stands still {format_count(len(channel.stuck), 'time')}, up to {longest} samples, where it "
             "otherwise changes: a sensor or a message that stopped, or a joint that stuck. If the joint stuck there, "
             "leave those samples, for a fit of friction needs them; else cut the log there, or set them to NaN. An "
-            f'input that holds its value is named: --input {name} (inputs=["{name}"])'
+            f"input that holds its value is named: {typed}"
         )
         yield _runs_finding("stuck", "warning", channel, channel.stuck, time, text)
     yield from _check_rails(channel, time)

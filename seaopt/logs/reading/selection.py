@@ -207,7 +207,8 @@ def _explain_missing(places: Sequence[Source], name: str, column: str | int) -> 
         return f'{len(repeated)} columns are named "{column}"; give the number of the one for {name}, {numbers}: {how}'
     names = [field.name for field in fields]
     near = get_close_matches(column, names, n=1, cutoff=0.6)
-    how = f' write {name} = "{near[0]}"' if near else f"; list them: seaopt inspect {places[0].path} --list"
+    listed = f"seaopt inspect {shlex.quote(str(places[0].path))} --list"
+    how = f' write {name} = "{near[0]}"' if near else f"; list them: {listed}"
     return f'no column "{column}" for {name}; {suggest_names(column, names)}{how}'
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -116,7 +117,8 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     held = contents(path)
     numeric = [field for field in held.fields if field.numeric]
     if not numeric:
-        raise LogError(f"{path}: holds no column of numbers; list what it holds with seaopt inspect {path} --list")
+        command = f"seaopt inspect {shlex.quote(str(path))} --list"
+        raise LogError(f"{path}: holds no column of numbers; list what it holds with {command}")
     headers = {field.name: read_header(field.name, field.unit) for field in numeric}
     times = [name for name, header in headers.items() if header.quantity == "time"]
     own = [field.clock for field in numeric if field.clock]
