@@ -37,6 +37,7 @@ from seaopt.control.loops.minimal import (
     has_response,
     read_companion,
     realise_rest,
+    refuse_slow_poles,
     split,
     split_integrators,
 )
@@ -190,8 +191,8 @@ class Law:
         """Return the balanced law of a state space in any coordinates, with what integrates set apart.
 
         Poles nearer to 1 than 1e-6 are integrators, two at most, where the response from 1e-4 of the sample rate on
-        stays the same, to 0.1 %. Of a companion form the coefficients are read. A
-        law without such poles has no integrators, and no anti-windup acts on it.
+        stays the same, to 0.1 %. Of a companion form the coefficients are read. A law without such poles, or whose slow
+        poles rounding does not tell from them, has no integrators, and no anti-windup acts on it.
 
         Raises
         ------
@@ -309,8 +310,8 @@ class Law:
         Raises
         ------
         ControlError
-            A coefficient is not finite, den[0] is not 1, or a pole lies so close to 1 that double precision does not
-            tell it from an integrator.
+            A coefficient is not finite, den[0] is not 1, or slow poles lie so close together that double precision does
+            not tell them from integrators.
 
         Examples
         --------
@@ -346,10 +347,7 @@ class Law:
         if find_wrong(balanced) is None:
             made = balanced
         elif (wrong := find_wrong(made)) is not None:
-            raise ControlError(
-                f"{wrong}: slow poles are too close together to tell from integrators in double precision; sample more "
-                "slowly, make them faster, or give the law as a state space"
-            )
+            raise refuse_slow_poles(wrong)
         near = np.any(np.abs(made.poles[m:] - 1.0) < NEAR_ONE)  # of coefficients with fewer digits
         return _set_apart(made) if near else made
 

@@ -29,11 +29,13 @@ from seaopt.records import record
 
 EPS = float(np.finfo(float).eps)
 POLE_AT_ONE = 64 * EPS  # a denominator this small at q = 1, against its coefficients, has a root there
+COEFFICIENTS = EPS  # to which the value of a polynomial at 1 is known, against its coefficients
 ZERO_AT_ONE = 4 * EPS  # stricter for a numerator: a weak integral is to be kept, and one of rounding does no harm
 NEGLIGIBLE_HANKEL = 1e-13  # Hankel singular values below this share of the law's gain are rounding
 RESPONSE_TOLERANCE = 1e-6  # how well a state space must have the response of its transfer function
 MOST_INTEGRATORS = 2  # of a law given as matrices: three poles at 1 lie too far apart to tell from slow lags
 NEAR_ONE = 1e-6  # a pole of matrices that is nearer to 1 is an integrator, where the response stays the same
+TINY = 1e-300
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
@@ -52,7 +54,7 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     Raises
     ------
     ControlError
-        A coefficient is not finite, or den[0] is not 1.
+        A coefficient is not finite, den[0] is not 1, or slow poles make a root at 1 of rounding.
 
     """
     num, den, m = tf.num.astype(float), np.trim_zeros(tf.den.astype(float), "b"), 0
@@ -60,7 +62,7 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
         raise ControlError(f"{name}: num or den has a number that is not finite, or den[0] is not 1; tune again")
     if not np.any(num):
         return SplitLaw(chain=np.zeros(0), rest=np.zeros(1), den=np.ones(1))
-    while den.size > 1 and _has_root_at_one(den, POLE_AT_ONE):
+    for _ in range(_count_roots_at_one(name, den)):
         den, m = np.cumsum(den)[:-1], m + 1
         if num.size > 1 and _has_root_at_one(num, ZERO_AT_ONE):
             num, m = np.cumsum(num)[:-1], m - 1
@@ -75,6 +77,30 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     for _ in range(m):
         rest = np.cumsum(rest)[:-1]
     return SplitLaw(chain=chain[1:], rest=rest, den=den)
+
+
+def refuse_slow_poles(name: str) -> ControlError:
+    """Return what is raised where coefficients do not tell slow poles from integrators."""
+    return ControlError(
+        f"{name}: slow poles are too close together to tell from integrators in double precision; sample more slowly, "
+        "make them faster, or give the law as a state space"
+    )
+
+
+def _count_roots_at_one(name: str, den: Float[np.ndarray, " n"]) -> int:
+    """Return how many roots at 1 a denominator has.
+
+    A value p(1) of rounding alone is that of a root there, or the product of the distances of slow poles. What it is
+    known to, over the value that is left without the root, is how far from 1 the root may lie.
+    """
+    count, reach = 0, 0.0
+    while den.size > 1 and _has_root_at_one(den, POLE_AT_ONE):
+        value = abs(math.fsum(den)) + COEFFICIENTS * np.sum(np.abs(den))
+        den, count = np.cumsum(den)[:-1], count + 1
+        reach = value / max(abs(math.fsum(den)), TINY)
+    if reach > NEAR_ONE:
+        raise refuse_slow_poles(name)
+    return count
 
 
 def realise_rest(
@@ -145,8 +171,10 @@ def split_integrators(
 
     Rounding moves an eigenvalue of multiplicity m by its m-th root, but the mean of the m by no more than a single one:
     the mean decides whether they are tried, and the caller's comparison of responses whether they are integrators. An
-    invariant subspace each (ordered Schur form and Sylvester's equation) takes the two apart: with N = A_1 - I the
-    first is :math:`\sum_j c_1 N^{j-1} b_1 w^j`, and what is left of :math:`N^m` is rounding.
+    invariant subspace each (ordered Schur form and Sylvester's equation, whose solution X takes the rest out) takes the
+    two apart: with N = A_1 - I the first is :math:`\sum_j c_1 N^{j-1} b_1 w^j`, and what is left of :math:`N^m` is
+    rounding. The mean is known to :math:`\epsilon |A| \sqrt{1 + |X|^2}` (Golub, Van Loan, Matrix Computations, 7.2),
+    and not taken for 1 where that is more than `NEAR_ONE`: slow poles beside it then hide where it lies.
     """
     # States of very different units would leave the Schur form's poles less exact than these, which are of scaled ones.
     scaled, scale = _scale(a)
@@ -164,6 +192,9 @@ def split_integrators(
             continue
         one, rest = triangle[:m, :m], triangle[m:, m:]
         link = np.asarray(solve_sylvester(one, -rest, -triangle[:m, m:])) if rest.size else np.zeros((m, 0))
+        known = COEFFICIENTS * np.linalg.norm(scaled) * np.hypot(1.0, np.linalg.norm(link))
+        if abs(np.mean(offsets[:m])) + known > NEAR_ONE:
+            continue
         into, out = basis.T @ b_scaled, c_scaled @ basis
         drive, read = into[:m] - link @ into[m:], out[:m]
         chain, power = np.zeros((m, b.shape[1])), np.eye(m)

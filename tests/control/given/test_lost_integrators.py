@@ -12,6 +12,7 @@ import seaopt as so
 from seaopt.control import Gains, Law, TransferFunction, parallel_pid, realise
 from seaopt.control.given.assessment import assess
 from seaopt.control.laws.structures import Notch
+from seaopt.control.loops.law import describe_integrators
 from seaopt.errors import ControlError
 from tests.laws import multiply_out
 
@@ -159,6 +160,53 @@ def test_a_slow_lag_stays_one_in_whatever_form(distance, integrators):
         companion = draw_companion(rng, integrators, k % 2 == 0, k // 2 % 2 == 0, also=(1 - distance,))
         for _, matrices, *_ in (turned, companion):
             assert Law.from_state_space(*matrices, TS).integrators == integrators
+
+
+def draw_slow_companion(rng, k, integrators=0):
+    """Return a companion form with two to four real poles or pairs at 1e-5 to 1e-3 from 1."""
+    slow = 1 - 10 ** rng.uniform(-5, -3, size=2 + k % 3) * np.exp(1j * (k // 3 % 2) * rng.uniform(0, 1.4))
+    slow = np.r_[slow[:1], np.conj(slow[:1]), slow[2:].real] if k // 3 % 2 else slow.real
+    return draw_companion(rng, integrators, k % 2 == 0, k // 2 % 2 == 0, also=tuple(slow))[1]
+
+
+def check_none_is_made(matrices):
+    """Rounding moves many slow poles by more than 1e-6, to 1 as well: the law stays as it was given, and is said so."""
+    (a, b, c, d), law = matrices, Law.from_state_space(*matrices, TS)
+    f = F[F > 0.01]  # below, coefficients of four slow poles have no digits of the response
+    z = np.exp(2j * np.pi * f)
+    given = np.array([d + c @ np.linalg.solve(x * np.eye(c.size) - a, b) for x in z]).T
+    size = np.max(np.abs(given), axis=1)[:, None]
+    np.testing.assert_array_less(np.abs(law.responses(f / TS) - given), 1e-2 * np.abs(given) + 1e-4 * size)
+    assert law.integrators == 0 and describe_integrators(law).startswith("no integral")
+
+
+def test_slow_poles_of_a_companion_form_make_no_integrator():
+    rng = np.random.default_rng(3)
+    for k in range(36):
+        check_none_is_made(draw_slow_companion(rng, k))
+
+
+@pytest.mark.slow
+def test_slow_poles_of_four_hundred_companion_forms_make_no_integrator():
+    rng = np.random.default_rng(4)
+    for k in range(400):
+        check_none_is_made(draw_slow_companion(rng, k))
+
+
+def test_an_integrator_beside_slow_poles_is_found_or_none_is_said():
+    """Next to two of them coefficients often do not tell it from a third: anti-windup acts on what is an integrator."""
+    rng, found = np.random.default_rng(5), []
+    for k in range(30):
+        law = Law.from_state_space(*draw_companion(rng, 1, k % 2 == 0, k // 2 % 2 == 0, (1 - 1e-3, 1 - 1e-4))[1], TS)
+        found.append(law.integrators)
+        assert law.integrators == 1 or describe_integrators(law).startswith("no integral")
+    assert 0 < sum(found) < 30
+    for slow, integrators in ((0.9999, 1), (0.99, 1)):
+        tf = TransferFunction(num=np.array([1.0, -0.9, 0.1]), den=np.convolve([1.0, -1.0], [1.0, -slow]))
+        assert Law.from_transfer_functions(tf, tf, TS).integrators == integrators
+    tf = TransferFunction(num=np.array([1.0, -0.9]), den=np.poly([1.0, 1 - 1e-4, 1 - 1e-5]))
+    with pytest.raises(ControlError, match="slow poles are too close together to tell from integrators"):
+        Law.from_transfer_functions(tf, tf, TS)
 
 
 def test_a_leak_that_nothing_shows_is_none():
