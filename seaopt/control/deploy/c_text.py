@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from seaopt.control.laws.delay import describe_delays
 from seaopt.errors import ControlError
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 Precision = Literal["double", "float"]
 LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
@@ -65,13 +69,18 @@ def literal(precision: Precision) -> Callable[[float], str]:
 
 def render(template: str, context: Mapping[str, Any]) -> str:
     """Return a template of this package filled in."""
+    return _make_environment().get_template(template).render(context)
+
+
+@cache
+def _make_environment() -> Environment:
+    """Return what keeps the templates that it has compiled."""
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-    environment = Environment(
+    return Environment(
         autoescape=select_autoescape(default=False), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
         undefined=StrictUndefined, loader=PackageLoader("seaopt.control.deploy"),
     )  # fmt: skip
-    return environment.get_template(template).render(context)
 
 
 def describe_timing(stored: Mapping[str, Any]) -> dict[str, Any]:

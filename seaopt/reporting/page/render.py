@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,11 +13,20 @@ from seaopt.estimation.advice.forecasts import Percent
 from seaopt.formatting import MISSING, format_band, format_number, printable
 from seaopt.units import unit_after
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 FIXED = {"style": "style.css", "script": "script.js", "table_script": "table.js"}  # files that pages take as they are
 
 
 def render_template(name: str, **values: Any) -> str:
     """Return a template of this package with its values filled in, every text escaped."""
+    return _make_environment().get_template(name).render(values)
+
+
+@cache
+def _make_environment() -> Environment:
+    """Return what keeps the templates that it has compiled, with the filters and the files that all of them take."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -29,8 +39,12 @@ def render_template(name: str, **values: Any) -> str:
         "unit": _format_unit, "slug": make_slug,
     }  # fmt: skip
     folder = files("seaopt.reporting.page").joinpath("templates")
-    fixed = {name: Markup(folder.joinpath(file).read_text(encoding="utf-8")) for name, file in FIXED.items()}  # noqa: S704
-    return environment.get_template(name).render(**values, **fixed)
+    fixed: dict[str, Any] = {
+        name: Markup(folder.joinpath(file).read_text(encoding="utf-8"))  # noqa: S704
+        for name, file in FIXED.items()
+    }
+    environment.globals.update(fixed)
+    return environment
 
 
 def make_slug(text: str) -> str:
