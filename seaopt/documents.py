@@ -138,7 +138,9 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
         return f"key {place} is missing; {remedy or f'add it: {own} = ...'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
     words = "should be a table" if first["type"] == "model_type" else words
-    if first["loc"] and isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
+    if not first["loc"]:  # of the whole file
+        return f"{words}; {remedy or 'correct the file'}"
+    if isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
         return f"{place} = {_shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
     kind = first["type"].partition("_")[0]
     if kind in ("float", "int") and isinstance(

@@ -14,7 +14,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -28,6 +28,7 @@ __all__ = ["Processes", "Shared", "connect_dask", "count_cores", "count_workers"
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+MOST_WORKERS, MOST_PER_CORE = 64, 4  # processes that may be asked for: the larger one
 QUEUED = 2  # parts in flight per worker: the next one lies ready while one is worked on
 RESTORED = 8  # shared objects that a worker keeps
 IPOPT = threading.Lock()  # held while it solves: MUMPS, in it, has state that all threads of a process share
@@ -48,7 +49,7 @@ class Processes(Executor):
     Raises
     ------
     SeaoptError
-        `workers` is not a whole number above zero.
+        `workers` is not a whole number above zero, or far more than there are cores: all of them start at once.
 
     Examples
     --------
@@ -61,6 +62,9 @@ class Processes(Executor):
     def __init__(self, workers: int | None = None) -> None:
         if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
             raise SeaoptError(f"workers = {workers!r} is not a number of processes; give 1 or more")
+        most = max(MOST_WORKERS, MOST_PER_CORE * count_cores())
+        if workers is not None and workers > most:
+            raise SeaoptError(f"workers = {workers} is far more than this machine has cores; give {most} at most")
         self._max_workers = workers or count_cores()  # named as the standard library's
         self._pool: ProcessPoolExecutor | None = None
         self._lock = threading.Lock()
@@ -195,7 +199,7 @@ def map_ordered(
     Raises
     ------
     SeaoptError
-        `executor` is none of `concurrent.futures`, or forks this process.
+        `executor` is none of `concurrent.futures`, or forks this process; or a process of it died.
 
     Examples
     --------
@@ -219,6 +223,10 @@ def map_ordered(
                 yield flying.popleft().result()
         while flying:
             yield flying.popleft().result()
+    except BrokenExecutor as error:
+        raise SeaoptError(
+            "a process died that worked on a part: something ended it, or the memory was full; give fewer workers"
+        ) from error
     finally:
         for future in flying:
             future.cancel()

@@ -47,6 +47,14 @@ def check_regular(path: Path) -> None:
         raise FileError(f"{path}: is {what}; give a regular file")
 
 
+def exists(path: Path) -> bool:
+    """Tell whether a file or a folder is there; where the name is none that a file can have, none is."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 def check_folder(path: Path) -> None:
     """Refuse a path of results at which no folder is or can be.
 

@@ -61,9 +61,10 @@ def test_few_are_in_flight():
     assert executor.submitted == QUEUED * count_workers(executor) == 6
 
 
-def test_a_number_of_workers_is_checked():
-    with pytest.raises(SeaoptError, match="workers = 0"):
-        Processes(0)
+@pytest.mark.parametrize("workers", [0, 100_000])
+def test_a_number_of_workers_is_checked(workers):
+    with pytest.raises(SeaoptError, match=f"workers = {workers}"):
+        Processes(workers)
 
 
 def test_processes_go_on_after_a_death():
@@ -72,6 +73,8 @@ def test_processes_go_on_after_a_death():
         with pytest.raises(BrokenExecutor):
             executor.submit(os._exit, 3).result()
         again = executor.submit(os.getpid).result()
+        with pytest.raises(SeaoptError, match=r"a process died.*fewer workers"):
+            list(map_ordered(os._exit, [3], executor))
     assert os.getpid() not in (first, again) and first != again
 
 

@@ -20,7 +20,7 @@ from seaopt.control.laws.verdict import join_labels
 from seaopt.control.mpc.export import SOURCES, set_gate, write_code
 from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ProblemError
-from seaopt.files import read_json, to_json
+from seaopt.files import exists, read_json, to_json
 from seaopt.records import record
 from seaopt.reporting.verdict import UNMET
 
@@ -52,7 +52,7 @@ def export_controller(
     """
     path, schema, certificate = _find_law(results)
     of_problem = f"PROBLEM -o {shlex.quote(str(results))}"
-    if not path.is_file():
+    if not exists(path):
         raise ProblemError(f"{path}: no such file; give the folder of results, or make them: seaopt run {of_problem}")
     content = read_json(path, schema, remedy=f"run seaopt tune {of_problem}{OWN_LAW}")
     fitted = results / FILES["fit"]
@@ -195,7 +195,7 @@ def _find_law(results: Path) -> tuple[Path, str, Path]:
 
     """
     one, scheduled = results / FILES["tune"], results / SCHEDULE_FILES["tune"]
-    if not scheduled.is_file():
+    if not exists(scheduled):
         return one, SCHEMAS["tune"], results / FILES["certify"]
     if one.is_file():
         raise ProblemError(

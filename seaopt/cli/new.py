@@ -12,7 +12,7 @@ from pathlib import Path
 from seaopt.cli.progress import show_progress
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import ProblemError, SeaoptError
-from seaopt.files import check_regular, describe_os_error, to_json, write_text
+from seaopt.files import check_regular, describe_os_error, exists, to_json, write_text
 from seaopt.problem import read_problem
 from seaopt.problem.proposal import Proposal, Question, propose
 
@@ -59,11 +59,11 @@ def _choose_target(logs: Sequence[Path], output: Path | None, *, force: bool) ->
     other = shlex.quote(str(target.parent / f"{target.stem or 'problem'}.toml"))
     if target.suffix.lower() != ".toml":
         raise ProblemError(f"{target}: a problem file ends in .toml; type {command} {other}")
-    if any(target.exists() and log.exists() and target.samefile(log) for log in logs):
+    if any(exists(target) and exists(log) and target.samefile(log) for log in logs):
         raise ProblemError(
             f"{target}: is one of the logs, which are never replaced; give another file: -o problem.toml"
         )
-    if target.exists() and not force:
+    if exists(target) and not force:
         again = f"{command} {shlex.quote(str(target))} --force"
         raise ProblemError(f"{target}: is there already; to replace it type {again}")
     return target

@@ -474,6 +474,7 @@ class Session:
 
     def _report(self, tell: Progress) -> None:
         simulating, drawing = divide(tell, SIMULATING, 1.0 - SIMULATING)
+        self.plan_stages()  # refuses a file that has nothing to report of
         results: list[Any] = []
         if self.problem.table.experiment:
             fitted = self.parameters()
@@ -483,7 +484,8 @@ class Session:
                         fitted, experiments=self.problem.choose_fitted(self.experiments())
                     )
                 results.append(fitted)
-        if self.problem.spec is not None and ("tune" in self.results or self._path("tune").exists()):
+        tuned = "tune" in self.results or self._path("tune").exists()
+        if self.problem.spec is not None and (tuned or not results):  # a report is of something
             designed = self._designed()
             results.append(designed if self.problem.mpc is None else self.plan())
             if "certify" not in self.results and self._path("certify").exists():

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt.errors import FileError, LogError, SeaoptError
-from seaopt.files import check_regular, describe_os_error
+from seaopt.files import check_regular, describe_os_error, exists
 from seaopt.formatting import join_words
 from seaopt.records import record
 
@@ -165,8 +165,8 @@ def _expand(name: str) -> list[str]:
     """Return the paths that a name stands for."""
     address = _ADDRESS.match(name)
     # A file that is not there is a row of the table, with its reason; one that is there is no pattern.
-    if not glob.has_magic(name) or (not address and Path(name).is_file()):
-        if not address and Path(name).is_dir():
+    if not glob.has_magic(name) or (not address and exists(Path(name))):
+        if not address and exists(Path(name)) and Path(name).is_dir():
             raise LogError(f"{name}: is a folder; give its logs: '{name.rstrip('/')}/**/*.csv'")
         return [name if address else _absolute(name)]
     if address:

@@ -13,7 +13,7 @@ from typing import Any
 from seaopt.control import ControllerSpec, LinkFeedforward, Notch, Prefilter
 from seaopt.documents import check_table
 from seaopt.errors import FileError, ProblemError, SeaoptError, require_type
-from seaopt.files import check_regular, parse_file
+from seaopt.files import check_regular, exists, parse_file
 from seaopt.plants import Plant, plant_of_kind
 from seaopt.problem.bench_tables import AnyPlant, EquationsTable, PlantTable
 from seaopt.problem.equations import make_plant, order_plants
@@ -155,13 +155,6 @@ def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     return ControllerSpec(**fields, notch=tuned, prefilter=prefilter, link_feedforward=link)
 
 
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # a name that no file can have
-        return False
-
-
 def _read_toml(source: Path) -> dict[str, Any]:
     try:
         check_regular(source)
@@ -172,6 +165,6 @@ def _read_toml(source: Path) -> dict[str, Any]:
     # What is there under another suffix is likely the log itself, which must not be offered as the file to write.
     is_log = source.suffix.lower() != ".toml"
     remedy = "write one from a log: " + shlex.join(
-        ["seaopt", "new", str(source)] if is_log and _exists(source) else ["seaopt", "new", "LOG", "-o", str(source)]
+        ["seaopt", "new", str(source)] if is_log and exists(source) else ["seaopt", "new", "LOG", "-o", str(source)]
     )
     return parse_file(source, tomllib.loads, "TOML", remedy=remedy, error=ProblemError)

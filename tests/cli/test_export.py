@@ -55,6 +55,7 @@ def one_line(out):
         (("nowhere", "--c", "out"), "give the folder of results"),
         (("short.toml", "--c", "out"), "give the folder of results"),
         (("results", "--c", "short.toml"), "is a file; give a folder"),
+        (("results", "--c", "n" * 300), "cannot be a folder"),
         (("results", "--c", "out", "--precision", "half"), 'use "double" or "float"'),
         (("results", "--c", "out", "--name", "7"), "cannot begin a name in C"),
         (("results", "--c", "out", "--current-limit", "0"), "is not positive"),

@@ -125,6 +125,9 @@ OPTIONS = {
     "long folder": (("inspect", "ok.csv", "-o", "n" * 300), "folder"),
     "long folder of results": (("fit", "p.toml", "-o", "n" * 300), "folder"),
     "below a file": (("inspect", "ok.csv", "-o", "ok.csv/x"), "cannot be"),
+    "long results": (("export", "n" * 300, "--c", "c"), "folder"),
+    "long new file": (("new", "ok.csv", "--yes", "-o", "n" * 300 + ".toml"), "cannot be written"),
+    "law of nothing": (("certify", "p.toml", "--controller", "empty.toml"), "empty.toml: should have one of"),
     "below what is no folder": (("fit", "p.toml", "-o", "ok.csv/x"), "cannot be"),
     "below what nobody writes": (("inspect", "ok.csv", "-o", "/proc/x"), "cannot be"),
     "control": (("inspect", "no\x1b]0;x\x07file"), "\\x1b]0;x"),
@@ -132,11 +135,25 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_options_are_refused_in_one_line(seaopt, bad, name):
+def test_options_are_refused_in_one_line(seaopt, bad, folder, name):
     bad(BASE + EXPERIMENT + CONTROLLER)
+    (folder / "empty.toml").touch()
     arguments, word = OPTIONS[name]
     with ended_within(30):
         check_refused(seaopt(*arguments), word)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (EXPERIMENT, "out/fit.json: no such file; run seaopt fit p.toml -o out first"),
+        (CONTROLLER, "out/controller.json: no such file; run seaopt tune p.toml -o out first"),
+        ("", "has no [[experiment]] and no [controller]"),
+    ],
+)
+def test_a_report_of_nothing_says_what_to_run(seaopt, bad, text, words):
+    result = seaopt("report", bad(BASE.replace("free = true, ", "") + text), "-o", "out")
+    check_refused(result, words)
 
 
 @pytest.mark.parametrize("kind", ["fifo", "device"])

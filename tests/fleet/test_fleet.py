@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import polars as pl
 import pytest
@@ -11,7 +12,7 @@ import pytest
 import seaopt as so
 from seaopt.errors import FileError, LogError, ProblemError, SeaoptError
 from seaopt.files import write_json
-from seaopt.fleet import FleetLog, read_fleet, read_manifest
+from seaopt.fleet import FleetLog, find_logs, read_fleet, read_manifest
 from seaopt.fleet.plan import make_plan
 from seaopt.fleet.table import Table
 from seaopt.logs import assess_quality, read_table
@@ -257,3 +258,10 @@ def test_a_log_much_shorter_than_its_siblings_has_a_finding(stand, threads):
     assert short == [True] + 7 * [False] and pl.read_parquet(out / "fleet").equals(fleet.rows)
     fleet = so.fit_fleet(problem, [logs / "r0_j0.csv"], out, executor=threads)  # no siblings: it goes again
     assert fleet.unchanged == 1 and "short" not in {one["kind"] for one in fleet.rows["findings"][0]}
+
+
+@pytest.mark.parametrize("name", ["n" * 300, "n" * 300 + "[a]"])
+def test_a_name_that_no_file_can_have_is_a_log_that_is_not_there(name):
+    with pytest.raises(so.SeaoptError, match="matches no file") if "[" in name else nullcontext():
+        (log,) = find_logs([name])
+        assert log.path.endswith(name)

@@ -42,7 +42,7 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, FileError, require_type
-from seaopt.files import write_text
+from seaopt.files import check_folder, write_text
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating
 from seaopt.units import mechanics_of
@@ -133,8 +133,7 @@ def export(
     if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
     prefix = check_prefix(name)
-    if Path(folder).exists() and not Path(folder).is_dir():
-        raise FileError(f"{folder}: is a file; give a folder")
+    check_folder(Path(folder))
     if isinstance(controller, Controller):
         stored = {field.name: getattr(controller, field.name) for field in fields(Controller)}
         figures, heat = _figures(controller), controller.heat_guard

@@ -34,7 +34,7 @@ from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
 from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA, ScheduledController
 from seaopt.errors import ControlError, FileError
-from seaopt.files import write_text
+from seaopt.files import check_folder, write_text
 
 TEMPLATES = {"{}.h": "schedule.h.jinja", "{}.c": "schedule.c.jinja"}
 COLUMNS = (*LAW_GAINS, "anti_windup")
@@ -82,8 +82,7 @@ def export_schedule(
     if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
     prefix = check_prefix(name)
-    if Path(folder).exists() and not Path(folder).is_dir():
-        raise FileError(f"{folder}: is a file; give a folder")
+    check_folder(Path(folder))
     check_command_limits(current_limit_A, command_limit)
     content = schedule.to_dict() if isinstance(schedule, ScheduledController) else schedule
     limit = command_limit if current_limit_A is None else current_limit_A
