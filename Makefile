@@ -31,13 +31,14 @@ demo: $(READY)
 test: $(READY)
 	$(PYTEST) -n 2 --dist worksteal -q -m "not slow"
 
-# Statistics over hundreds of fits: coverage of intervals, scatter against stated standard deviations.
+# Statistics over hundreds of fits: coverage of intervals, scatter against stated standard deviations. Argument types are
+# checked in `make test`, which makes the same calls: here the checks would take a twentieth of the time.
 slow: $(READY)
-	$(PYTEST) -n 2 --dist worksteal -q -m slow tests
+	SEAOPT_TYPES=0 $(PYTEST) -n 2 --dist worksteal -q -m slow tests
 
 # The same numbers without a C compiler: the tests that compare both ways, and the simulation and fit tests.
 nocompiler: $(READY)
-	SEAOPT_COMPILER=none $(PYTEST) -n 2 -q -m "not slow" $(INTERPRETED)
+	SEAOPT_TYPES=0 SEAOPT_COMPILER=none $(PYTEST) -n 2 -q -m "not slow" $(INTERPRETED)
 
 # The lowest versions of the libraries that pyproject.toml declares; FLOOR_TESTS=... for some of the tests. What they
 # themselves depend on is newer, so that they may use what is deprecated there.

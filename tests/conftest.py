@@ -1,6 +1,6 @@
 """Shared fixtures. Array shapes and types of seaopt are checked while the tests run (jaxtyping and beartype).
 
-A check of one call costs about 0.1 ms, more than most functions here: see `check_calls`.
+A check of one call costs about 0.1 ms, more than most functions here: see `check_calls`. SEAOPT_TYPES=0 leaves all out.
 """
 
 from __future__ import annotations
@@ -111,7 +111,8 @@ def pytest_runtest_setup() -> None:
 
 shapes_of_one_call = partial(jaxtyping.jaxtyped, "context")
 jaxtyping.jaxtyped = lambda typechecker: check_calls
-jaxtyping.install_import_hook("seaopt", "seaopt_type_checker.check")
+if os.environ.get("SEAOPT_TYPES") != "0":  # long tests make calls that the quick ones have had checked
+    jaxtyping.install_import_hook("seaopt", "seaopt_type_checker.check")
 
 import seaopt as so  # noqa: E402
 from seaopt.bench import PAPER_STAND  # noqa: E402

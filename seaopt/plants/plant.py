@@ -387,7 +387,7 @@ def dynamics_function(plant: Plant) -> Any:
 @memo
 def output_function(plant: Plant) -> Any:
     """Return the CasADi function (t, x, u, p) -> h."""
-    return ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [plant.output])
+    return ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [ca.densify(plant.output)])
 
 
 @memo

@@ -41,9 +41,15 @@ def test_results_agree(done, document):
         assert list(check.iter_errors({name: value for name, value in content.items() if name != key}))
 
 
-@pytest.mark.slow  # a whole run of a rotary joint with friction
+@pytest.mark.slow  # a run of a rotary joint with friction
 def test_results_of_a_rotary_joint_agree(tmp_path):
-    session = Session(PROBLEMS / "knee.toml", tmp_path)
+    """On shorter logs and fewer draws than the problem file's: the documents have the same keys."""
+    text = (PROBLEMS / "knee.toml").read_text(encoding="utf-8")
+    for long, short in (("duration_s = 30", "duration_s = 3"), ("duration_s = 20", "duration_s = 3"), ("1375", "60")):
+        assert long in text
+        text = text.replace(long, short)
+    (tmp_path / "knee.toml").write_text(text, encoding="utf-8")
+    session = Session(tmp_path / "knee.toml", tmp_path)
     for stage in ("fit", "tune", "certify"):
         session.run(stage)
     for document, name in RESULTS.items():

@@ -17,6 +17,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation import Squares, profile
+from seaopt.estimation.judgement import judge
 from seaopt.files import to_json
 
 FREE = ("J", "b_r", "eta")
@@ -455,8 +456,9 @@ def test_how_far_a_value_is_from_its_start_has_few_digits(stand, short_log, thor
 
 @pytest.mark.slow
 @pytest.mark.parametrize("samples", [40, 100])
-def test_intervals_of_few_samples_are_not_far_too_narrow(stand, thor, samples):
+def test_intervals_of_few_samples_are_not_far_too_narrow(stand, thor, samples, monkeypatch):
     """Windows of one log: what a fit takes out of few residuals may not narrow their intervals."""
+    monkeypatch.setattr(judge, "find_causes", lambda *_, **__: [])  # most of the time, and no interval depends on it
     log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=40, rate_hz=400, seed=3,
                          sensors=so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}))  # fmt: skip
     off = []
