@@ -11,7 +11,9 @@ with their stds s. They are independent and standard normal, although the baseli
 :math:`\phi = 0` they are recursive residuals (Brown, Durbin and Evans 1975). Charts of them start by themselves
 (Hawkins 1987) and need no healthy period. Where runs have heavy tails, or variances are estimates of few degrees of
 freedom, Student's distribution is mapped to the normal one. An innovation counts for no more than `CLIP`, in chart and
-baseline alike: one wild run raises no alarm, two that agree do. Both sides are
+baseline alike: one wild run raises no alarm, two that agree do. u follows it in full, for what is alike in the next
+runs is a wild u too, which else would count again there; since it may be a wild v instead, the part of it that does not
+count adds its square to the variance of u. Both sides are
 
 .. math:: S^\pm_t = \max(0,\ S^\pm_{t-1} \pm z_t - k), \qquad \text{alarm where } S^\pm_t > h
 
@@ -226,10 +228,11 @@ def chart_runs(
         gain, gain_state = (of_mean + of_both) / total, (of_both + of_state) / total
         learns = known & (alarm < 0)
         mean = mean + np.where(learns, gain * z * spread, 0.0)
-        state = state + np.where(known, gain_state * z * spread, 0.0)
+        state = state + np.where(known, gain_state * ratio * spread, 0.0)
         of_mean = of_mean - np.where(learns, gain**2 * total, 0.0)
-        of_both = np.where(learns, of_both - gain * gain_state * total, np.where(known, 0.0, of_both))
-        of_state = of_state - np.where(known, gain_state**2 * total, 0.0)
+        of_both = of_both - np.where(known, gain * gain_state * total, 0.0)  # also of a mean that does not learn
+        excess = (ratio - z) * spread
+        of_state = of_state + np.where(known, gain_state**2 * (excess**2 - total), 0.0)
         starts = present & ~begun & (run >= start - 1)
         if starts.any():
             begun |= starts

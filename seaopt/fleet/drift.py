@@ -29,9 +29,11 @@ from seaopt.fleet.scatter import (
     FEWEST_PAIRS,
     MOST_OF_TAILS,
     Between,
+    Runs,
     differ_in_scatter,
     estimate_between_runs,
     estimate_tails,
+    wander,
 )
 from seaopt.fleet.worker import FAILED, MET
 from seaopt.formatting import format_count, format_number, format_table, html_text, join_words
@@ -41,6 +43,7 @@ FALSE_ALARMS, PER_RUNS = 0.01, 100  # per actuator, within so many runs
 LOW_CHANCE = 0.25  # of an alarm at the threshold by which it is seen whether healthy actuators scatter as assumed
 MATTERS = 1.3  # times as many beyond it as should be are no longer as assumed
 FEWEST_OF_TREND = 3  # runs
+WANDER = "wander over many runs, as with season, temperature or wear"
 CELLS = 2_000_000  # of arrays at once
 _PLACE, _RUN = "place:", "run:"  # columns that are added
 
@@ -267,6 +270,7 @@ def find_drift(
     alarms: list[Alarm] = []
     between: dict[str, Between] = {}
     unlike: list[str] = []
+    wandering: list[str] = []
     tops = _Tops(level=np.zeros(actuators), runs=np.zeros(actuators, dtype=int), charts=max(len(names), 1))
     labels = {label: place for place, label in enumerate(history.rows[LABEL].unique(maintain_order=True))}
     for name in names:
@@ -281,15 +285,19 @@ def find_drift(
         if differ_in_scatter(runs, spread):
             unlike.append(name)
         between[name] = spread = _shape(batches, spread, threshold)
+        still: list[tuple[Runs, Runs]] = []
         for batch in batches:
             charts = chart_runs(batch.values, batch.variances, threshold, **spread.chart)
             tables.append(_tabulate(batch, name, fleet.units[name], spread, charts, threshold))
             alarms += _list_alarms(batch, history, name, fleet.units[name], spread, charts, threshold)
+            still.append((batch.values[charts.alarm < 0], batch.variances[charts.alarm < 0]))
             own = np.array([labels[label] for label in batch.actuators], dtype=int)
             highest = np.maximum(charts.upper, charts.lower).max(axis=1)
             tops.level[own] = np.maximum(tops.level[own], highest)
             tops.runs[own] = np.maximum(tops.runs[own], np.isfinite(batch.values).sum(axis=1))
-    doubt = _doubt(tops, threshold, between, unlike) if between else ""
+        if wander(still, spread):
+            wandering.append(name)
+    doubt = _doubt(tops, threshold, between, unlike, wandering) if between else ""
     return Drift(
         table=pl.concat(tables) if tables else pl.DataFrame(), alarms=_order_alarms(alarms), actuators=actuators,
         history=history, between=between, threshold=threshold, false_alarms=false_alarms,
@@ -330,7 +338,9 @@ class _Tops:
         return np.minimum(within, 1.0)[np.maximum(self.runs - 1, 0)]
 
 
-def _doubt(tops: _Tops, threshold: float, between: Mapping[str, Between], unlike: Sequence[str]) -> str:
+def _doubt(
+    tops: _Tops, threshold: float, between: Mapping[str, Between], unlike: Sequence[str], wandering: Sequence[str]
+) -> str:
     """Return why nobody can say how many healthy actuators would have an alarm; "" where one can."""
     few = [name for name, one in between.items() if not one.shaped]
     healthy = tops.level <= threshold
@@ -344,12 +354,14 @@ def _doubt(tops: _Tops, threshold: float, between: Mapping[str, Between], unlike
         return f"actuators scatter unlike one another in {join_words(unlike)}"
     if healthy.sum() < tops.runs.size / 2:
         return "more than half of them have one, so that healthy ones are not known"
+    if wandering:
+        return f"values of {join_words(wandering)} {WANDER}"
     low = choose_threshold(LOW_CHANCE, max(int(np.median(tops.runs)) - 1, 1), tops.charts)
     beyond, share = tops.level[healthy] > low, 1.0 - np.exp(-tops.expect(low)[healthy])
     if beyond.sum() > max(share.sum() * MATTERS, share.sum() + 3.0 * share.sum() ** 0.5):
         return (
             f"{beyond.sum()} of the {beyond.size} without one are beyond a threshold that {share.sum():.0f} should be: "
-            "values wander over many runs, as with season, temperature or wear"
+            f"values {WANDER}"
         )
     return ""
 

@@ -13,8 +13,9 @@ standard error larger: too large a one makes alarms rarer.
 freedom by maximum likelihood, where that is likelier than a normal distribution by more than chance.
 
 *What does not fit.* With all this each chart's innovations should be independent and normal. A chart at a threshold so
-low that about a quarter of healthy actuators go beyond it tells whether they are, by its count; and so does whether
-actuators scatter unlike one another.
+low that about a quarter of healthy actuators go beyond it tells whether they are, by its count. So do actuators that
+scatter unlike one another, and means of two halves of a history that are further apart than the correlation lets them:
+over many runs a slow walk adds up that hardly shows from run to run.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import chi2, norm, t
 
@@ -37,6 +38,8 @@ FEWEST_PAIRS = 8  # of runs that follow each other, in the whole fleet, from whi
 FEWEST_OF_SHAPE = 200  # pairs from which correlation and tails can be told
 FEWEST_ACTUATORS = 10  # of which it can be told whether they scatter alike
 UNLIKE = 0.05  # by which the stds of actuators may differ: charts then raise 1.2 times as many alarms
+FEWEST_OF_HALVES = 8  # runs of a history whose halves are compared
+WANDERS = 0.1  # by which squares of their differences may be larger: charts then raise 1.3 times as many alarms
 LAGS = 6  # runs apart, at most, of which differences are taken
 LARGEST_CORRELATION = 0.95
 HEAVIEST, LIGHTEST = 2.2, 200.0  # degrees of freedom of Student's t
@@ -96,9 +99,13 @@ class Between:
 
     def widen(self, variances: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return by what each run counts in the variance of a mean of many, from the variances of their fits."""
-        tails = self.tails / (self.tails - 2.0) if np.isfinite(self.tails) else 1.0
         alike = (1.0 + self.correlation) / (1.0 - self.correlation)
-        return self.scale**2 * tails * (variances + self.std**2 * alike)
+        return self.inflation * (variances + self.std**2 * alike)
+
+    @property
+    def inflation(self) -> float:
+        """By how much the tails make a variance larger."""
+        return self.scale**2 * (self.tails / (self.tails - 2.0) if np.isfinite(self.tails) else 1.0)
 
 
 def estimate_between_runs(runs: Sequence[tuple[Runs, Runs]]) -> Between | None:
@@ -243,13 +250,50 @@ def differ_in_scatter(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bo
     return bool(own > (2.0 * UNLIKE) ** 2 and covariance[0, 1] > 3.0 * chance)
 
 
+def wander(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bool:
+    """Return whether the halves of histories differ by more than chance, and by enough to matter to a chart.
+
+    Parameters
+    ----------
+    runs : sequence of (values, variances)
+        As in `estimate_between_runs`, of actuators that have not changed.
+    between : Between
+        Of all of them.
+
+    """
+    squares = np.concatenate([_compare_halves(values, variances, between) for values, variances in runs])
+    squares = _select(squares)
+    if squares.size < FEWEST_ACTUATORS:
+        return False
+    chance = ((CLIPPED_SQUARE - CLIPPED**2) / squares.size) ** 0.5
+    return bool(squares.mean() > CLIPPED + max(3.0 * chance, WANDERS * CLIPPED))
+
+
+def _compare_halves(values: Runs, variances: Runs, between: Between) -> Float[np.ndarray, " actuators"]:
+    """Return the clipped square of the difference of the halves' means, over its variance; nan of short histories."""
+    known, later = _split_halves(values)
+    halves = [known & part for part in (~later, later)]
+    first, second = (half / np.maximum(half.sum(axis=1, keepdims=True), 1) for half in halves)
+    weights, apart = second - first, np.arange(values.shape[1])
+    alike = between.std**2 * ((weights @ between.correlation ** np.abs(apart[:, None] - apart)) * weights).sum(axis=1)
+    variance = between.inflation * (alike + (weights**2 * np.where(known, variances, 0.0)).sum(axis=1))
+    difference = (weights * np.where(known, values, 0.0)).sum(axis=1)
+    enough = known.sum(axis=1) >= FEWEST_OF_HALVES
+    return np.where(enough, np.minimum(difference**2 / np.where(enough, variance, 1.0), CLIP_SQUARE), np.nan)
+
+
+def _split_halves(values: Runs) -> tuple[Bool[np.ndarray, "actuators runs"], Bool[np.ndarray, "actuators runs"]]:
+    """Return where there are runs (or differences of them), and which are of the second half of a history."""
+    known = np.isfinite(values)
+    return known, np.cumsum(known, axis=1) > known.sum(axis=1, keepdims=True) / 2
+
+
 def _measure_halves(values: Runs, variances: Runs, between: Between) -> Float[np.ndarray, "actuators 2"]:
     """Return the mean clipped square of the differences in the first and the second half of each history."""
     fits = variances[:, 1:] + variances[:, :-1]
     expected = 2.0 * between.std**2 * (1.0 - between.correlation) + fits
     squares = np.minimum(np.diff(values, axis=1) ** 2 / expected, CLIP_SQUARE)
-    known = np.isfinite(squares)
-    later = np.cumsum(known, axis=1) > known.sum(axis=1, keepdims=True) / 2
+    known, later = _split_halves(squares)
     halves = [np.where(known & part, squares, 0.0).sum(axis=1) / (known & part).sum(axis=1) for part in (~later, later)]
     return np.stack(halves, axis=1)
 

@@ -12,7 +12,7 @@ from scipy.stats import poisson
 
 from seaopt.fleet import Drift, Fleet, find_drift
 from seaopt.fleet.cusum import chart_runs
-from seaopt.fleet.scatter import estimate_between_runs, estimate_tails
+from seaopt.fleet.scatter import Between, estimate_between_runs, estimate_tails, wander
 
 Values = Float[np.ndarray, "actuators runs"]
 RUNS, FIT = 61, 0.5  # std of a fit, in stds between runs
@@ -50,6 +50,8 @@ def draw(kind: str, actuators: int, seed: int, runs: int = RUNS) -> Values:
         "t(3)": lambda: rng.standard_t(3, normal.shape) / 3**0.5,
         "AR(0.3)": lambda: correlate(normal, 0.3),
         "AR(0.6)": lambda: correlate(normal, 0.6),
+        "t(3) AR(0.3)": lambda: correlate(rng.standard_t(3, normal.shape) / 3**0.5, 0.3),
+        "slow walk": lambda: normal + np.cumsum(0.05 * rng.normal(size=normal.shape), axis=1),
         "wild": lambda: normal * np.where(rng.random(normal.shape) < 0.1, 3.0, 1.0),
         "season": lambda: normal + np.sin(2 * np.pi * np.arange(runs) / 50),
         "own seasons": lambda: normal + np.sin(2 * np.pi * (np.arange(runs) / 50 + rng.random((actuators, 1)))),
@@ -65,7 +67,7 @@ def count_alarms(drift: Drift) -> int:
 
 
 BORNE_OUT = ("normal", "t(3)", "AR(0.3)", "AR(0.6)", "wild")
-DOUBTED = ("season", "own seasons", "wear of all", "some scatter twice", "half AR(0.6)")
+DOUBTED = ("slow walk", "season", "own seasons", "wear of all", "some scatter twice", "half AR(0.6)")
 
 
 @pytest.mark.slow
@@ -79,6 +81,14 @@ def test_alarms_of_healthy_actuators_are_those_that_are_stated(kind: str, seed: 
 
 
 @pytest.mark.slow
+def test_alarms_of_heavy_tails_that_are_alike_are_those_that_are_stated() -> None:
+    """5.4 of a fleet were 2.2 stated, as long as a wild run counted again in the runs that are like it."""
+    drifts = [judge(draw("t(3) AR(0.3)", 400, seed), seed) for seed in range(8)]
+    assert sum(drift.expected is not None for drift in drifts) >= 6
+    assert sum(map(count_alarms, drifts)) <= poisson.ppf(0.99, 8 * 2.19)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", DOUBTED)
 def test_what_no_chart_is_made_for_has_no_expectation(kind: str, seed: int) -> None:
@@ -87,7 +97,8 @@ def test_what_no_chart_is_made_for_has_no_expectation(kind: str, seed: int) -> N
 
 
 @pytest.mark.parametrize(("kind", "words"), [
-    ("AR(0.6)", ""), ("t(3)", ""), ("season", "wander"), ("some scatter twice", "unlike one another in J"),
+    ("AR(0.6)", ""), ("t(3)", ""), ("t(3) AR(0.3)", ""), ("season", "wander"),
+    ("some scatter twice", "unlike one another in J"),
 ])  # fmt: skip
 def test_a_hundred_actuators(kind: str, words: str) -> None:
     drift = judge(draw(kind, 100, 1, 41), 1)
@@ -156,3 +167,37 @@ def test_innovations_are_those_of_least_squares_with_runs_missing(gaps: list[int
         left = values[run] - mean - to_each @ (values[before] - mean)
         variance = covariance[run, run] - to_each @ covariance[before, run] + (1 - to_each.sum()) ** 2 / of_mean.sum()
         assert chart.ratios[0, run] == pytest.approx(left / np.sqrt(variance), rel=1e-9)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.9])
+def test_one_wild_run_raises_no_alarm_and_a_step_does(correlation: float) -> None:
+    """Whether it was the fit's or the actuator's: what is expected of the next run is then less sure."""
+    values = 0.3 * correlate(np.random.default_rng(6).normal(size=(20, 60)), correlation)
+    wild, stepped = values.copy(), values.copy()
+    wild[:, 30] += 100.0
+    stepped[:, 30:] += 100.0
+    charts = [
+        chart_runs(one, np.full(one.shape, 0.09), 8.6, between=1.0, correlation=correlation) for one in (wild, stepped)
+    ]
+    assert np.all(charts[0].alarm < 0) and np.all(np.isin(charts[1].alarm, (32, 33)))
+
+
+def test_after_an_alarm_innovations_are_those_of_a_mean_that_learns_no_more() -> None:
+    """The mean of the first run for good: of many healthy actuators with an alarm at once each run's std is 1."""
+    rng, fits = np.random.default_rng(8), 0.2
+    values = correlate(rng.normal(size=(4000, 12)), 0.8) + fits**0.5 * rng.normal(size=(4000, 12))
+    charts = chart_runs(values, np.full(values.shape, fits), -1.0, between=1.0, correlation=0.8)
+    assert np.all(charts.alarm == 0)
+    np.testing.assert_allclose(np.std(charts.ratios[:, 1:], axis=0), 1.0, atol=0.05)
+
+
+@pytest.mark.parametrize(("share", "wanders"), [(0.0, False), (0.06, True)])
+def test_halves_of_a_history_tell_a_walk(share: float, wanders: bool) -> None:
+    """Of 300 actuators that start one after the other; a hundredth of a run's variance is added in each."""
+    rng = np.random.default_rng(9)
+    values = correlate(rng.normal(size=(300, 60)), 0.5) + np.cumsum(2.0 * share * rng.normal(size=(300, 60)), axis=1)
+    values[np.arange(60) >= rng.integers(20, 61, size=(300, 1))] = np.nan
+    fits = np.full(values.shape, 0.1)
+    own = values + fits**0.5 * rng.normal(size=values.shape)
+    between = Between(std=1.0, pairs=15_000, dof=10_000.0, correlation=0.5, shaped=True)
+    assert wander([(own, fits)], between) is wanders
