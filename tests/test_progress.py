@@ -97,7 +97,7 @@ def test_a_tune_tells_its_starts(heard):
 
 
 def test_a_tune_that_is_not_possible_tells_the_bandwidths_that_it_tries(heard):
-    spec = so.ControllerSpec(bandwidth_hz=30, max_noise_gain=3, bandwidth_range_hz=(28, 32))
+    spec = so.ControllerSpec(structure="pd", bandwidth_hz=30, max_noise_gain=3, bandwidth_range_hz=(29, 31))
     assert not so.tune(STAND, THOR, spec, progress=heard).feasible
     heard.check("Hz instead", "refining start")
 

@@ -148,7 +148,7 @@ def certify_plan(executor):
     mpc = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
     ranges = {"J": (2e-6, 5e-6)}
     return certify_mpc(
-        mpc, {"stand": STAND}, THOR, ranges=ranges, samples=20, runs=3, sensors=so.Sensors(noise_std={"F1": 1.0}),
+        mpc, {"stand": STAND}, THOR, ranges=ranges, samples=20, runs=2, sensors=so.Sensors(noise_std={"F1": 1.0}),
         executor=executor,
     )  # fmt: skip
 

@@ -32,7 +32,7 @@ def test_dry_friction_takes_four_f_c_a_cycle_and_holds():
     assert np.ptp(runs.force[0, -100:]) < 1e-9 and abs(runs.force[0, -1] - force) <= 5.0
 
 
-@pytest.mark.parametrize("f_s", [0.0, 8.0])
+@pytest.mark.parametrize("f_s", [pytest.param(0.0, marks=pytest.mark.slow), 8.0])
 def test_smoothed_friction_is_the_differential_equation(f_s):
     mass = replace(ACTUATOR, b=3.0, v_s=0.02, f_s=f_s, v_st=0.1)
     runs = simulate([mass], [PASS_ON], np.full((1, 400), 20.0), substeps=40)

@@ -25,6 +25,7 @@ import logging
 import os
 import platform
 import re
+import select
 import shutil
 import signal
 import stat
@@ -250,12 +251,29 @@ def _succeeds(command: list[str], limit_s: float) -> bool:
     silent = subprocess.DEVNULL
     process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)  # noqa: S603
     try:
-        return process.wait(limit_s) == 0
+        _await_end(process, limit_s)
+        return process.wait() == 0
     except BaseException:
         with suppress(OSError):
             os.killpg(process.pid, signal.SIGKILL)  # a compiler's driver starts others
         process.wait()
         raise
+
+
+def _await_end(process: subprocess.Popen[bytes], limit_s: float) -> None:
+    """Wait until a process ends, at once where its end is an event: `wait` itself looks only every 50 ms."""
+    try:
+        handle = os.pidfd_open(process.pid)
+    except (AttributeError, OSError):  # not on Linux, or of an older kernel
+        process.wait(limit_s)
+        return
+    try:
+        ended = select.poll()
+        ended.register(handle, select.POLLIN)
+        if not ended.poll(1e3 * limit_s):
+            raise subprocess.TimeoutExpired(process.args, limit_s)
+    finally:
+        os.close(handle)
 
 
 def define_constants(constants: Mapping[str, float]) -> str:

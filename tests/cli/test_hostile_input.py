@@ -202,7 +202,9 @@ def test_a_log_that_a_link_puts_elsewhere_is_refused_and_not_quoted(seaopt, bad,
     assert "hunter2" not in result.stderr
     (folder / "within.csv").symlink_to(folder / "real.csv")
     write_csv(folder / "real.csv", ["time [s]", "I", "F1"])
-    assert "link" not in seaopt("fit", bad(BASE + EXPERIMENT.replace("ok.csv", "within.csv"))).stderr
+    within = EXPERIMENT.replace("ok.csv", "within.csv").replace('"F1"', '"F11"')  # read as far as its columns
+    result = seaopt("fit", bad(BASE + within))
+    assert "F11" in result.stderr and "link" not in result.stderr
 
 
 def test_names_that_a_terminal_obeys_or_that_look_like_markup_are_shown(seaopt, folder):
@@ -267,10 +269,9 @@ def test_a_full_disk_under_stdout_is_one_line(folder, options):
 def test_names_that_are_not_utf8_are_files_too(folder):
     write_csv(folder / "ok.csv", ["time [s]", "F1 [N]"])
     shutil.copy(folder / "ok.csv", os.fsencode(folder) + b"/l\xff.csv")
-    for options in (("-o", b"out\xfe"), ("--json",)):
-        done = run_inspect(folder, b"l\xff.csv", *options, stdout=subprocess.PIPE)
-        assert (done.returncode, done.stderr) == (0, b"")
-        io.TextIOWrapper(io.BytesIO(done.stdout), encoding="utf-8").read()
+    done = run_inspect(folder, b"l\xff.csv", "-o", b"out\xfe", "--json", stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, b"")
+    json.loads(io.TextIOWrapper(io.BytesIO(done.stdout), encoding="utf-8").read())
     assert (os.fsencode(folder) + b"/out\xfe/quality.json").decode("utf-8", "surrogateescape")
     assert os.path.exists(os.fsencode(folder) + b"/out\xfe/quality.json")  # noqa: PTH110
 

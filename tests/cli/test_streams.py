@@ -20,9 +20,9 @@ def run_without(streams, *arguments, cwd):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("streams", ["1", "0,1,2"])
-def test_streams_that_are_closed_are_no_failure(streams, tmp_path):
-    done = run_without(streams, "schema", "problem", cwd=tmp_path)
+@pytest.mark.parametrize(("streams", "arguments"), [("1", ("schema", "problem")), ("0,1,2", ("--version",))])
+def test_streams_that_are_closed_are_no_failure(streams, arguments, tmp_path):
+    done = run_without(streams, *arguments, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
 
 

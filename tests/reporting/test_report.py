@@ -19,8 +19,7 @@ from seaopt.reporting.figures.panel import Panel
 from seaopt.reporting.page.chart import make_chart, make_id
 
 
-def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
-    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+def test_text_from_problems_is_escaped(controller, tmp_path, without_drawing):
     told: list[tuple[str, float]] = []
     title = "<script>alert(1)</script>"
     page = so.write_report([controller], tmp_path / "r.html", title=title, progress=lambda *each: told.append(each))
@@ -30,10 +29,9 @@ def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
     assert "&lt;script&gt;alert(1)" in text
 
 
-def test_nothing_or_two_of_a_kind_is_refused(stand, thor, tmp_path, without_drawing):
+def test_nothing_or_two_of_a_kind_is_refused(controller, tmp_path, without_drawing):
     with pytest.raises(so.SeaoptError, match="no result"):
         so.write_report([], tmp_path / "r.html")
-    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     with pytest.raises(so.SeaoptError, match="2 results of kind Controller"):
         so.write_report([controller, controller], tmp_path / "r.html")
     assert not list(tmp_path.iterdir())
@@ -187,7 +185,8 @@ SECTIONS = [
 ]  # fmt: skip
 
 
-def test_the_page_has_its_order_and_needs_nothing_else(fitted, controller, certificate, tmp_path, without_files):
+def test_the_page_has_its_order(fitted, controller, certificate, tmp_path, without_drawing):
+    """With its charts, `tests/cli/test_cli.py` looks at a page."""
     problem = tmp_path / "actuator.toml"
     problem.write_bytes(b"schema = 1")
     page = so.write_report(
@@ -196,14 +195,7 @@ def test_the_page_has_its_order_and_needs_nothing_else(fitted, controller, certi
     text = page.read_text(encoding="utf-8")
     assert re.findall(r'<section id="(\w+)"', text) == SECTIONS
     assert re.findall(r'<li><a href="#(\w+)">', text) == SECTIONS
-    for fetched in re.findall(r'(?:src|href)="([^"]+)"|url\(([^)]+)\)', text):
-        assert "".join(fetched).startswith(("#", "data:image/png;base64,")), fetched
-    assert "http" not in re.sub(r"http://www\.w3\.org/[\w/]+", "", text)  # names of vocabularies are not fetched
-    assert page.stat().st_size < 6e6
-    ids = re.findall(r'\bid="([^"]+)"', text)
-    assert len(ids) == len(set(ids))
-    charts = text.count('<figure class="chart"')
-    assert charts == text.count('role="img"') == text.count("<figcaption>") > 40
+    assert text.count('<figure class="chart"') == text.count("<figcaption>") > 40
     own = text.split('id="provenance"')[1]
     digest = hashlib.sha256(b"schema = 1").hexdigest()
     assert digest in own and "seaopt run actuator.toml" in own and so.__version__ in own

@@ -209,8 +209,8 @@ SETTINGS = [
 @pytest.mark.parametrize("options", SETTINGS)
 def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
     keep = {"outputs": True, "columns": True, "states": True}
-    model, segment, point, weights, x0 = passes(case, thor, n=240, **options)
-    edges = np.array([0, 90, 240])
+    model, segment, point, weights, x0 = passes(case, thor, n=140, **options)
+    edges = np.array([0, 60, 140])
     starts = np.vstack([x0, 2 * x0])
     fast = Program.make(model, segment, point, weights).run(edges, starts, **keep)
     slow = interpreted_passes(model, segment, point, weights, edges, starts, **keep)

@@ -343,9 +343,13 @@ def _find_remedy(
     if (own := play(*mpc.design)).kind:
         return f"{_name_obstacle(mpc, own)}: the run fails on the design plant with its own parameters too"
     room = f", or leave {failed.signal} more room by bound_tolerance" if failed.kind == OVER_BOUND else ""
-    if play(plant, place_values(plant, nominal, {})).kind:
+    values = place_values(plant, nominal, {})
+    known = plant is mpc.design[0] and values == place_values(*mpc.design, {})  # that run has just passed
+    if not known and play(plant, values).kind:
         return f"design on {name}, which is not what the model says at its nominal parameters either{room}"
-    alone = [key for key in draw if play(plant, place_values(plant, nominal, {key: draw[key]})).kind]
+    alone = list(draw)  # of a single one it is the run that failed
+    if len(draw) > 1:
+        alone = [key for key in draw if play(plant, place_values(plant, nominal, {key: draw[key]})).kind]
     wrong = ", ".join(alone or draw)
     together = "" if alone else " together"
     return f"fit {wrong} or narrow their ranges in [robustness]: the model is too wrong in them{together}{room}"

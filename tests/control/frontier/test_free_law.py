@@ -56,7 +56,7 @@ def test_one_sample_late_it_is_the_integral_of_bode_filled_like_water():
     assert 0.98 * least < found.bound < 1.08 * least
 
 
-@pytest.mark.parametrize("late", [1, 3])
+@pytest.mark.parametrize("late", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_what_a_delay_rules_out_is_impossible(late):
     """Caratheodory and Schur decide it in closed form: `sensitivity_possible`, tested against Bode's integral."""
     rate, ms = 400.0, 1.2

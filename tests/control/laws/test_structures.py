@@ -97,7 +97,7 @@ def judged(controller, plants, params):
     [
         ({"structure": "pid_dob", "bandwidth_hz": 30}, False),
         ({"structure": "pid_dob", "bandwidth_hz": 45}, True),
-        ({"structure": "pid", "bandwidth_hz": 60, "notch": Notch()}, False),
+        pytest.param({"structure": "pid", "bandwidth_hz": 60, "notch": Notch()}, False, marks=pytest.mark.slow),
         pytest.param({"structure": "pid", "bandwidth_hz": 60, "notch": Notch()}, True, marks=pytest.mark.slow),
         ({"structure": "pid", "bandwidth_hz": 30, "notch": Notch(frequency_hz=80, width=0.2, depth=0.5)}, True),
         ({"structure": "pd", "bandwidth_hz": 30, "min_disk_margin": 0.9, "objective": "noise"}, True),

@@ -248,6 +248,7 @@ def show_stability(g: dict[str, float], slope: float, theta: np.ndarray, multipl
     return np.array(least)
 
 
+@pytest.mark.slow
 def test_a_friction_margin_is_shown_by_the_aliases_written_out() -> None:
     """Of a cascade on the stand, whose margin is 0.042 N m s/rad without the limit."""
     asked = replace(SPEC, min_friction_margin=0.1)

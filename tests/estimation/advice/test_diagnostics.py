@@ -39,7 +39,7 @@ def shifted(log, samples):
 
 @pytest.fixture(scope="module")
 def log(stand, thor):
-    return so.virtual_log(stand, thor, PAPER_STAND, duration_s=40, rate_hz=400, seed=3, sensors=NOISE)
+    return so.virtual_log(stand, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=3, sensors=NOISE)
 
 
 def ar1(a, n, rng):
@@ -115,7 +115,7 @@ def test_a_fit_without_diagnostics_is_judged(stand, thor, log):
 def test_a_missing_mode_is_found_with_its_frequency(thor):
     """The screw mode of the defaults lies at 80 Hz (paper, Sec. IV-A); the bare model lacks it."""
     true = so.plants.high_impedance(parts=("screw_mode",))
-    log = so.virtual_log(true, thor, PAPER_STAND, duration_s=40, rate_hz=400, seed=3, sensors=NOISE)
+    log = so.virtual_log(true, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=3, sensors=NOISE)
     sentences = diagnose(fitted(so.plants.high_impedance(), log, thor)).sentences
     (said,) = [s for s in sentences if s.startswith("stand.F2") and "a missing pole" in s]
     assert 70 < float(said.split("below ")[1].split(" Hz")[0]) < 90

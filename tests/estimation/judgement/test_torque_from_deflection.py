@@ -18,7 +18,7 @@ K_N_GUESS = so.Parameter(name="k_n", value=250.0, unit="N m/rad")
 
 @pytest.fixture(scope="module")
 def log():
-    period, n, rng = 2e-3, 3000, np.random.default_rng(4)
+    period, n, rng = 2e-3, 2000, np.random.default_rng(4)
     pull, damp = K_S / N, C_S / N
     a = np.array([
         [0, 1, 0, 0], [-pull / N / J_M, -(damp / N + B_R) / J_M, pull / J_M, damp / J_M],

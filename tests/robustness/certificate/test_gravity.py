@@ -41,10 +41,11 @@ def test_eigenvalue_is_that_of_the_link_under_what_is_left_of_its_weight(plain):
 
 def test_a_link_that_weighs_less_than_is_compensated_is_found(plain):
     lighter = [{}, {"m": 3.5}, {"m": 4.5}]
-    neutral = find_worst_gravity(compensate(plain, 1.0), KNEE, VALUES, [{}])
+    whole = compensate(plain, 1.0)
+    neutral = find_worst_gravity(whole, KNEE, VALUES, [{}])
     assert neutral.radius <= 1.0 + NEUTRAL
     assert find_worst_gravity(compensate(plain, 0.8), KNEE, VALUES, lighter).radius < 1.0
-    worst = find_worst_gravity(compensate(plain, 1.0), KNEE, VALUES, lighter)
+    worst = find_worst_gravity(whole, KNEE, VALUES, lighter)
     assert (worst.radius > 1.0 + NEUTRAL, worst.parameters) == (True, {"m": 3.5})
     held = compensate(add_impedance(plain, KNEE, VALUES, Impedance(stiffness=20.0, damping=1.0)), 1.0)
     assert find_worst_gravity(held, KNEE, VALUES, lighter).radius < 1.0

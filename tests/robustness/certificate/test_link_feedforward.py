@@ -123,9 +123,15 @@ def slope_of(state: str) -> float:
     return RUBBING["f_c"].value / RUBBING["v_s"].value if state == "stuck" else 0.0
 
 
+@pytest.fixture(scope="module")
+def certificate(fed: Controller) -> so.Certificate:
+    return so.certify(fed, {"swing": SWING}, RUBBING, samples=1, simulations=False)
+
+
 @pytest.mark.parametrize("state", ["sliding", "stuck"])
-def test_the_certificate_has_the_loop_that_stands_in_each_state(fed: Controller, state: str) -> None:
-    certificate = so.certify(fed, {"swing": SWING}, RUBBING, samples=1, simulations=False)
+def test_the_certificate_has_the_loop_that_stands_in_each_state(
+    fed: Controller, certificate: so.Certificate, state: str
+) -> None:
     assert list(certificate.plants) == ["design sliding", "design stuck", "swing sliding", "swing stuck"]
     found, slope = certificate.plants[f"swing {state}"], slope_of(state)
     f = np.geomspace(0.05, 499.0, 20_000)
@@ -180,6 +186,7 @@ def test_the_friction_margin_is_that_of_the_aliases_written_out(fed: Controller)
     assert find_least(fed, 1.05 * margin.slopes[0], np.array([at]), popov_s) < 0.0
 
 
+@pytest.mark.slow
 def test_a_friction_margin_is_asked_beside_it() -> None:
     asked = replace(SPEC, min_friction_margin=3e4)
     controller = so.tune(STAND, RUBBING, asked, {"swing": SWING})

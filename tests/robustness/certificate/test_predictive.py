@@ -181,7 +181,7 @@ def test_what_a_run_swings_is_its_peak(mpc, stand, thor):
     """By the simulation of this test, of other steps and with the quantum as coarse."""
     coarse = so.Sensors(quantisation={"F1": 20.0})
     runs = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=3, sensors=coarse).constrained
-    force = [simulate_rounded(mpc, thor, r, 20.0)[-160:] for r in (412.3, 777.0, 1003.9, 1234.5)]
+    force = [simulate_rounded(mpc, thor, r, 20.0, 0.6)[-160:] for r in (777.0, 1234.5)]
     assert 0.0 < max(np.ptp(one) / 2 for one in force) <= runs.largest_ring
 
 
@@ -192,7 +192,7 @@ def test_devices_that_keep_a_run_from_settling_are_named(mpc, stand, thor):
 
 
 def test_what_an_amplifier_rounds_reaches_the_steps_of_the_linear_region_too(mpc, stand, thor):
-    rough = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=2, current_step_A=2.0)
+    rough = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, current_step_A=2.0)
     assert all(stage.current_step_A == 2.0 for stage in rough.runs.stages.values())
     assert 0.0 < rough.constrained.largest_ring < 0.5 * 2.0 * abs(mpc.static_gain)
 

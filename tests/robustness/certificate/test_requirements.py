@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.cli import main
 from seaopt.files import to_json
 
 BAND = (1.0, 60.0)
@@ -116,14 +116,17 @@ samples = 1
 """
 
 
-def test_the_command_exits_1(loud, tmp_path):
+def test_the_command_exits_1(loud, tmp_path, monkeypatch, capsys):
     (tmp_path / "problem.toml").write_text(PROBLEM, encoding="utf-8")
     (tmp_path / "loud.json").write_text(to_json(loud.to_dict()), encoding="utf-8")
-    command = [sys.executable, "-W", "error", "-m", "seaopt.cli", "certify", "problem.toml", "-o", "out"]
-    command += ["--controller", "loud.json"]
-    out = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert out.returncode == 1, out.stderr
-    assert "not met" in out.stdout and "passive_band_hz -0." in out.stdout
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["seaopt", "certify", "problem.toml", "-o", "out", "--controller", "loud.json"])
+    monkeypatch.setattr(so.Certificate, "with_simulation", lambda certificate, **_: certificate)
+    with pytest.raises(SystemExit) as end:
+        main()
+    out = capsys.readouterr()
+    assert end.value.code == 1, out.err
+    assert "not met" in out.out and "passive_band_hz -0." in out.out
     content = json.loads((tmp_path / "out" / "robustness.json").read_text(encoding="utf-8"))
     (row,) = [item for item in content["requirements"] if item["name"] == "passive_band_hz"]
     assert not row["met"] and row["limit"] == 0.0 and row["value"] < 0.0

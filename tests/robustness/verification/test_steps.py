@@ -143,7 +143,7 @@ def test_a_step_that_ends_short_neither_settles_nor_passes(stand, rubbing):
         assert faults["settling"].value == np.inf
 
 
-@pytest.mark.parametrize(("factor", "late"), [(40.0, 0), (1.0, 30)])
+@pytest.mark.parametrize(("factor", "late"), [(40.0, 0), pytest.param(1.0, 30, marks=pytest.mark.slow)])
 def test_a_run_away_is_told_once_and_allows_nothing_absurd(blind, stand, rubbing, factor, late):
     wild = replace(blind, law=scaled(blind.law, factor), compute_delay_samples=2 + late)
     certificate = so.certify(wild, {"stand": stand}, rubbing, simulations=False)
