@@ -65,6 +65,7 @@ from seaopt.records import record
 SEED = 20260
 MEMBERS = 40
 GENERATIONS = 150
+SHORT = 50  # generations where no second population begins
 HANDED_ON = 4  # laws of one population to the next
 BEST_SHARE = 0.15  # of the population: what members are drawn to
 NEUTRAL_SHARE = 0.3  # of the population: begin without the optional parts
@@ -233,7 +234,7 @@ class Evolution:
         Where the first population keeps no limits another one may begin `again`, with its best, and with the best of
         one without the optional parts.
         """
-        usage, laws = self.run(known)
+        usage, laws = self.run(known, generations=GENERATIONS if again else SHORT)
         if usage[0] > KEPT and again:
             handed, bare = list(laws[:HANDED_ON]), self.without_parts()
             if bare.free.size < self.free.size:

@@ -118,7 +118,7 @@ class _Complex:
         return _Complex(self.re[where], self.im[where])
 
 
-def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNumbers:
+def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5, *, keeping: bool = False) -> LawNumbers:
     """Return the numbers at a local optimum, or the start if no better ones are found.
 
     Parameters
@@ -131,11 +131,15 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNum
         Stable.
     rounds : int
         Solutions at most; each adds the points where the one before broke a limit.
+    keeping : bool
+        Whether the first numbers that keep all limits are enough, whatever their objective.
 
     """
     x, chosen, factor = start, _choose_points(task, grid, start), LARGEST_FACTOR
     rank, stalled = task.rank(grid, start), 0
     for _ in range(rounds):
+        if keeping and rank[0] == 0.0:
+            break
         trial = _solve(task, grid, x, chosen, factor)
         if trial is None:
             break

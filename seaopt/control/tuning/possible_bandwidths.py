@@ -25,6 +25,7 @@ from seaopt.progress import Progress, ignore
 FARTHEST_BELOW, FARTHEST_ABOVE = 4.0, 2.0  # of the bandwidth asked: where others are looked for
 USUAL_HZ = 60.0  # and as far as force loops usually go: above a resonance a law may need less than below it
 PROBE_RATIO = 1.2  # of a probe to the next
+STEP = 1.001 * math.log(PROBE_RATIO)
 RESOLUTION = 0.01  # to which the end of what is possible is found
 BISECTIONS = math.ceil(math.log2(math.log(PROBE_RATIO) / RESOLUTION))  # that find such an end
 MEMBERS, GENERATIONS = 30, 40  # of the evolution at every bandwidth
@@ -133,9 +134,10 @@ class _Probes:
         return replace(self.task, spec=spec)
 
     def _tune(self, bandwidth_hz: float) -> tuple[float, LawNumbers]:
-        """Return usage and numbers: from the nearest bandwidth's law first, one that keeps the limits if there is any.
+        """Return usage and numbers: from the nearest bandwidth's law, one that keeps the limits if there is any.
 
-        Close to a bandwidth that is possible, what misses clearly from there is not looked for anywhere else.
+        A step away from a bandwidth that is possible its law is refined first, and what misses clearly from there is
+        not looked for anywhere else. From further away a refinement leads nowhere.
         """
         task = self._aim(bandwidth_hz)
         grid = task.grid(place_frequencies(task))
@@ -143,20 +145,20 @@ class _Probes:
             (abs(np.log(f / bandwidth_hz)) + FAR * (usage > 0.0), usage == 0.0, f)
             for f, (usage, _) in self.tried.items()
         )
-        x = task.tidy(self.tried[start][1])
-        if kept and task.is_stable(x):
-            x = refine(task, grid, x, REFINEMENTS)
+        x, refined = task.tidy(self.tried[start][1]), False
+        if kept and apart < STEP and task.is_stable(x):
+            x, refined = refine(task, grid, x, REFINEMENTS), True
             usage, _ = task.rank(grid, x)
-            if usage == 0.0 or (apart < np.log(PROBE_RATIO) and usage > HOPELESS_USAGE):
+            if usage == 0.0 or usage > HOPELESS_USAGE:
                 return usage, x
         search = Evolution.of(task, grid, [x])
         usages, laws = search.run([x], members=MEMBERS, generations=GENERATIONS)
         starts = [one for one in map(task.tidy, laws[usages < ENCIRCLES][:STARTS_TRIED]) if task.is_stable(one)]
         if not starts:
             return np.inf, x
-        x = min(starts, key=lambda one: task.rank(grid, one))
+        known, x = x, min(starts, key=lambda one: task.rank(grid, one))
         usage, _ = task.rank(grid, x)
-        if usage > PROMISING_USAGE:
+        if usage > PROMISING_USAGE or (refined and np.allclose(x, known, rtol=1e-3)):
             return usage, x
         x = refine(task, grid, x, REFINEMENTS)
         return task.rank(grid, x)[0], x

@@ -153,17 +153,23 @@ def search(task: Task, x: LawNumbers, loops: list[MeasuredLoop], *, again: bool 
     if not list_broken_limits(task.spec, loops, task.design_states) - {FRICTION}:
         return x, loops
     grid = task.grid(place_frequencies(task))
-    return retry(task, x, loops, Evolution.of(task, grid, [x]).find([x], again=again))
+    return retry(task, x, loops, Evolution.of(task, grid, [x]).find([x], again=again), keeping=not again)
 
 
-def retry(task: Task, x: LawNumbers, loops: list[MeasuredLoop], starts: Sequence[LawNumbers]) -> Solution:
-    """Return a better law than the one that misses limits, from other starts; else that one."""
+def retry(
+    task: Task, x: LawNumbers, loops: list[MeasuredLoop], starts: Sequence[LawNumbers], *, keeping: bool = False
+) -> Solution:
+    """Return a better law than the one that misses limits, from other starts; else that one.
+
+    `keeping` is of `refine`: the first numbers that keep the limits may be enough.
+    """
     grid = task.grid(place_frequencies(task))
     best, rank = (x, loops), task.rank(grid, x)
     for start in map(task.tidy, starts):
         if not task.is_stable(start):
             continue
-        tried = _finish(task, grid, refine(task, grid, improve(task, grid, start)[1], _count_rounds(task)), ignore)
+        tried = refine(task, grid, improve(task, grid, start)[1], _count_rounds(task), keeping=keeping)
+        tried = _finish(task, grid, tried, ignore)
         missed = list_broken_limits(task.spec, tried[1], task.design_states)
         if not missed - {FRICTION}:
             return _meet_friction_margin(task, *tried, ignore) if missed else tried
