@@ -182,6 +182,24 @@ class _Cluster(Executor):
             self._client.close(timeout=2)
 
 
+def solve_ipopt(solver: Any, **given: Any) -> Any:
+    """Return what a solver of CasADi's that is IPOPT finds, one at a time in a process.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        It was interrupted: by Ctrl-C, or by any signal whose handler raises. CasADi takes that for a failure of the
+        solver, and drops the exception.
+
+    """
+    with IPOPT:
+        try:
+            return solver(**given)
+        finally:
+            if solver.stats()["return_status"] == "NonIpopt_Exception_Thrown":
+                raise KeyboardInterrupt
+
+
 def map_ordered(
     function: Callable[[Item], Result], items: Iterable[Item], executor: Executor | None = None
 ) -> Iterator[Result]:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import time
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 
+import casadi as ca
 import pytest
 
 import seaopt as so
 from seaopt.errors import SeaoptError
-from seaopt.executors import QUEUED, Processes, connect_dask, count_workers, map_ordered
+from seaopt.executors import QUEUED, Processes, connect_dask, count_workers, map_ordered, solve_ipopt
 
 
 class Counting(Executor):
@@ -27,6 +29,22 @@ class Counting(Executor):
         future = Future()
         future.set_result(fn(*args, **kwargs))
         return future
+
+
+def test_an_interrupt_ends_what_ipopt_solves():
+    """CasADi takes Ctrl-C for a failure of the solver, and returns."""
+    x = ca.MX.sym("x", 200)
+    cost = ca.sum1((x[1:] - x[:-1] ** 2) ** 2 * 100 + (1 - x[:-1]) ** 2)
+    endless = {"tol": 1e-300, "max_iter": 10**6, "acceptable_iter": 0, "hessian_approximation": "limited-memory"}
+    quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **endless}}
+    solver = ca.nlpsol("endless", "ipopt", {"x": x, "f": cost}, quiet)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.05)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            solve_ipopt(solver, x0=[2.0] * 200)
+    finally:
+        signal.signal(signal.SIGALRM, before)
 
 
 def late(k):

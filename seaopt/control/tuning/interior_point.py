@@ -51,7 +51,7 @@ from seaopt.control.tuning.optimisation_problem import (
     LawNumbers,
     Task,
 )
-from seaopt.executors import IPOPT
+from seaopt.executors import solve_ipopt
 
 POINTS_PER_LIMIT = 24  # of each kind of limit
 SPREAD_POINTS = 10  # of them, at even distances
@@ -401,12 +401,11 @@ def _solve(
     lower, upper = np.full(count, -np.inf), np.zeros(count)
     lower[0] = 0.0
     lower[1 : 1 + least.size], upper[1 : 1 + least.size] = least / rows, largest / rows
-    with IPOPT:
-        answer = solver(
-            x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,
-            lbx=[*(near / scale), -np.inf, 0.0],
-            ubx=[*(far / scale), np.inf, np.inf],
-        )  # fmt: skip
+    answer = solve_ipopt(
+        solver, x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,
+        lbx=[*(near / scale), -np.inf, 0.0],
+        ubx=[*(far / scale), np.inf, np.inf],
+    )  # fmt: skip
     x = np.array(answer["x"]).ravel()[: start.size] * scale
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 

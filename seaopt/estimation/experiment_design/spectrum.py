@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import EstimationError
-from seaopt.executors import IPOPT
+from seaopt.executors import solve_ipopt
 from seaopt.records import record
 from seaopt.simulation import Clock, Model, linearise, transition
 
@@ -184,8 +184,7 @@ def optimal_powers(
     options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "error_on_fail": True}
     solver = ca.nlpsol("powers", "ipopt", nlp, options)
     try:
-        with IPOPT:
-            solution = solver(x0=np.full(k, 0.9), lbx=0.0, ubg=1.0)
+        solution = solve_ipopt(solver, x0=np.full(k, 0.9), lbx=0.0, ubg=1.0)
     except RuntimeError as error:
         raise EstimationError("the powers were not found; use fewer lines, or narrow band_hz") from error
     return np.maximum(np.array(solution["x"]).ravel(), 0.0) * even
