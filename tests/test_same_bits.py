@@ -158,11 +158,8 @@ def certify_here(certify_one):
     return to_json(certify_one(None).to_dict())
 
 
-SLOW = (certify_friction, certify_link, certify_points)
-OTHERS = [certify_plan, *(pytest.param(one, marks=pytest.mark.slow) for one in SLOW)]
-
-
-@pytest.mark.parametrize("certify_one", OTHERS)
+@pytest.mark.slow
+@pytest.mark.parametrize("certify_one", [certify_plan, certify_friction, certify_link, certify_points])
 @pytest.mark.parametrize("make", EXECUTORS)
 def test_other_certificates(certify_one, make):
     with make() as executor:

@@ -328,7 +328,7 @@ def test_what_cannot_be_drawn_says_why(fitted, controller, certificate, stand, t
 
 
 def test_text_stays_text_in_files(controller, tmp_path):
-    figure = controller.plot()
+    figure = controller.plot.sensitivity().get_figure(root=True)
     figure.savefig(tmp_path / "a.svg")
     svg = (tmp_path / "a.svg").read_text(encoding="utf-8")
     assert ">|S| [dB]</text>" in svg and "<image" not in svg

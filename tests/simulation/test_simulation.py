@@ -205,8 +205,14 @@ SETTINGS = [
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
-@pytest.mark.parametrize("case", ["stand", pytest.param("swing", marks=pytest.mark.slow), "swing friction"])
-@pytest.mark.parametrize("options", SETTINGS)
+@pytest.mark.parametrize(
+    ("case", "options"),
+    [
+        pytest.param(case, options, marks=pytest.mark.slow if case == "swing" or number in others else ())
+        for case, others in (("stand", ()), ("swing", ()), ("swing friction", (3, 5, 6)))
+        for number, options in enumerate(SETTINGS)
+    ],
+)
 def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
     keep = {"outputs": True, "columns": True, "states": True}
     model, segment, point, weights, x0 = passes(case, thor, n=140, **options)

@@ -47,8 +47,14 @@ def make_point(theta, hold="zero", *, free=False, delay_s=0.0):
     return Point(theta=np.array(theta), offset=np.zeros(2), gain=np.ones(2), clock=clock, substeps=3)
 
 
-@pytest.mark.parametrize("hold", ["zero", "first"])
-@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize(
+    ("hold", "free"),
+    [
+        ("zero", False),
+        ("first", True),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("first", False), ("zero", True))),
+    ],
+)
 def test_compiled_and_interpreted_passes_agree_and_their_derivatives_are_those_of_differences(drive, hold, free):
     model, start, plain = make_model(BLOCK, VALUES, FREE), np.array([[0.01, 0.0]]), Weights.plain(2)
     segment = Segment(u=(drive,), y=(np.zeros(drive.size), np.zeros(drive.size)))

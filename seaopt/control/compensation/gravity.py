@@ -14,9 +14,9 @@ from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebfit, chebval
 
 from seaopt.control.loops.compensation.terms import CompensateGravity, GravityTerm
-from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.loops.sampled_plant import find_rests
 from seaopt.errors import ControlError
-from seaopt.parameters import Parameter, ParameterSet
+from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import output_function
 
@@ -88,10 +88,7 @@ def _rest_at(
 ) -> Float[np.ndarray, "2 n"]:
     """Return two outputs where the plant rests at angles of its link."""
     observe, rows = output_function(plant), [list(plant.outputs).index(name) for name in names]
-    found = np.zeros((2, angles.size))
-    for k, angle in enumerate(angles):
-        placed = params.with_parameters(Parameter(name=coordinate, value=float(angle), unit=plant.states[coordinate]))
-        values = plant.complete(placed)
-        x, u = find_rest(plant, values)
-        found[:, k] = np.array(observe(0.0, x, u, values.vector)).ravel()[rows]
-    return found
+    values = plant.complete(params)
+    x, u = find_rests(plant, values, {coordinate: angles}, angles.size)
+    found = [np.array(observe(0.0, *at, values.vector)).ravel()[rows] for at in zip(x.T, u.T, strict=True)]
+    return np.array(found).T

@@ -390,11 +390,20 @@ def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarr
     -88.70 N, -88.70 N
 
     """
-    at = {name: np.array([value]) for name, value in read_conditions(plant, params).items() if name not in DELAYS}
+    x, u = find_rests(plant, params, {}, 1)
+    return x[:, 0], u[:, 0]
+
+
+def find_rests(
+    plant: Plant, params: CompletedParameters, places: Mapping[str, Float[np.ndarray, " k"]], count: int
+) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
+    """Return what `find_rest` does at `count` places, a column each: of a coordinate by name, before the conditions."""
+    known = {name: value for name, value in read_conditions(plant, params).items() if name not in DELAYS}
+    at = {name: np.full(count, value) for name, value in known.items()} | dict(places)
     cool = freeze_heat(plant)
-    x, u = _solve_rest(_let_slide(cool), params.vector[:, None], at)
-    rest = dict(zip(cool.states, x[:, 0], strict=True))  # a winding is cold there, though a current flows
-    return np.array([rest.get(name, 0.0) for name in plant.states]), u[:, 0]
+    x, u = _solve_rest(_let_slide(cool), np.repeat(params.vector[:, None], count, axis=1), at)
+    rest = dict(zip(cool.states, x, strict=True))  # a winding is cold there, though a current flows
+    return np.array([rest.get(name, np.zeros(count)) for name in plant.states]), u
 
 
 def _let_slide(plant: Plant) -> Plant:
@@ -416,6 +425,7 @@ def _solve_rest(
     loose = [i for i in range(len(names)) if i not in fixed]
     if len(fixed) > 1:
         raise ControlError(f"{', '.join(names[i] for i in fixed)} are both given; a plant rests at one of them")
+    slowest = 0
     for _ in range(NEWTON_STEPS):
         (rates,) = _map_columns(plant, dynamics_function, x, u, p)
         a, b, _, _ = _evaluate_jacobians(plant, x, u, p)
@@ -426,9 +436,11 @@ def _solve_rest(
         x[loose] -= step[:-1]
         u[0] -= step[-1]
         size = np.max(np.abs(np.concatenate([x[loose], u[:1]])), axis=0)
-        if np.all(np.max(np.abs(step), axis=0) <= 1e-12 * np.maximum(size, 1e-6)):
+        left = np.max(np.abs(step), axis=0) / np.maximum(size, 1e-6)
+        if np.all(left <= 1e-12):
             return x, u
-    place = ", ".join(f"{names[i]} = {at[names[i]][0]:g}" for i in fixed)
+        slowest = int(np.argmax(left))
+    place = ", ".join(f"{names[i]} = {at[names[i]][slowest]:g}" for i in fixed)
     raise ControlError(f"plant {plant.name} cannot rest at {place}, so it cannot be linearised there; give another")
 
 

@@ -100,7 +100,13 @@ def test_a_pid_bridges_what_is_short_and_stops_at_what_is_long(name, tuned, thor
     check(run(*of_law(law), thor, stand, FAULTS[name]), clean, name)
 
 
-@pytest.mark.parametrize("name", list(FAULTS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in ("spikes", "nan", "outage of 200") else pytest.mark.slow)
+        for name in FAULTS
+    ],
+)
 def test_predictive_control_does_the_same(name, mpc, thor, stand):
     clean = run(*of_mpc(replace(mpc, gate=None)), thor, stand, {})[0]
     check(run(*of_mpc(mpc), thor, stand, FAULTS[name]), clean, name)

@@ -138,7 +138,7 @@ def test_without_limits_it_is_its_transfer_functions(stand, thor, delay):
     assert np.max(np.abs(run.current - expected)) < 0.02 * np.max(np.abs(expected))
 
 
-@pytest.mark.parametrize("slew", [None, 500.0])
+@pytest.mark.parametrize("slew", [pytest.param(None, marks=pytest.mark.slow), 500.0])
 def test_limits_are_never_broken(stand, thor, slew):
     """References that jump beyond reach, a sensor that spikes and fails."""
     mpc = made(stand, thor, current_slew_A_per_s=slew)

@@ -47,6 +47,7 @@ def test_a_loop_that_is_fine_at_rest_and_rings_once_it_slides_fails(thor):
     assert max(row.overshoot for row in certificate.steps.rows) > 0.35, "steps are played"
 
 
+@pytest.mark.slow
 def test_a_spring_with_hysteresis_is_certified_at_its_stiffest_and_its_softest(thor):
     """They are plain springs of k and of k + k_h, each with its figures; a law tuned for k alone fails on the other."""
     stand, plain = so.plants.high_impedance(parts=["hysteresis"]), so.plants.high_impedance()

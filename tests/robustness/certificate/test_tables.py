@@ -19,6 +19,11 @@ def certificate():
     return so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.3, 0.5)}, samples=20, simulations=False)
 
 
+@pytest.fixture(autouse=True)
+def without_drawing(monkeypatch):
+    monkeypatch.setattr("seaopt.reporting.figures.canvas.render_figure", lambda figure, kind: b"<svg/>")
+
+
 def rows(shown):
     """Return the tables' cells, a list a row; what is no XML is refused, but for images, which HTML leaves open."""
     closed = re.sub(r"(<img\b[^>]*[^/>])>", r"\1/>", shown)
