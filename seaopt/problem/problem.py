@@ -13,7 +13,7 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
-from seaopt.control.laws.delay import DelayedSpec, find_drive_delay, take_own_delays
+from seaopt.control.laws.delay import DelayedSpec, find_drive, find_drive_delay, take_own_delays
 from seaopt.control.loops.sampled_plant import add_drive_delay, list_names
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
@@ -262,7 +262,10 @@ class Problem:
     def draws(self, source: Fit | ParameterSet) -> list[dict[str, float]]:
         """Return the draws of parameters at which the controller must hold while it is tuned."""
         count = self.table.controller.draws if self.table.controller else 0
-        return draw_values(source, count, self.robustness.seed, self.ranges) if count else []
+        if self.spec is None or not count:
+            return []
+        drive = find_drive(self.spec, self.design_plant, source)
+        return draw_values(source, count, self.robustness.seed, self.ranges, drive)
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Read the logs, and make the virtual ones.

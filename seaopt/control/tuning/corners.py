@@ -7,9 +7,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from seaopt.control.laws.delay import Drive
+from seaopt.control.loops.sampled_plant import DRIVE_DELAY
 from seaopt.errors import ControlError, require_seed
 from seaopt.estimation import Fit
-from seaopt.parameters import ParameterSet
+from seaopt.estimation.result.covariance import take_root
+from seaopt.parameters import Parameter, ParameterSet
 
 MOST_CORNERS = 256
 
@@ -46,6 +49,7 @@ def draw(
     count: int,
     seed: int,
     ranges: Mapping[str, tuple[float, float]] | None = None,
+    drive: Drive | None = None,
 ) -> list[dict[str, float]]:
     """Draw parameter values: a fit's joint normal distribution, or prior_stds, and uniform ranges.
 
@@ -59,6 +63,8 @@ def draw(
         The same seed gives the same draws.
     ranges : mapping of name to (low, high), optional
         Parameters drawn uniformly instead.
+    drive : Drive, optional
+        Whose delay is drawn with a fit's parameters, as uncertain as the fit left it; `laws.delay.find_drive` finds it.
 
     Raises
     ------
@@ -73,19 +79,24 @@ def draw(
 
     """
     rng, uniform = np.random.default_rng(require_seed(seed, ControlError)), dict(ranges or {})
-    values = parameters.parameters if isinstance(parameters, Fit) else parameters
     if isinstance(parameters, Fit):
-        names, matrix = list(parameters.covariance.names), np.asarray(parameters.covariance.matrix)
+        values, covariance = parameters.parameters, parameters.covariance
+        if drive is not None:
+            covariance = drive.take_covariance(parameters)
+            values = values.with_parameters(Parameter(name=DRIVE_DELAY, value=drive.delay_s, unit="s", min=0.0))
+        names, matrix = list(covariance.names), np.asarray(covariance.matrix)
     else:
+        values = parameters
         names = [name for name, parameter in values.items() if parameter.prior_std is not None]
         matrix = np.diag([float(values[name].prior_std or 0.0) ** 2 for name in names])
     used = [i for i, name in enumerate(names) if name in values and name not in uniform and np.isfinite(matrix[i, i])]
     if not used and not uniform:
         raise ControlError("parameters has no covariance and no prior_std, and there are no ranges: nothing to draw")
     names, matrix = [names[i] for i in used], matrix[used][:, used]
+    mean, root = np.array([values[name].value for name in names]), take_root(matrix)
     out: list[dict[str, float]] = []
     for _ in range(count):
-        normal = rng.multivariate_normal([values[name].value for name in names], matrix) if names else []
+        normal = mean + root @ rng.normal(size=mean.size)
         drawn = {
             name: float(np.clip(value, values[name].min, values[name].max))
             for name, value in zip(names, normal, strict=True)

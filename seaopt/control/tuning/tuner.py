@@ -51,6 +51,7 @@ from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import (
     DRIVE_DELAY,
     DigitalPlant,
+    conditions,
     find_signals,
     list_names,
     read_conditions,
@@ -472,21 +473,23 @@ def _draw_plants(
     models: Mapping[str, tuple[Plant, CompletedParameters]], draws: Sequence[Mapping[str, float]]
 ) -> list[tuple[str, tuple[Plant, CompletedParameters]]]:
     """Return every plant at every draw, under a name; a draw that changes nothing of a plant is left out."""
-    known = {name for model, _ in models.values() for name in model.parameters}
+    known = {name for model, _ in models.values() for name in (*model.parameters, *conditions((model,)))}
     out: list[tuple[str, tuple[Plant, CompletedParameters]]] = []
     for number, values in enumerate(draws, start=1):
         for parameter in values:
             if parameter not in known:
                 raise ControlError(f'draws name "{parameter}", which no plant has; {suggestion(parameter, known)}')
         for name, (model, nominal) in models.items():
+            own = {**conditions((model,)), **nominal}
             used = {
                 key: require_number(value, f"draws: {key}", ControlError)
-                for key, value in values.items() if key in model.parameters
+                for key, value in values.items() if key in own
             }  # fmt: skip
             if not used:
                 continue
             label = format_values(used, missing="") if len(used) < 3 else f"draw {number}"
-            out.append((f"{name}, {label}", (model, model.complete(nominal.update(**used)))))
+            drawn = nominal.given.with_parameters(*(replace(own[key], value=value) for key, value in used.items()))
+            out.append((f"{name}, {label}", (model, model.complete(drawn))))
     return out
 
 

@@ -59,6 +59,18 @@ class Covariance:
         return float(np.sqrt(max(self.matrix[i, i], 0.0)))
 
 
+def take_root(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """Return a factor of a covariance, R R^T, for draws: standard deviations times the correlation's root.
+
+    The root is taken of the correlation, whose entries are of one size: the eigenvalues of a covariance in m, N/m
+    and kg m^2 span so many decades that the small ones would be lost in rounding.
+    """
+    std = np.sqrt(np.diag(covariance))
+    scale = np.where(std > 0.0, std, 1.0)
+    values, vectors = np.linalg.eigh(covariance / scale / scale[:, None])
+    return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
+
 def compute_bread(problem: FitProblem, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
     return _sum_weighted(problem, z, lambda experiment, o, r: problem.loss.curvature(r))

@@ -19,6 +19,7 @@ from seaopt.control.laws.delay import Drive
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY, conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
+from seaopt.estimation.result.covariance import take_root
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import PARTS, Mode, Plant, state_space
 from seaopt.records import record
@@ -210,15 +211,8 @@ class Uncertainty:
                 yield -normal, (values[:, j] - parameter.min) / std
 
     def factor(self) -> Float[np.ndarray, "g g"]:
-        """Return the covariance's factor, coordinates to parameters: standard deviations times the correlation's root.
-
-        The root is taken of the correlation, whose entries are of one size: the eigenvalues of a covariance in m, N/m
-        and kg m^2 span so many decades that the small ones would be lost in rounding.
-        """
-        std = np.sqrt(np.diag(self.covariance))
-        scale = np.where(std > 0.0, std, 1.0)
-        values, vectors = np.linalg.eigh(self.covariance / scale / scale[:, None])
-        return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        """Return the covariance's factor, coordinates to parameters."""
+        return take_root(self.covariance)
 
     def _gaussian_values(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
         mean = np.array(self.nominal.values_of(self.names))

@@ -12,12 +12,13 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import MPCSpec, force_mpc, read_law
+from seaopt.control import MPCSpec, draw, force_mpc, read_law
 from seaopt.control.laws.delay import find_drive, settle_delays, split_delayed, warn_delays
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.passivity import passivity
 from seaopt.control.loops.port import probe_of
 from seaopt.control.loops.sampled_plant import add_drive_delay, read_conditions
+from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, ProblemError
 from seaopt.files import to_json
 from seaopt.plants.friction import split_friction
@@ -274,6 +275,60 @@ def test_a_fitted_delay_is_drawn_with_the_parameters(fit, stand):
     assert [row.name for row in certificate.varied] == ["b_r", "drive_delay_s"]
     again = so.estimation.Fit.from_dict(json.loads(to_json(fit.to_dict())))
     np.testing.assert_array_equal(again.delay_covariance.matrix, joint)
+
+
+@pytest.fixture(scope="module")
+def vague(fit):
+    """The same fit with a delay that is known to 0.4 ms, and goes with friction, as of a short log."""
+    joint = fit.delay_covariance
+    std, correlation = np.array([joint.std("b_r"), 4e-4]), np.array([[1.0, -0.8], [-0.8, 1.0]])
+    return replace(fit, delay_covariance=replace(joint, matrix=std[:, None] * correlation * std))
+
+
+def test_the_tuner_draws_a_fitted_delay_as_the_certificate_does(vague, stand, tmp_path):
+    """From Python and from a problem file: its std, and its correlation with friction."""
+    drive = find_drive(SPEC, stand, vague)
+    unknown = combine_uncertainty(vague, so.ParameterSet(), {}, {"stand": stand}, drive)
+    drawn = draw(vague, 3000, 1, drive=drive)
+    of = {name: np.array([one[name] for one in drawn]) for name in unknown.names}
+    assert set(drawn[0]) == set(unknown.names) == {"b_r", "drive_delay_s"}
+    np.testing.assert_allclose(np.cov([*of.values()]), unknown.covariance, rtol=0.1)
+    (tmp_path / "p.toml").write_text(
+        'schema = 1\ntitle = "t"\n[plant.stand]\nkind = "high_impedance"\ndrive = "unlumped"\n'
+        '[controller]\nplant = "stand"\nbandwidth_hz = 25\ndraws = 3\n',
+        encoding="utf-8",
+    )
+    assert read_problem(tmp_path / "p.toml").draws(vague) == drawn[:3]
+    whole = tmp_path / "whole.toml"
+    whole.write_text((tmp_path / "p.toml").read_text().replace("draws", "delay_samples = 3\ndraws"), encoding="utf-8")
+    assert set(read_problem(whole).draws(vague)[0]) == {"b_r"}
+
+
+def test_a_delay_that_is_drawn_is_that_of_its_plant(stand, thor):
+    """Which is later by as much at every frequency where a hold does next to nothing."""
+    spec, values = settle_delays(replace(SPEC, drive_delay_s=1e-3), stand, thor)
+    nominal, drawn = make_task(stand, values, spec, {}, [{"drive_delay_s": 2.3e-3}]).plants
+    f = np.array([0.5, 2.0, 5.0])
+    np.testing.assert_allclose(drawn.response(f) / nominal.response(f), np.exp(-2j * np.pi * f * 1.3e-3), rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_law_tuned_with_draws_keeps_its_limits_at_the_delays_drawn(vague, stand):
+    """On a loop held in steps of 40 us, whose delays are whole numbers of them; without draws it does not."""
+    drawn = [
+        one | {"drive_delay_s": 4e-5 * round(one["drive_delay_s"] / 4e-5)}
+        for one in draw(vague, 6, 1, drive=find_drive(SPEC, stand, vague))
+    ]
+    assert max(one["drive_delay_s"] for one in drawn) > DELAY_S + 2e-4
+
+    def find_worst(controller):
+        return max(
+            _true_ms(controller, stand, vague.parameters.update(b_r=one["b_r"]), one["drive_delay_s"]) for one in drawn
+        )
+
+    alone, held = so.tune(stand, vague, SPEC), so.tune(stand, vague, SPEC, draws=drawn)
+    assert held.feasible and held.drive_delay_s == alone.drive_delay_s
+    assert find_worst(held) < SPEC.max_sensitivity * 1.002 and find_worst(alone) > SPEC.max_sensitivity * 1.01
 
 
 def test_a_plant_that_the_law_is_robust_to_has_the_delay_of_its_own_experiments(fit, stand, swing, tmp_path):
