@@ -168,7 +168,8 @@ def test_the_pid_beside_mixed_sensitivity_synthesis(stand, thor):
     assert f"the pid has an integral of {disturbance(law.close(stand, thor), 27.2):.2f};" in text
 
 
-@pytest.mark.parametrize("bandwidth_hz", [20.0, pytest.param(30.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("bandwidth_hz", [20.0, 30.0])
 def test_feedback_of_the_error_cannot_have_what_the_page_says(bandwidth_hz, monkeypatch):
     """One more than tests/control/tuning/test_reference_weights.py, which has what the tuned weights can."""
     monkeypatch.syspath_prepend(str(DOCS.parent / "benchmarks"))

@@ -78,7 +78,7 @@ def test_steps_of_the_stabilised_plant_end_without_hunting(plant, tuned):
     steps = np.array([20.0, 60.0, 200.0, 600.0])
     params = falling(plant, 35.0, 0.02)
     mass = Mass.of({name: params[name].value for name in params})
-    runs = simulate([mass] * steps.size, [tuned.to_dict()] * steps.size, np.tile(steps[:, None], 1500), substeps=20)
+    runs = simulate([mass] * steps.size, [tuned.to_dict()] * steps.size, np.tile(steps[:, None], 1000), substeps=20)
     assert np.all(runs.ringing(steps) < 0.02)
     assert np.all(runs.overshoot(steps) < 0.3 * 1.1)
 
