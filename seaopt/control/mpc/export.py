@@ -20,7 +20,7 @@ from seaopt.errors import FileError
 from seaopt.files import write_text
 from seaopt.records import record
 
-SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "example.c")
+SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "arithmetic.h", "example.c")
 
 
 @record(eq=False)

@@ -442,8 +442,8 @@ def _find_violation(
     applied = np.append(np.zeros(late), run.current)[: run.time.size] + disturbance
     inputs = np.zeros((run.time.size, len(plant.inputs)))
     inputs[:, 0] = applied
-    whole = output_function(plant).map(run.time.size)
-    outputs = np.array(whole(run.time[None], run.state.T, inputs.T, ca.DM(completed.vector)))
+    outputs_of = output_function(plant).map(run.time.size)
+    outputs = np.array(outputs_of(run.time[None], run.state.T, inputs.T, ca.DM(completed.vector)))
     for name, (low, high) in mpc.spec.bounds.items():
         if not _has(plant, name):
             continue

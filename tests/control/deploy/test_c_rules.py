@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import seaopt as so
 from seaopt.control import MPCSpec, PlausibilityGate, export_mpc, force_mpc
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
@@ -43,12 +42,6 @@ FINITE = [0.0, -0.0, 5e-324, -5e-324, 1e-308, -2e-308, 1.0000001e15, -1e16, 1e15
 EXTREME = [*FINITE, np.nan, np.inf, -np.inf]
 CHECKS = ["-Wconversion", "-Wsign-conversion", "-Wdouble-promotion", "-Wshadow"]
 DEVIATIONS = {"2.4", "2.5", "8.7", "8.9", "14.1", "15.5"}  # docs/howto/on_the_target.md has the reasons
-
-
-@pytest.fixture(scope="module")
-def tuned(stand, thor):
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
-    return so.tune(stand, thor, spec)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-import seaopt as so
 from seaopt.control import GateState, MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.control.laws.plausibility import largest_step
 from seaopt.control.running.sampled_loop import SampledLoop
@@ -61,12 +60,6 @@ def of_mpc(mpc):
         return result.current_A, result.state, result.state.gate.status
 
     return step, mpc.start
-
-
-@pytest.fixture(scope="module")
-def tuned(stand, thor):
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
-    return so.tune(stand, thor, spec)
 
 
 @pytest.fixture(scope="module")

@@ -8,23 +8,10 @@
 #include <math.h>
 #include <string.h>
 
-#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0)) || defined(_M_FP_FAST)
-#error "compile without -ffast-math and -ffinite-math-only: they take out the check for numbers that are not finite"
-#endif
-#if defined(__clang__) || !defined(__GNUC__)
-#pragma STDC FP_CONTRACT OFF
-#endif
+#include "arithmetic.h"
 
 #define VARIABLES FORCE_MPC_VARIABLES
 #define ROWS FORCE_MPC_ROWS
-
-typedef force_mpc_real real;
-
-static real dot(const real *a, const real *b, int n) {
-  real sum = 0;
-  for (int i = 0; i < n; i++) sum += a[i] * b[i];
-  return sum;
-}
 
 /* The signed end of row i at which it is held. */
 static real end_of(const force_mpc_program *s, int i, const real *low, const real *high) {

@@ -2,12 +2,7 @@
 
 #include <string.h>
 
-#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0)) || defined(_M_FP_FAST)
-#error "compile without -ffast-math and -ffinite-math-only: they take out the check for numbers that are not finite"
-#endif
-#if defined(__clang__) || !defined(__GNUC__)
-#pragma STDC FP_CONTRACT OFF
-#endif
+#include "arithmetic.h"
 
 #define STATES FORCE_MPC_STATES
 #define PLANT (FORCE_MPC_PLANT_STATES)
@@ -21,20 +16,12 @@
 #define PREVIEW FORCE_MPC_PREVIEW
 #define KNOWN (PREVIEW > DELAY ? PREVIEW - DELAY : 0) /* samples of the horizon whose references differ */
 
-typedef force_mpc_real real;
-
 static int finite_number(real x) { return x - x == 0; }
 
 /* Of what is given: finite, and within a range in which nothing that follows overflows. */
 static int is_number(real x) { return x >= (real)-1e15 && x <= (real)1e15; }
 
 static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
-
-static real dot(const real *a, const real *b, int n) {
-  real sum = 0;
-  for (int i = 0; i < n; i++) sum += a[i] * b[i];
-  return sum;
-}
 
 /* z := A z + B newer + B' older: where a drive's delay is no whole number of samples, the older command still acts */
 static void advance(real *z, real older, real newer) {
