@@ -256,8 +256,8 @@ def check_content(content: Any) -> None:
             raise ValueError(f"it is nested more than {MOST_LEVELS} deep")
         inner: list[Any] = []
         for value in level:
-            if isinstance(value, int) and value.bit_length() > 63:
-                raise ValueError(f"an integer has {value.bit_length()} bits, and 64 are the most")
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise ValueError(f"an integer has {value.bit_length()} bits, and 63 beside its sign are the most")
             inner += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
         level, depth = inner, depth + 1
 

@@ -8,7 +8,7 @@ import stat
 import pytest
 
 from seaopt.errors import FileError
-from seaopt.files import write_bytes
+from seaopt.files import check_content, write_bytes
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
@@ -34,3 +34,14 @@ def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path, name):
     with pytest.raises(FileError, match="cannot be written"):
         write_bytes(tmp_path / name, b"x")
     assert [path.name for path in tmp_path.iterdir()] == ["below"]
+
+
+@pytest.mark.parametrize("value", [-(2**63), 2**63 - 1, True])
+def test_integers_of_64_bits_are_read(value):
+    check_content({"seed": [value]})
+
+
+@pytest.mark.parametrize("value", [-(2**63) - 1, 2**63])
+def test_integers_of_more_are_refused(value):
+    with pytest.raises(ValueError, match="an integer has 64 bits, and 63 beside its sign are the most"):
+        check_content({"seed": [value]})

@@ -61,7 +61,7 @@ def export_controller(
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
         options["derate"] = read_guard(content, derate_margin_K) or True
-    options["gate"] = _choose_gate(content, gate or GateOptions(), options)
+    options["gate"] = choose_gate(content, gate or GateOptions(), options)
     broken = _list_broken_requirements(path, certificate)
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
@@ -97,7 +97,7 @@ def export_controller(
     return content["feasible"] and met and not broken
 
 
-def _choose_gate(
+def choose_gate(
     content: Mapping[str, Any], asked: GateOptions, options: Mapping[str, Any]
 ) -> PlausibilityGate | Literal[False] | None:
     """Return the gate that is typed; False for none, None for that of the controller."""
@@ -126,8 +126,8 @@ def _choose_gate(
         raise ProblemError(
             "--gate: is not exported with a schedule; leave it out, and check the reading before the step"
         )
-    own = ((content.get("guards") or {}).get("gate") or {}).get("max_step_N")
-    step, limit = own if asked.max_step_N is None else asked.max_step_N, _find_limit(content, options)
+    step = _find_own_step(content) if asked.max_step_N is None else asked.max_step_N
+    limit = _find_limit(content, options)
     if step is None:
         raise ProblemError(
             "--gate: controller.json does not say how far the plant moves in a sample; type --gate-max-step, or write "
@@ -139,6 +139,13 @@ def _choose_gate(
     if not ramp > 0.0:
         raise ProblemError(f"--gate-ramp {ramp:g}: is not a time; type seconds above zero, such as 0.1")
     return PlausibilityGate(range_N=(low, high), max_step_N=step, max_held=held, ramp_A_per_s=limit / ramp)
+
+
+def _find_own_step(content: Mapping[str, Any]) -> float | None:
+    """Return how far a reading moves in a sample by the controller's own gate; None without one."""
+    if "mpc" in content:
+        return read_code(content["mpc"]["code"]).numbers.get("step")
+    return ((content.get("guards") or {}).get("gate") or {}).get("max_step_N")
 
 
 def _find_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> float | None:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.cli.export import GateOptions, choose_gate
 from seaopt.control import MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.control.laws.stored import read_controller
-from seaopt.errors import FileError
+from seaopt.control.mpc.export import collect_code
+from seaopt.errors import FileError, ProblemError
 from seaopt.files import seal
 from seaopt.problem.stages import design_mpc, tune_problem
 from tests.c_code import LoadedLaw, LoadedMPC
@@ -159,6 +161,16 @@ def test_an_edited_gate_is_refused(tuned, folder):
         read_controller(content)
 
 
+def test_a_plans_own_step_is_that_of_its_code(stand, thor):
+    gate = PlausibilityGate(range_N=(-3000.0, 3500.0), max_step_N=300.0, max_held=8, ramp_A_per_s=45.0)
+    plans = [force_mpc(stand, thor, MPCSpec(current_limit_A=9.0), gate=one) for one in (gate, None)]
+    gated, bare = ({"mpc": {"code": collect_code(plan).to_dict()}, "guards": {"gate": None}} for plan in plans)
+    chosen = choose_gate(gated, GateOptions(range_N="-100:200", ramp_s=0.2), {})
+    assert chosen == PlausibilityGate(range_N=(-100.0, 200.0), max_step_N=300.0, max_held=5, ramp_A_per_s=45.0)
+    with pytest.raises(ProblemError, match=r"type --gate-max-step, or write \[controller.gate\]"):
+        choose_gate(bare, GateOptions(range_N="-100:200"), {})
+
+
 @pytest.mark.slow
 def test_predictive_control_takes_both(tuned, folder, compiler, seaopt):
     planned = PROBLEM.replace("max_sensitivity = 1.6", 'structure = "mpc"').replace("= 30", "= 20")
@@ -173,6 +185,10 @@ def test_predictive_control_takes_both(tuned, folder, compiler, seaopt):
     assert seaopt("export", "out", "--c", "typed", *typed).returncode == 0
     gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=3, ramp_A_per_s=90.0)
     compare_plans(LoadedMPC(compiler, folder / "typed"), force_mpc(*bare.design, bare.spec, gate=gate))
+    assert seaopt("export", "out", "--c", "ranged", "--gate", "-100:200").returncode == 0  # with the problem's step
+    assert f"mpc_step = (force_mpc_real){mpc.gate.max_step_N:.17g};" in (
+        folder / "ranged" / "force_mpc_data.h"
+    ).read_text(encoding="utf-8")
     assert seaopt("export", "out", "--c", "bare", "--no-gate").returncode == 0
     assert "FORCE_MPC_GATE 0" in (folder / "bare" / "force_mpc_data.h").read_text(encoding="utf-8")
     assert isinstance(mpc.spec, MPCSpec)

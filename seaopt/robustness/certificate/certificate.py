@@ -77,32 +77,39 @@ _REPORTED = (
 )  # fmt: skip
 
 
+def find_sense(name: str) -> str:
+    """Return what a requirement's value must be to its limit, as a sign, of a law that was tuned."""
+    if name in BY_REQUIREMENT:
+        return BY_REQUIREMENT[name].symbol
+    return "≥" if name == FRICTION_COMPENSATION or name.startswith("min_") else "≤"
+
+
 @record
 class Requirement:
-    """One figure against its limit; `where` names the plant, and the parameters that decide if a draw does."""
+    """One figure against its limit; `where` names the plant, and the parameters that decide if a draw does.
+
+    `sense` is what the value must be to the limit, as a sign, and follows from the name where it is left out: of draws
+    and worst cases at most that. `tolerance` is the share of the limit by which the value may be beyond it.
+    """
 
     name: str
     limit: float
     value: float
     met: bool
     where: str
+    sense: str = ""
+    tolerance: float = KEPT_TO
 
-    @property
-    def sense(self) -> str:
-        """What the value must be to the limit, as a sign; of draws and worst cases it is at most that."""
-        if self.name in BY_REQUIREMENT:
-            return BY_REQUIREMENT[self.name].symbol
-        return "≥" if self.name == FRICTION_COMPENSATION or self.name.startswith("min_") else "≤"
+    def __post_init__(self) -> None:
+        if not self.sense:
+            object.__setattr__(self, "sense", find_sense(self.name))
 
     @property
     def keeps(self) -> bool:
-        """Whether the value keeps the limit but for rounding; what is met may need more, as a stable loop.
-
-        Where it is to be equal, a law of the user's own may have more, and less by its tolerance, of up to a half.
-        """
-        slack = KEPT_TO * (abs(self.limit) or 1.0)
+        """Whether the value keeps the limit but for its tolerance; what is met may need more, as a stable loop."""
+        slack = self.tolerance * (abs(self.limit) or 1.0)
         if self.sense == "=":
-            return self.value >= 0.5 * self.limit
+            return abs(self.value - self.limit) <= slack
         return self.value >= self.limit - slack if self.sense == "≥" else self.value <= self.limit + slack
 
 

@@ -19,7 +19,7 @@ from seaopt.formatting import format_values
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, Requirement
+from seaopt.robustness.certificate.certificate import KEPT_TO, MIN_FRICTION_MARGIN, Requirement
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
     GRAVITY_COMPENSATION,
@@ -89,10 +89,11 @@ def _measure_discs(controller: Controller, name: str, measured: MeasuredResponse
 
 
 def _make_requirement(verdict: Verdict, remark: str) -> Requirement:
-    name = verdict.limit.requirement or verdict.limit.name
+    limit = verdict.limit
     return Requirement(
-        name=name, limit=verdict.allowed, value=verdict.value, met=verdict.met, where=f"{verdict.plant}{remark}"
-    )
+        name=limit.requirement or limit.name, limit=verdict.allowed, value=verdict.value, met=verdict.met,
+        where=f"{verdict.plant}{remark}", sense=limit.symbol, tolerance=max(limit.tolerance, KEPT_TO),
+    )  # fmt: skip
 
 
 def _place_passive(verdict: Verdict, port: PortFigures | None, band: tuple[float, float] | None) -> str:

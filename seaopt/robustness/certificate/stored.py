@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from seaopt.bench import Sensors
 from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
 from seaopt.errors import FileError
 from seaopt.files import check_seal, plain
-from seaopt.robustness.certificate.certificate import Requirement
+from seaopt.robustness.certificate.certificate import KEPT_TO, Requirement, find_sense
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.units import LINEAR
 
 CERTIFY_AGAIN = "certify again"
+OLDER_TOLERANCE = 0.5  # of a bandwidth, of which older files do not say whether a law was tuned for it
 
 
 class StoredRequirement(ResultTable):
@@ -28,6 +31,15 @@ class StoredRequirement(ResultTable):
     value: NullIsInfinite
     met: Flag
     where: str
+    sense: Literal["≤", "≥", "="] | None = None
+    tolerance: Annotated[Number, Field(ge=0.0, le=0.5)] | None = None
+
+    def build(self) -> Requirement:
+        """Return the row; of an older file, which does not say it, one that is to be equal may be off by a half."""
+        sense = self.sense or find_sense(self.name)
+        older = OLDER_TOLERANCE if sense == "=" else KEPT_TO
+        fields = self.model_dump() | {"sense": sense, "tolerance": older if self.tolerance is None else self.tolerance}
+        return Requirement(**fields)
 
 
 class StoredLargest(ResultTable):
@@ -238,8 +250,14 @@ def read_requirements(stored: Sequence[StoredRequirement], source: str = "robust
     """
     if not stored:
         raise FileError(f"{source}: requirements is empty, and a certificate requires something; {CERTIFY_AGAIN}")
-    rows = tuple(Requirement(**row.model_dump()) for row in stored)
+    rows = tuple(row.build() for row in stored)
     for row in rows:
+        known = find_sense(row.name)
+        if row.sense not in (known, "≥" if known == "=" else known):  # a law that is given may have more
+            raise FileError(
+                f"{source}: requirements: {row.name} has the sense {row.sense}, and must be {known} its limit; "
+                f"{CERTIFY_AGAIN}"
+            )
         if row.met and not row.keeps:
             raise FileError(
                 f"{source}: requirements: {row.name} is called met, and its value {row.value:g} is not {row.sense} "

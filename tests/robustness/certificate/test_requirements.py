@@ -11,7 +11,10 @@ import pytest
 
 import seaopt as so
 from seaopt.cli import main
-from seaopt.files import to_json
+from seaopt.control import assess, ideal_pid
+from seaopt.errors import FileError
+from seaopt.files import seal, to_json
+from seaopt.robustness.certificate.stored import list_requirements
 
 BAND = (1.0, 60.0)
 QUIET = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, objective="noise", passive_band_hz=BAND)
@@ -131,3 +134,33 @@ def test_the_command_exits_1(loud, tmp_path, monkeypatch, capsys):
     (row,) = [item for item in content["requirements"] if item["name"] == "passive_band_hz"]
     assert not row["met"] and row["limit"] == 0.0 and row["value"] < 0.0
     assert " Hz, of 1 to 60 Hz" in row["where"]
+
+
+@pytest.mark.parametrize(("sense", "tolerance", "value", "kept"), [
+    ("=", 0.005, 30.1, True), ("=", 0.005, 30.2, False), ("=", 0.005, 29.9, True), ("=", 0.005, 29.8, False),
+    ("=", 0.005, np.inf, False), ("≥", 0.02, 60.0, True), ("≥", 0.02, 29.5, True), ("≥", 0.02, 29.3, False),
+    (None, None, 44.0, True), (None, None, 46.0, False), (None, None, 14.0, False), ("≤", 0.005, 30.0, False),
+    ("≥", 0.6, 30.0, False),
+])  # fmt: skip
+def test_a_bandwidth_that_is_read_is_judged_on_both_sides(sense, tolerance, value, kept):
+    """As it was asked of a tuned law, at least of one that is given, and both with the tolerance that was taken."""
+    said = {} if sense is None else {"sense": sense, "tolerance": tolerance}
+    row = {"name": "bandwidth_hz", "limit": 30.0, "value": value, "met": True, "where": "design plant"} | said
+    if kept:
+        assert list_requirements({"requirements": [row]}, "robustness.json")[0].value == value
+        return
+    with pytest.raises(FileError, match=r"bandwidth_hz is called met|has the sense|tolerance"):
+        list_requirements({"requirements": [row]}, "robustness.json")
+
+
+def test_a_law_that_is_given_needs_its_bandwidth_at_least(stand, thor, robust_controller):
+    law = ideal_pid(K=2.0, T_i=0.05, T_d=0.01, N=10.0, sample_time_s=1e-3)
+    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=2.0, max_droop_db=False, bandwidth_tolerance=0.1)
+    rows = {}
+    for name, controller in (("given", assess(stand, thor, law, spec)), ("tuned", robust_controller)):
+        certificate = so.certify(controller, {"stand": stand}, thor, samples=2, simulations=False)
+        (row,) = [row for row in certificate.requirements if row.name == "bandwidth_hz"]
+        rows[name] = row.sense, row.tolerance, row.keeps
+        again = so.robustness.Certificate.from_dict(seal(certificate.to_dict()), controller, {"stand": stand}, thor)
+        assert again.requirements == certificate.requirements
+    assert rows == {"given": ("≥", 0.1, True), "tuned": ("=", 0.005, True)}
