@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -15,7 +16,7 @@ from seaopt.bench import Sensors
 from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
 from seaopt.errors import FileError
 from seaopt.files import check_seal, plain
-from seaopt.robustness.certificate.certificate import KEPT_TO, Requirement, find_sense
+from seaopt.robustness.certificate.certificate import Requirement, find_sense
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.units import LINEAR
 
@@ -36,10 +37,8 @@ class StoredRequirement(ResultTable):
 
     def build(self) -> Requirement:
         """Return the row; of an older file, which does not say it, one that is to be equal may be off by a half."""
-        sense = self.sense or find_sense(self.name)
-        older = OLDER_TOLERANCE if sense == "=" else KEPT_TO
-        fields = self.model_dump() | {"sense": sense, "tolerance": older if self.tolerance is None else self.tolerance}
-        return Requirement(**fields)
+        row = Requirement(**self.model_dump(exclude_none=True))
+        return replace(row, tolerance=OLDER_TOLERANCE) if self.tolerance is None and row.sense == "=" else row
 
 
 class StoredLargest(ResultTable):
