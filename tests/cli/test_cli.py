@@ -162,7 +162,7 @@ def test_a_wrong_controller_keeps_no_fit_from_its_logs(folder, seaopt, stand_alo
     assert out.returncode == 2 and said in out.stderr
 
 
-def test_an_unidentifiable_fit_exits_1_with_a_report(folder, seaopt, stand_alone, without_drawing):
+def test_an_unidentifiable_fit_exits_1_with_a_report(folder, seaopt, stand_alone, without_drawing, without_causes):
     text = stand_alone.replace(*OPEN).replace("duration_s = 20", "duration_s = 4")
     (folder / "open.toml").write_text(text, encoding="utf-8")
     out = seaopt("run", "open.toml", "-o", "open")
