@@ -14,7 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_limits
+from seaopt.control.tuning.easing import tighten_limits
 from seaopt.control.tuning.evolution import ENCIRCLES, Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
@@ -119,13 +121,14 @@ class _Probes:
         task = self._aim(bandwidth_hz)
         plain = replace(task, spec=replace(task.spec, min_friction_margin=None))
 
-        def keeps(x: LawNumbers) -> bool:
-            return not list_broken_limits(plain.spec, plain.measure(x), plain.design_states)
+        def keeps(loops: list[MeasuredLoop]) -> bool:
+            return not list_broken_limits(plain.spec, loops, plain.design_states)
 
-        if keeps(x):
+        if keeps(plain.measure(x)):
             return 0.0, x
         x = recheck(task, task.grid(place_frequencies(task)), x, REFINEMENTS)
-        return (0.0 if keeps(x) else NEARLY_KEPT), x
+        x, loops = tighten_limits(plain, x, plain.measure(x))
+        return (0.0 if keeps(loops) else NEARLY_KEPT), x
 
     def _aim(self, bandwidth_hz: float) -> Task:
         low, high = self.task.spec.bandwidth_range_hz  # what may be asked, not what may be looked at
