@@ -106,5 +106,6 @@ def test_a_free_joint_is_tuned_and_certified(structure, damping):
     figures = controller.close(free, params).figures()
     assert figures.stable
     assert figures.ms < 1.7 * 1.001
-    certificate = so.certify(controller, {"locked": locked, "free": free}, params, samples=10)
+    plants = {"locked": locked, "free": free}
+    certificate = so.certify(controller, plants, params, samples=10, simulations=structure == "pd")
     assert certificate.passed, certificate

@@ -47,6 +47,13 @@ def certificate(controller, stand, swing, thor):
     )
 
 
+@pytest.fixture
+def linear(without_steps):
+    """Let a test's certificates have no simulated steps."""
+    with without_steps():
+        yield
+
+
 def test_it_passes_with_the_stated_bound(certificate):
     assert certificate.passed
     assert certificate.monte_carlo.failures == 0
@@ -109,6 +116,7 @@ def test_a_controller_that_fails_is_named_with_its_witness(controller, stand, th
     assert "NOT MET" in repr(certificate)
 
 
+@pytest.mark.usefixtures("linear")
 def test_an_unstable_draw_is_a_failure(controller, stand, thor):
     certificate = so.certify(
         controller, {"stand": stand}, thor, ranges={"eta": (20.0, 21.0)}, samples=20, simulations=False
@@ -125,6 +133,7 @@ def test_the_bound_is_clopper_pearson(n, k):
     assert failure_bound(n, k, 1 - 1e-6) == pytest.approx(expected, rel=1e-9) == pytest.approx(searched, rel=1e-9)
 
 
+@pytest.mark.usefixtures("linear")
 def test_fit_covariance_drives_the_draws(controller, stand, swing, short_log, thor):
     fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], thor.free("J", "b_r", "eta"))
     certificate = so.certify(controller, {"stand": stand, "swing": swing}, fit, samples=100, simulations=False)
@@ -201,6 +210,7 @@ def test_fits_that_cannot_be_trusted(controller, stand, short_log, thor):
         so.certify(controller, {"stand": stand}, good.parameters)
 
 
+@pytest.mark.usefixtures("linear")
 def test_a_parameter_on_its_bound_is_drawn_from_one_side(controller, stand, short_log, thor):
     start = thor.update(J=5e-6).free("J", "b_r").bound(J=(3.3101e-6, 1e-5))
     fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], start)
@@ -208,6 +218,7 @@ def test_a_parameter_on_its_bound_is_drawn_from_one_side(controller, stand, shor
     assert certificate.worst["stand"].parameters["J"] >= 3.3101e-6
 
 
+@pytest.mark.usefixtures("linear")
 def test_a_known_parameters_prior_is_drawn_too(controller, stand, short_log, thor):
     from dataclasses import replace
 
@@ -249,6 +260,7 @@ def test_the_design_plant_is_certified_though_nobody_lists_it(controller, stand,
     assert repr(again) == repr(alone)
 
 
+@pytest.mark.usefixtures("linear")
 def test_another_law_meets_other_draws(controller, stand, thor):
     """A law tuned with the worst draws of a certificate must not be certified on the same draws."""
     softer = replace(controller, law=scaled(controller.law, 1.0, 0.9))
@@ -293,6 +305,7 @@ def test_an_edited_verdict_is_not_believed(certificate, controller, stand, swing
     assert not again.passed
 
 
+@pytest.mark.usefixtures("linear")
 def test_a_nominal_value_outside_its_range_is_noted(controller, swing, thor):
     found = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.5, 0.6)}, samples=5, simulations=False)
     assert "I_p = 0.36 lies outside its range of 0.5 to 0.6" in found.notes[0]
@@ -333,6 +346,7 @@ def test_the_bound_is_required_where_it_is_asked_for(certificate, controller, st
     ).passed  # nothing is drawn
 
 
+@pytest.mark.usefixtures("linear")
 def test_values_in_other_units_are_the_same_values(controller, stand, thor):
     """646 g known within 1 g, and 0.2 ms of delay."""
     late = [Parameter(name="delay_s", value=value, unit=unit) for value, unit in ((2e-4, "s"), (0.2, "ms"))]
@@ -348,6 +362,7 @@ def test_values_in_other_units_are_the_same_values(controller, stand, thor):
     assert told[1].std == pytest.approx(told[0].std)
 
 
+@pytest.mark.usefixtures("linear")
 def test_a_ranged_parameter_that_nobody_gave_has_its_default(controller, stand, swing):
     """A set with the stand's names alone: the swing's inertia is the plant's, inside its range."""
     stands = stand.complete(so.plants.thor())
