@@ -65,6 +65,11 @@ def draw(rng: np.random.Generator) -> Case:
     return Case(spec=spec, params=params, swing=bool(rng.random() < 0.5))
 
 
+def absolute(values):
+    """Return absolute values, as np.abs does in three times as long, to be safe from overflow."""
+    return np.sqrt(values.real**2 + values.imag**2)
+
+
 class Judge:
     """Limits and objective of a law in NumPy alone, for many laws at once."""
 
@@ -113,14 +118,14 @@ class Judge:
         residues = (c @ vectors) * np.linalg.solve(vectors, b)
         return (residues / (1 / self.q[:, None] - values)).sum(axis=1) * self.q**self.spec.compute_delay_samples
 
-    def law(self, numbers):
-        """Return C_y and C_r for columns of named numbers, each of shape (n, 1)."""
-        q, ts = self.q, self.ts
+    def law(self, numbers, only=slice(None)):
+        """Return C_y and C_r for columns of named numbers, each of shape (n, 1), at all frequencies or some."""
+        q, ts = self.q[only], self.ts
         rate = (1 - q) / (numbers["T"] + ts - q * numbers["T"])
         series, more = 1.0, 0.0
         if self.spec.structure == "pid_dob":
             lag = (ts / (numbers["Q"] + ts - q * numbers["Q"])) ** 2
-            series, more = 1 / (1 - lag * self.kept), lag * self.inverse
+            series, more = 1 / (1 - lag * self.kept[only]), lag * self.inverse[only]
         if self.spec.notch is not None:
             s, w = (1 - q) / (1 + q), np.tan(np.pi * numbers["f"] * ts)
             damping = 2 * numbers["w"] * w * s
@@ -133,7 +138,8 @@ class Judge:
         """Return both k_p with the bandwidth, from three samples of the quadratic equation."""
 
         def gap(k_p):
-            c_y, c_r = (c[:, self.at] for c in self.law(numbers | {"p": np.full_like(numbers["d"], k_p)}))
+            at = slice(self.at, self.at + 1)
+            c_y, c_r = (c[:, 0] for c in self.law(numbers | {"p": np.full_like(numbers["d"], k_p)}, at))
             p = self.p[0][self.at]
             return 2 * np.abs(p * c_r) ** 2 - np.abs(1 + p * c_y) ** 2
 
@@ -157,21 +163,21 @@ class Judge:
         for row, p in enumerate(self.p):
             loop = p * c_y
             s = 1 / (1 + loop)
-            top(np.abs(s), spec.max_sensitivity)
-            top(np.abs(loop * s), spec.max_complementary)
-            top(np.abs(s - loop * s), spec.min_disk_margin and 2 / spec.min_disk_margin)
-            angle = np.unwrap(np.angle(1 + loop), axis=1)
-            turned = np.minimum(turned, angle[:, -1] - angle[:, 0])
+            size = absolute(s)
+            top(size, spec.max_sensitivity)
+            top(absolute(loop * s), spec.max_complementary)
+            top(absolute(s - loop * s), spec.min_disk_margin and 2 / spec.min_disk_margin)
+            turned = np.minimum(turned, np.sum(np.angle(s[:, :-1] * np.conj(s[:, 1:])), axis=1))
             if spec.objective == "disturbance":
-                value = np.maximum(value, np.abs(s) @ self.weights)
+                value = np.maximum(value, size @ self.weights)
             if row == 0:
-                t = np.abs(p * c_r * s)
+                t, noise = absolute(p * c_r * s), absolute(c_y * s)
                 top(t, spec.max_reference_peak)
-                top(np.abs(c_y * s), spec.max_noise_gain)
-                top(np.abs(s)[:, self.f <= spec.sensitivity_bandwidth_limit_hz], np.sqrt(0.5))
+                top(noise, spec.max_noise_gain)
+                top(size[:, self.f <= spec.sensitivity_bandwidth_limit_hz], np.sqrt(0.5))
                 top(1 / t[:, self.f < 0.97 * spec.bandwidth_hz], np.sqrt(2))
                 if spec.objective == "noise":
-                    value = np.max(np.abs(c_y * s), axis=1)
+                    value = np.max(noise, axis=1)
         if spec.structure == "pid":
             worst = np.maximum(worst, 1 + RATE * (1 + numbers["p"][:, 0]) - numbers["i"][:, 0])
         return worst, turned > -0.3 * np.pi, value
