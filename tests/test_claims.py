@@ -98,6 +98,12 @@ class Scratch:
         assert figures.tracking_band_hz == pytest.approx(widest, rel=2e-3, abs=2e-3)
 
 
+@pytest.fixture(autouse=True)
+def without_steps(monkeypatch):
+    """Let certificates have no simulated steps: what is looked at here is linear."""
+    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+
+
 @pytest.mark.parametrize(
     ("structure", "bandwidth", "delay"),
     [

@@ -38,6 +38,12 @@ SUBSTEPS, STEPS_LATE = 25, 51  # of 1 ms: 2.04 ms are 51 steps of 40 us
 SPEC = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25)
 
 
+@pytest.fixture(autouse=True)
+def without_steps(monkeypatch):
+    """Let certificates have no simulated steps: what is looked at here is linear."""
+    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+
+
 @pytest.fixture(scope="module")
 def fit(stand, thor):
     """A fit of a log made outside the package: steps of a microsecond's grid, the command late by a known time."""

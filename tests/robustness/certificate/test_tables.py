@@ -12,11 +12,12 @@ import seaopt as so
 
 
 @pytest.fixture(scope="module")
-def certificate():
+def certificate(without_steps):
     stand, swing, thor = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
     controller = so.tune(stand, thor, spec, robust_to={"swing": swing}, draws=so.control.corners({"I_p": (0.3, 0.5)}))
-    return so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.3, 0.5)}, samples=20, simulations=False)
+    with without_steps():
+        return so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.3, 0.5)}, samples=20, simulations=False)
 
 
 @pytest.fixture(autouse=True)
