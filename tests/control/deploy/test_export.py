@@ -29,12 +29,6 @@ from tests.laws import law_of, scaled
 TS = 1e-3
 
 
-@pytest.fixture(scope="module")
-def tuned():
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
-    return so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
-
-
 def with_law(controller, law):
     return replace(controller, law=law, design=None)
 

@@ -20,11 +20,9 @@ NAN = float("nan")
 
 
 @pytest.fixture(scope="module")
-def controller():
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
-    force = so.tune(so.plants.high_impedance(), THOR, spec)
+def controller(tuned):
     impedance = Impedance(stiffness=20_000.0, damping=900.0, velocity_filter_s=3e-3)
-    return add_impedance(force, SWING, THOR, impedance, name="swing")
+    return add_impedance(tuned, SWING, THOR, impedance, name="swing")
 
 
 class Law(ctypes.Structure):
