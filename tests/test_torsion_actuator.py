@@ -80,7 +80,7 @@ def test_the_cascade_is_assessed_with_its_encoder(script):
     law = script.read_matrices(*script.PUBLISHED["cascaded PID"])
     spec = replace(problem.spec, measured=("tau_s", "thetad_m"), passive_band_hz=None)
     given = Law.from_state_space(law.a, law.b, law.c, law.d, script.PERIOD)
-    controller = so.assess(problem.design_plant, problem.parameters, given, spec)
+    controller = so.assess(given, problem.design_plant, problem.parameters, spec)
     found, judged = controller.achieved, script.judge(law, script.run_law(law))
     assert not controller.feasible
     assert found.bandwidth_hz == pytest.approx(95.3, abs=0.05)

@@ -40,6 +40,7 @@ def experiment(**changes):
 
 
 CASES = {
+    "older order": lambda: so.assess(PLANT, THOR, tuned().law, SPEC),
     "complex channel": lambda: so.Log.from_arrays(time=[0, 1], I=[1j, 2]),
     "masked channel": lambda: so.Log.from_arrays(time=[0, 1], I=np.ma.array([1, 2], mask=[0, 1])),
     "units": lambda: so.Log.from_arrays(time=[0, 1], I=[1, 2], units={"I": 3}),

@@ -426,7 +426,7 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
     design, values = problem.design_plant, problem.values(source, spec)
     _, robust_to = list_plants(problem, source, spec)
     law = given.to_effort(command_of(design, values, spec.regulated).per_effort)
-    controller = assess(design, values, law, spec, robust_to, draws=problem.draws(source))
+    controller = assess(law, design, values, spec, robust_to, draws=problem.draws(source))
     return complete_controller(problem, controller, source)
 
 

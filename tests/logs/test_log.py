@@ -93,6 +93,16 @@ def test_restamping_straightens_rounded_timestamps_and_touches_no_sample():
     np.testing.assert_array_equal(even["F1"], log["F1"])
 
 
+def test_the_rate_is_of_the_mean_step_where_the_median_one_is_off():
+    time = np.floor(4.25 * np.arange(4001)) / 1e3  # cut to milliseconds: three steps of four are of 4 ms
+    time[2000:] += 1.0
+    log = make(time, F1=sine(time))
+    assert np.median(np.diff(time)) == pytest.approx(4e-3)
+    assert log.rate_hz == pytest.approx(1000 / 4.25, rel=1e-3)
+    with pytest.raises(LogError, match=f"rise at {log.rate_hz:.6g} Hz on average"):
+        log.restamp(rate_hz=300.0)
+
+
 def test_restamping_refuses_real_jitter():
     t = np.arange(1000) / 400 + np.random.default_rng(0).uniform(-5e-4, 5e-4, 1000)
     with pytest.raises(LogError, match="more than their rounding"):

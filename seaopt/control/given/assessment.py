@@ -23,9 +23,9 @@ SAME_RATE = 1e-9  # share by which a law's sample rate may be off the specificat
 
 
 def assess(
+    law: Any,
     plant: Plant,
     params: Fit | ParameterSet,
-    law: Any,
     spec: ControllerSpec,
     robust_to: RobustTo | None = None,
     *,
@@ -35,12 +35,12 @@ def assess(
 
     Parameters
     ----------
-    plant, params
-        The design plant, and its parameters, as in `tune`.
     law : Law or a python-control system
         From reference and each measured signal to effort: `Law.from_state_space`, `Law.from_transfer_functions`,
         `seaopt.control.parallel_pid`, `ideal_pid`, or what `Law.from_control` takes. A law to the command itself (A) is
         divided by the command for one unit of effort: `law.scaled(1/command_of(plant, params, measured).per_effort)`.
+    plant, params
+        The design plant, and its parameters, as in `tune`.
     spec : ControllerSpec
         Limits, and the bandwidth that the law should have at least; its structure, notch, prefilter,
         link_feedforward and reference_weights are those of no law, and its sample rate must be the law's.
@@ -63,11 +63,13 @@ def assess(
     >>> from seaopt.control import ideal_pid
     >>> law = ideal_pid(K=2.0, T_i=0.05, T_d=0.01, N=10.0, sample_time_s=1e-3)
     >>> spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=2.0, max_droop_db=False)
-    >>> controller = assess(so.plants.high_impedance(), so.plants.thor(), law, spec)
+    >>> controller = assess(law, so.plants.high_impedance(), so.plants.thor(), spec)
     >>> controller.structure, controller.achieved.stable
     ('custom', True)
 
     """
+    if isinstance(law, Plant):
+        raise ControlError("law = a Plant; the law comes first, as in certify: assess(law, plant, params, spec)")
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     require_plant(plant, "plant", ControlError)
     given = law if isinstance(law, Law) else Law.from_control(law)

@@ -131,7 +131,7 @@ class Log:
 
     @property
     def rate_hz(self) -> float:
-        """Sample rate in Hz: one over the median step of time, to nine digits."""
+        """Sample rate in Hz, to nine digits: one over the mean step of time, without the steps across gaps."""
         return sample_rate_hz(self.period)
 
     @property

@@ -94,7 +94,7 @@ def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tupl
 
     """
     if rate_hz is not None:
-        return _restamp_at(log, rate_hz)
+        return _restamp_at(log, period, rate_hz)
     resolution = timestamp_resolution(log.time)
     uniform = log.time.copy()
     for stretch in split_at_gaps(log.time, GAP * period):
@@ -114,7 +114,7 @@ def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tupl
     return uniform, f"timestamps{rounded} put on a uniform clock of {sample_rate_hz(period):.6g} Hz"
 
 
-def _restamp_at(log: Recording, rate_hz: float) -> tuple[Float[np.ndarray, " n"], str]:
+def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Float[np.ndarray, " n"], str]:
     """Return a clock of a stated rate, with gaps of whole samples where the timestamps move on for good.
 
     A sample that was stamped late is followed by a step that is too short: the timestamps come back to their line. At a
@@ -136,7 +136,7 @@ def _restamp_at(log: Recording, rate_hz: float) -> tuple[Float[np.ndarray, " n"]
     if abs(drift) > MOST_DRIFT or left > 0.5 * period:  # a half, and samples would be counted wrongly
         raise LogError(
             f"{log.source}: rate_hz = {rate_hz:g} is not the rate of the timestamps, which drift from it by "
-            f"{np.ptp(line) * abs(drift) + left:.3g} s and rise at {sample_rate_hz(_median_period(log)):.6g} Hz on "
+            f"{np.ptp(line) * abs(drift) + left:.3g} s and rise at {sample_rate_hz(mean_period):.6g} Hz on "
             "average; correct it, or call log.resample(rate_hz=...), in a problem file "
             "resample = { rate_hz = ... }"
         )
@@ -171,9 +171,3 @@ def _measure_drift(line: Float[np.ndarray, " n"], off: Float[np.ndarray, " n"]) 
     if drift**2 * power * max(count - 2, 0) <= RESOLVED**2 * float(left @ left):
         drift, left = 0.0, y
     return drift, float(np.ptp(left))
-
-
-def _median_period(log: Recording) -> float:
-    """Return the mean step between samples, but for gaps."""
-    step = np.diff(log.time)
-    return float(np.mean(step[step <= GAP * np.median(step)]))

@@ -52,7 +52,7 @@ def linear_controller(mpc: ForceMPC) -> Controller:
     """
     law = mpc.law  # its integrator apart: rounding leaves that pole on either side of the unit circle
     split = Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
-    return assess(*mpc.design, split, linear_spec(mpc.spec))
+    return assess(split, *mpc.design, linear_spec(mpc.spec))
 
 
 def linear_spec(spec: MPCSpec) -> ControllerSpec:

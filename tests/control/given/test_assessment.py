@@ -110,7 +110,7 @@ def test_python_control_laws_are_taken_as_they_are():
 
 def test_its_figures_are_those_of_python_control(stand, swing, thor):
     law = ideal_pid(K=2.0, T_i=0.05, T_d=0.01, N=10.0, feedforward=1.0, sample_time_s=TS)
-    controller = assess(stand, thor, law, SPEC, {"swing": swing})
+    controller = assess(law, stand, thor, SPEC, {"swing": swing})
     per_effort = command_of(stand, thor, "F1").per_effort
     feedback = control.tf([1.0], [1.0, 0.0], TS) * -law.to_control()[0, 1]  # one sample of delay
     f = np.linspace(0.05, 250.0, 4000)
@@ -132,11 +132,11 @@ def test_more_bandwidth_than_asked_is_enough(stand, thor):
     tuned = so.tune(stand, thor, SPEC)
     for asked, met in ((15.5, True), (20.0, True), (20.3, False)):
         spec = so.ControllerSpec(bandwidth_hz=asked, max_sensitivity=1.8, max_noise_gain=40.0)
-        assert assess(stand, thor, tuned.law, spec).feasible == met
+        assert assess(tuned.law, stand, thor, spec).feasible == met
     with pytest.raises(ControlError, match=r"use seaopt\.assess"):
         so.tune(stand, thor, so.ControllerSpec(structure="custom"))
     with pytest.raises(ControlError, match="sample_rate_hz = 1000"):
-        assess(stand, thor, tuned.law, so.ControllerSpec(bandwidth_hz=20, sample_rate_hz=2000.0))
+        assess(tuned.law, stand, thor, so.ControllerSpec(bandwidth_hz=20, sample_rate_hz=2000.0))
 
 
 def test_a_law_beyond_the_structures_is_certified_and_exported(stand, swing, thor, compiler, tmp_path, monkeypatch):
@@ -147,7 +147,7 @@ def test_a_law_beyond_the_structures_is_certified_and_exported(stand, swing, tho
     law = Law.from_control(control.ss(shape) * pid)
     lifted = dict.fromkeys(("max_sensitivity", "max_complementary", "max_reference_peak", "max_droop_db"), False)
     spec = so.ControllerSpec(bandwidth_hz=5, bandwidth_range_hz=(1, 60), min_sensitivity_bandwidth_hz=False, **lifted)
-    controller = assess(stand, thor, law, spec, {"swing": swing})
+    controller = assess(law, stand, thor, spec, {"swing": swing})
     stored = so.Controller.from_dict(json.loads(json.dumps(_plain(controller.to_dict()))), stand, thor)
     np.testing.assert_allclose(stored.law.a, controller.law.a)
     assert stored.feasible == controller.feasible
@@ -165,8 +165,14 @@ def _plain(content):
     return json.loads(to_json(content))
 
 
+def test_the_law_comes_first_as_in_certify(stand, thor):
+    law = ideal_pid(K=2.0, T_i=0.05, T_d=0.01, N=10.0, sample_time_s=1e-3)
+    named = assess(spec=SPEC, params=thor, plant=stand, law=law)
+    assert named.achieved == assess(law, stand, thor, SPEC).achieved
+
+
 def test_a_stored_custom_law_has_no_gains(stand, thor):
-    content = _plain(assess(stand, thor, law_of([1.0], [1.0, -0.5]), SPEC).to_dict())
+    content = _plain(assess(law_of([1.0], [1.0, -0.5]), stand, thor, SPEC).to_dict())
     with pytest.raises(FileError, match="gains"):
         so.Controller.from_dict(content | {"gains": {"k_p": 1.0}}, stand, thor)
 

@@ -279,7 +279,7 @@ def test_a_law_without_an_integral_is_said_to_have_none(stand, thor, tmp_path):
         law = Law.from_state_space(
             np.array([[1.0 - leak]]), np.array([[0.02, -0.02]]), np.array([1.0]), np.array([1.0, -1.0]), TS
         )
-        controller = assess(stand, thor, law, spec)
+        controller = assess(law, stand, thor, spec)
         assert words in repr(controller)
         certificate = so.certify(controller, {"stand": stand}, thor, samples=10, simulations=False)
         assert any(f"with {words}" in note for note in certificate.notes)

@@ -34,7 +34,7 @@ def test_what_is_left_is_that_of_the_simulated_step(stand, tuned):
 def test_a_law_whose_integral_takes_seconds_says_so(stand, tuned):
     """The tuner leaves an integral no more than it brings in time: this one is of a law of one's own."""
     law = parallel_pid(k_p=3.0, k_i=1.0, k_d=0.06, T_f=2.5e-3, b=1.0, feedforward=0.6, sample_time_s=1e-3)
-    slow = assess(*stand, law, tuned.spec)
+    slow = assess(law, *stand, tuned.spec)
     left = abs(slow.close(*stand).measure_step_left(20.0 / slow.achieved.bandwidth_hz))
     assert left > 0.05
     assert any(f"of the reference is still {100 * left:.2g} % off" in note for note in slow.notes)

@@ -54,12 +54,12 @@ def share(law, part, stiffness):
 
 @pytest.fixture(scope="module")
 def one():
-    return assess(STAND, VALUES, PID, so.ControllerSpec(**{**SPEC.to_dict(), "measured": "tau_s"}), {"swing": SWING})
+    return assess(PID, STAND, VALUES, so.ControllerSpec(**{**SPEC.to_dict(), "measured": "tau_s"}), {"swing": SWING})
 
 
 @pytest.fixture(scope="module")
 def two():
-    return assess(STAND, VALUES, share(PID, 0.4, 300.0), SPEC, {"swing": SWING})
+    return assess(share(PID, 0.4, 300.0), STAND, VALUES, SPEC, {"swing": SWING})
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def speed():
     """The PID with the motor's speed fed back, computed from its encoder."""
     b = np.hstack([PID.b, np.zeros((PID.c.size, 1))])
     law = Law(a=PID.a, b=b, c=PID.c, d=np.append(PID.d, -K_V), sample_time_s=TS)
-    return assess(STAND, VALUES, law, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "thetad_m")}))
+    return assess(law, STAND, VALUES, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "thetad_m")}))
 
 
 def judge(link):
@@ -243,7 +243,7 @@ def test_a_cascade_is_its_difference_equation(T_v):
 @pytest.mark.slow
 def test_a_cascade_is_measured_like_any_law():
     law = cascade_pid(k_v=0.3, k_p=2.0, k_i=30.0, T_v=0.1, feedforward=1.0, sample_time_s=TS)
-    measured = assess(STAND, VALUES, law, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "thetad_m")}))
+    measured = assess(law, STAND, VALUES, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "thetad_m")}))
     assert measured.achieved.stable
     assert measured.signals == ("tau_s", "theta_m")
     certificate = so.certify(measured, {"swing": SWING}, VALUES, ranges={"J_l": (0.2, 0.3)}, samples=50)
@@ -266,16 +266,16 @@ def test_the_noise_of_every_signal_reaches_the_force(two):
 
 def test_a_limit_that_is_missed_is_explained():
     law = cascade_pid(k_v=0.1, k_p=0.5, k_i=1.0, feedforward=1.0, sample_time_s=TS)
-    weak = assess(STAND, VALUES, law, so.ControllerSpec(measured=("tau_s", "thetad_m"), bandwidth_hz=15))
+    weak = assess(law, STAND, VALUES, so.ControllerSpec(measured=("tau_s", "thetad_m"), bandwidth_hz=15))
     assert not weak.feasible
     assert any("|S| reaches" in line for line in weak.blocked_by)
 
 
 def test_what_does_not_fit_is_refused(speed):
     with pytest.raises(ControlError, match="names 1"):
-        assess(STAND, VALUES, speed.law, so.ControllerSpec(**{**SPEC.to_dict(), "measured": "tau_s"}))
+        assess(speed.law, STAND, VALUES, so.ControllerSpec(**{**SPEC.to_dict(), "measured": "tau_s"}))
     with pytest.raises(ControlError, match="omega"):
-        assess(STAND, VALUES, speed.law, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "omega")}))
+        assess(speed.law, STAND, VALUES, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "omega")}))
     for wrong in ((), ("tau_s", "tau_s"), ("tau_s", "")):
         with pytest.raises(ControlError, match="measured"):
             so.ControllerSpec(measured=wrong)

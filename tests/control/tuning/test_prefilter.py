@@ -80,7 +80,7 @@ def test_its_poles_are_among_those_of_every_stated_radius(stand, thor, prefilter
     assert radius == pytest.approx(np.max(np.abs(np.roots(den))), rel=1e-9) and num.size  # it is the slowest of all
     spec = so.ControllerSpec(bandwidth_hz=5, bandwidth_range_hz=(0.5, 60), compute_delay_samples=1)
     law = Gains(**g, prefilter=prefilter).law("pid", TS).balanced()
-    controller = so.assess(stand, thor, law, spec)
+    controller = so.assess(law, stand, thor, spec)
     certificate = so.certify(
         controller, {"stand": stand}, thor, ranges={"k": (6.4e5, 6.6e5)}, samples=10, simulations=False
     )
