@@ -376,11 +376,22 @@ def _with_design(
     """Return the plants with the design plant among them, and its own values of what nobody else gives."""
     assert controller.design is not None
     design, values = controller.design
+    models = add_design(design, plants)
+    if len(models) > len(plants):
+        missing = (values[name] for name in values if name in design.parameters and name not in others)
+        others = others.with_parameters(*missing)
+    return models, others
+
+
+def add_design(design: Plant, plants: Mapping[str, Plant]) -> dict[str, Plant]:
+    """Return the plants with the design plant first, by a name that is free, where it is not among them."""
     if any(plant is design for plant in plants.values()):
-        return dict(plants), others
-    missing = (values[name] for name in values if name in design.parameters and name not in others)
-    name = next(name for name in DESIGN_NAMES if name not in plants)
-    return {name: design, **plants}, others.with_parameters(*missing)
+        return dict(plants)
+    name = next((name for name in DESIGN_NAMES if name not in plants), None)
+    if name is None:
+        taken = '" and "'.join(DESIGN_NAMES)
+        raise ControlError(f'plants other than the design plant are called "{taken}"; give one of them another name')
+    return {name: design, **plants}
 
 
 def _check_delay(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> None:

@@ -17,8 +17,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.control import Controller
-from seaopt.control.laws.limits import LIMIT_ROUNDING
-from seaopt.control.loops.loop import STABLE
 from seaopt.executors import Shared, map_ordered
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide
@@ -26,7 +24,7 @@ from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures, join_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty
-from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
+from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, find_failures, severities
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, find_worst, measure_worst, place_values
 
 DRAWS_PER_BLOCK = 50_000
@@ -84,10 +82,9 @@ class Failures:
     over_ms: int = 0
     over_mt: int = 0
 
-    def add(
-        self, unstable: Bool[np.ndarray, " n"], over_ms: Bool[np.ndarray, " n"], over_mt: Bool[np.ndarray, " n"]
-    ) -> None:
-        """Count draws of a block."""
+    def add(self, failed: Bool[np.ndarray, "3 n"]) -> None:
+        """Count draws of a block, each failed on some plant as `find_failures` tells."""
+        unstable, over_ms, over_mt = failed
         self.unstable += int(np.count_nonzero(unstable))
         self.over_ms += int(np.count_nonzero(over_ms & ~unstable))
         self.over_mt += int(np.count_nonzero(over_mt & ~over_ms & ~unstable))
@@ -105,24 +102,21 @@ def measure_draws(
     controller, plants, unknown = loops.value.controller, loops.value.plants, loops.value.unknown
     none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
     tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
-    ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
     failures = Failures()
     sizes = [min(DRAWS_PER_BLOCK, samples - start) for start in range(0, samples, DRAWS_PER_BLOCK)]
     hooks = iter(divide(progress, *(float(size) for size in sizes)))
     first: dict[str, Float[np.ndarray, " m"]] = {}
     for size in sizes:
         points = unknown.draw(size, rng)
-        unstable, over_ms, over_mt = (np.zeros(size, dtype=bool) for _ in range(3))
+        failed = np.zeros((3, size), dtype=bool)
         for name, batch in _measure_block(loops, unknown.values(points), size, executor, next(hooks)):
-            unstable |= batch.spectral_radius >= STABLE
-            over_ms |= batch.ms > ms
-            over_mt |= batch.mt > mt
+            failed |= find_failures(controller, batch)
             first.setdefault(name, batch.ms[:DRAWS_KEPT])
             tallies[name] = [
                 tally.add(points, severities(controller, batch, by))
                 for tally, by in zip(tallies[name], (LARGEST_MS, LARGEST_MT), strict=True)
             ]
-        failures.add(unstable, over_ms, over_mt)
+        failures.add(failed)
     drawn = {name: np.unique(np.vstack([tally.points for tally in own]), axis=0) for name, own in tallies.items()}
     return failures, drawn, first
 

@@ -28,9 +28,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
-from seaopt.control import LoopFigures, ScheduledController
+from seaopt.control import Controller, LoopFigures, ScheduledController
 from seaopt.control.laws.delay import split_delayed
-from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError, require_number, require_seed, require_type
@@ -43,20 +42,26 @@ from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
-from seaopt.robustness.certificate.certificate import DESIGN_PLANT, Certificate, Requirement
-from seaopt.robustness.certificate.certify import CONFIDENCE, certify, failure_bound, find_own_drive
-from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
+from seaopt.robustness.certificate.certificate import DESIGN_PLANT, MIN_FRICTION_MARGIN, Certificate, Requirement
+from seaopt.robustness.certificate.certify import CONFIDENCE, add_design, certify, failure_bound, find_own_drive
+from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
+from seaopt.robustness.certificate.measured_draws import Failures, Loops
+from seaopt.robustness.certificate.requirements import (
+    design_requirements,
+    draw_requirements,
+    friction_requirements,
+    plant_requirements,
+)
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty, find_modes
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
-from seaopt.robustness.uncertainty.severity import limits
+from seaopt.robustness.uncertainty.severity import find_failures
 from seaopt.robustness.uncertainty.worst import Worst, find_worst
 from seaopt.robustness.verification.schedule_motion import Motion, describe_motion, move_plants
 from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps, find_fastest, sweep_schedule
 from seaopt.units import unit_after
 
 SCHEDULE_ROBUSTNESS_SCHEMA = "seaopt/schedule_robustness/1"
-DESIGN = "design"  # the design plant's name where the caller does not list it
 MOTION_RATE = "min_motion_rate"
 POINT, BOUND, SWEEP = 4.0, 0.2, 5.0  # seconds that a part takes as a rule: of a point, a stretch, the sweeps of a plant
 
@@ -331,7 +336,7 @@ def certify_schedule(
         raise ControlError(f"min_rate = {min_rate:g} is not positive; give a rate in {schedule.unit}/s")
     ranges, others = dict(ranges or {}), others or ParameterSet()
     _check_variable(schedule, parameters, ranges)
-    models = _with_design(schedule, plants)
+    models = add_design(schedule.design[0], plants)
     models = split_delayed(schedule.spec, schedule.design[0], models, parameters)
     values = sorted({*schedule.points, *list_inner(schedule.points, PARTS)})
     standing, proving, sweeping = divide(
@@ -344,13 +349,12 @@ def certify_schedule(
     unknowns = [combine_uncertainty(source, rest, ranges, models, drive) for source, rest in sources]
     drawn = [unknown.draw(count if unknown.size else 0, rng) for unknown in unknowns]
     shared, nominal = Shared((schedule, models)), unknowns[-1].nominal
-    standing_at = map_ordered(partial(_certify_place, shared), zip(values, unknowns, drawn, strict=True), executor)
-    held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
+    parts = zip(values, unknowns, drawn, rng.spawn(len(values)), strict=True)
+    standing_at = map_ordered(partial(_certify_place, shared), parts, executor)
     places: list[PlaceCertificate] = []
     for number, value in enumerate(count_off(values, f"value of {schedule.over}", standing)):
         place, (source, rest) = next(standing_at).on(_split(models, unknowns[number])), sources[number]
-        if place.point and schedule.design[0] in held.values():
-            # Where a plant moves the variable, a law that is frozen there is not what runs.
+        if held := _list_held(schedule, models, value):
             simulated = certify(
                 schedule.at(value), held, source, ranges=_choose_ranges(ranges, held), others=rest, samples=count,
                 seed=seed, simulations=simulations, sensors=sensors if simulations else None,
@@ -400,11 +404,6 @@ def _check_variable(
         )
 
 
-def _with_design(schedule: ScheduledController, plants: Mapping[str, Plant]) -> dict[str, Plant]:
-    design, _ = schedule.design
-    return dict(plants) if design in plants.values() else {DESIGN: design, **plants}
-
-
 def _place_source(
     schedule: ScheduledController, parameters: Fit | ParameterSet, others: ParameterSet, value: float
 ) -> tuple[Fit | ParameterSet, ParameterSet]:
@@ -426,23 +425,15 @@ def _split(models: Mapping[str, Plant], unknown: Uncertainty) -> dict[str, Plant
 
 
 def _certify_place(
-    shared: Shared[_Scheduled], part: tuple[float, Uncertainty, Float[np.ndarray, "n k"]]
+    shared: Shared[_Scheduled], part: tuple[float, Uncertainty, Float[np.ndarray, "n k"], np.random.Generator]
 ) -> PlaceCertificate:
     """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case."""
-    (schedule, models), (value, unknown, points) = shared.value, part
+    (schedule, models), (value, unknown, points, rng) = shared.value, part
     controller, point, plants = schedule.at(value), value in schedule.points, _split(models, unknown)
     figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
-    count, drawn = len(points), unknown.values(points)
-    unstable, over_ms, over_mt = (np.zeros(count, dtype=bool) for _ in range(3))
-    ms, mt = limits(controller)
-    for plant in plants.values() if count else ():
-        batch = batch_figures(controller, plant, unknown.nominal, drawn)
-        unstable |= batch.spectral_radius >= STABLE
-        over_ms |= batch.ms > ms
-        over_mt |= batch.mt > mt
-    over_ms &= ~unstable
-    over_mt &= ~(unstable | over_ms)
+    failures = _count_failures(controller, plants, unknown, points)
     rows = [row for name in plants for row in plant_requirements(controller, name, figures[name])]
+    rows += _require_friction(schedule, models, value, unknown, len(points), rng)
     if point:
         design, _ = schedule.design
         rows += design_requirements(
@@ -451,9 +442,47 @@ def _certify_place(
     return PlaceCertificate(
         value=value, point=point, plants=figures,
         worst={name: find_worst(controller, plant, unknown, points) for name, plant in plants.items()} if point else {},
-        draws=count, unstable=int(np.sum(unstable)), over_ms=int(np.sum(over_ms)), over_mt=int(np.sum(over_mt)),
+        draws=len(points), unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
         requirements=_name_place(schedule, value, rows),
     )  # fmt: skip
+
+
+def _list_held(schedule: ScheduledController, models: Mapping[str, Plant], value: float) -> dict[str, Plant]:
+    """Return the plants that `certify` takes: at a point those that hold the variable, if the design plant does.
+
+    Where a plant moves the variable, a law that is frozen there is not what runs.
+    """
+    held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
+    design, _ = schedule.design
+    return held if value in schedule.points and any(plant is design for plant in held.values()) else {}
+
+
+def _require_friction(
+    schedule: ScheduledController, models: Mapping[str, Plant], value: float, unknown: Uncertainty, samples: int,
+    rng: np.random.Generator,
+) -> list[Requirement]:  # fmt: skip
+    """Return the friction margins asked at a value, of the plants that `certify` does not take there."""
+    controller, held = schedule.at(value), _list_held(schedule, models, value)
+    least = controller.spec.level(MIN_FRICTION_MARGIN)
+    apart = {name: plant for name, plant in models.items() if name not in held}
+    if least is None or not apart:
+        return []
+    margins = find_nominal_margins(controller, apart, unknown.nominal)
+    loops = Loops(controller=controller, models=apart, plants=apart, unknown=unknown, bounds=None)
+    draws = find_margins_at_draws(Shared(loops), margins, samples, rng, least)
+    return friction_requirements(margins, draws, least)
+
+
+def _count_failures(
+    controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, points: Float[np.ndarray, "n k"]
+) -> Failures:
+    """Count the draws that fail on some plant, as `certify` does."""
+    failed, drawn = np.zeros((3, len(points)), dtype=bool), unknown.values(points)
+    for plant in plants.values() if len(points) else ():
+        failed |= find_failures(controller, batch_figures(controller, plant, unknown.nominal, drawn))
+    failures = Failures()
+    failures.add(failed)
+    return failures
 
 
 def _name_place(schedule: ScheduledController, value: float, rows: Sequence[Requirement]) -> tuple[Requirement, ...]:

@@ -17,9 +17,10 @@ from __future__ import annotations
 from dataclasses import fields
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control import Controller
+from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAYS, differentiate_linearisation, find_delay, hold
 from seaopt.plants import Plant
@@ -70,6 +71,12 @@ def limits(controller: Controller) -> tuple[float, float]:
     """Return the limits on Ms and Mt; infinite where none is imposed."""
     ms, mt = controller.spec.level("max_sensitivity"), controller.spec.level("max_complementary")
     return np.inf if ms is None else ms, np.inf if mt is None else mt
+
+
+def find_failures(controller: Controller, figures: BatchFigures) -> Bool[np.ndarray, "3 n"]:
+    """Return which draws are unstable, which are over Ms, and which over Mt; one that lies on its limit keeps it."""
+    ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
+    return np.stack([figures.spectral_radius >= STABLE, figures.ms > ms, figures.mt > mt])
 
 
 def levels(controller: Controller) -> Levels:

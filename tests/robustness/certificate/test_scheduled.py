@@ -2,16 +2,29 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import seaopt as so
 from seaopt.control import tune_schedule
+from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.errors import ControlError
+from seaopt.executors import Shared
 from seaopt.files import to_json
+from seaopt.parameters import ParameterSet
 from seaopt.robustness import certify_schedule
-from seaopt.robustness.certificate.scheduled import _require_motion, _require_rate
+from seaopt.robustness.certificate.certify import add_design, find_own_drive
+from seaopt.robustness.certificate.measured_draws import Loops, measure_draws
+from seaopt.robustness.certificate.scheduled import (
+    _certify_place,
+    _require_friction,
+    _require_motion,
+    _require_rate,
+)
+from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.uncertainty.draws import combine_uncertainty
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
 from tests.schedules import POINTS, read_knee, tune_knee
@@ -71,6 +84,71 @@ def test_a_limit_that_is_broken_between_the_points_fails_it():
     found = certify_schedule(coarse, {"stand": stand}, values, simulations=False)
     missed = {row.name for row in found.requirements if not row.met}
     assert not found.passed and {"limits_between_points", "max_sensitivity"} <= missed
+
+
+def ask(schedule, **limits):
+    """Return a schedule of which other limits are asked."""
+    return replace(
+        schedule, controllers=tuple(replace(one, spec=replace(one.spec, **limits)) for one in schedule.controllers)
+    )
+
+
+def know(schedule, plants, values, ranges):
+    """Return what is uncertain of the plants, with the variable where the values have it."""
+    drive = find_own_drive(schedule.controllers[0], values)
+    return combine_uncertainty(values, ParameterSet(), ranges, plants, drive)
+
+
+def test_a_draw_that_lies_on_its_limit_keeps_it_as_in_the_certificate_of_one_law():
+    _, swing, values = read_knee()
+    schedule, value, models = tune_knee(), 0.2, {"swing": swing}
+    unknown = know(schedule, models, values.update(phi=value), {"I_p": (0.33, 0.39)})
+    points = unknown.draw(4, np.random.default_rng(1))
+    largest = np.max(batch_figures(schedule.at(value), swing, unknown.nominal, unknown.values(points)).ms)
+    for beyond, fails in ((5e-7, False), (5e-6, True)):
+        asked = ask(schedule, max_sensitivity=float(largest / (1.0 + beyond)))
+        loops = Loops(controller=asked.at(value), models=models, plants=models, unknown=unknown, bounds=None)
+        alone, _, _ = measure_draws(Shared(loops), 4, np.random.default_rng(1), None, lambda *_: None)
+        place = _certify_place(Shared((asked, models)), (value, unknown, points, np.random.default_rng(2)))
+        assert (place.over_ms > 0, alone.over_ms > 0) == (fails, fails)
+        assert place.over_ms == alone.over_ms
+
+
+def test_the_design_plant_is_certified_too_where_another_plant_has_its_name():
+    stand, swing, values = read_knee()
+    assert add_design(stand, {"design": swing}) == {"design plant": stand, "design": swing}
+    assert list(add_design(stand, {"swing": swing, "stand": stand})) == ["swing", "stand"]
+    with pytest.raises(ControlError, match='are called "design" and "design plant"'):
+        certify_schedule(tune_knee(), {"design": swing, "design plant": swing}, values)
+
+
+def read_rubbing_knee(folder):
+    """Return the swinging shank with Coulomb friction at the screw, and its parameters."""
+    before, swing = Path("problems/lever_knee.toml").read_text(encoding="utf-8").split("[plant.swing.parameters]")
+    swing = swing.replace("- b*v - F)/M", "- b*v - F - rub)/M").replace(
+        "[plant.swing.f]",
+        'f_c = { unit = "N", value = 40 }\nv_s = { unit = "m/s", value = 1e-3 }\n[plant.swing.friction.rub]\n'
+        'velocity = "v"\nforce = "f_c*tanh(v/v_s)"\njump = "f_c"\n'
+        'slopes = ["0", "f_c/v_s"]\nunit = "N"\n\n[plant.swing.f]',
+    )  # fmt: skip
+    path = folder / "rubbing.toml"
+    path.write_text(f"{before}[plant.swing.parameters]{swing}", encoding="utf-8")
+    problem = so.read_problem(path)
+    return problem.plants["swing"], problem.parameters
+
+
+def test_the_friction_margin_is_asked_of_a_plant_that_moves_the_variable_and_of_its_draws(tmp_path):
+    schedule, value = ask(tune_knee(), min_friction_margin=1e9), 0.2
+    stand, _, _ = read_knee()
+    swing, values = read_rubbing_knee(tmp_path)
+    models = {"stand": stand, "swing": swing}
+    unknown = know(schedule, models, values.update(phi=value), {"I_p": (0.33, 0.39), "f_c": (5.0, 10.0)})
+    rows = _require_friction(schedule, models, value, unknown, 4, np.random.default_rng(2))
+    controller, nominal = schedule.at(value), unknown.nominal
+    margin = find_friction_margin(controller, swing, nominal)
+    assert len(rows) == 1 and rows[0].where.startswith("swing")
+    assert rows[0].value <= margin.least_slope and rows[0].limit == 1e9
+    assert _require_friction(tune_knee(), models, value, unknown, 4, np.random.default_rng(2)) == []
 
 
 def test_a_rate_is_required_where_it_is_asked_and_the_slowest_sweep_always(certificate):
