@@ -75,6 +75,10 @@ class FileError(SeaoptError):
     """A file cannot be read or written."""
 
 
+class UnknownAttributeError(SeaoptError, AttributeError):
+    """A result has no such attribute; an AttributeError too, which `hasattr`, `copy` and notebooks expect."""
+
+
 class InternalError(Exception):
     """A defect of seaopt, not of the input: no SeaoptError, so that nothing takes it for one.
 

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, TypeVar, dataclass_transform, overload
+from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform, overload
+
+from seaopt.errors import UnknownAttributeError, suggestion
 
 T = TypeVar("T")
+# What people who know lmfit, SciPy and python-control try first, and what has it here.
+GUESSES = {
+    "params": "parameters", "stderr": 'parameters["NAME"].std', "success": "met", "ok": "met",
+    "residuals": "minimum.residuals()", "save": "to_dict()", "to_json": "to_dict()",
+    "kp": 'gains["k_p"]', "ki": 'gains["k_i"]', "kd": 'gains["k_d"]',
+    "k_p": 'gains["k_p"]', "k_i": 'gains["k_i"]', "k_d": 'gains["k_d"]',
+    "bandwidth": "achieved.bandwidth_hz", "cov": "covariance", "covar": "covariance", "nit": "iterations",
+}  # fmt: skip
 
 
 @overload
@@ -38,6 +49,25 @@ def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = Tru
     """
     decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=eq, repr=repr)
     return decorate if cls is None else decorate(cls)
+
+
+class Result:
+    """What all results with a verdict have in common: `met`; a wrong name is answered with the right one."""
+
+    __slots__ = ()
+
+    if not TYPE_CHECKING:  # or every name would be known to a type checker
+
+        def __getattr__(self, name: str) -> Any:
+            if hasattr(type(self), name):  # a property that failed by itself, whose own error tells more
+                return object.__getattribute__(self, name)
+            own = type(self).__name__
+            if name.startswith("_"):
+                raise UnknownAttributeError(f"{own} has no attribute {name}")
+            known = [each for each in dir(type(self)) if not each.startswith("_")]
+            guess = GUESSES.get(name, "")
+            remedy = f"use .{guess}" if guess and re.split(r"\W", guess)[0] in known else suggestion(name, known)
+            raise UnknownAttributeError(f"{own} has no attribute {name}; {remedy}")
 
 
 class PlotAccessor:

@@ -15,7 +15,7 @@ from seaopt.estimation.result.findings import GUESS
 from seaopt.fleet.worker import FAILED, GAP, MET, NOT_MET
 from seaopt.formatting import format_count, format_number, format_table, html_text
 from seaopt.problem.problem import name_after
-from seaopt.records import record
+from seaopt.records import Result, record
 
 FLEET_SCHEMA = "seaopt/fleet/1"
 SHORT = "short"  # kind of finding of a log that is much shorter than its siblings
@@ -46,7 +46,7 @@ class Spread:
 
 
 @record(eq=False, repr=False)
-class Fleet:
+class Fleet(Result):
     """What `fit_fleet` returns; ``print(fleet)`` is a summary.
 
     Parameters

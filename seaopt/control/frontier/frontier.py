@@ -35,7 +35,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.progress import Progress, divide, ignore, prefix
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Result, record
 from seaopt.units import LINEAR, Mechanics
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
@@ -53,7 +53,7 @@ class SlidingAlone:
 
 
 @record
-class FrontierRow:
+class FrontierRow(Result):
     """One bandwidth; what is not said to be of the worst plant is of the design plant.
 
     Parameters
@@ -97,6 +97,11 @@ class FrontierRow:
     blocked_by: tuple[str, ...]
     without_sticking: SlidingAlone | None = None
     free_law: FreeLaw | None = None
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met."""
+        return self.feasible
 
     def describe_structure_cost(self) -> str:
         """Return a free law's value of the objective and by how much this is above, or that none keeps the limits."""

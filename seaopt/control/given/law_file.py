@@ -136,6 +136,7 @@ class LawFile(_Strict):
     gains: Any = None
     spec: Any = None
     achieved: Any = None
+    met: Any = None
     feasible: Any = None
     active_constraints: Any = None
     engineering: Any = None

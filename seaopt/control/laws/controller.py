@@ -56,7 +56,7 @@ from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Result, record
 from seaopt.units import divide_units
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
 @record(eq=False)
-class Controller(LoopDelays):
+class Controller(LoopDelays, Result):
     """A law from reference and measured force to an effort, commanded as the input of the plant that makes that effort.
 
     Parameters
@@ -153,6 +153,11 @@ class Controller(LoopDelays):
     reads: tuple[str, ...] = ()
     compensation: Compensation | None = None
     gate: PlausibilityGate | None = None
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met, as measured."""
+        return self.feasible
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -406,6 +411,7 @@ class Controller(LoopDelays):
             "achieved": _list_achieved(self.achieved)
             | {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope}
             | self._prefilter_figures(),
+            "met": self.met,
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},

@@ -74,7 +74,7 @@ from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import find_range, name_input, require_plant
-from seaopt.records import record
+from seaopt.records import Result, record
 from seaopt.units import mechanics_of, name_command, show_command, unit_after
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
@@ -83,7 +83,7 @@ SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then
 
 
 @record(eq=False)
-class ForceMPC(LoopDelays):
+class ForceMPC(LoopDelays, Result):
     """A force controller within limits; `force_mpc` makes one.
 
     Parameters
@@ -123,6 +123,11 @@ class ForceMPC(LoopDelays):
     gate: PlausibilityGate | None = None
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met, as measured."""
+        return self.feasible
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _design, (*self.design, self.spec, self.gate, self.warnings)  # what it remembers does not pickle

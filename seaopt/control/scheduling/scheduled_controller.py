@@ -23,7 +23,7 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import format_count, format_number, html_text, join_words
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.records import record
+from seaopt.records import Result, record
 from seaopt.units import unit_after
 
 SCHEDULE_SCHEMA = "seaopt/schedule/2"
@@ -62,7 +62,7 @@ class PlaceFigures:
 
 
 @record(eq=False, repr=False)
-class ScheduledController:
+class ScheduledController(Result):
     """A controller per point of one scheduling variable, with its gains interpolated between them.
 
     Parameters
@@ -89,6 +89,11 @@ class ScheduledController:
     others: Plants
     fallback: float
     between: tuple[PlaceFigures, ...] = ()
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met at the points, and where it was looked between them."""
+        return self.feasible
 
     @property
     def table(self) -> GainTable:
@@ -262,6 +267,7 @@ class ScheduledController:
             "unit": self.unit,
             "points": list(self.points),
             "fallback": self.fallback,
+            "met": self.met,
             "feasible": self.feasible,
             "broken": list(self.broken),
             "notes": list(self.notes),

@@ -23,7 +23,7 @@ from seaopt.formatting import format_figure, format_number, html_list, html_para
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.parts import list_dead_times
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Result, record
 from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
 
@@ -45,7 +45,7 @@ class Minimum:
 
 
 @record(eq=False)
-class Fit:
+class Fit(Result):
     """What `fit` returns; ``print(fit)`` is a report.
 
     Parameters

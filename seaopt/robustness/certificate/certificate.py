@@ -36,7 +36,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes, remembers, split_friction
 from seaopt.progress import Progress, ignore
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Result, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
@@ -114,7 +114,7 @@ class Requirement:
 
 
 @record(eq=False)
-class Certificate:
+class Certificate(Result):
     """What `certify` returns.
 
     Parameters
@@ -194,6 +194,11 @@ class Certificate:
     drawn_ms: Mapping[str, Float[np.ndarray, " n"]] = field(
         default_factory=dict[str, Float[np.ndarray, " n"]], repr=False
     )
+
+    @property
+    def met(self) -> bool:
+        """Whether every requirement is met."""
+        return self.passed
 
     @property
     def linear_models(self) -> dict[str, Plant]:
@@ -426,6 +431,7 @@ class Certificate:
         """Return the content of robustness.json (schema seaopt/robustness/2), with its digest."""
         return seal({
             "schema": ROBUSTNESS_SCHEMA,
+            "met": self.met,
             "passed": self.passed,
             "requirements": [_list_fields(row) for row in self.requirements],
             "plants": {

@@ -27,7 +27,7 @@ from seaopt.formatting import format_count, format_table, format_values, html_te
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore, prefix
-from seaopt.records import record
+from seaopt.records import Result, record
 from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, Certificate
 from seaopt.robustness.certificate.certify import CONFIDENCE, certify
 from seaopt.robustness.uncertainty.severity import UNSTABLE
@@ -65,7 +65,7 @@ class Round:
 
 
 @record(eq=False)
-class JointTuning:
+class JointTuning(Result):
     """What `tune_certified` returns.
 
     Parameters
@@ -89,6 +89,11 @@ class JointTuning:
     certificate: Certificate | None
     rounds: tuple[Round, ...]
     robust_to: Pairs
+
+    @property
+    def met(self) -> bool:
+        """Whether it is certified."""
+        return self.status == "certified"
 
     @property
     def explanation(self) -> str:

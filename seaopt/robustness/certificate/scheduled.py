@@ -40,7 +40,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off, divide, ignore
-from seaopt.records import record
+from seaopt.records import Result, record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
 from seaopt.robustness.certificate.certificate import DESIGN_PLANT, MIN_FRICTION_MARGIN, Certificate, Requirement
 from seaopt.robustness.certificate.certify import CONFIDENCE, add_design, certify, failure_bound, find_own_drive
@@ -116,7 +116,7 @@ class PlaceCertificate:
 
 
 @record(eq=False, repr=False)
-class ScheduleCertificate:
+class ScheduleCertificate(Result):
     """What `certify_schedule` returns.
 
     Parameters
@@ -145,6 +145,11 @@ class ScheduleCertificate:
     sweeps: Mapping[str, tuple[Sweep, ...]]
     motions: Mapping[str, Motion]
     requirements: tuple[Requirement, ...]
+
+    @property
+    def met(self) -> bool:
+        """Whether every requirement is met."""
+        return self.passed
 
     @property
     def passed(self) -> bool:
@@ -220,6 +225,7 @@ class ScheduleCertificate:
         """Return the content of schedule_robustness.json (schema seaopt/schedule_robustness/1)."""
         return {
             "schema": SCHEDULE_ROBUSTNESS_SCHEMA,
+            "met": self.met,
             "passed": self.passed,
             "over": self.schedule.over,
             "unit": self.schedule.unit,

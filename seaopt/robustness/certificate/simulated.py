@@ -20,7 +20,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
 from seaopt.progress import Progress, divide, ignore
-from seaopt.records import record
+from seaopt.records import Result, record
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
@@ -33,7 +33,7 @@ from seaopt.robustness.verification.verification import (
     verify,
 )
 
-Result = TypeVar("Result")
+Played = TypeVar("Played")
 SIMULATION_FAILURES = "simulation_failures"
 SWEEP, SCENARIOS, PORT = 1.5, 2.0, 0.7  # of the time of simulations: of each plant, and of the design plant's port
 STEP_OVERSHOOT, STEP_SETTLING = "step_overshoot", "step_settling_s"
@@ -56,7 +56,7 @@ class SimulationRequirement:
 
 
 @record(eq=False)
-class Simulated:
+class Simulated(Result):
     """Scenarios and large signals on every plant; passivity and coupled stability on the design plant.
 
     Parameters
@@ -81,6 +81,11 @@ class Simulated:
     sensors: Sensors
     current_step_A: float
     seed: int
+
+    @property
+    def met(self) -> bool:
+        """Whether every scenario passed."""
+        return self.passed
 
     @property
     def passed(self) -> bool:
@@ -209,7 +214,7 @@ def _attempt_job(jobs: Shared[tuple[Callable[[], Any], ...]], number: int) -> tu
     return _attempt(jobs.value[number])
 
 
-def _attempt(verb: Callable[[], Result]) -> tuple[Result | None, str]:
+def _attempt(verb: Callable[[], Played]) -> tuple[Played | None, str]:
     """Return what a verb returns, or None and why it cannot be had."""
     try:
         return verb(), ""

@@ -41,7 +41,7 @@ from seaopt.control.running.sampled_loop import largest_current
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import find_locked_modes
-from seaopt.records import record
+from seaopt.records import Result, record
 from seaopt.robustness.verification.linear import LinearView, linearise_last_phase
 from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Playback, Stage
@@ -85,7 +85,7 @@ class Fault:
 
 
 @record
-class Outcome:
+class Outcome(Result):
     """One scenario on one plant at one set of parameters.
 
     Parameters
@@ -141,6 +141,11 @@ class Outcome:
     overshoot_by_limit: bool = False
     contact_impulse: float | None = None
     contact_loss_J: float | None = None
+
+    @property
+    def met(self) -> bool:
+        """Whether the run passed."""
+        return self.passed
 
 
 @record

@@ -22,7 +22,7 @@ from seaopt.plants.impacts import check_held
 from seaopt.plants.plant import share_drive
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.progress import Progress, ignore
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Result, record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
@@ -33,7 +33,7 @@ TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it 
 
 
 @record(eq=False)
-class Verification:
+class Verification(Result):
     """The runs of all scenarios, their judgement, and the data to simulate them again.
 
     Parameters
@@ -71,6 +71,11 @@ class Verification:
     scenarios: Mapping[str, tuple[Scenario, ...]]
     draws: Mapping[str, tuple[ParameterSet, ...]]
     follows_hz: Mapping[str, tuple[float, float] | None]
+
+    @property
+    def met(self) -> bool:
+        """Whether every run passed, and there is one."""
+        return self.passed
 
     @property
     def mechanics(self) -> Mechanics:
