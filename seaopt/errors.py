@@ -79,6 +79,10 @@ class UnknownAttributeError(SeaoptError, AttributeError):
     """A result has no such attribute; an AttributeError too, which `hasattr`, `copy` and notebooks expect."""
 
 
+class KeywordError(SeaoptError, TypeError):
+    """A record of the user's is made with a keyword that it does not have."""
+
+
 class InternalError(Exception):
     """A defect of seaopt, not of the input: no SeaoptError, so that nothing takes it for one.
 

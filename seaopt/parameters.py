@@ -12,7 +12,7 @@ from seaopt.records import record
 from seaopt.units import factor, unit_after
 
 
-@record
+@record(keywords=True)
 class Parameter:
     """One named value in an SI unit.
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import wraps
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform, overload
 
-from seaopt.errors import UnknownAttributeError, suggestion
+from seaopt.errors import KeywordError, UnknownAttributeError, suggestion
 
 T = TypeVar("T")
 # What people who know lmfit, SciPy and python-control try first, and what has it here.
@@ -24,9 +25,9 @@ GUESSES = {
 @overload
 def record(cls: type[T], /) -> type[T]: ...
 @overload
-def record(*, eq: bool = True, repr: bool = True) -> Callable[[type[T]], type[T]]: ...
+def record(*, eq: bool = True, repr: bool = True, keywords: bool = False) -> Callable[[type[T]], type[T]]: ...
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field,))
-def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = True) -> Any:
+def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = True, keywords: bool = False) -> Any:
     """Make a class a frozen, slotted dataclass with keyword-only fields.
 
     Parameters
@@ -37,6 +38,8 @@ def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = Tru
         Compare by value. Give False where fields are arrays or symbols: such records compare, and hash, by identity.
     repr : bool
         Write a repr of all fields; False where the class prints itself.
+    keywords : bool
+        Answer an unknown keyword with the nearest field. For what users write: it costs a microsecond at each call.
 
     Examples
     --------
@@ -48,7 +51,27 @@ def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = Tru
 
     """
     decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=eq, repr=repr)
-    return decorate if cls is None else decorate(cls)
+    make = (lambda own: _explain_keywords(decorate(own))) if keywords else decorate
+    return make if cls is None else make(cls)
+
+
+def _explain_keywords(cls: type[Any]) -> type[Any]:
+    """Let the constructor answer an unknown keyword with a SeaoptError that names the nearest."""
+    make = cls.__init__
+
+    @wraps(make)
+    def construct(self: Any, *args: Any, **fields: Any) -> None:
+        try:
+            make(self, *args, **fields)
+        except TypeError as error:
+            known = [name for name, one in cls.__dataclass_fields__.items() if one.init]
+            wrong = next((name for name in fields if name not in known), None)
+            if wrong is None:
+                raise
+            raise KeywordError(f"{cls.__name__} has no {wrong}; {suggestion(wrong, known)}") from error
+
+    cls.__init__ = construct
+    return cls
 
 
 class Result:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
 
 import pytest
 
@@ -60,3 +61,18 @@ def test_a_property_that_fails_by_itself_says_its_own_error():
     fit = object.__new__(so.Fit)
     with pytest.raises(AttributeError, match="status"):
         _ = fit.met
+
+
+@pytest.mark.parametrize(
+    ("make", "right"),
+    [
+        (lambda: so.ControllerSpec(bandwidth=30), "ControllerSpec has no bandwidth; .*bandwidth_hz"),
+        (lambda: replace(SPEC, max_sensitvity=1.6), "max_sensitivity"),
+        (lambda: so.Experiment(plant=so.plants.high_impedance(), data=None), "Experiment has no data"),
+        (lambda: so.Parameter(name="J", val=1.0), "Parameter has no val; .*value"),
+    ],
+)
+def test_a_wrong_keyword_is_answered_with_the_right_one(make, right):
+    with pytest.raises(SeaoptError, match=right) as caught:
+        make()
+    assert isinstance(caught.value, TypeError)

@@ -20,7 +20,7 @@ from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
 
-@record
+@record(keywords=True)
 class Sensors:
     """Errors of the sensors of each output, by name; what is left out is ideal.
 

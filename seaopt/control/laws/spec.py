@@ -43,7 +43,7 @@ LOWEST_HZ = 1e-3  # limits are kept from here
 FASTEST_HZ = 1e6  # of sampling
 
 
-@record
+@record(keywords=True)
 class ControllerSpec:
     """A bandwidth and the limits of `seaopt.control.laws.limits`: left out, each has its default; False lifts one.
 

@@ -34,7 +34,7 @@ MPC_LIMITS = (  # of the table of limits, those of a loop without gains
 )  # fmt: skip
 
 
-@record
+@record(keywords=True)
 class MPCSpec:
     """Limits of the plan, and bandwidth and margins while none of them is active.
 

@@ -32,7 +32,7 @@ Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
 
-@record(eq=False, repr=False)
+@record(eq=False, repr=False, keywords=True)
 class Experiment:
     """One log of one plant.
 

@@ -15,7 +15,7 @@ from seaopt.records import record
 from seaopt.units import factor, si_unit
 
 
-@record
+@record(keywords=True)
 class Column:
     """A column of a file and its conversion to SI: (value, unwrapped, times scale, plus offset) in `unit`.
 
