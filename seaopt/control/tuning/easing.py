@@ -63,13 +63,13 @@ def tighten_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solu
     With no reserve a law is on its limits at the frequencies looked at, and may be beyond them in between. So these
     are lowered by what is missed, and the law refined.
     """
-    best, factors = (x, loops), dict.fromkeys(_measure_missed(task, loops), 1.0)
+    best, factors = (x, loops), dict(task.eased)
     for _ in range(TIGHTENINGS):
         missed = _measure_missed(task, best[1])
         if not missed or max(missed.values()) > NARROW or not all(map(_can_ease, missed)):
             break
         factors |= {name: factors.get(name, 1.0) / used**2 for name, used in missed.items()}
-        tight = replace(task, eased={**task.eased, **factors})
+        tight = replace(task, eased=factors)
         trial = refine(tight, tight.grid(place_frequencies(tight)), best[0])
         best = (trial, task.measure(trial))
         if not list_broken_limits(task.spec, best[1], task.design_states):
