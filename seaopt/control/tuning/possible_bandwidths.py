@@ -16,12 +16,11 @@ import numpy as np
 
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_limits
-from seaopt.control.tuning.easing import tighten_limits
 from seaopt.control.tuning.evolution import ENCIRCLES, Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task
-from seaopt.control.tuning.solution import recheck
+from seaopt.control.tuning.solution import recheck, tighten_limits
 from seaopt.progress import Progress, ignore
 
 FARTHEST_BELOW, FARTHEST_ABOVE = 4.0, 2.0  # of the bandwidth asked: where others are looked for

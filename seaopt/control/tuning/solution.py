@@ -21,9 +21,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.laws.limits import BY_NAME, MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ
-from seaopt.control.laws.verdict import list_broken_limits
+from seaopt.control.laws.verdict import judge_all, list_broken_limits
 from seaopt.control.loops.absolute_stability import SIMPLEST
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.tuning.convex_concave import improve
@@ -41,6 +41,9 @@ FAR_OFF = 1.3  # worst usage of the best of two refined starts beyond which no o
 ROUNDS, LONG_ROUNDS = 5, 9  # of the interior point; integrals of a cascade move far
 QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
+NARROW = 1.01  # of a limit: what a law misses by less, it may miss between the frequencies alone
+TIGHTENINGS = 3
+NO_LEVEL_ABOVE = 10.0  # a frequency further off counts no more: |F/F_ref| along -3 dB falls below it anywhere
 LOWER_FRACTIONS = 4  # of a link's feedforward, by a fifth each
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: of a law without any, less is not looked for
@@ -185,7 +188,44 @@ def _finish(task: Task, grid: Grid, x: LawNumbers, checking: Progress) -> Soluti
         x = refine(task, grid, improve(task, grid, settling)[1], _count_rounds(task))
     checking("checking between the frequencies", 0.0)
     x = recheck(task, grid, x)
-    return x, task.measure(x)
+    loops = task.measure(x)
+    return (x, loops) if task.rank(grid, x)[0] > 0.0 else tighten_limits(task, x, loops)
+
+
+def tighten_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
+    """Return a law that keeps limits which the given one misses by next to nothing; that one where none is found.
+
+    With no reserve a law is on its limits at the frequencies looked at, and may be beyond them in between. So these
+    are lowered by what is missed, and the law refined.
+    """
+    best, factors = (x, loops), dict(task.eased)
+    for _ in range(TIGHTENINGS):
+        missed = measure_missed(task, best[1])
+        if not missed or max(missed.values()) > NARROW or not all(map(can_ease, missed)):
+            break
+        factors |= {name: factors.get(name, 1.0) / used**2 for name, used in missed.items()}
+        tight = replace(task, eased=factors)
+        trial = refine(tight, tight.grid(place_frequencies(tight)), best[0])
+        best = (trial, task.measure(trial))
+        if not list_broken_limits(task.spec, best[1], task.design_states):
+            return best
+    return x, loops
+
+
+def can_ease(name: str) -> bool:
+    """Tell whether a limit is a level, and not a frequency, which is what is asked for."""
+    return BY_NAME[name].curve is not None and BY_NAME[name].reserve == "figure"
+
+
+def measure_missed(task: Task, loops: Sequence[MeasuredLoop]) -> dict[str, float]:
+    """Return how much of each limit that is missed is used, on the plant that uses most."""
+    missed: dict[str, float] = {}
+    for verdict in judge_all(task.spec, loops, task.design_states):
+        if not verdict.met:
+            name = verdict.limit.name
+            used = verdict.severity if can_ease(name) or name == "stability" else min(verdict.severity, NO_LEVEL_ABOVE)
+            missed[name] = max(missed.get(name, 1.0), used)
+    return missed
 
 
 def recheck(task: Task, grid: Grid, x: LawNumbers, rounds: int = ROUNDS) -> LawNumbers:

@@ -58,7 +58,7 @@ from seaopt.control.loops.sampled_plant import (
     sample,
 )
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.control.tuning.easing import ROOM, ease_limits, tighten_limits
+from seaopt.control.tuning.easing import ROOM, ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.frequencies import count_growing
@@ -217,7 +217,7 @@ def _tune(
     x, loops = solve(task, progress=solving)
     task, x, loops = lower_fraction(task, x, loops)
     if not task.eased:
-        x, loops = search(task, *tighten_limits(task, x, loops))
+        x, loops = search(task, x, loops)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
     if broken - {FRICTION}:  # of a margin alone it is known what can be had
         near: list[LawNumbers] = []

@@ -12,11 +12,10 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control import Notch
 from seaopt.control.laws.verdict import list_broken_limits
-from seaopt.control.tuning.easing import tighten_limits
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.optimisation_problem import K_P
-from seaopt.control.tuning.solution import solve
+from seaopt.control.tuning.solution import solve, tighten_limits
 from seaopt.control.tuning.tuner import make_task
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
