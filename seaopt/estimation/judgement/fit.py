@@ -107,10 +107,11 @@ def fit(
     if not 0.0 <= holdout <= 0.9:
         raise EstimationError(f"holdout = {holdout:g} is not a fraction; give 0 (none) to 0.9")
     check_choices(chosen, loss, band_hz)
+    band = None if band_hz is None else (band_hz[0], band_hz[1])  # a list is taken, too
     _check_differences(named, chosen)
     _check_motion(named)
     problem = pose_problem(
-        named, complete_parameters(named, params), loss=loss if loss is not None else Squares(), band_hz=band_hz,
+        named, complete_parameters(named, params), loss=loss if loss is not None else Squares(), band_hz=band,
         holdout=holdout, noise=chosen.models_noise,
     )  # fmt: skip
     _check_samples(problem)

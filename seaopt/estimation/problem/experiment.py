@@ -123,7 +123,7 @@ class Experiment:
                 f'experiment name "{self.name[:40]}" is not a name; start with a letter, then letters, digits, _ and -'
             )
         self._add_differences()
-        chosen = self.outputs or tuple(name for name in self.plant.outputs if name in self.log.signals)
+        chosen = tuple(self.outputs) or tuple(name for name in self.plant.outputs if name in self.log.signals)
         if not chosen:
             raise EstimationError(
                 f"experiment {self.name}: the log has none of the outputs of {self.plant.name} "
@@ -131,6 +131,9 @@ class Experiment:
             )
         object.__setattr__(self, "outputs", chosen)
         for name in chosen:
+            require_type(name, str, f"experiment {self.name}: outputs", "give a name each", EstimationError)
+            if chosen.count(name) > 1:
+                raise EstimationError(f"experiment {self.name}: outputs names {name} twice; keep one")
             if name not in self.plant.outputs:
                 raise EstimationError(
                     f'experiment {self.name}: output "{name}" is not one of {self.plant.name}; '
