@@ -14,8 +14,8 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 DOCUMENTS = {  # the module and model of each, its title, and the version that it stands for
     "problem": ("seaopt.problem.schema", "ProblemTable", "seaopt problem file", 1),
     "fit": ("seaopt.estimation.result.stored", "StoredFit", "seaopt fit.json", 2),
-    "controller": ("seaopt.control.laws.stored", "StoredController", "seaopt controller.json", 2),
-    "schedule": ("seaopt.control.scheduling.stored", "StoredSchedule", "seaopt schedule.json", 1),
+    "controller": ("seaopt.control.laws.stored", "StoredController", "seaopt controller.json", 3),
+    "schedule": ("seaopt.control.scheduling.stored", "StoredSchedule", "seaopt schedule.json", 2),
     "robustness": ("seaopt.robustness.certificate.stored", "StoredCertificate", "seaopt robustness.json", 2),
 }
 

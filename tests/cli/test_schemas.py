@@ -11,6 +11,10 @@ import pytest
 
 from seaopt.cli.schemas import DOCUMENTS, json_schema
 from seaopt.cli.session import Session
+from seaopt.control.laws.controller import CONTROLLER_SCHEMA
+from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
+from seaopt.estimation.result.fit_result import FIT_SCHEMA
+from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
 
 jsonschema = pytest.importorskip("jsonschema")
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
@@ -39,6 +43,15 @@ def test_results_agree(done, document):
     assert not [f"{error.json_path}: {error.message}" for error in check.iter_errors(content)]
     for key in check.schema["required"]:
         assert list(check.iter_errors({name: value for name, value in content.items() if name != key}))
+
+
+@pytest.mark.parametrize(
+    ("document", "written"),
+    [("fit", FIT_SCHEMA), ("controller", CONTROLLER_SCHEMA), ("schedule", SCHEDULE_SCHEMA),
+     ("robustness", ROBUSTNESS_SCHEMA)],
+)  # fmt: skip
+def test_a_schema_has_the_version_of_the_files(document, written):
+    assert json_schema(document)["$id"].rsplit(":", 1)[1] == written.rsplit("/", 1)[1]
 
 
 @pytest.mark.slow  # a run of a rotary joint with friction
