@@ -163,7 +163,7 @@ def test_a_law_that_is_given_needs_its_bandwidth_at_least(stand, thor, robust_co
     law = ideal_pid(K=2.0, T_i=0.05, T_d=0.01, N=10.0, sample_time_s=1e-3)
     spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=2.0, max_droop_db=False, bandwidth_tolerance=0.1)
     rows = {}
-    for name, controller in (("given", assess(stand, thor, law, spec)), ("tuned", robust_controller)):
+    for name, controller in (("given", assess(law, stand, thor, spec)), ("tuned", robust_controller)):
         certificate = so.certify(controller, {"stand": stand}, thor, samples=2, simulations=False)
         (row,) = [row for row in certificate.requirements if row.name == "bandwidth_hz"]
         rows[name] = row.sense, row.tolerance, row.keeps
