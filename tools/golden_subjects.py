@@ -61,7 +61,8 @@ def run_problem(name: str, arguments: Sequence[str] = ()) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         done = call("run", str(ROOT / "problems" / f"{name}.toml"), "-o", folder, *arguments)
         results = {path.stem: strip(json.loads(path.read_text())) for path in sorted(Path(folder).glob("*.json"))}
-    return done | results
+    said = done["stdout"].replace(folder, "OUT").replace(f"{ROOT}/", "")  # stderr tells times
+    return {"exit": done["exit"], "stdout": said} | results
 
 
 def call(*arguments: str) -> dict[str, Any]:
