@@ -63,14 +63,15 @@ types: $(READY)
 contract: $(READY)
 	$(BIN)/lint-imports --no-cache
 
+# Every notebook runs, and shows what is stored in it; `python tools/notebooks.py write` stores what it shows now.
 notebooks: $(READY)
-	$(PYTEST) --nbmake --nbmake-timeout=300 -q notebooks
+	$(BIN)/python tools/notebooks.py compare
 
-# The site, in an environment of its own: warnings are errors, notebooks run, search and pages are tried in a browser.
+# The site, in an environment of its own: warnings are errors, search and pages are tried in a browser.
 DOCS := $(VENV)-docs
 SITE := docs/_build/html
 docs: $(DOCS)/.ready
-	rm -rf $(SITE) docs/reference/api  # pages of what is gone; executed notebooks are kept
+	rm -rf $(SITE) docs/reference/api  # pages of what is gone
 	$(DOCS)/bin/sphinx-build -W --keep-going -q -b html docs $(SITE)
 	SEAOPT_SITE=$(SITE) $(DOCS)/bin/python -m pytest -q tests/test_site.py
 

@@ -105,7 +105,7 @@ def against_hand() -> None:
         theta=np.array(thor.values_of(FREE)), offset=np.zeros(2), gain=np.ones(2), clock=Clock(period=log.period),
         drift=np.zeros((2, 0)),
     )  # fmt: skip
-    x0 = np.zeros((1, 2))
+    x0 = np.zeros(2)
     compiler = find_compiler()
     if compiler is None:
         print("no C compiler: no pass to compare")
@@ -135,7 +135,7 @@ def against_hand() -> None:
         def by_hand() -> None:
             hand(len(log), *(a.ctypes.data for a in arrays), gram.ctypes.data)
 
-        ours = run_passes(model, segment, point, x0).gram[0]
+        ours = run_passes(model, segment, point, x0).gram
         by_hand()
         np.testing.assert_allclose(ours, gram, rtol=1e-9, atol=1e-9 * np.max(gram))
         pairs = [(best(lambda: run_passes(model, segment, point, x0), 3), best(by_hand, 3)) for _ in range(9)]
@@ -179,7 +179,7 @@ def one_size(n: int) -> None:
     point = Point(
         theta=np.zeros(0), offset=np.zeros(2), gain=np.ones(2), clock=Clock(period=1 / 400), drift=np.zeros((2, 0))
     )
-    found = run_passes(model, Segment(u=(log["I"],)), point, np.zeros((1, 2)), outputs=True).outputs
+    found = run_passes(model, Segment(u=(log["I"],)), point, np.zeros(2), outputs=True).outputs
     assert found is not None
     for o, name in enumerate(("F1", "F2")):
         log[name].setflags(write=True)

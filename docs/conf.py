@@ -15,16 +15,14 @@ import seaopt
 project = "seaopt"
 author = "The seaopt developers"
 version = release = seaopt.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc", "sphinx_copybutton"]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 nitpicky = True
 default_role = "code"
 
-# Pages are MyST; the notebooks (a link to those of the repository) are executed here, and their outputs shown.
+# Pages are MyST; the notebooks (a link to those of the repository) show what is stored in them (`make notebooks`).
 myst_heading_anchors = 4
-nb_execution_mode = "cache"
-nb_execution_timeout = 300
-nb_execution_raise_on_error = True
+nb_execution_mode = "off"
 nb_merge_streams = True
 
 # One page per public name: docs/reference/api.md lists them. Types and shapes stand in the docstrings.
@@ -33,6 +31,11 @@ autodoc_typehints = "none"
 autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
+
+# The button copies what is typed, without prompts and without what is printed.
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+copybutton_only_copy_prompt_lines = True
 
 html_math_renderer = "mathml"
 html_theme = "furo"

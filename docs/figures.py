@@ -39,7 +39,11 @@ from seaopt.control.loops.port import hold_response, port_of
 from seaopt.estimation import Limits, design_experiment
 from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.panel import compose_sheet
-from seaopt.reporting.figures.simulation import amplitude_panel, environment_panels, saturation_panel
+from seaopt.reporting.figures.simulation import (
+    amplitude_panel,
+    environment_panels,
+    saturation_panel,
+)
 from seaopt.robustness.verification.environments import coupled_stability
 from seaopt.robustness.verification.large_signal import large_signal
 

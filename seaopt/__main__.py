@@ -14,8 +14,11 @@ def main() -> None:
         signal.signal(signal.SIGINT, _leave)  # an import that is interrupted may raise anything, anywhere
     from seaopt.cli.main import main as run
 
-    signal.signal(signal.SIGINT, before)
-    run()
+    try:
+        signal.signal(signal.SIGINT, before)
+        run()
+    except KeyboardInterrupt:  # between the two handlers
+        _leave()
 
 
 def _leave(*_: object) -> NoReturn:

@@ -60,23 +60,10 @@ def check_table(
 ) -> Document:
     """Return a table as a model.
 
-    Parameters
-    ----------
-    model : type of pydantic.BaseModel
-        What the table may hold.
-    content : mapping
-        As read from the file.
-    source : str
-        The file, for messages.
-    remedy : str
-        What to do about any mistake; left out where the place is the user's own, to be corrected there.
-    error : type of SeaoptError
-        What is raised.
-
-    Raises
-    ------
-    SeaoptError
-        A key is unknown or missing, or a value is of the wrong kind or out of range; of the kind asked for.
+    `model`: what the table may hold. `content`: as read from the file. `source`: the file, for messages. `remedy`: what
+    to do about any mistake; left out where the place is the user's own, to be corrected there. `error`: what is raised.
+    Raises SeaoptError: a key is unknown or missing, or a value is of the wrong kind or out of range; of the kind asked
+    for.
 
     Examples
     --------
@@ -99,11 +86,7 @@ def check_table(
 def check_result(model: type[Document], content: Mapping[str, Any], source: str, *, remedy: str) -> Document:
     """Return a result as a model, as `check_table` does; one that carries a digest was not edited since.
 
-    Raises
-    ------
-    FileError
-        A key is missing, a value is of the wrong kind, or the digest is not that of the content.
-
+    Raises FileError: a key is missing, a value is of the wrong kind, or the digest is not that of the content.
     """
     if "made_from" in content:
         check_seal(content, source, remedy)
@@ -115,13 +98,14 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     mistakes = problem.errors(include_url=False)
     # A misspelt key is also a missing one: the misspelling is the mistake.
     first = next((mistake for mistake in mistakes if mistake["type"] == "extra_forbidden"), mistakes[0])
-    # Where a string or a table may stand, what is wrong inside the table is the mistake.
+    # Where something else or a table may stand, what is wrong inside the table is the mistake.
     inside = [
         mistake
         for mistake in mistakes
         if mistake["loc"][:-1] != first["loc"][:-1] and _within(mistake["loc"], first["loc"])
     ]
-    first = inside[0] if first["type"] == "string_type" and inside else first
+    is_table = first["type"] == "string_type" or isinstance(first["input"], Mapping)
+    first = inside[0] if inside and is_table else first
     place = _place(first["loc"])
     own = place.rpartition(".")[2]
     if first["type"] == "extra_forbidden":
@@ -132,7 +116,7 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     if _is_range(first):
         at = _place(first["loc"][:-1] if first["type"] == "missing" else first["loc"])
         return (
-            f"{at} = {_shorten(first['input'])} is not a range; give [low, high]: {at.rpartition('.')[2]} = [1.0, 2.0]"
+            f"{at} = {shorten(first['input'])} is not a range; give [low, high]: {at.rpartition('.')[2]} = [1.0, 2.0]"
         )
     if first["type"] == "missing":
         return f"key {place} is missing; {remedy or f'add it: {own} = ...'}"
@@ -140,16 +124,30 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     words = "should be a table" if first["type"] == "model_type" else words
     if not first["loc"]:  # of the whole file
         return f"{words}; {remedy or 'correct the file'}"
+    if first["type"] == "value_error" and isinstance(first["input"], Mapping):  # what a whole table says wrongly
+        return f"{place}: {words}; {remedy or 'correct that table'}"
     if isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
-        return f"{place} = {_shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
+        return f"{place} = {shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
     kind = first["type"].partition("_")[0]
-    if kind in ("float", "int") and isinstance(
+    if kind in ("greater", "less"):
+        correct = f"correct it: {own} = {_suggest_number(model, first)}"
+    elif kind in ("float", "int") and isinstance(
         first["input"], str
     ):  # with its unit, as a rule: a number may be another
         correct = "give the number alone, without quotes, in the key's own unit"
     else:
         correct = f"correct it: {own} = {EXAMPLES.get(kind, '...')}"
-    return f"{place} = {_shorten(first['input'])}: {words}; {remedy or correct}"
+    return f"{place} = {shorten(first['input'])}: {words}; {remedy or correct}"
+
+
+def _suggest_number(model: type[BaseModel], mistake: Mapping[str, Any]) -> str:
+    """Return a number in the range that a mistake leaves: its end where that belongs to it, else the key's default."""
+    (end,) = mistake["ctx"].values()
+    if mistake["type"].endswith("_equal"):
+        return f"{end:g}"
+    inside = _find_model(model, mistake["loc"]).model_fields
+    default = next((field.default for name, field in inside.items() if mistake["loc"][-1] in (name, field.alias)), None)
+    return f"{default:g}" if isinstance(default, int | float) else "..."
 
 
 def _spell(value: Any) -> str:
@@ -164,7 +162,8 @@ def _is_range(mistake: Mapping[str, Any]) -> bool:
     )
 
 
-def _shorten(value: Any) -> str:
+def shorten(value: Any) -> str:
+    """Return the repr of a value, cut where it is long."""
     text = repr(value)
     return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 3] + "..."
 
@@ -180,14 +179,19 @@ def _place(loc: Sequence[int | str]) -> str:
 
 
 def _known_keys(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:
-    """Return the keys that are known where `loc` points; of several models, it names the one that was tried."""
+    """Return the keys that are known where `loc` points."""
+    return [field.alias or name for name, field in _find_model(model, loc).model_fields.items()]
+
+
+def _find_model(model: type[BaseModel], loc: Sequence[int | str]) -> type[BaseModel]:
+    """Return the model of the table that `loc` points into; of several, it names the one that was tried."""
     inner: list[type[BaseModel]] = []
     for key in loc[:-1]:
         if key in model.model_fields:
             inner = _models_in(model.model_fields[str(key)].annotation)
             model = inner[0] if inner else model
         model = next((one for one in inner if one.__name__ == key), model)
-    return [field.alias or name for name, field in model.model_fields.items()]
+    return model
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

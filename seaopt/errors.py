@@ -83,6 +83,10 @@ class KeywordError(SeaoptError, TypeError):
     """A record of the user's is made with a keyword that it does not have."""
 
 
+class TruthValueError(SeaoptError, TypeError):
+    """A result is taken for a truth value."""
+
+
 class InternalError(Exception):
     """A defect of seaopt, not of the input: no SeaoptError, so that nothing takes it for one.
 
@@ -140,7 +144,7 @@ def require_type(
 
     """
     if not isinstance(value, kind):
-        raise error(f"{argument} = {repr(value)[:60]} is a {type(value).__name__}; {remedy}")
+        raise error(f"{argument} = {' '.join(repr(value)[:60].split())} is a {type(value).__name__}; {remedy}")
 
 
 def require_number(value: Any, argument: str, error: type[SeaoptError] = SeaoptError) -> float:

@@ -41,15 +41,10 @@ class Processes(Executor):
     with `BrokenProcessPool` all the same, and `submit` goes on with a new pool. The processes ignore Ctrl-C, which the
     caller handles, and end where the caller is killed.
 
-    Parameters
-    ----------
-    workers : int, optional
-        How many; as many as there are cores, if left out.
+    `workers`: how many; as many as there are cores, if left out.
 
-    Raises
-    ------
-    SeaoptError
-        `workers` is not a whole number above zero, or far more than there are cores: all of them start at once.
+    Raises SeaoptError: `workers` is not a whole number above zero, or far more than there are cores: all of them start
+    at once.
 
     Examples
     --------
@@ -138,18 +133,7 @@ def connect_dask(address: str, timeout_s: float = 30.0) -> Generator[Executor]:
 
     Encryption and certificates of a ``tls://`` address are Dask's own settings (``distributed.comm.tls``).
 
-    Parameters
-    ----------
-    address : str
-        Such as ``tcp://10.0.0.1:8786``.
-    timeout_s : float
-        How long to wait for it.
-
-    Raises
-    ------
-    SeaoptError
-        Dask is not installed, or no scheduler answers.
-
+    Raises SeaoptError: dask is not installed, or no scheduler answers.
     """
     try:
         import distributed
@@ -185,12 +169,8 @@ class _Cluster(Executor):
 def solve_ipopt(solver: Any, **given: Any) -> Any:
     """Return what a solver of CasADi's that is IPOPT finds, one at a time in a process.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        It was interrupted: by Ctrl-C, or by any signal whose handler raises. CasADi takes that for a failure of the
-        solver, and drops the exception.
-
+    Raises KeyboardInterrupt: it was interrupted: by Ctrl-C, or by any signal whose handler raises. CasADi takes that
+    for a failure of the solver, and drops the exception.
     """
     with IPOPT:
         try:
@@ -205,19 +185,10 @@ def map_ordered(
 ) -> Iterator[Result]:
     """Yield what a function makes of items, in their order; a bounded number of them is in flight.
 
-    Parameters
-    ----------
-    function : callable
-        Of one item; with an executor of processes, one that pickles.
-    items : iterable
-        Taken as they are needed.
-    executor : Executor, optional
-        Where it is called; here, if left out.
+    `function`: of one item; with an executor of processes, one that pickles. `executor`: where it is called; here, if
+    left out.
 
-    Raises
-    ------
-    SeaoptError
-        `executor` is none of `concurrent.futures`, or forks this process; or a process of it died.
+    Raises SeaoptError: `executor` is none of `concurrent.futures`, or forks this process; or a process of it died.
 
     Examples
     --------
@@ -256,10 +227,7 @@ class Shared(Generic[Item]):
     A plant that is restored for every part would each time build again what it remembers: its linearisations and
     its kernels.
 
-    Parameters
-    ----------
-    value : object
-        That pickles. It must not be changed.
+    `value`: that pickles. It must not be changed.
 
     Examples
     --------

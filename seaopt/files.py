@@ -32,11 +32,7 @@ _ESCAPED = re.compile(r"[\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\
 def check_regular(path: Path) -> None:
     """Refuse what is there and is not a regular file: reading a pipe or a device may never end.
 
-    Raises
-    ------
-    FileError
-        It is a pipe, a device, a socket or a folder.
-
+    Raises FileError: it is a pipe, a device, a socket or a folder.
     """
     try:
         mode = path.stat().st_mode
@@ -58,11 +54,7 @@ def exists(path: Path) -> bool:
 def check_folder(path: Path) -> None:
     """Refuse a path of results at which no folder is or can be.
 
-    Raises
-    ------
-    FileError
-        It is a file, or no path of this system.
-
+    Raises FileError: it is a file, or no path of this system.
     """
     try:
         is_file = path.exists() and not path.is_dir()
@@ -72,14 +64,25 @@ def check_folder(path: Path) -> None:
         raise FileError(f"{path}: is a file; give a folder for the results: -o out")
 
 
-def write_bytes(path: Path | str, content: bytes) -> Path:
-    """Write `content` to `path` in one step: a reader sees the old file or the new one, never a part.
+def check_name(path: Path | str, remedy: str, error: type[SeaoptError] = FileError) -> None:
+    """Refuse a name that is not UTF-8: it is one of a file, but none that Polars, a table or a problem file can hold.
 
     Raises
     ------
-    FileError
-        The folder cannot be made or written.
+    SeaoptError
+        Of the kind that is asked for.
 
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise error(f"{path}: its name is not UTF-8; {remedy}") from None
+
+
+def write_bytes(path: Path | str, content: bytes) -> Path:
+    """Write `content` to `path` in one step: a reader sees the old file or the new one, never a part.
+
+    Raises FileError: the folder cannot be made or written.
     """
     target = Path(path)
     temporary = target.with_name(f".seaopt-{secrets.token_hex(8)}")
@@ -107,11 +110,7 @@ def describe_os_error(error: OSError | ValueError) -> str:
 def write_text(path: Path | str, content: str) -> Path:
     """Write text as UTF-8, as `write_bytes` does.
 
-    Raises
-    ------
-    FileError
-        It holds half a character, as a name that is no text does; or as of `write_bytes`.
-
+    Raises FileError: it holds half a character, as a name that is no text does; or as of `write_bytes`.
     """
     try:
         raw = content.encode()
@@ -173,11 +172,7 @@ def seal(content: Mapping[str, Any]) -> dict[str, Any]:
 def check_seal(content: Mapping[str, Any], source: Path | str, remedy: str) -> None:
     """Refuse a result without a digest, which somebody wrote by hand, and one that was edited since.
 
-    Raises
-    ------
-    FileError
-        The digest is missing or damaged, or another one than the content has.
-
+    Raises FileError: the digest is missing or damaged, or another one than the content has.
     """
     made_from = content.get("made_from")
     if not isinstance(made_from, Mapping) or CONTENT not in made_from:
@@ -202,24 +197,9 @@ def parse_file(
 ) -> Any:
     """Read a small file of text and parse it, or say in one line why that cannot be.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    parse : callable
-        `json.loads` or `tomllib.loads`.
-    form : str
-        What it should be: "JSON" or "TOML".
-    remedy : str
-        Where such a file comes from.
-    error : type of SeaoptError
-        What is raised.
-
-    Raises
-    ------
-    SeaoptError
-        The file is missing, is no regular file, is larger than `MOST_BYTES`, or is not what it should be.
-
+    `path`: the file. `parse`: `json.loads` or `tomllib.loads`. `form`: what it should be: "JSON" or "TOML". `remedy`:
+    where such a file comes from. `error`: what is raised. Raises SeaoptError: the file is missing, is no regular file,
+    is larger than `MOST_BYTES`, or is not what it should be.
     """
     source = Path(path)
     check_regular(source)
@@ -244,11 +224,7 @@ def parse_file(
 def check_content(content: Any) -> None:
     """Refuse what Python can read but not always print: deep nesting, and integers of any size.
 
-    Raises
-    ------
-    ValueError
-        It is nested deeper than `MOST_LEVELS`, or an integer has more than 64 bits.
-
+    Raises ValueError: it is nested deeper than `MOST_LEVELS`, or an integer has more than 64 bits.
     """
     level, depth = [content], 0
     while level:
@@ -265,11 +241,7 @@ def check_content(content: Any) -> None:
 def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage again") -> dict[str, Any]:
     """Read a result file; check its "schema" field and its digest.
 
-    Raises
-    ------
-    FileError
-        The file is missing, is not JSON, carries another schema, was edited, or was written by hand.
-
+    Raises FileError: the file is missing, is not JSON, carries another schema, was edited, or was written by hand.
     """
     source = Path(path)
     content = parse_file(source, json.loads, "JSON", remedy=remedy)

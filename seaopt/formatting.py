@@ -110,14 +110,8 @@ def join_words(words: Sequence[str]) -> str:
 def format_table(rows: Iterable[Sequence[str]], head: Sequence[str] | None = None, align: str = "") -> list[str]:
     """Return the lines of a table in aligned columns.
 
-    Parameters
-    ----------
-    rows : sequences of str
-        All of the same length.
-    head : sequence of str, optional
-        Titles of the columns.
-    align : str
-        "<" or ">" for each column; those without one are left aligned.
+    `rows`: all of the same length. `head`: titles of the columns. `align`: "<" or ">" for each column; those without
+    one are left aligned.
 
     Examples
     --------

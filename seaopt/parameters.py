@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import Annotated, Any
 
+from seaopt.codec import Fields, OrInfinite, OrMinusInfinite
 from seaopt.errors import ParameterError, UnitError, require_number, require_type, suggestion
 from seaopt.formatting import format_table, html_table
 from seaopt.records import record
@@ -41,12 +43,17 @@ class Parameter:
 
     """
 
+    json_keys = (
+        *("value", "unit", "free", "std", "ci95", "at_bound", "min", "max", "prior_std", "description", "identified"),
+        "plausible",
+    )
+
     name: str
     value: float
     unit: str
     free: bool = False
-    min: float = -math.inf
-    max: float = math.inf
+    min: OrMinusInfinite = -math.inf
+    max: OrInfinite = math.inf
     prior_std: float | None = None
     std: float | None = None
     description: str = ""
@@ -83,7 +90,7 @@ class Parameter:
             )
 
     @property
-    def ci95(self) -> tuple[float, float] | None:
+    def ci95(self) -> tuple[OrMinusInfinite, OrInfinite] | None:
         """The 95 % interval value ± 1.96 std, where a std is known."""
         if self.std is None:
             return None
@@ -134,6 +141,17 @@ class ParameterSet(Mapping[str, Parameter]):
             Parameter(name=name, value=require_number(value, name, ParameterError), unit=unit)
             for name, (value, unit) in pairs.items()
         )
+
+    @classmethod
+    def _from_json(cls, content: Mapping[str, Annotated[Mapping[str, Any], Fields(of=Parameter)]]) -> ParameterSet:
+        """Return the parameters of a file; one that is free and has no std there has an infinite one."""
+
+        def build(name: str, own: Mapping[str, Any]) -> Parameter:
+            std = (math.inf if own["std"] is None else own["std"]) if own["free"] else None
+            identified = own["identified"] and std != math.inf  # an older file does not say it
+            return Parameter(**dict(own, name=name, std=std, identified=identified))
+
+        return cls(build(name, own) for name, own in content.items())
 
     def __getitem__(self, name: str) -> Parameter:
         try:

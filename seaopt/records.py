@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import wraps
 from importlib import import_module
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform, overload
 
-from seaopt.errors import KeywordError, UnknownAttributeError, suggestion
+from seaopt.errors import KeywordError, TruthValueError, UnknownAttributeError, suggestion
+from seaopt.options import document_options, option
 
 T = TypeVar("T")
+_MET = attrgetter("met")  # a field of some results, a property of others
 # What people who know lmfit, SciPy and python-control try first, and what has it here.
 GUESSES = {
     "params": "parameters", "stderr": 'parameters["NAME"].std', "success": "met", "ok": "met",
@@ -26,7 +29,7 @@ GUESSES = {
 def record(cls: type[T], /) -> type[T]: ...
 @overload
 def record(*, eq: bool = True, repr: bool = True, keywords: bool = False) -> Callable[[type[T]], type[T]]: ...
-@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field,))
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field, option))
 def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = True, keywords: bool = False) -> Any:
     """Make a class a frozen, slotted dataclass with keyword-only fields.
 
@@ -51,7 +54,13 @@ def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = Tru
 
     """
     decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=eq, repr=repr)
-    make = (lambda own: _explain_keywords(decorate(own))) if keywords else decorate
+
+    def make(own: type[Any]) -> type[Any]:
+        made = decorate(own)
+        if any("option" in one.metadata for one in fields(made)):
+            made.__doc__ = document_options(made)
+        return _explain_keywords(made) if keywords else made
+
     return make if cls is None else make(cls)
 
 
@@ -74,10 +83,40 @@ def _explain_keywords(cls: type[Any]) -> type[Any]:
     return cls
 
 
+WORDS = "seaopt.reporting.sections"  # found by its name when a result is printed, as what draws is
+
+
+class Worded:
+    """What prints itself, in text and in notebooks, with the sections that the report has of it, too."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return import_module(WORDS).write_text(self)
+
+    def _repr_html_(self) -> str:
+        return import_module(WORDS).write_html(self)
+
+
 class Result:
     """What all results with a verdict have in common: `met`; a wrong name is answered with the right one."""
 
     __slots__ = ()
+
+    @property
+    def passed(self) -> bool:
+        """The same as `met`."""
+        return _MET(self)
+
+    @property
+    def feasible(self) -> bool:
+        """The same as `met`."""
+        return _MET(self)
+
+    def __bool__(self) -> bool:
+        raise TruthValueError(
+            f"a {type(self).__name__} has no truth value, which would be true whatever the result says; use .met"
+        )
 
     if not TYPE_CHECKING:  # or every name would be known to a type checker
 

@@ -11,51 +11,31 @@ from jaxtyping import Float
 from seaopt.errors import LogError
 from seaopt.records import record
 
+# What channels are called where nobody says what they are, in any case.
+INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u", "v", "duty", "goal"})
+HOLDING_NAMES = frozenset({"duty", "goal"})  # of inputs that hold a value for as long as they like
+INPUT_UNITS = frozenset({"A", "V"})
+SAME_SIGN = ("f1", "f2")  # both forces of an actuator between two links
+
 
 @record
 class Origin:
-    """Where a channel came from.
+    """Where a channel came from."""
 
-    Parameters
-    ----------
-    file : str
-        The file's path as given; "" for arrays.
-    sha256 : str
-        Of the file's bytes, hexadecimal; "" for arrays.
-    column : str
-        Header, path or topic.field inside the file.
-    conversion : str
-        What was done to its numbers on the way to SI, in words, for example "mA to A".
-
-    """
-
-    file: str = ""
-    sha256: str = ""
-    column: str = ""
-    conversion: str = ""
+    file: str = ""  # the file's path as given; "" for arrays
+    sha256: str = ""  # of the file's bytes, hexadecimal; "" for arrays
+    column: str = ""  # header, path or topic.field inside the file
+    conversion: str = ""  # what was done to its numbers on the way to SI, in words, for example "mA to A"
 
 
 @record(eq=False)
 class Signal:
-    """One channel of a log: samples in an SI unit.
+    """One channel of a log: samples in an SI unit."""
 
-    Parameters
-    ----------
-    name : str
-        The channel's name, usually that of a plant's input or output.
-    values : array, shape (n,)
-        Samples in `unit`; NaN marks a missing one.
-    unit : str
-        SI unit text; "" where it was not said (arrays from Python are SI by convention).
-    origin : Origin
-        File, column and conversion.
-
-    """
-
-    name: str
-    values: Float[np.ndarray, " n"]
-    unit: str = ""
-    origin: Origin = Origin()
+    name: str  # the channel's name, usually that of a plant's input or output
+    values: Float[np.ndarray, " n"]  # samples in `unit`; NaN marks a missing one
+    unit: str = ""  # SI unit text; "" where it was not said (arrays from Python are SI by convention)
+    origin: Origin = Origin()  # file, column and conversion
 
     def __post_init__(self) -> None:
         if self.values.ndim != 1:
@@ -119,16 +99,8 @@ class Table:
 def check_distinct(channels: Mapping[str, tuple[tuple[str, str], str]]) -> list[str]:
     """Refuse one column for two channels; say so where they are two quantities, each with a conversion of its own.
 
-    Parameters
-    ----------
-    channels : mapping of channel name to ((file, column), SI unit)
-        A screw's angle (rad) and its nut's place (m) may come of one encoder; two forces do not come of one load cell.
-
-    Raises
-    ------
-    LogError
-        Two channels of one column have the same SI unit.
-
+    `channels`: ((file, column), SI unit) by name. A screw's angle (rad) and its nut's place (m) may come of one
+    encoder; two forces do not come of one load cell. Raises LogError: two channels of one column have the same SI unit.
     """
     seen: dict[tuple[str, str], dict[str, str]] = {}
     notes: list[str] = []

@@ -66,15 +66,8 @@ def _parse(unit: str) -> Any:
 def factor(unit: str, to: str) -> float:
     """Return the number that turns a value in `unit` into one in `to`.
 
-    Parameters
-    ----------
-    unit, to : str
-        Unit texts; "", "-" and "1" are dimensionless.
-
-    Raises
-    ------
-    UnitError
-        A unit is unknown, the dimensions differ, or the scale has an offset (degrees Celsius).
+    `unit`, `to`: unit texts; "", "-" and "1" are dimensionless. Raises UnitError: a unit is unknown, the dimensions
+    differ, or the scale has an offset (degrees Celsius).
 
     Examples
     --------
@@ -89,10 +82,13 @@ def factor(unit: str, to: str) -> float:
     source, target = _parse(unit), _parse(to)
     if source.dimensionality != target.dimensionality:
         raise UnitError(f'unit "{unit}" is not one of {to or "a pure number"}; give a unit with that dimension')
-    zero, one = (_registry().Quantity(value, source).to(target).magnitude for value in (0.0, 1.0))
+    zero, scale = (_registry().Quantity(value, source).to(target).magnitude for value in (0.0, 1.0))
     if abs(zero) > 0.0:
         raise UnitError(f'unit "{unit}" has an offset against "{to}"; convert the values before reading them')
-    return float(f"{one:.15g}")
+    return float(f"{scale:.15g}")
+
+
+COMMON_SI = ("", "m", "s", "kg", "N", "A", "rad", "N m", "m/s", "rad/s", "m/s^2", "V", "rad/s^2", "K", "Hz", "W")
 
 
 @lru_cache(maxsize=1024)
@@ -108,28 +104,10 @@ def si_unit(unit: str) -> str:
     if unit.strip() in CELSIUS:  # the offset against K makes it a unit of its own
         return "degC"
     parsed = _parse(unit)
-    for known in (
-        "",
-        "m",
-        "s",
-        "kg",
-        "N",
-        "A",
-        "rad",
-        "N m",
-        "m/s",
-        "rad/s",
-        "m/s^2",
-        "V",
-        "rad/s^2",
-        "K",
-        "Hz",
-        "W",
-    ):
-        candidate = _parse(known)
-        same_angle = ("radian" in str(_registry().Quantity(1, parsed).to_root_units().units)) == ("rad" in known)
-        if parsed.dimensionality == candidate.dimensionality and same_angle:
-            return known
+    angular = "radian" in str(_registry().Quantity(1, parsed).to_root_units().units)
+    for candidate in COMMON_SI:
+        if parsed.dimensionality == _parse(candidate).dimensionality and angular == ("rad" in candidate):
+            return candidate
     return f"{_registry().Quantity(1.0, parsed).to_base_units().units:~C}".replace("**", "^").replace("*", " ")
 
 

@@ -281,6 +281,14 @@ def test_a_command_of_a_page_has_these_options(page, words):
             raise
 
 
+@pytest.mark.parametrize("page", list_pages())
+def test_code_fits_the_column_of_the_site(page):
+    """At 1280 px a line of code is 100 characters long (docs/_static/site.css)."""
+    for language in ("python", "toml", "sh", "c"):
+        for block in blocks(page, language):
+            assert max(map(len, block.splitlines()), default=0) <= 100
+
+
 def test_the_problem_file_of_the_docs_is_valid(tmp_path, stand, thor, short_log):
     (text,) = blocks("reference/problem_file.md", "toml")
     path = tmp_path / "problem.toml"

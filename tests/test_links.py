@@ -21,7 +21,9 @@ def strip_code(text):
 def list_anchors(path):
     """Return the anchors of a page's headings, as GitHub and MyST make them."""
     text = re.sub(r"^(```+).*?^\1", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    headings = (re.sub(r"[*_`]", "", found) for found in re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE))
+    headings = (
+        re.sub(r"[*`]|(?<!\w)_|_(?!\w)", "", text) for text in re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    )
     labels = re.findall(r"^\(([\w-]+)\)=$", text, flags=re.MULTILINE)
     return {*labels, *(re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings)}
 

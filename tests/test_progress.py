@@ -8,7 +8,7 @@ import pytest
 import seaopt as so
 from seaopt.cli.progress import LEAST_SHARE, TimeLeft
 from seaopt.control import sweep
-from seaopt.estimation.judgement.fit import SCALED
+from seaopt.estimation.fit import SCALED
 from seaopt.logs import assess_quality
 from seaopt.problem.proposal import propose
 from seaopt.progress import divide

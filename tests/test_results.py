@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import copy
 import pickle
+import sys
 from dataclasses import replace
+from functools import partial
+from importlib import import_module
 
 import pytest
 
 import seaopt as so
 from seaopt.errors import SeaoptError
+from seaopt.records import Result
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.8)
 
@@ -46,6 +50,38 @@ def test_a_fit_knows_what_users_of_other_tools_try(wrong, right):
     fit = object.__new__(so.Fit)  # no field is set: the answer needs none
     with pytest.raises(AttributeError, match=right):
         getattr(fit, wrong)
+
+
+def list_results(cls=Result):
+    """Return the classes of results; a dataclass with slots leaves the class that it was made from behind."""
+    return [sub for sub in cls.__subclasses__() if getattr(sys.modules[sub.__module__], sub.__name__, None) is sub]
+
+
+def test_results_with_a_verdict_share_its_words():
+    """Every public class with `met` is one, and so are the parts of results that have a verdict of their own."""
+    public = {
+        each
+        for package in (
+            "seaopt",
+            *(f"seaopt.{name}" for name in ("control", "estimation", "robustness", "fleet", "logs")),
+        )
+        for each in map(partial(getattr, import_module(package)), import_module(package).__all__)
+        if isinstance(each, type) and ("met" in dir(each) or "met" in getattr(each, "__annotations__", {}))
+    }
+    assert public <= {*list_results()}
+    names = {each.__name__ for each in list_results()}
+    assert {"Fit", "Controller", "ForceMPC", "ScheduledController", "Certificate", "ScheduleCertificate", "Frontier",
+            "FrontierRow", "SlidingAlone", "PlaceCertificate", "Quality", "ConstrainedRuns", "Requirement", "Simulated",
+            "Verification", "Outcome", "JointTuning", "Fleet"} <= names  # fmt: skip
+
+
+@pytest.mark.parametrize("cls", list_results(), ids=lambda cls: cls.__name__)
+def test_no_result_is_taken_for_a_truth_value(cls):
+    result = object.__new__(cls)
+    with pytest.raises(TypeError, match=r"use \.met") as caught:
+        bool(result)
+    assert isinstance(caught.value, SeaoptError)
+    assert hasattr(cls, "met")
 
 
 def test_what_looks_for_optional_attributes_finds_none(controller):

@@ -22,6 +22,7 @@ from seaopt.plants.impacts import catch, release
 from seaopt.plants.plant import deflection_row
 from seaopt.robustness.verification.environments import coupled_stability
 from seaopt.robustness.verification.verification import verify
+from tests.words import flatten
 
 WORDS = {
     "q": "weg", "qd": "tempo", "phi": "winkel", "phid": "drehung", "x_2": "ort", "v_2": "geschwindigkeit", "I": "strom",
@@ -136,7 +137,7 @@ def test_a_friction_margin_has_the_unit_of_the_plants_friction(pair):
         rubbing = params.update(**{f_c: 20.0})
         margin = find_friction_margin(controller, plant, rubbing)
         shown += [repr(replace(controller, design=(plant, rubbing), friction=margin))]
-    built_in, strange = (re.search(r"friction margin (\S+) (N.*?)(?=[:(])", text).groups() for text in shown)
+    built_in, strange = (re.search(r"Friction margin (\S+) (N.*?)(?=[:(])", flatten(text)).groups() for text in shown)
     assert built_in == (strange[0], "N s/m") and strange[1] == "N m s/rad"
 
 

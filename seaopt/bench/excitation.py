@@ -8,25 +8,17 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SimulationError, require_memory
+from seaopt.options import option
 from seaopt.records import record
 
 
 @record
 class Chirp:
-    """A sine whose frequency grows exponentially from f0_hz to f1_hz over the whole duration.
+    """A sine whose frequency grows exponentially from f0_hz to f1_hz over the whole duration."""
 
-    Parameters
-    ----------
-    amplitude : float
-        In the input's unit (A).
-    f0_hz, f1_hz : float
-        First and last frequency.
-
-    """
-
-    amplitude: float
-    f0_hz: float
-    f1_hz: float
+    amplitude: float = option("In the input's unit.")
+    f0_hz: float = option("At the start.", unit="Hz")
+    f1_hz: float = option("At the end.", unit="Hz")
 
     def samples(self, time: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Return the excitation at `time`, which starts at 0."""
@@ -40,19 +32,10 @@ class Chirp:
 
 @record
 class Noise:
-    """Gaussian noise, white up to band_hz and nothing above it.
+    """Gaussian noise, white up to band_hz and nothing above it."""
 
-    Parameters
-    ----------
-    std : float
-        Standard deviation, in the input's unit (A).
-    band_hz : float
-        Highest frequency.
-
-    """
-
-    std: float
-    band_hz: float
+    std: float = option("Standard deviation, in the input's unit.")
+    band_hz: float = option("Highest frequency.", unit="Hz")
 
     def samples(self, time: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Return the excitation at `time`, drawn from `rng`."""
@@ -69,15 +52,6 @@ class Noise:
 class Multisine:
     """A sum of sines, sum_k a_k sin(2 pi f_k t + phi_k).
 
-    Parameters
-    ----------
-    amplitudes : tuple of float
-        In the input's unit (A).
-    frequencies_hz : tuple of float
-        Positive, below half the sample rate; multiples of 1/duration make the whole log one period.
-    phases_rad : tuple of float
-        Zero for each where left out.
-
     Examples
     --------
     >>> import numpy as np
@@ -87,9 +61,13 @@ class Multisine:
 
     """
 
-    amplitudes: tuple[float, ...]
-    frequencies_hz: tuple[float, ...]
-    phases_rad: tuple[float, ...] = ()
+    amplitudes: tuple[float, ...] = option("In the input's unit.")
+    frequencies_hz: tuple[float, ...] = option(
+        "One for each amplitude, positive and below half the sample rate; multiples of 1/duration make the whole log "
+        "one period.",
+        unit="Hz",
+    )
+    phases_rad: tuple[float, ...] = option("Zero for each where left out.", default=(), unit="rad")
 
     def __post_init__(self) -> None:
         count = len(self.amplitudes)

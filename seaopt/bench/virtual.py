@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import field, fields
+from dataclasses import fields
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from seaopt.bench.excitation import Excitation, excite
 from seaopt.errors import SeaoptError, SimulationError, require_memory, require_seed, suggestion
 from seaopt.logs import Log
+from seaopt.options import option
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.sensors.deflection import evaluate_weights
@@ -25,24 +26,18 @@ class Sensors:
     """Errors of the sensors of each output, by name; what is left out is ideal.
 
     An output that is computed from encoders (`deflection_sensor`) has their errors besides its own.
-
-    Parameters
-    ----------
-    noise_std : mapping
-        White Gaussian noise, in the output's unit.
-    offset : mapping
-        A constant added.
-    quantisation : mapping
-        The step that readings are rounded to.
-    saturation : mapping
-        Readings are clipped to plus and minus this.
-
     """
 
-    noise_std: Mapping[str, float] = field(default_factory=dict[str, float])
-    offset: Mapping[str, float] = field(default_factory=dict[str, float])
-    quantisation: Mapping[str, float] = field(default_factory=dict[str, float])
-    saturation: Mapping[str, float] = field(default_factory=dict[str, float])
+    noise_std: Mapping[str, float] = option(
+        "White Gaussian noise, in the output's unit.", default_factory=dict[str, float], least=0.0
+    )
+    offset: Mapping[str, float] = option("A constant that is added.", default_factory=dict[str, float])
+    quantisation: Mapping[str, float] = option(
+        "The step that readings are rounded to.", default_factory=dict[str, float], least=0.0
+    )
+    saturation: Mapping[str, float] = option(
+        "Readings are clipped to plus and minus this.", default_factory=dict[str, float], least=0.0
+    )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,10 +58,12 @@ class Sensors:
 
     def of(self, names: Collection[str]) -> Sensors:
         """Return the errors of these alone."""
-        return Sensors(**{
-            each.name: {name: value for name, value in getattr(self, each.name).items() if name in names}
-            for each in fields(self)
-        })  # fmt: skip
+        return Sensors(
+            **{
+                each.name: {name: value for name, value in getattr(self, each.name).items() if name in names}
+                for each in fields(self)
+            }
+        )
 
     def read(self, name: str, values: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Return what the sensor of one output records."""

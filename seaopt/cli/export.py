@@ -14,7 +14,7 @@ from seaopt.cli.session import OWN_LAW, SCHEDULE_SCHEMAS, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.deploy.schedule_export import is_schedule
-from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.laws.plausibility import GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.mpc.export import SOURCES, set_gate, write_code
@@ -22,7 +22,7 @@ from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ProblemError
 from seaopt.files import exists, read_json, to_json
 from seaopt.records import record
-from seaopt.reporting.verdict import UNMET
+from seaopt.reporting.sections.verdict import UNMET
 
 
 @record
@@ -37,9 +37,14 @@ class GateOptions:
 
 
 def export_controller(
-    results: Path, target: Path, json: bool, derate_margin_K: float | None = None, amount: Amount = "usual",
-    gate: GateOptions | None = None, **options: Any,
-) -> bool:  # fmt: skip
+    results: Path,
+    target: Path,
+    json: bool,
+    derate_margin_K: float | None = None,
+    amount: Amount = "usual",
+    gate: GateOptions | None = None,
+    **options: Any,
+) -> bool:
     """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
 
     It may where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail.
@@ -74,10 +79,16 @@ def export_controller(
             f"{says} nothing of more; raise the limit in the problem file, then tune and certify again"
         )
     if json:
+        feasible, failed = content["feasible"], broken or []
         result = {
-            "schema": "seaopt/export/1", "feasible": content["feasible"], "fit_met": met,
-            "certified": broken == [], "certificate_failed": broken or [], "files": written,
-        }  # fmt: skip
+            "schema": "seaopt/export/1",
+            "met": feasible and met and not failed,
+            "feasible": feasible,
+            "fit_met": met,
+            "certified": broken == [],
+            "certificate_failed": failed,
+            "files": written,
+        }
         sys.stdout.write(to_json(result))
     else:
         console = Terminal()
@@ -102,10 +113,14 @@ def choose_gate(
 ) -> PlausibilityGate | Literal[False] | None:
     """Return the gate that is typed; False for none, None for that of the controller."""
     typed = [
-        name for name, value in (
-            ("gate-max-step", asked.max_step_N), ("gate-max-held", asked.max_held), ("gate-ramp", asked.ramp_s)
-        ) if value is not None
-    ]  # fmt: skip
+        name
+        for name, value in (
+            ("gate-max-step", asked.max_step_N),
+            ("gate-max-held", asked.max_held),
+            ("gate-ramp", asked.ramp_s),
+        )
+        if value is not None
+    ]
     if asked.range_N is None or asked.leave_out:
         if typed or (asked.range_N is not None and asked.leave_out):
             option = typed[0] if typed else "no-gate"
@@ -135,7 +150,9 @@ def choose_gate(
         )
     if limit is None:
         raise ProblemError("--gate: the command has no limit from which it goes to zero; type --current-limit")
-    held, ramp = 5 if asked.max_held is None else asked.max_held, 0.1 if asked.ramp_s is None else asked.ramp_s
+    usual = GateSpec(range_N=(low, high))
+    held = usual.max_held if asked.max_held is None else asked.max_held
+    ramp = usual.ramp_s if asked.ramp_s is None else asked.ramp_s
     if not ramp > 0.0:
         raise ProblemError(f"--gate-ramp {ramp:g}: is not a time; type seconds above zero, such as 0.1")
     return PlausibilityGate(range_N=(low, high), max_step_N=step, max_held=held, ramp_A_per_s=limit / ramp)

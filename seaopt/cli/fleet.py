@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from seaopt.cli.progress import show_progress
-from seaopt.cli.show import MOST_REASONS, heading, show_verdicts
+from seaopt.cli.show import SCREEN, heading, show_verdicts
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
 from seaopt.formatting import format_count, printable
 from seaopt.records import record
-from seaopt.reporting.verdict import Reason, StageVerdict
+from seaopt.reporting.sections.data import Reason, Verdict
 
 if TYPE_CHECKING:
     from seaopt.fleet import Drift, Fleet, FleetLog, Population
@@ -36,10 +36,21 @@ class DriftOptions:
 
 
 def run_fleet(
-    problem: Path, names: Sequence[str], folder: Path, *, manifest: Path | None, identity: str | None,
-    scheduler: str | None, workers: int | None, like: str | None, time_limit_s: float | None, drift: DriftOptions,
-    json: bool, quiet: bool, verbose: bool,
-) -> bool:  # fmt: skip
+    problem: Path,
+    names: Sequence[str],
+    folder: Path,
+    *,
+    manifest: Path | None,
+    identity: str | None,
+    scheduler: str | None,
+    workers: int | None,
+    like: str | None,
+    time_limit_s: float | None,
+    drift: DriftOptions,
+    json: bool,
+    quiet: bool,
+    verbose: bool,
+) -> bool:
     """Fit the logs, write tables and page, and print verdict and spread; return whether every log is met."""
     # Before workers start, who inherit it: threads of BLAS would fight over cores that all have a log.
     for name in THREADS:
@@ -121,22 +132,28 @@ def _write(fleet: Fleet, drift: Drift, population: Population | None, folder: Pa
     from seaopt.fleet.result import FLEET_SCHEMA
 
     content = fleet.to_dict() | {
-        "drift": drift.to_dict(), "population": None if population is None else population.to_dict()
-    }  # fmt: skip
+        "drift": drift.to_dict(),
+        "population": None if population is None else population.to_dict(),
+    }
     made_from = read_json(folder / "fleet.json", FLEET_SCHEMA)
     write_json(folder / "fleet.json", made_from | content)
     write_actuators(tabulate_actuators(fleet, drift, population), folder / ACTUATORS)
     write_fleet_page(
-        fleet, drift, folder / PAGE, population=population, title=f"Fleet: {problem.stem}", files=[problem],
+        fleet,
+        drift,
+        folder / PAGE,
+        population=population,
+        title=f"Fleet: {problem.stem}",
+        files=[problem],
         command=" ".join(["seaopt", *sys.argv[1:]]),
-    )  # fmt: skip
+    )
     return content
 
 
 def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> None:
     """Print the verdict on the logs, and which actuators have an alarm."""
     reasons = tuple(Reason(what=f"{text} ({log})", where="", count=count) for text, count, log in fleet.reasons)
-    verdict = StageVerdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=_advise(fleet))
+    verdict = Verdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=_advise(fleet))
     show_verdicts(console, [verdict], verbose=verbose)
     if fleet.short:
         count = format_count(len(fleet.short), "log")
@@ -152,7 +169,7 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
         return
     word, colour = ("alarm  ", "red") if drift.alarms else ("steady ", "green")
     console.label(word, f"Drift: {drift.verdict}", style=colour, indent=9)
-    shown = drift.alarms if verbose else drift.alarms[:MOST_REASONS]
+    shown = drift.alarms if verbose else drift.alarms[: SCREEN.reasons]
     for alarm in shown:
         console.wrap(printable(f"{alarm.actuator}: {alarm.describe()}"), indent=9)
     if len(drift.alarms) > len(shown):

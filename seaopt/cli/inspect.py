@@ -13,12 +13,13 @@ from seaopt.cli.progress import show_progress
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import check_folder, to_json, write_json
-from seaopt.formatting import format_count, join_words
 from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, contents, read_table
 from seaopt.logs.log.alignment import Rule
-from seaopt.logs.quality.report import CHANNEL_HEAD, format_channel
 from seaopt.logs.reading.selection import ClockError, is_time_name
 from seaopt.progress import divide
+from seaopt.reporting.sections import describe
+from seaopt.reporting.sections.data import Section
+from seaopt.reporting.sections.text import Most, render_sections
 from seaopt.signals import Table
 from seaopt.units import is_unit, same_dimension
 
@@ -26,14 +27,22 @@ READING, LOOKING, DRAWING = 1.0, 1.0, 1.0  # of the time, of a long log
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 MAX_DIGITS = 9  # of a count
 MOST_LINES = 200  # of channels, and of findings
-STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
 def inspect_log(
-    path: Path, *, time: str | None = None, channels: Sequence[str] = (), inputs: Sequence[str] = (),
-    units: Sequence[str] = (), align: str | None = None, counter: str | None = None, rate_hz: float | None = None,
-    folder: Path | None = None, json: bool = False, amount: Amount = "usual",
-) -> bool:  # fmt: skip
+    path: Path,
+    *,
+    time: str | None = None,
+    channels: Sequence[str] = (),
+    inputs: Sequence[str] = (),
+    units: Sequence[str] = (),
+    align: str | None = None,
+    counter: str | None = None,
+    rate_hz: float | None = None,
+    folder: Path | None = None,
+    json: bool = False,
+    amount: Amount = "usual",
+) -> bool:
     """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked.
 
     Returns whether it has no error, with which a fit refuses it or is wrong.
@@ -54,9 +63,13 @@ def inspect_log(
             raise SeaoptError(f"--unit {unit}: name its column too: {command}")
     columns = {name: Column(column=header, unit=unit_of.get(name)) for name, header in headers.items()}
     read = partial(
-        read_table, path, channels=columns or None, align=_parse_rule(align), counter=_parse_counter(counter),
+        read_table,
+        path,
+        channels=columns or None,
+        align=_parse_rule(align),
+        counter=_parse_counter(counter),
         rate_hz=rate_hz,
-    )  # fmt: skip
+    )
     written: list[Path] = []
     console = Terminal(stderr=True)
     with show_progress(console, "inspecting the log", console.say, brief=True) as tell:
@@ -153,31 +166,12 @@ def _parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def _print_report(quality: Quality, written: list[Path], amount: Amount) -> None:
-    console, most = Terminal(), None if amount == "verbose" else MOST_LINES
-    console.wrap(f"{quality.source}: {_describe_verdict(quality)}", style="bold")
+    """Print the verdict, and with it findings and channels unless asked for little."""
+    console, first, *others = Terminal(), *describe(quality)
     if amount == "quiet":
+        console.write(render_sections([Section(title=first.title)], console.width)[1:])
         return
-    console.wrap(quality.summary)
-    for finding in quality.findings[:most]:
-        first, *rest = console.break_lines(finding.sentence, indent=9)
-        console.say(f"{finding.severity:<8}", style=STYLES[finding.severity], end=" ")
-        console.say("\n".join([first, *(" " * 9 + line for line in rest)]), soft_wrap=True)
-    if most is not None and len(quality.findings) > most:
-        console.say(f"... and {len(quality.findings) - most} more findings: --verbose prints them")
-    rows = [format_channel(channel) for channel in quality.channels.values()]
-    console.tabulate(rows[:most], CHANNEL_HEAD, "<<" + ">" * (len(CHANNEL_HEAD) - 2), indent=0, gap=1)
-    if most is not None and len(rows) > most:
-        console.say(f"... and {len(rows) - most} more channels: --verbose prints them")
-    for note in quality.notes:
-        console.wrap(note, style="dim")
+    most = Most() if amount == "verbose" else Most(rows=MOST_LINES, items=MOST_LINES)
+    console.write(render_sections([first, *others], console.width, most)[1:])
     if written:
-        console.wrap("wrote " + ", ".join(str(path) for path in written))
-
-
-def _describe_verdict(quality: Quality) -> str:
-    """Return whether a log can be fitted as it is, and how many findings say otherwise."""
-    errors, warnings = (sum(one.severity == kind for one in quality.findings) for kind in ("error", "warning"))
-    if not errors and not warnings:
-        return "No problem found."
-    counts = join_words([format_count(n, word) for n, word in ((errors, "error"), (warnings, "warning")) if n])
-    return f"{counts}: " + ("mend them before a fit" if errors else "look at them")
+        console.list_files(written)

@@ -117,9 +117,13 @@ def demo(output: Folder = Path("out/demo"), json: Json = False, quiet: Quiet = F
 
 @app.command()
 def run(
-    problem: ProblemFile, output: Folder = Path("out"), json: Json = False, quiet: Quiet = False,
-    verbose: Verbose = False, workers: Workers = None,
-) -> None:  # fmt: skip
+    problem: ProblemFile,
+    output: Folder = Path("out"),
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    workers: Workers = None,
+) -> None:
     """Fit, tune, certify and report."""
     from seaopt.cli.session import Session
 
@@ -147,9 +151,12 @@ def run(
 
 @app.command()
 def simulate(
-    problem: ProblemFile, output: Folder = Path("out"), json: Json = False, quiet: Quiet = False,
+    problem: ProblemFile,
+    output: Folder = Path("out"),
+    json: Json = False,
+    quiet: Quiet = False,
     verbose: Verbose = False,
-) -> None:  # fmt: skip
+) -> None:
     """Simulate every experiment with the file's values; write one CSV each, and the logs of virtual ones."""
     from seaopt.cli.session import Session
 
@@ -220,10 +227,18 @@ def inspect(
         typer.echo(printable(repr(contents(log))))
         return
     if not inspect_log(
-        log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
-        counter=counter, rate_hz=rate_hz, folder=output, json=json,
+        log,
+        time=time,
+        channels=channel or (),
+        inputs=driven_by or (),
+        units=unit or (),
+        align=align,
+        counter=counter,
+        rate_hz=rate_hz,
+        folder=output,
+        json=json,
         amount=_choose_amount(quiet, verbose),
-    ):  # fmt: skip
+    ):
         raise typer.Exit(1)
 
 
@@ -296,9 +311,12 @@ def validate(
 
 def _make_command(name: str, text: str) -> Callable[..., None]:
     def command(
-        problem: ProblemFile, output: Folder = Path("out"), json: Json = False, quiet: Quiet = False,
+        problem: ProblemFile,
+        output: Folder = Path("out"),
+        json: Json = False,
+        quiet: Quiet = False,
         verbose: Verbose = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         from seaopt.cli.session import Session
 
         session = Session(problem, output, design=name != "fit")
@@ -455,13 +473,26 @@ def fleet(
     from seaopt.cli.fleet import DriftOptions, run_fleet
 
     options = DriftOptions(
-        time=None if time is None else time.split(","), actuator=None if actuator is None else actuator.split(","),
-        since=since, false_alarms=false_alarms,
-    )  # fmt: skip
+        time=None if time is None else time.split(","),
+        actuator=None if actuator is None else actuator.split(","),
+        since=since,
+        false_alarms=false_alarms,
+    )
     if not run_fleet(
-        problem, logs or [], output, manifest=manifest, identity=identity, scheduler=scheduler, workers=workers,
-        like=like, time_limit_s=time_limit, drift=options, json=json, quiet=quiet, verbose=verbose,
-    ):  # fmt: skip
+        problem,
+        logs or [],
+        output,
+        manifest=manifest,
+        identity=identity,
+        scheduler=scheduler,
+        workers=workers,
+        like=like,
+        time_limit_s=time_limit,
+        drift=options,
+        json=json,
+        quiet=quiet,
+        verbose=verbose,
+    ):
         raise typer.Exit(1)
 
 

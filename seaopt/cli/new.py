@@ -38,11 +38,18 @@ def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force
     _write_checked(target, proposal.text)
     if json:
         rows = [asdict(column) for column in proposal.columns]
-        sys.stdout.write(to_json({
-            "schema": "seaopt/new/1", "file": str(target), "columns": rows,
-            "guesses": {one.key: one.guess for one in proposal.guesses}, "guessed": list(proposal.guessed),
-            "notes": list(proposal.notes),
-        }))  # fmt: skip
+        sys.stdout.write(
+            to_json(
+                {
+                    "schema": "seaopt/new/1",
+                    "file": str(target),
+                    "columns": rows,
+                    "guesses": {one.key: one.guess for one in proposal.guesses},
+                    "guessed": list(proposal.guessed),
+                    "notes": list(proposal.notes),
+                }
+            )
+        )
         return target
     if yes:
         _print_columns(console, proposal)

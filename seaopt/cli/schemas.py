@@ -7,13 +7,14 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from seaopt.codec import json_schema as record_schema
 from seaopt.errors import SeaoptError, suggestion
 from seaopt.problem.schema import json_schema as problem_schema
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 DOCUMENTS = {  # the module and model of each, its title, and the version that it stands for
     "problem": ("seaopt.problem.schema", "ProblemTable", "seaopt problem file", 1),
-    "fit": ("seaopt.estimation.result.stored", "StoredFit", "seaopt fit.json", 2),
+    "fit": ("seaopt.estimation.result.fit_result", "Fit", "seaopt fit.json", 2),
     "controller": ("seaopt.control.laws.stored", "StoredController", "seaopt controller.json", 3),
     "schedule": ("seaopt.control.scheduling.stored", "StoredSchedule", "seaopt schedule.json", 2),
     "robustness": ("seaopt.robustness.certificate.stored", "StoredCertificate", "seaopt robustness.json", 2),
@@ -35,6 +36,9 @@ def json_schema(document: str) -> dict[str, Any]:
         )
     module, name, title, version = DOCUMENTS[document]
     loaded = import_module(module)
-    model: type[BaseModel] = getattr(loaded, name)
-    schema = problem_schema() if document == "problem" else model.model_json_schema(by_alias=True)
+    model: type[Any] = getattr(loaded, name)
+    if document == "problem":
+        schema = problem_schema()
+    else:
+        schema = model.model_json_schema(by_alias=True) if issubclass(model, BaseModel) else record_schema(model)
     return {"$schema": DIALECT, "$id": f"urn:seaopt:{document}:{version}", **schema, "title": title}

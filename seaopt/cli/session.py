@@ -21,8 +21,7 @@ from seaopt.cli.provenance import (
     digest_sources,
     name_file,
 )
-from seaopt.cli.responses import estimate_responses
-from seaopt.cli.show import show_all, show_figures, show_verdicts
+from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, warn_delays
@@ -30,7 +29,7 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentified
-from seaopt.estimation.judgement.fit import SCALED
+from seaopt.estimation.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.executors import Processes
 from seaopt.files import CONTENT, check_folder, read_json, to_json, write_json
@@ -55,19 +54,10 @@ from seaopt.problem.stages import (
 )
 from seaopt.progress import Progress, count_off, divide
 from seaopt.reporting import write_frontier_figure, write_report
-from seaopt.reporting.verdict import (
-    UNMET,
-    StageVerdict,
-    doubt_design,
-    judge_certificate,
-    judge_controller,
-    judge_expectations,
-    judge_fit,
-    judge_mpc,
-    judge_schedule,
-    judge_schedule_certificate,
-    name_guesses,
-)
+from seaopt.reporting.responses import estimate_responses
+from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.data import Commands, Verdict
+from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, name_guesses
 from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate, linear_controller
 from seaopt.testing.expectations import list_expectations
 
@@ -89,7 +79,7 @@ LABELS = {
     "report": "writing the report",
 }
 OWN_LAW = "; as a law of your own it is taken by seaopt certify PROBLEM --controller FILE -o DIR"
-READING, SIMULATING = 0.1, 0.3  # of the time of a fit, and of a report of earlier results
+READING = 0.1  # of the time of a fit
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 FILTERS = ("notch", "prefilter", "link_feedforward")
 OF_THE_LAW = ("structure", *FILTERS, "reference_weights", "sample_rate_hz", *DELAY_KEYS)
@@ -452,9 +442,16 @@ class Session:
             )
         draws = self.problem.draws(self.parameters())
         result = sweep(
-            design, values, self._spec(), self.bandwidths_hz, robust_to, draws=draws, free_law=self.free_law,
-            executor=self.executor, progress=tell,
-        )  # fmt: skip
+            design,
+            values,
+            self._spec(),
+            self.bandwidths_hz,
+            robust_to,
+            draws=draws,
+            free_law=self.free_law,
+            executor=self.executor,
+            progress=tell,
+        )
         self.results["sweep"] = result
         self._write("sweep", result.to_dict())
         self.written += write_frontier_figure(result, self.folder / "frontier")
@@ -473,7 +470,6 @@ class Session:
         self._write("certify", result.to_dict())
 
     def _report(self, tell: Progress) -> None:
-        simulating, drawing = divide(tell, SIMULATING, 1.0 - SIMULATING)
         self.plan_stages()  # refuses a file that has nothing to report of
         results: list[Any] = []
         if self.problem.table.experiment:
@@ -489,21 +485,32 @@ class Session:
             designed = self._designed()
             results.append(designed if self.problem.mpc is None else self.plan())
             if "certify" not in self.results and self._path("certify").exists():
-                simulating("simulating again", 0.0)
-                self._read_certificate(simulating)
+                self._read_certificate()
             results += [self.results["certify"]] if "certify" in self.results else []
         page = write_report(
-            results, self.folder / "report.html", title=self.problem.title, progress=drawing,
-            files=[self.problem.source], command=shlex.join(["seaopt", *sys.argv[1:]]), expectations=self._expected(),
-        )  # fmt: skip
+            results,
+            self.folder / "report.html",
+            title=self.problem.title,
+            progress=tell,
+            files=[self.problem.source],
+            command=shlex.join(["seaopt", *sys.argv[1:]]),
+            expectations=self._expected(),
+        )
         self.results["report"] = page
         self.written.append(page)
 
-    def _read_certificate(self, tell: Progress) -> None:
-        """Take the folder's certificate; what it simulated is simulated again."""
+    def _read_certificate(self) -> None:
+        """Take the folder's certificate."""
         content, source = self._read("certify"), self.parameters()
         if self.problem.schedule is not None:
-            self.results["certify"] = certify_schedule_problem(self.problem, self.schedule(), source, tell)
+            self.results["certify"] = ScheduleCertificate.from_dict(
+                content,
+                self.schedule(),
+                self.problem.certified_plants(),
+                source,
+                ranges=self.problem.ranges,
+                others=self.problem.parameters,
+            )
             return
         asked, design = self.problem.spec or self.problem.mpc, self.problem.design_plant
         assert asked is not None
@@ -524,45 +531,49 @@ class Session:
         if expectations and isinstance(fit := self.results.get("fit"), Fit) and "scores" not in self.results:
             self.results["scores"] = score_problem(self.problem, fit, self.experiments())
         results = Stages(
-            self.problem, fit=self.results.get("fit"), scores=self.results.get("scores", []),
+            self.problem,
+            fit=self.results.get("fit"),
+            scores=self.results.get("scores", []),
             **({} if self.problem.schedule is not None else self._design_results()),
-        )  # fmt: skip
+        )
         return [expectation.check(results) for expectation in expectations]
 
     def _design_results(self) -> dict[str, Any]:
         return {"controller": self.results.get("tune"), "certificate": self.results.get("certify")}
 
-    def _verdicts(self, stage: str) -> list[StageVerdict]:
+    def _verdicts(self, stage: str) -> list[Verdict]:
         """Return what to say of a stage that has run; a design on a fit that is not met is not met either."""
         if stage == "expect":
             return judge_expectations(self._expected())
         result = self.results.get(stage)
         if stage == "frf" and result is not None:
-            return [StageVerdict(met=good, text=text) for good, text in result.verdict()]
-        verdicts: list[StageVerdict] = []
+            return [Verdict(met=good, text=text) for good, text in result.verdict()]
         if stage == "fit" and result is not None:
-            return self._name_guesses([judge_fit(result, self._spell("fit"))])
+            return self._name_guesses([self._judge(result)])
+        verdicts: list[Verdict] = []
         if stage == "tune" and result is not None:
-            joint, sweep = self.results.get("joint"), f"{self._spell('tune')} --sweep"
+            joint = self.results.get("joint")
             if joint is not None:
-                verdicts.append(StageVerdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
-            if self.problem.schedule is not None:
-                verdicts.append(judge_schedule(result))
-            else:
-                verdicts.append(judge_controller(result, sweep) if self.problem.mpc is None else judge_mpc(self.plan()))
+                verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
+            verdicts.append(self._judge(result if self.problem.mpc is None else self.plan()))
         if stage == "certify" and result is not None:
-            again = self._spell("run" if self.problem.table.experiment else "tune")
-            if isinstance(result, ScheduleCertificate):
-                verdicts.append(judge_schedule_certificate(result, again))
-            else:
-                verdicts.append(judge_certificate(result, again, f"{self._spell('tune')} --sweep"))
+            verdicts.append(self._judge(result))
         if stage not in ("tune", "certify", "sweep") or self.fit_met():
             return self._name_guesses(verdicts)
         if stage == "sweep":
-            return [StageVerdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
+            return [Verdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
         return [doubt_design(one) for one in verdicts]
 
-    def _name_guesses(self, verdicts: list[StageVerdict]) -> list[StageVerdict]:
+    def _judge(
+        self, result: Fit | Controller | ScheduledController | ForceMPC | Certificate | ScheduleCertificate
+    ) -> Verdict:
+        """Return the verdict on a result, with what to type next."""
+        again = self._spell("run" if self.problem.table.experiment else "tune")
+        verdict = judge(result, Commands(fit=self._spell("fit"), tune=self._spell("tune"), certify=again))
+        assert verdict is not None
+        return verdict
+
+    def _name_guesses(self, verdicts: list[Verdict]) -> list[Verdict]:
         """Return verdicts of which those that are met name the guesses that they rest on."""
         guesses = state_guesses(self.problem.table.guessed)
         return [name_guesses(one, guesses) for one in verdicts]
@@ -586,11 +597,8 @@ class Session:
         if amount == "quiet" and judged:
             return
         for stage in stages if amount != "quiet" else ():
-            if amount != "verbose" or stage in ("report", "expect"):
-                show_figures(console, stage, self.results, self.problem)
-                continue
-            show_all(console, stage, self.results, self.problem)
-            for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
+            show_results(console, stage, self.results, self.problem, verbose=amount == "verbose")
+            for remark in self.problem.remarks(self.values()) if stage == "certify" and amount == "verbose" else ():
                 console.say(f"  note: {remark}")
         if self.written:
             console.list_files(self.written)

@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from seaopt.formatting import format_table, printable
+from seaopt.reporting.sections.text import Line
 
 Amount = Literal["quiet", "usual", "verbose"]  # of what is printed
 
@@ -46,6 +47,11 @@ class Terminal(Console):
         first, *rest = self.break_lines(text, indent=indent)
         self.say(word, style=style, end=" " * (indent - len(word)))
         self.say("\n".join([first, *(" " * indent + line for line in rest)]), soft_wrap=True)
+
+    def write(self, lines: Iterable[Line]) -> None:
+        """Print lines of sections as they are, in their colours."""
+        for line in lines:
+            self.print(Text.assemble(*line), soft_wrap=True)
 
     def list_files(self, paths: Iterable[object]) -> None:
         """Print which files were written; a path is never broken, to be copied whole."""

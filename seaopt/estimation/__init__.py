@@ -11,15 +11,14 @@ from seaopt.estimation.experiment_design.design import (
     design_experiment,
     expected_covariance,
 )
-from seaopt.estimation.judgement.fit import fit
+from seaopt.estimation.fit import fit
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.losses import Huber, SoftL1, Squares
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import DerivedFigure, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.identifiability import Identifiability, warn_unidentified
-from seaopt.estimation.solver.methods import Method, OutputError, PredictionError
-from seaopt.estimation.solver.shooting import MultipleShooting
+from seaopt.estimation.solver.methods import Method, MultipleShooting, OutputError, PredictionError
 from seaopt.estimation.uncertainty.bootstrap import Bootstrap, bootstrap
 from seaopt.estimation.uncertainty.profile import Profile, profile
 

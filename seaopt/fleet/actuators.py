@@ -100,19 +100,19 @@ def write_actuators(table: pl.DataFrame, path: Path | str) -> Path:
 def _average(name: str, between: Between | None) -> tuple[pl.Expr, pl.Expr]:
     """Return the mean of a parameter over logs that are met, weighted by fits and spread between runs, and its std."""
     value, std = (pl.col(column).cast(pl.Float64) for column in (name, f"{name}_std"))
-    known = (pl.col("status") == MET) & value.is_finite() & (std > 0.0)
-    weights = 1.0 / (std.filter(known) ** 2 + (between.std**2 if between else 0.0))
+    identified = (pl.col("status") == MET) & value.is_finite() & (std > 0.0)
+    weights = 1.0 / (std.filter(identified) ** 2 + (between.std**2 if between else 0.0))
     total = weights.sum()
     some = total > 0.0
-    mean = (value.filter(known) * weights).sum() / total
+    mean = (value.filter(identified) * weights).sum() / total
     return pl.when(some).then(mean).alias(name), pl.when(some).then(total**-0.5).alias(f"{name}_std")
 
 
 def _list_alarms(drift: Drift) -> pl.DataFrame:
     """Return each actuator's alarms in words."""
     words: dict[str, list[str]] = {}
-    for one in drift.alarms:
-        words.setdefault(one.actuator, []).append(one.describe())
+    for alarm in drift.alarms:
+        words.setdefault(alarm.actuator, []).append(alarm.describe())
     content: dict[str, Any] = {"label": list(words), "alarms": ["; ".join(texts) for texts in words.values()]}
     schema = {"label": pl.String, "alarms": pl.String}
     return pl.DataFrame(content, schema=schema).with_columns(pl.lit(value=True).alias("alarm"))
@@ -126,9 +126,9 @@ def _add_trends(table: pl.DataFrame, drift: Drift) -> pl.DataFrame:
     worst = drift.table.group_by(label).agg(pl.col("level").max())
     table = table.join(worst, on="label", how="left", maintain_order="left")
     for name in drift.between:
-        own = drift.table.filter(pl.col("parameter") == name)
-        own = own.select(label, *(pl.col(column).alias(f"{name}_{column}") for column in TRENDS))
-        table = table.join(own, on="label", how="left", maintain_order="left")
+        trends = drift.table.filter(pl.col("parameter") == name)
+        trends = trends.select(label, *(pl.col(column).alias(f"{name}_{column}") for column in TRENDS))
+        table = table.join(trends, on="label", how="left", maintain_order="left")
     return table
 
 
@@ -139,10 +139,10 @@ def _add_population(table: pl.DataFrame, population: Population) -> pl.DataFrame
         for name, logarithmic, mean in zip(population.names, population.logarithmic, population.mean, strict=True)
     ]
     stds = [float(population.between[k, k]) ** 0.5 for k in range(len(off))]
-    furthest = pl.max_horizontal((one / std).abs() for one, std in zip(off, stds, strict=True))
-    known = population.table.drop("logs").rename({"actuator": "label"}).with_columns(furthest.alias("off"))
-    both = [name for name in known.columns if name in table.columns and name != "label"]
-    table = table.join(known, on="label", how="left", maintain_order="left", suffix=":siblings")
+    furthest = pl.max_horizontal((distance / std).abs() for distance, std in zip(off, stds, strict=True))
+    values = population.table.drop("logs").rename({"actuator": "label"}).with_columns(furthest.alias("off"))
+    both = [name for name in values.columns if name in table.columns and name != "label"]
+    table = table.join(values, on="label", how="left", maintain_order="left", suffix=":siblings")
     return table.with_columns(pl.coalesce(f"{name}:siblings", name).alias(name) for name in both).drop(
         [f"{name}:siblings" for name in both]
     )

@@ -57,10 +57,7 @@ def _make_chain(threshold: float, allowance: float) -> Float[np.ndarray, "m m"]:
 def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
     """Return after how many runs a one-sided chart raises an alarm on average, where nothing has changed.
 
-    Parameters
-    ----------
-    threshold, allowance : float
-        h and k, in standard deviations.
+    `threshold`, `allowance`: h and k, in standard deviations.
 
     Examples
     --------
@@ -77,14 +74,7 @@ def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
 def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> Float[np.ndarray, " n"]:
     """Return the probabilities that a one-sided chart raises an alarm within 0, 1, ... runs, where nothing has changed.
 
-    Parameters
-    ----------
-    threshold : float
-        h, in standard deviations.
-    runs : int
-        How many, at most.
-    allowance : float
-        k, in standard deviations.
+    `threshold`: h, in standard deviations. `runs`: how many, at most. `allowance`: k, in standard deviations.
 
     Examples
     --------
@@ -104,19 +94,9 @@ def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANC
 def choose_threshold(probability: float, runs: int, charts: int, allowance: float = ALLOWANCE) -> float:
     """Return the threshold h with which an actuator raises a false alarm with at most this probability.
 
-    Parameters
-    ----------
-    probability : float
-        Of an alarm of any of its charts within `runs` runs.
-    runs, charts : int
-        How many runs; how many parameters of an actuator have a chart.
-    allowance : float
-        k, in standard deviations.
-
-    Raises
-    ------
-    SeaoptError
-        The probability is not between 0 and 1, or smaller than 1e-6.
+    `probability`: of an alarm of any of its charts within `runs` runs. `runs`, `charts`: how many runs; how many
+    parameters of an actuator have a chart. `allowance`: k, in standard deviations. Raises SeaoptError: the probability
+    is not between 0 and 1, or smaller than 1e-6.
 
     Examples
     --------
@@ -139,26 +119,15 @@ def choose_threshold(probability: float, runs: int, charts: int, allowance: floa
 
 @record(eq=False)
 class Charts:
-    """Charts of one parameter, a row an actuator, a column a run.
+    """Charts of one parameter, a row an actuator, a column a run."""
 
-    Parameters
-    ----------
-    ratios : array
-        Innovations over their stds; nan at the first run and where there is none.
-    innovations : array
-        The same as they counted.
-    upper, lower : array
-        S+ and S-.
-    alarm : array of int
-        At which run the alarm was raised; -1 for none.
-
-    """
-
+    # innovations over their stds; nan at the first run and where there is none
     ratios: Float[np.ndarray, "actuators runs"]
-    innovations: Float[np.ndarray, "actuators runs"]
+    innovations: Float[np.ndarray, "actuators runs"]  # the same as they counted
+    # upper, lower: S+ and S-
     upper: Float[np.ndarray, "actuators runs"]
     lower: Float[np.ndarray, "actuators runs"]
-    alarm: Int[np.ndarray, " actuators"]
+    alarm: Int[np.ndarray, " actuators"]  # at which run the alarm was raised; -1 for none
 
 
 def chart_runs(
@@ -177,20 +146,11 @@ def chart_runs(
 
     After an alarm the baseline stays as it was, so that it does not learn what is wrong.
 
-    Parameters
-    ----------
-    values : array
-        nan where an actuator has no run.
-    variances : array
-        Of each value: independent from run to run, as that of its fit.
-    threshold, allowance : float
-        h and k, in standard deviations.
-    between, correlation : float
-        Variance between runs, and the correlation of that in runs that follow each other.
-    scale, dof : float
-        Of Student's t, of which innovations over their stds are; 1 and infinite where they are normal.
-    start : int
-        Runs that a baseline starts from, without a chart of them: of heavy tails several, by Student's t.
+    `values`: nan where an actuator has no run. `variances`: of each value: independent from run to run, as that of its
+    fit. `threshold`, `allowance`: h and k, in standard deviations. `between`, `correlation`: variance between runs, and
+    the correlation of that in runs that follow each other. `scale`, `dof`: of Student's t, of which innovations over
+    their stds are; 1 and infinite where they are normal. `start`: runs that a baseline starts from, without a chart of
+    them: of heavy tails several, by Student's t.
 
     Examples
     --------
@@ -212,27 +172,27 @@ def chart_runs(
     of_mean, of_both, of_state = np.zeros(count), np.zeros(count), np.full(count, between)
     for run in range(runs):
         present = np.isfinite(values[:, run])
-        known = present & begun
-        own = np.where(present, variances[:, run], 1.0)
+        charted = present & begun
+        variance = np.where(present, variances[:, run], 1.0)
         state, of_both = correlation * state, correlation * of_both
         of_state = correlation**2 * of_state + (1.0 - correlation**2) * between
-        spread = scale * np.sqrt(of_mean + 2.0 * of_both + of_state + own)
+        spread = scale * np.sqrt(of_mean + 2.0 * of_both + of_state + variance)
         ratio = (values[:, run] - mean - state) / spread
-        z = np.where(known, np.clip(_normalise(ratio, dof), -CLIP, CLIP), 0.0)
-        ratios[known, run], innovations[known, run] = ratio[known], z[known]
-        now = np.where(known, np.maximum(0.0, now + np.stack([z, -z]) - allowance), now)
+        z = np.where(charted, np.clip(_normalise(ratio, dof), -CLIP, CLIP), 0.0)
+        ratios[charted, run], innovations[charted, run] = ratio[charted], z[charted]
+        now = np.where(charted, np.maximum(0.0, now + np.stack([z, -z]) - allowance), now)
         sums[:, :, run] = now
         alarm[(alarm < 0) & np.any(now > threshold, axis=0)] = run
         # Kalman's gains, of the innovation as it counted
         total = (spread / scale) ** 2
         gain, gain_state = (of_mean + of_both) / total, (of_both + of_state) / total
-        learns = known & (alarm < 0)
+        learns = charted & (alarm < 0)
         mean = mean + np.where(learns, gain * z * spread, 0.0)
-        state = state + np.where(known, gain_state * ratio * spread, 0.0)
+        state = state + np.where(charted, gain_state * ratio * spread, 0.0)
         of_mean = of_mean - np.where(learns, gain**2 * total, 0.0)
-        of_both = of_both - np.where(known, gain * gain_state * total, 0.0)  # also of a mean that does not learn
+        of_both = of_both - np.where(charted, gain * gain_state * total, 0.0)  # also of a mean that does not learn
         excess = (ratio - z) * spread
-        of_state = of_state + np.where(known, gain_state**2 * (excess**2 - total), 0.0)
+        of_state = of_state + np.where(charted, gain_state**2 * (excess**2 - total), 0.0)
         starts = present & ~begun & (run >= start - 1)
         if starts.any():
             begun |= starts
@@ -244,28 +204,32 @@ def chart_runs(
 
 
 def _start(
-    values: Float[np.ndarray, "actuators runs"], variances: Float[np.ndarray, "actuators runs"],
-    between: float, correlation: float, scale: float, dof: float,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:  # fmt: skip
+    values: Float[np.ndarray, "actuators runs"],
+    variances: Float[np.ndarray, "actuators runs"],
+    between: float,
+    correlation: float,
+    scale: float,
+    dof: float,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the mean of the first runs, its variance, and its covariance with u of the last of them.
 
     They tell mean and u together, and nothing of u alone. Of several runs it is the most likely mean of Student's t.
     """
-    known = np.isfinite(values)
+    present = np.isfinite(values)
     if values.shape[1] == 1:
         return values[:, 0], between + variances[:, 0], np.full(len(values), -between)
-    count, apart = known.sum(axis=1), np.arange(values.shape[1])
-    weights = known / (between + np.where(known, variances, 1.0))
+    count, apart = present.sum(axis=1), np.arange(values.shape[1])
+    weights = present / (between + np.where(present, variances, 1.0))
     mean = np.nanmedian(values, axis=1)
     for _ in range(STEPS):
-        square = np.where(known, (values - mean[:, None]) ** 2, 0.0) * weights / scale**2
-        own = weights * (1.0 + 1.0 / dof) / (1.0 + square / dof)
-        mean = np.sum(own * np.where(known, values, 0.0), axis=1) / own.sum(axis=1)
+        square = np.where(present, (values - mean[:, None]) ** 2, 0.0) * weights / scale**2
+        pulls = weights * (1.0 + 1.0 / dof) / (1.0 + square / dof)
+        mean = np.sum(pulls * np.where(present, values, 0.0), axis=1) / pulls.sum(axis=1)
     alike = between * correlation ** np.abs(apart[:, None] - apart)
-    pairs = known[:, :, None] & known[:, None, :]
-    spread = np.where(pairs, alike, 0.0).sum(axis=(1, 2)) + np.where(known, variances, 0.0).sum(axis=1)
+    pairs = present[:, :, None] & present[:, None, :]
+    spread = np.where(pairs, alike, 0.0).sum(axis=(1, 2)) + np.where(present, variances, 0.0).sum(axis=1)
     spread *= (1.0 + 3.0 / dof) / (1.0 + 1.0 / dof)
-    return mean, spread / count**2, -np.where(known, alike[-1], 0.0).sum(axis=1) / count
+    return mean, spread / count**2, -np.where(present, alike[-1], 0.0).sum(axis=1) / count
 
 
 def _normalise(ratio: Float[np.ndarray, " n"], dof: float) -> Float[np.ndarray, " n"]:
@@ -278,11 +242,7 @@ def _normalise(ratio: Float[np.ndarray, " n"], dof: float) -> Float[np.ndarray, 
 def find_change(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> int:
     """Return from which run on a mean is another one: the step that is most likely, if there is one (Hinkley 1970).
 
-    Parameters
-    ----------
-    values, weights : array
-        Of at least two runs; one over their variances.
-
+    `weights`: one over the variances of the values, of at least two runs.
     """
     before = np.cumsum(weights)[:-1]
     after = weights.sum() - before

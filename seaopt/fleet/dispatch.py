@@ -7,6 +7,7 @@ flight are tried again at the end, one at a time and alone, and one on which a w
 
 from __future__ import annotations
 
+import errno
 from collections import deque
 from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
@@ -25,20 +26,21 @@ LOOK_S = 1.0  # between looks at what is in flight, where nothing is said to be 
 COUNT_S = 5.0  # between counts of the workers
 DEATHS = 2  # of a worker that works on one log alone, until that log is given up
 PATIENCE_S, AGAIN_S = 120.0, 1.0  # how long, and how often, work is offered to an executor that takes none
+REMEDIES = {
+    errno.EMFILE: "allow more open files (ulimit -n 1024)",
+    errno.ENFILE: "close what holds files open on this machine",
+    errno.EAGAIN: "allow more processes (ulimit -u)",
+    errno.ENOMEM: "give it more memory (ulimit -v)",
+}
+
+
+def _propose_remedy(error: Exception) -> str:
+    remedy = REMEDIES.get(error.errno or 0) if isinstance(error, OSError) else None
+    return remedy or "start the workers again"
 
 
 class Dispatcher:
-    """The logs that wait, and the batches that are in flight.
-
-    Parameters
-    ----------
-    executor : Executor
-    plan : Plan
-    logs : sequence of FleetLog
-    known : mapping of path to SHA-256
-        As in `fit_batch`.
-
-    """
+    """The logs that wait, and the batches that are in flight; `known` is as in `fit_batch`."""
 
     def __init__(self, executor: Executor, plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> None:
         self.executor = executor
@@ -94,17 +96,17 @@ class Dispatcher:
         return max(1, min(int(BATCH_S / max(self.log_s, 1e-9)), LARGEST, share))
 
     def _submit(self, batch: tuple[FleetLog, ...]) -> None:
-        known = {log.path: self.known[log.path] for log in batch if log.path in self.known}
+        done = {log.path: self.known[log.path] for log in batch if log.path in self.known}
         patience = PATIENCE_S if hasattr(self.executor, "_client") else 0.0  # a scheduler that restarts is back soon
         end = monotonic() + patience
         while True:
             try:
-                self.flying[self.executor.submit(fit_batch, self.plan, batch, known)] = batch
+                self.flying[self.executor.submit(fit_batch, self.plan, batch, done)] = batch
                 return
             except Exception as error:  # each engine has its own
                 if monotonic() >= end:
                     raise SeaoptError(
-                        f"the executor takes no more work ({type(error).__name__}: {error}); start the workers again"
+                        f"the executor takes no more work ({type(error).__name__}: {error}); {_propose_remedy(error)}"
                     ) from error
                 sleep(AGAIN_S)
 

@@ -19,9 +19,8 @@ import numpy as np
 import polars as pl
 from jaxtyping import Float, Int
 
-from seaopt.errors import SeaoptError, suggestion
 from seaopt.fleet.cusum import ALLOWANCE, Charts, alarm_probabilities, chart_runs, choose_threshold, find_change
-from seaopt.fleet.history import LABEL, TIME, History, format_time, order_runs, parse_time
+from seaopt.fleet.history import LABEL, TIME, History, check_names, format_time, leave_out, order_runs, parse_time
 from seaopt.fleet.result import Fleet
 from seaopt.fleet.scatter import (
     BETWEEN_HEAD,
@@ -146,7 +145,7 @@ class Drift:
         """What to say of it in one line."""
         if self.missing:
             return f"not looked for: {self.missing}"
-        count = len({one.actuator for one in self.alarms})
+        count = len({alarm.actuator for alarm in self.alarms})
         found = f"{count or 'none'} of {format_count(self.actuators, 'actuator')} with an alarm"
         return f"{found}; {self.describe_expected()}"
 
@@ -164,28 +163,39 @@ class Drift:
         """Return the content of the part drift of fleet.json."""
         names = [name for name in Alarm.__dataclass_fields__ if name != "identity"]
         return {
-            "verdict": self.verdict, "actuators": self.actuators, "time": self.history.source,
-            "time_unit": self.history.unit, "actuator": list(self.history.actuator), "false_alarms": self.false_alarms,
-            "per_runs": PER_RUNS, "threshold": self.threshold, "allowance": ALLOWANCE, "expected": self.expected,
+            "verdict": self.verdict,
+            "actuators": self.actuators,
+            "time": self.history.source,
+            "time_unit": self.history.unit,
+            "actuator": list(self.history.actuator),
+            "false_alarms": self.false_alarms,
+            "per_runs": PER_RUNS,
+            "threshold": self.threshold,
+            "allowance": ALLOWANCE,
+            "expected": self.expected,
             "doubt": self.doubt,
             "left_out": dict(self.left_out),
             "between_runs": {
                 name: {
-                    "std": one.std, "pairs": one.pairs, "dof": one.dof, "correlation": one.correlation,
-                    "tails": one.tails if np.isfinite(one.tails) else None, "scale": one.scale,
+                    "std": spread.std,
+                    "pairs": spread.pairs,
+                    "dof": spread.dof,
+                    "correlation": spread.correlation,
+                    "tails": spread.tails if np.isfinite(spread.tails) else None,
+                    "scale": spread.scale,
                 }
-                for name, one in self.between.items()
+                for name, spread in self.between.items()
             },
             "alarms": [
-                {name: getattr(one, name) for name in names} | {"text": one.describe()} for one in self.alarms
+                {name: getattr(alarm, name) for name in names} | {"text": alarm.describe()} for alarm in self.alarms
             ],
-        }  # fmt: skip
+        }
 
     def __repr__(self) -> str:
-        lines = [f"Drift: {self.verdict}", *(f"  {one.actuator}: {one.describe()}" for one in self.alarms[:20])]
+        lines = [f"Drift: {self.verdict}", *(f"  {alarm.actuator}: {alarm.describe()}" for alarm in self.alarms[:20])]
         if len(self.alarms) > 20:
             lines.append(f"  and {len(self.alarms) - 20} more: drift.alarms")
-        cells = [(name, *one.describe()) for name, one in self.between.items()]
+        cells = [(name, *spread.describe()) for name, spread in self.between.items()]
         table = format_table(cells, ("parameter", *BETWEEN_HEAD), "<>>>>") if cells else []
         return "\n".join([*lines, *(f"  {line}" for line in table)])
 
@@ -262,7 +272,9 @@ def find_drift(
 
     """
     history = order_runs(fleet, actuator, time)
-    names = _choose_parameters(fleet, parameters)
+    names = fleet.fitted or tuple(fleet.units)
+    if parameters is not None:
+        names = check_names(parameters, tuple(fleet.units), "parameters", "column of the fleet")
     threshold = choose_threshold(false_alarms, PER_RUNS, max(len(names), 1))
     rows, left_out = _select_rows(history, since)
     actuators = history.rows[LABEL].n_unique()
@@ -272,12 +284,12 @@ def find_drift(
     unlike: list[str] = []
     wandering: list[str] = []
     tops = _Tops(level=np.zeros(actuators), runs=np.zeros(actuators, dtype=int), charts=max(len(names), 1))
-    labels = {label: place for place, label in enumerate(history.rows[LABEL].unique(maintain_order=True))}
+    labels = {label: number for number, label in enumerate(history.rows[LABEL].unique(maintain_order=True))}
     for name in names:
-        known = rows.filter(pl.col(name).is_finite() & pl.col(f"{name}_std").is_finite())
-        if len(known) < len(rows):
-            left_out[f"{name} not identified"] = len(rows) - len(known)
-        batches = list(_batch_runs(known, name))
+        identified = rows.filter(pl.col(name).is_finite() & pl.col(f"{name}_std").is_finite())
+        if len(identified) < len(rows):
+            left_out[f"{name} not identified"] = len(rows) - len(identified)
+        batches = list(_batch_runs(identified, name))
         runs = [(batch.values, batch.variances) for batch in batches]
         spread = estimate_between_runs(runs)
         if spread is None:
@@ -291,19 +303,26 @@ def find_drift(
             tables.append(_tabulate(batch, name, fleet.units[name], spread, charts, threshold))
             alarms += _list_alarms(batch, history, name, fleet.units[name], spread, charts, threshold)
             still.append((batch.values[charts.alarm < 0], batch.variances[charts.alarm < 0]))
-            own = np.array([labels[label] for label in batch.actuators], dtype=int)
+            numbers = np.array([labels[label] for label in batch.actuators], dtype=int)
             highest = np.maximum(charts.upper, charts.lower).max(axis=1)
-            tops.level[own] = np.maximum(tops.level[own], highest)
-            tops.runs[own] = np.maximum(tops.runs[own], np.isfinite(batch.values).sum(axis=1))
+            tops.level[numbers] = np.maximum(tops.level[numbers], highest)
+            tops.runs[numbers] = np.maximum(tops.runs[numbers], np.isfinite(batch.values).sum(axis=1))
         if wander(still, spread):
             wandering.append(name)
     doubt = _doubt(tops, threshold, between, unlike, wandering) if between else ""
     return Drift(
-        table=pl.concat(tables) if tables else pl.DataFrame(), alarms=_order_alarms(alarms), actuators=actuators,
-        history=history, between=between, threshold=threshold, false_alarms=false_alarms,
-        expected=None if doubt else float(tops.expect(threshold).sum()), left_out=left_out,
-        missing="" if between else _explain_missing(history, rows), doubt=doubt,
-    )  # fmt: skip
+        table=pl.concat(tables) if tables else pl.DataFrame(),
+        alarms=_order_alarms(alarms),
+        actuators=actuators,
+        history=history,
+        between=between,
+        threshold=threshold,
+        false_alarms=false_alarms,
+        expected=None if doubt else float(tops.expect(threshold).sum()),
+        left_out=left_out,
+        missing="" if between else _explain_missing(history, rows),
+        doubt=doubt,
+    )
 
 
 def _shape(batches: Sequence[_Runs], between: Between, threshold: float) -> Between:
@@ -314,11 +333,11 @@ def _shape(batches: Sequence[_Runs], between: Between, threshold: float) -> Betw
         values, variances = batch.values[::step], batch.variances[::step]
         charts = chart_runs(values, variances, threshold, **between.chart)
         end = np.full(len(values), values.shape[1])
-        for one in np.flatnonzero(charts.alarm >= 0):
-            runs = slice(int(charts.alarm[one]) + 1)
-            end[one] = find_change(values[one, runs], 1.0 / (variances[one, runs] + between.std**2))
-        own = charts.ratios[np.arange(values.shape[1]) < end[:, None]]
-        ratios.append(own[np.isfinite(own)])
+        for row in np.flatnonzero(charts.alarm >= 0):
+            runs = slice(int(charts.alarm[row]) + 1)
+            end[row] = find_change(values[row, runs], 1.0 / (variances[row, runs] + between.std**2))
+        healthy = charts.ratios[np.arange(values.shape[1]) < end[:, None]]
+        ratios.append(healthy[np.isfinite(healthy)])
     tails, scale = estimate_tails(np.concatenate(ratios))
     return replace(between, tails=tails, scale=scale)
 
@@ -342,10 +361,10 @@ def _doubt(
     tops: _Tops, threshold: float, between: Mapping[str, Between], unlike: Sequence[str], wandering: Sequence[str]
 ) -> str:
     """Return why nobody can say how many healthy actuators would have an alarm; "" where one can."""
-    few = [name for name, one in between.items() if not one.shaped]
+    few = [name for name, spread in between.items() if not spread.shaped]
     healthy = tops.level <= threshold
     if few or tops.runs.size < FEWEST_ACTUATORS:
-        least = between[few[0]].pairs if few else min(one.pairs for one in between.values())
+        least = between[few[0]].pairs if few else min(spread.pairs for spread in between.values())
         return (
             f"{format_count(tops.runs.size, 'actuator')} and {least} times one run after another are too few to tell "
             "how healthy ones scatter"
@@ -366,32 +385,13 @@ def _doubt(
     return ""
 
 
-def _choose_parameters(fleet: Fleet, parameters: Sequence[str] | None) -> tuple[str, ...]:
-    """Return what has a chart."""
-    if parameters is None:
-        return fleet.fitted or tuple(fleet.units)
-    chosen = (parameters,) if isinstance(parameters, str) else tuple(parameters)
-    for name in chosen:
-        if name not in fleet.units:
-            raise SeaoptError(f'parameters = "{name}" is no column of the fleet; {suggestion(name, fleet.units)}')
-    return chosen
-
-
 def _select_rows(history: History, since: str | float | None) -> tuple[pl.DataFrame, dict[str, int]]:
     """Return the logs that charts have, and how many are left out for which reason."""
-    rows = history.rows.with_row_index(_PLACE)
-    left_out: dict[str, int] = {}
-    status = pl.col("status")
-    conditions = [("failed", status != FAILED), ("not met", status == MET)]
-    conditions.append(("without a time", pl.col(TIME).is_not_null()))
+    status, time = pl.col("status"), pl.col(TIME)
+    conditions = {"failed": status != FAILED, "not met": status == MET, "without a time": time.is_not_null()}
     if since is not None:
-        conditions.append((f"before {since}", pl.col(TIME) >= parse_time(since, history)))
-    for reason, condition in conditions:
-        kept = rows.filter(condition)
-        if len(kept) < len(rows):
-            left_out[reason] = len(rows) - len(kept)
-        rows = kept
-    return rows, left_out
+        conditions[f"before {since}"] = time >= parse_time(since, history)
+    return leave_out(history.rows.with_row_index(_PLACE), conditions)
 
 
 def _explain_missing(history: History, rows: pl.DataFrame) -> str:
@@ -406,19 +406,19 @@ def _explain_missing(history: History, rows: pl.DataFrame) -> str:
 
 def _batch_runs(rows: pl.DataFrame, name: str) -> Iterator[_Runs]:
     """Yield the runs of a parameter, some actuators at once, those of about as many runs together."""
-    own = rows.with_columns(pl.int_range(pl.len()).over(LABEL).alias(_RUN))
-    counts = own.group_by(LABEL, maintain_order=True).len().sort("len", maintain_order=True)
+    numbered = rows.with_columns(pl.int_range(pl.len()).over(LABEL).alias(_RUN))
+    counts = numbered.group_by(LABEL, maintain_order=True).len().sort("len", maintain_order=True)
     batch: list[str] = []
     for label, count in [*counts.iter_rows(), ("", 0)]:
         if batch and (not count or (len(batch) + 1) * count > CELLS):
-            yield _pack(own.filter(pl.col(LABEL).is_in(batch)), batch, name)
+            yield _pack(numbered.filter(pl.col(LABEL).is_in(batch)), batch, name)
             batch = []
         batch.append(label)
 
 
 def _pack(rows: pl.DataFrame, actuators: list[str], name: str) -> _Runs:
     """Return runs as arrays."""
-    index = {label: place for place, label in enumerate(actuators)}
+    index = {label: row for row, label in enumerate(actuators)}
     at = np.array([index[label] for label in rows[LABEL]]), rows[_RUN].to_numpy()
     shape = len(actuators), int(at[1].max()) + 1
     places, times, values, variances = np.full(shape, -1), *(np.full(shape, np.nan) for _ in range(3))
@@ -443,33 +443,44 @@ def _tabulate(batch: _Runs, name: str, unit: str, spread: Between, charts: Chart
         np.isfinite(batch.values).sum(axis=1),
         (f(batch.times, axis=1) for f in (np.nanmin, np.nanmax)),
     )
-    known = (runs >= FEWEST_OF_TREND) & (last > first)
-    slope, slope_std = np.where(known, slope, np.nan), np.where(known, slope_std, np.nan)
+    sloped = (runs >= FEWEST_OF_TREND) & (last > first)
+    slope, slope_std = np.where(sloped, slope, np.nan), np.where(sloped, slope_std, np.nan)
     now = np.maximum(charts.upper[:, -1], charts.lower[:, -1]) / threshold
-    return pl.DataFrame({
-        "actuator": batch.actuators, "parameter": name, "unit": unit, "runs": runs, "first": first, "last": last,
-        "mean": mean, "mean_std": widened.sum(axis=1) ** 0.5 / total,
-        "slope": slope, "slope_std": slope_std, "change": slope * (last - first),
-        "change_std": slope_std * (last - first), "level": now, "alarm": charts.alarm >= 0,
-    })  # fmt: skip
+    return pl.DataFrame(
+        {
+            "actuator": batch.actuators,
+            "parameter": name,
+            "unit": unit,
+            "runs": runs,
+            "first": first,
+            "last": last,
+            "mean": mean,
+            "mean_std": widened.sum(axis=1) ** 0.5 / total,
+            "slope": slope,
+            "slope_std": slope_std,
+            "change": slope * (last - first),
+            "change_std": slope_std * (last - first),
+            "level": now,
+            "alarm": charts.alarm >= 0,
+        }
+    )
 
 
 def _list_alarms(
-    batch: _Runs, history: History, name: str, unit: str, spread: Between, charts: Charts,
-    threshold: float,
-) -> list[Alarm]:  # fmt: skip
+    batch: _Runs, history: History, name: str, unit: str, spread: Between, charts: Charts, threshold: float
+) -> list[Alarm]:
     """Return the alarms of a parameter."""
     alarms: list[Alarm] = []
-    for own in np.flatnonzero(charts.alarm >= 0):
-        raised, runs = int(charts.alarm[own]), int(np.isfinite(batch.values[own]).sum())
-        weights = 1.0 / (batch.variances[own, :runs] + spread.std**2)
-        rises = bool(charts.upper[own, raised] > charts.lower[own, raised])
-        widened = spread.widen(batch.variances[own, :runs]) * weights**2
-        start, end, before, after = _measure_change(batch.values[own, :runs], weights, raised, rises=rises)
-        first, then = (history.rows.row(int(batch.places[own, run]), named=True) for run in (start, raised))
+    for row in np.flatnonzero(charts.alarm >= 0):
+        raised, runs = int(charts.alarm[row]), int(np.isfinite(batch.values[row]).sum())
+        weights = 1.0 / (batch.variances[row, :runs] + spread.std**2)
+        rises = bool(charts.upper[row, raised] > charts.lower[row, raised])
+        widened = spread.widen(batch.variances[row, :runs]) * weights**2
+        start, end, before, after = _measure_change(batch.values[row, :runs], weights, raised, rises=rises)
+        first, then = (history.rows.row(int(batch.places[row, run]), named=True) for run in (start, raised))
         alarms.append(
             Alarm(
-                actuator=batch.actuators[own],
+                actuator=batch.actuators[row],
                 identity={column: str(first[column]) for column in history.actuator},
                 parameter=name,
                 unit=unit,
@@ -483,7 +494,7 @@ def _list_alarms(
                 after=after,
                 after_std=float(widened[start:end].sum() ** 0.5 / weights[start:end].sum()),
                 runs=end - start,
-                level=float(max(charts.upper[own].max(), charts.lower[own].max()) / threshold),
+                level=float(max(charts.upper[row].max(), charts.lower[row].max()) / threshold),
             )
         )
     return alarms
@@ -508,6 +519,6 @@ def _measure_change(
 def _order_alarms(alarms: Sequence[Alarm]) -> tuple[Alarm, ...]:
     """Return alarms, each actuator's together, the worst first."""
     worst: dict[str, float] = {}
-    for one in alarms:
-        worst[one.actuator] = max(worst.get(one.actuator, 0.0), one.level)
-    return tuple(sorted(alarms, key=lambda one: (-worst[one.actuator], one.actuator, -one.level)))
+    for alarm in alarms:
+        worst[alarm.actuator] = max(worst.get(alarm.actuator, 0.0), alarm.level)
+    return tuple(sorted(alarms, key=lambda alarm: (-worst[alarm.actuator], alarm.actuator, -alarm.level)))

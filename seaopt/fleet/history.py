@@ -8,9 +8,8 @@ file's own time is not looked at, for it is that of its last copy.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
 
 import polars as pl
 
@@ -31,6 +30,7 @@ FORMATS = (
 YEARS = (1980, 2100)  # other numbers are no dates
 UNIX_S = 1e8  # seconds since 1970, beyond which a number is that, and no count
 DAY_S = 86400.0
+COLUMN = "column of the identity"
 DAY, ORDER = "day", ""  # units: the latter of texts that have an order only
 
 
@@ -61,6 +61,17 @@ class History:
     warning: str = ""
 
 
+def leave_out(rows: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Return the rows that meet all conditions, and how many do not, by the reason that names the first of them."""
+    left_out: dict[str, int] = {}
+    for reason, condition in conditions.items():
+        kept = rows.filter(condition)
+        if len(kept) < len(rows):
+            left_out[reason] = len(rows) - len(kept)
+        rows = kept
+    return rows, left_out
+
+
 def order_runs(fleet: Fleet, actuator: Sequence[str] | None = None, time: Sequence[str] | None = None) -> History:
     """Return the logs of a fleet by actuator and time.
 
@@ -89,12 +100,12 @@ def order_runs(fleet: Fleet, actuator: Sequence[str] | None = None, time: Sequen
     (['a/9.csv', 'a/10.csv', 'b/2.csv'], 'run', 'column "run"')
 
     """
-    when = _choose_time(fleet.identity) if time is None else _check_columns(time, fleet.identity, "time")
+    when = _choose_time(fleet.identity) if time is None else check_names(time, fleet.identity, "time", COLUMN)
     if actuator is None:
         temporal = {name for name in fleet.identity if name.lower() in (*DATES, *ORDERS)} | set(when)
         whose = tuple(name for name in fleet.identity if name not in temporal)
     else:
-        whose = _check_columns(actuator, fleet.identity, "actuator")
+        whose = check_names(actuator, fleet.identity, "actuator", COLUMN)
     if not fleet.identity:
         whose = ("log",)
     rows = fleet.rows.with_columns(_label(fleet.rows, whose))
@@ -116,13 +127,13 @@ def order_runs(fleet: Fleet, actuator: Sequence[str] | None = None, time: Sequen
     return History(rows=rows.drop(":path"), actuator=whose, unit=unit or "run", source=source, warning=warning)
 
 
-def _check_columns(names: Sequence[str], identity: Sequence[str], argument: str) -> tuple[str, ...]:
-    """Return the columns that are named, if the identity has them."""
+def check_names(names: Sequence[str], valid: Sequence[str], argument: str, what: str) -> tuple[str, ...]:
+    """Return the names that an argument gives, one or several, if all are valid."""
     chosen = (names,) if isinstance(names, str) else tuple(names)
     for name in chosen:
-        if name not in identity:
-            known = suggestion(name, identity) if identity else "give --identity or --manifest, which make columns"
-            raise SeaoptError(f'{argument} = "{name}" is no column of the identity; {known}')
+        if name not in valid:
+            remedy = suggestion(name, valid) if valid else "give --identity or --manifest, which make columns"
+            raise SeaoptError(f'{argument} = "{name}" is no {what}; {remedy}')
     return chosen
 
 
@@ -160,14 +171,14 @@ def _read_times(rows: pl.DataFrame, when: Sequence[str]) -> tuple[list[float | N
         return days, DAY, source
     numbers = _read_numbers(texts)
     if numbers is not None:
-        if when[0].lower() in DATES and min((one for one in numbers if one is not None), default=0.0) > UNIX_S:
-            return [None if one is None else one / DAY_S for one in numbers], DAY, source
+        if when[0].lower() in DATES and min((number for number in numbers if number is not None), default=0.0) > UNIX_S:
+            return [None if number is None else number / DAY_S for number in numbers], DAY, source
         return numbers, when[0], source
     if when[0].lower() in DATES:
         first, odd = _find_odd_date(texts)
-        others = "" if odd == first else f', but "{first}" elsewhere'
+        exception = "" if odd == first else f', but "{first}" elsewhere'
         raise SeaoptError(
-            f'{source} has "{odd}"{others}, which are no dates of one form; write all as 2026-01-31 or '
+            f'{source} has "{odd}"{exception}, which are no dates of one form; write all as 2026-01-31 or '
             "2026-01-31T12:00:00, or name another column with --time"
         )
     ranks = _rank(texts)
@@ -217,23 +228,18 @@ def _read_numbers(texts: Sequence[str]) -> list[float | None] | None:
 
 def _rank(texts: Sequence[str]) -> list[int]:
     """Return the place of each text in the order that people count in: run2 before run10; equal texts share one."""
-    keys = [_natural(text) for text in texts]
-    places = {key: place for place, key in enumerate(sorted(set(keys)))}
+    keys = [
+        tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)
+        for text in texts
+    ]
+    places = {key: rank for rank, key in enumerate(sorted(set(keys)))}
     return [places[key] for key in keys]
-
-
-def _natural(text: str) -> tuple[tuple[int, Any], ...]:
-    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)
 
 
 def parse_time(text: str | float, history: History) -> float:
     """Return a time in the unit of a history.
 
-    Raises
-    ------
-    SeaoptError
-        It is none.
-
+    Raises SeaoptError: it is no time.
     """
     days = _read_dates([str(text)]) if history.unit == DAY else None
     numbers = days or _read_numbers([str(text)])

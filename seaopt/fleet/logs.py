@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt.errors import FileError, LogError, SeaoptError
-from seaopt.files import check_regular, describe_os_error, exists
+from seaopt.files import check_name, check_regular, describe_os_error, exists
 from seaopt.formatting import join_words
 from seaopt.records import record
 
@@ -102,6 +102,7 @@ def read_manifest(path: Path | str, column: str = "log") -> tuple[FleetLog, ...]
 
     source = Path(path)
     check_regular(source)
+    check_name(source, "rename the manifest, or its folder")
     try:
         table = pl.read_csv(source, infer_schema=False)
     except OSError as error:
@@ -128,11 +129,7 @@ def read_manifest(path: Path | str, column: str = "log") -> tuple[FleetLog, ...]
 def open_local(path: str) -> Generator[tuple[Path, str]]:
     """Yield a local file with a log's content and its SHA-256; what lies elsewhere is fetched, and deleted afterwards.
 
-    Raises
-    ------
-    FileError
-        It cannot be read or fetched.
-
+    Raises FileError: it cannot be read or fetched.
     """
     if not _ADDRESS.match(path):
         local = Path(path)
@@ -180,7 +177,9 @@ def _expand(name: str) -> list[str]:
 
 
 def _absolute(path: str | Path) -> str:
-    return os.path.abspath(path)  # noqa: PTH100  (links are kept: the name is the log's identity)
+    full = os.path.abspath(path)  # noqa: PTH100  (links are kept: the name is the log's identity)
+    check_name(full, "the fleet's table cannot name it: rename the log, or its folder", LogError)
+    return full
 
 
 def _open_filesystem(address: str) -> Any:

@@ -108,8 +108,8 @@ def _compose(fleet: Fleet, drift: Drift, population: Population | None, title: s
         verdicts=_judge(fleet, drift),
         glance=_glance(fleet, drift),
         alarms=tuple(
-            AlarmLine(actuator=one.actuator, text=one.describe(), since=one.since, raised=one.raised)
-            for one in drift.alarms[:MOST_ALARMS]
+            AlarmLine(actuator=alarm.actuator, text=alarm.describe(), since=alarm.since, raised=alarm.raised)
+            for alarm in drift.alarms[:MOST_ALARMS]
         ),
         more_alarms=max(len(drift.alarms) - MOST_ALARMS, 0),
         remedies=REMEDIES,
@@ -145,7 +145,7 @@ def _glance(fleet: Fleet, drift: Drift) -> tuple[tuple[str, str, str], ...]:
         ("actuators", str(drift.actuators), "by " + join_words(drift.history.actuator or ("all logs",))),
     ]
     if not drift.missing:
-        alarmed = len({one.actuator for one in drift.alarms})
+        alarmed = len({alarm.actuator for alarm in drift.alarms})
         healthy = "not known" if drift.expected is None else format_number(drift.expected, 2)
         figures.append(("with an alarm", str(alarmed), f"{healthy} if all were healthy"))
     return tuple(figures)
@@ -154,7 +154,7 @@ def _glance(fleet: Fleet, drift: Drift) -> tuple[tuple[str, str, str], ...]:
 def _list_rows(table: pl.DataFrame, names: Sequence[str], drift: Drift, siblings: bool) -> tuple[Row, ...]:
     """Return the rows of the table, with drawings of those that are worst."""
     runs = _group_runs(drift, table["label"].head(MOST_DRAWN).to_list())
-    begun = {(one.actuator, one.parameter): one.begun for one in drift.alarms}
+    begun = {(alarm.actuator, alarm.parameter): alarm.begun for alarm in drift.alarms}
     rows: list[Row] = []
     for row in table.iter_rows(named=True):
         state, tone = _name_state(row)
@@ -162,10 +162,16 @@ def _list_rows(table: pl.DataFrame, names: Sequence[str], drift: Drift, siblings
         cells += [_show_parameter(row, name, runs.get(row["label"]), begun) for name in names]
         rows.append(
             Row(
-                name=row["label"], state=state, tone=tone, logs=row["logs"], met=row["met"], last=row["last"] or "",
-                level=row["level"], cells=tuple(cells),
+                name=row["label"],
+                state=state,
+                tone=tone,
+                logs=row["logs"],
+                met=row["met"],
+                last=row["last"] or "",
+                level=row["level"],
+                cells=tuple(cells),
             )
-        )  # fmt: skip
+        )
     return tuple(rows)
 
 
@@ -203,10 +209,10 @@ def _show_parameter(
     cell = Cell(text=text, sort=_show(value, text).sort, trend=trend)
     if runs is None:
         return cell
-    known = runs.filter(pl.col(name).is_finite() & pl.col(f"{name}_std").is_finite())
-    if len(known) < 2:
+    identified = runs.filter(pl.col(name).is_finite() & pl.col(f"{name}_std").is_finite())
+    if len(identified) < 2:
         return cell
-    times, values, stds = (known[column].to_numpy() for column in (TIME, name, f"{name}_std"))
+    times, values, stds = (identified[column].to_numpy() for column in (TIME, name, f"{name}_std"))
     drawing = draw_trend(times, values, stds, label=f"{name} of {row['label']}", since=begun.get((row["label"], name)))
     return replace(cell, drawing=drawing)
 
@@ -263,7 +269,8 @@ def _list_tables(fleet: Fleet, drift: Drift, population: Population | None) -> t
                 heading="From run to run",
                 heads=(("parameter", "<"), *((head, ">") for head in BETWEEN_HEAD)),
                 rows=tuple(
-                    (f"{name}{unit_after(fleet.units[name])}", *one.describe()) for name, one in drift.between.items()
+                    (f"{name}{unit_after(fleet.units[name])}", *between.describe())
+                    for name, between in drift.between.items()
                 ),
             )
         )

@@ -23,29 +23,15 @@ _PARTS = {"version", "guessed", "parameters", "plant", "fit"}  # of a problem, t
 
 @record
 class Plan:
-    """What a worker is told once: data only, no code.
+    """What a worker is told once: data only, no code."""
 
-    Parameters
-    ----------
-    problem : str
-        The problem file as JSON, with the one experiment that says how a log is read.
-    source, folder : str
-        The problem file, for messages, and where relative paths start.
-    time_limit_s : float or None
-        For a log.
-    client : str
-        Which process asks; that one a worker must not end.
-    version : str
-        Of the client's seaopt; a worker of another one would give other results.
-
-    """
-
-    problem: str
+    problem: str  # the problem file as JSON, with the one experiment that says how a log is read
+    # source, folder: the problem file, for messages, and where relative paths start
     source: str
     folder: str
-    time_limit_s: float | None
-    client: str
-    version: str
+    time_limit_s: float | None  # for a log
+    client: str  # which process asks; that one a worker must not end
+    version: str  # of the client's seaopt; a worker of another one would give other results
 
     @property
     def digest(self) -> str:
@@ -60,34 +46,19 @@ class Plan:
 
 @record
 class Columns:
-    """The columns of a fleet's table that the problem gives, in order.
+    """The columns of a fleet's table that the problem gives, in order."""
 
-    Parameters
-    ----------
-    units : mapping of name to unit
-        Of the parameters and figures, each of which has a column of its standard deviation, too.
-    outputs : tuple of str
-    fitted : tuple of str
-        Which of the units a fit estimates: free parameters, delay and gains; the others follow from these.
-    free : tuple of str
-        The parameters among them, of whose covariance a fit tells.
-
-    """
-
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # of the parameters and figures, each of which has a column of its standard deviation, too
     outputs: tuple[str, ...]
+    # which of the units a fit estimates: free parameters, delay and gains; the others follow from these
     fitted: tuple[str, ...]
-    free: tuple[str, ...]
+    free: tuple[str, ...]  # the parameters among them, of whose covariance a fit tells
 
 
 def make_plan(problem: Problem, like: str | None, time_limit_s: float | None, client: str) -> Plan:
     """Return the plan of a fleet.
 
-    Raises
-    ------
-    ProblemError
-        No experiment says how to read a log, or it reads more files than one.
-
+    Raises ProblemError: no experiment says how to read a log, or it reads more files than one.
     """
     template = problem.choose_template(like)
     if list_log_files(template) != [template.log]:
@@ -98,9 +69,13 @@ def make_plan(problem: Problem, like: str | None, time_limit_s: float | None, cl
     table = problem.table.model_dump(mode="json", by_alias=True, exclude_unset=True, include=_PARTS)
     table["experiment"] = [template.model_dump(mode="json", by_alias=True, exclude_unset=True) | {"use": "fit"}]
     return Plan(
-        problem=json.dumps(table), source=problem.source, folder=str(problem.folder.resolve()),
-        time_limit_s=time_limit_s, client=client, version=VERSION,
-    )  # fmt: skip
+        problem=json.dumps(table),
+        source=problem.source,
+        folder=str(problem.folder.resolve()),
+        time_limit_s=time_limit_s,
+        client=client,
+        version=VERSION,
+    )
 
 
 def list_columns(problem: Problem) -> Columns:
@@ -121,7 +96,7 @@ def list_columns(problem: Problem) -> Columns:
     return Columns(units=units, outputs=tuple(template.outputs), fitted=fitted, free=free)
 
 
-def name_correlation(one: str, other: str) -> str:
+def name_correlation(first: str, second: str) -> str:
     """Return the column with the correlation of two parameters' errors, whichever is named first.
 
     Examples
@@ -130,7 +105,7 @@ def name_correlation(one: str, other: str) -> str:
     ('J:b_r_corr', 'J:b_r_corr')
 
     """
-    return ":".join(sorted((one, other))) + "_corr"  # no parameter's name has a colon
+    return ":".join(sorted((first, second))) + "_corr"  # no parameter's name has a colon
 
 
 def _is_free(given: Any) -> bool:

@@ -35,8 +35,9 @@ import numpy as np
 import polars as pl
 from jaxtyping import Float, Int
 
-from seaopt.errors import SeaoptError, suggestion
-from seaopt.fleet.history import LABEL, order_runs
+from seaopt.codec import to_content
+from seaopt.errors import SeaoptError
+from seaopt.fleet.history import LABEL, check_names, leave_out, order_runs
 from seaopt.fleet.plan import name_correlation
 from seaopt.fleet.result import Fleet
 from seaopt.fleet.worker import FAILED, MET
@@ -74,6 +75,8 @@ class Population:
 
     """
 
+    json_keys = ("names", "units", "logarithmic", "mean", "between", "within", "actuators", "left_out")
+
     names: tuple[str, ...]
     units: Mapping[str, str]
     logarithmic: tuple[bool, ...]
@@ -82,6 +85,11 @@ class Population:
     within: Float[np.ndarray, "p p"]
     table: pl.DataFrame
     left_out: Mapping[str, int]
+
+    @property
+    def actuators(self) -> int:
+        """How many it is of."""
+        return len(self.table)
 
     def describe(self) -> list[tuple[str, ...]]:
         """Return of each parameter name, unit, mean, and its std between actuators and between runs."""
@@ -95,11 +103,7 @@ class Population:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the part population of fleet.json."""
-        return {
-            "names": list(self.names), "units": dict(self.units), "logarithmic": list(self.logarithmic),
-            "mean": self.mean, "between": self.between, "within": self.within, "actuators": len(self.table),
-            "left_out": dict(self.left_out),
-        }  # fmt: skip
+        return to_content(self)
 
     def __repr__(self) -> str:
         counts = (len(self.table), "actuator"), (int(self.table["logs"].sum()), "log")
@@ -188,7 +192,10 @@ def estimate_population(
     [0.09, 0.05]
 
     """
-    names = _choose_parameters(fleet, parameters)
+    wanted = fleet.free if parameters is None else parameters
+    names = check_names(wanted, fleet.free, "parameters", "free parameter of the fleet")
+    if not names:
+        raise SeaoptError("no parameter of the fleet is free; give one free = true in the problem file")
     history = order_runs(fleet, actuator, time)
     rows, left_out = _select_rows(history.rows, names)
     count = rows[LABEL].n_unique()
@@ -205,27 +212,20 @@ def estimate_population(
     columns: dict[str, Any] = {"actuator": labels, "logs": logs.add_up(np.ones(len(rows), dtype=int))}
     for k, name in enumerate(names):
         shrunk = posterior.values[:, k] * scale[k] + offset[k], np.sqrt(covariances[:, k, k]) * scale[k]
-        own = posterior.own[:, k] * scale[k] + offset[k], np.sqrt(posterior.own_covariances[:, k, k]) * scale[k]
-        known = (*_restore(*shrunk, logarithmic[k]), *_restore(*own, logarithmic[k])[:2])
-        columns |= dict(zip((f"{name}{part}" for part in PARTS), known, strict=True))
+        alone = posterior.own[:, k] * scale[k] + offset[k], np.sqrt(posterior.own_covariances[:, k, k]) * scale[k]
+        parts = (*_restore(*shrunk, logarithmic[k]), *_restore(*alone, logarithmic[k])[:2])
+        columns |= dict(zip((f"{name}{part}" for part in PARTS), parts, strict=True))
     outer = np.outer(scale, scale)
     return Population(
-        names=names, units={name: fleet.units[name] for name in names}, logarithmic=logarithmic,
-        mean=posterior.mean * scale + offset, between=between * outer, within=within * outer,
-        table=pl.DataFrame(columns), left_out=left_out,
-    )  # fmt: skip
-
-
-def _choose_parameters(fleet: Fleet, parameters: Sequence[str] | None) -> tuple[str, ...]:
-    chosen = fleet.free if parameters is None else (parameters,) if isinstance(parameters, str) else tuple(parameters)
-    for name in chosen:
-        if name not in fleet.free:
-            raise SeaoptError(
-                f'parameters = "{name}" is no free parameter of the fleet; {suggestion(name, fleet.free)}'
-            )
-    if not chosen:
-        raise SeaoptError("no parameter of the fleet is free; give one free = true in the problem file")
-    return chosen
+        names=names,
+        units={name: fleet.units[name] for name in names},
+        logarithmic=logarithmic,
+        mean=posterior.mean * scale + offset,
+        between=between * outer,
+        within=within * outer,
+        table=pl.DataFrame(columns),
+        left_out=left_out,
+    )
 
 
 def _select_rows(rows: pl.DataFrame, names: Sequence[str]) -> tuple[pl.DataFrame, dict[str, int]]:
@@ -238,13 +238,7 @@ def _select_rows(rows: pl.DataFrame, names: Sequence[str]) -> tuple[pl.DataFrame
         "not identified": pl.all_horizontal(pl.col(name).is_not_null() & pl.col(name).is_finite() for name in needed),
         "certain": pl.all_horizontal(pl.col(f"{name}_std") > 0.0 for name in names),
     }
-    left_out: dict[str, int] = {}
-    for reason, condition in conditions.items():
-        kept = rows.filter(condition)
-        if len(kept) < len(rows):
-            left_out[reason] = len(rows) - len(kept)
-        rows = kept
-    return rows, left_out
+    return leave_out(rows, conditions)
 
 
 def _prepare(
@@ -288,12 +282,17 @@ def _infer(logs: _Logs, between: Float[np.ndarray, "p p"], within: Float[np.ndar
     mean_covariance = np.linalg.inv(precisions.sum(axis=0))
     mean = mean_covariance @ _times(precisions, own).sum(axis=0)
     shrinkage = between @ precisions
-    rest = np.eye(len(mean)) - shrinkage
-    covariances = between - shrinkage @ between + rest @ mean_covariance @ _turn(rest)
+    remaining = np.eye(len(mean)) - shrinkage
+    covariances = between - shrinkage @ between + remaining @ mean_covariance @ _turn(remaining)
     return _Posterior(
-        mean=mean, mean_covariance=mean_covariance, own=own, own_covariances=own_covariances, shrinkage=shrinkage,
-        values=mean + _times(shrinkage, own - mean), covariances=_mirror(covariances),
-    )  # fmt: skip
+        mean=mean,
+        mean_covariance=mean_covariance,
+        own=own,
+        own_covariances=own_covariances,
+        shrinkage=shrinkage,
+        values=mean + _times(shrinkage, own - mean),
+        covariances=_mirror(covariances),
+    )
 
 
 def _estimate_covariances(logs: _Logs) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
@@ -332,14 +331,14 @@ def _propagate_sampling(
     size = between.shape[0]
     entries = [(i, j) for i in range(size) for j in range(i, size)]
     derivatives = np.zeros((len(entries), size, size))
-    for place, (i, j) in enumerate(entries):
-        derivatives[place, i, j] = derivatives[place, j, i] = 1.0
+    for row, (i, j) in enumerate(entries):
+        derivatives[row, i, j] = derivatives[row, j, i] = 1.0
     precisions = np.linalg.inv(posterior.own_covariances + between)
     turned = precisions[:, None] @ derivatives  # k entries p p
     information = 0.5 * np.einsum("kaij,kbji->ab", turned, turned) * (count / len(precisions))
     sampling = np.linalg.inv(information)
-    rest = np.eye(size) - posterior.shrinkage
-    slopes = np.einsum("kij,ajl,kl->kia", rest, derivatives, _times(precisions, posterior.own - posterior.mean))
+    remaining = np.eye(size) - posterior.shrinkage
+    slopes = np.einsum("kij,ajl,kl->kia", remaining, derivatives, _times(precisions, posterior.own - posterior.mean))
     return slopes @ sampling @ _turn(slopes)
 
 

@@ -102,8 +102,8 @@ class Fleet(Result):
     @property
     def guesses(self) -> str:
         """What to say of the guesses that its fits rest on, "on 2 guesses: N_p, l"; empty where there are none."""
-        findings = (one for found in self.rows["findings"].drop_nulls() for one in found)
-        return next((one["where"] for one in findings if one["kind"] == GUESS), "")
+        findings = (finding for found in self.rows["findings"].drop_nulls() for finding in found)
+        return next((finding["where"] for finding in findings if finding["kind"] == GUESS), "")
 
     @property
     def short(self) -> tuple[str, ...]:
@@ -118,7 +118,9 @@ class Fleet(Result):
     def _list_findings(self, kind: str) -> tuple[tuple[str, str], ...]:
         """Return the logs with a finding of a kind, and its text."""
         rows = self.rows.select("log", "findings").drop_nulls().iter_rows()
-        return tuple((log, one["text"]) for log, findings in rows for one in findings if one["kind"] == kind)
+        return tuple(
+            (log, finding["text"]) for log, findings in rows for finding in findings if finding["kind"] == kind
+        )
 
     @property
     def reasons(self) -> tuple[tuple[str, int, str], ...]:
@@ -136,18 +138,28 @@ class Fleet(Result):
     def to_dict(self) -> dict[str, Any]:
         """Return the content of fleet.json (schema seaopt/fleet/1)."""
         return {
-            "schema": FLEET_SCHEMA, "met": self.met, "guesses": self.guesses, "logs": len(self.rows),
+            "schema": FLEET_SCHEMA,
+            "met": self.met,
+            "guesses": self.guesses,
+            "logs": len(self.rows),
             "counts": self.counts,
             "reasons": [{"reason": text, "logs": count, "example": log} for text, count, log in self.reasons],
-            "units": dict(self.units), "identity": list(self.identity),
-            "fitted": list(self.fitted), "free": list(self.free),
+            "units": dict(self.units),
+            "identity": list(self.identity),
+            "fitted": list(self.fitted),
+            "free": list(self.free),
             "spreads": {
-                one.name: {
-                    "unit": one.unit, "logs": one.logs, "median": one.median, "p10": one.low, "p90": one.high,
-                    "median_std": one.std,
-                } for one in self.spreads
+                spread.name: {
+                    "unit": spread.unit,
+                    "logs": spread.logs,
+                    "median": spread.median,
+                    "p10": spread.low,
+                    "p90": spread.high,
+                    "median_std": spread.std,
+                }
+                for spread in self.spreads
             },
-        }  # fmt: skip
+        }
 
     def __repr__(self) -> str:
         lines = [f"Fleet: {self.verdict}"]
@@ -163,8 +175,13 @@ HEAD, ALIGN = ("parameter", "unit", "logs", "median", "10 %", "90 %", "std of on
 def list_cells(spreads: Sequence[Spread]) -> list[list[str]]:
     """Return the rows of a table of spreads."""
     return [
-        [one.name, one.unit, str(one.logs), *map(format_number, (one.median, one.low, one.high, one.std))]
-        for one in spreads
+        [
+            spread.name,
+            spread.unit,
+            str(spread.logs),
+            *map(format_number, (spread.median, spread.low, spread.high, spread.std)),
+        ]
+        for spread in spreads
     ]
 
 
@@ -183,10 +200,10 @@ def count_reasons(
     """
     counts, examples = Counter[str](), dict[str, tuple[str, str]]()
     for log, reason, findings in rows:
-        errors = [one for one in findings or () if one["severity"] == "error"]
-        text, own = (reason or "").replace(log, "LOG"), name_after(PurePath(log).stem)
-        text = text.replace(f"experiment {own}", "experiment LOG")
-        kind = f"{errors[0]['kind']} {errors[0]['where'].removeprefix(own)}" if errors else text
+        errors = [finding for finding in findings or () if finding["severity"] == "error"]
+        text, name = (reason or "").replace(log, "LOG"), name_after(PurePath(log).stem)
+        text = text.replace(f"experiment {name}", "experiment LOG")
+        kind = f"{errors[0]['kind']} {errors[0]['where'].removeprefix(name)}" if errors else text
         counts[kind] += 1
         examples.setdefault(kind, (text, log))
     return tuple((examples[kind][0], count, examples[kind][1]) for kind, count in counts.most_common())
@@ -203,5 +220,5 @@ def _spread(name: str, unit: str, met: pl.DataFrame) -> Spread | None:
 def select_known(rows: pl.DataFrame, name: str) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the values of a parameter and their standard deviations, of the rows that identify it."""
     values, stds = (rows[column].cast(pl.Float64).to_numpy() for column in (name, f"{name}_std"))
-    known = np.isfinite(values) & np.isfinite(stds)
-    return values[known], stds[known]
+    identified = np.isfinite(values) & np.isfinite(stds)
+    return values[identified], stds[identified]

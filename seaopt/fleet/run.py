@@ -14,12 +14,12 @@ import polars as pl
 
 from seaopt.errors import FileError, LogError, SeaoptError, require_number
 from seaopt.executors import Processes, check_executor
-from seaopt.files import check_folder, read_json, to_json, write_json
+from seaopt.files import check_folder, check_name, read_json, to_json, write_json
 from seaopt.fleet.dispatch import Dispatcher
 from seaopt.fleet.logs import FleetLog, find_logs
 from seaopt.fleet.plan import list_columns, make_plan
 from seaopt.fleet.result import FLEET_SCHEMA, Fleet
-from seaopt.fleet.table import Table, find_done, make_schema, note_short_logs, read_rows
+from seaopt.fleet.table import FleetTable, find_done, make_schema, note_short_logs, read_rows
 from seaopt.fleet.worker import FAILED, MET, NOT_MET, UNCHANGED, name_process
 from seaopt.problem import Problem, read_problem
 from seaopt.progress import Progress, ignore
@@ -110,14 +110,17 @@ def fit_fleet(
     plan = make_plan(problem, like, time_limit_s, name_process())
     columns, names = list_columns(plan.make_problem()), list(chosen[0].identity)
     schema = make_schema(columns, names)
-    _check_names(names, make_schema(columns, ()))
+    for name in names:
+        if name in make_schema(columns, ()):
+            raise LogError(f'identity has a column "{name}", which the table has for something else; rename it')
     with ExitStack() as stack:
         if folder is None:
             place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="seaopt-fleet-")))
         else:
             place = Path(folder)
             check_folder(place)
-        table = Table(place, schema, plan)
+            check_name(place, "a fleet's tables cannot lie there; give another folder: -o out")
+        table = FleetTable(place, schema, plan)
         stack.callback(table.close)
         if executor is None:
             executor = Processes()
@@ -129,9 +132,13 @@ def fit_fleet(
         content = table.read()
         rows = content.filter(named).select(*schema)
         result = Fleet(
-            rows=rows, units=columns.units, identity=tuple(names), unchanged=unchanged, fitted=columns.fitted,
+            rows=rows,
+            units=columns.units,
+            identity=tuple(names),
+            unchanged=unchanged,
+            fitted=columns.fitted,
             free=columns.free,
-        )  # fmt: skip
+        )
         if folder is not None:
             summary = result.to_dict() | {"problem_sha256": plan.digest, "version": plan.version}
             summary["other_logs"] = content.filter(~named)["log"].to_list()
@@ -171,10 +178,15 @@ def read_fleet(folder: Path | str) -> Fleet:
         raise FileError(f"{place / 'fleet.json'}: has no {missing[0]}, as of an older seaopt; {remedy}")
     rows = read_rows(place).filter(~pl.col("log").is_in(content["other_logs"]))
     fleet = Fleet(
-        rows=rows, units=content["units"], identity=tuple(content["identity"]), unchanged=len(rows),
-        fitted=tuple(content["fitted"]), free=tuple(content["free"]), drift=content.get("drift"),
+        rows=rows,
+        units=content["units"],
+        identity=tuple(content["identity"]),
+        unchanged=len(rows),
+        fitted=tuple(content["fitted"]),
+        free=tuple(content["free"]),
+        drift=content.get("drift"),
         population=content.get("population"),
-    )  # fmt: skip
+    )
     if fleet.counts != content["counts"]:
         raise FileError(f"{place}: its table has changed since fleet.json, as where a run was stopped; {remedy}")
     return fleet
@@ -204,18 +216,12 @@ def _choose_logs(logs: Sequence[str | Path | FleetLog], identity: str | None) ->
     return listed
 
 
-def _check_names(identity: Sequence[str], schema: dict[str, Any]) -> None:
-    taken = [name for name in identity if name in schema]
-    if taken:
-        raise LogError(f'identity has a column "{taken[0]}", which the table has for something else; rename it')
-
-
-def _fit_all(table: Table, executor: Executor, logs: Sequence[FleetLog], progress: Progress) -> int:
+def _fit_all(table: FleetTable, executor: Executor, logs: Sequence[FleetLog], progress: Progress) -> int:
     """Fit what is not done, and write it; return how many logs were done before."""
-    known = find_done(table.read(), table.plan)
+    done_before = find_done(table.read(), table.plan)
     counts = dict.fromkeys((MET, NOT_MET, FAILED, UNCHANGED), 0)
     try:
-        for batch in Dispatcher(executor, table.plan, logs, known).run():
+        for batch in Dispatcher(executor, table.plan, logs, done_before).run():
             table.add([row for row in batch if row["status"] != UNCHANGED])
             for row in batch:
                 counts[row["status"]] += 1

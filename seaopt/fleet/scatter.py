@@ -20,7 +20,7 @@ over many runs a slow walk adds up that hardly shows from run to run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -85,9 +85,12 @@ class Between:
     def chart(self) -> dict[str, Any]:
         """Return the arguments of `seaopt.fleet.cusum.chart_runs`."""
         return {
-            "between": self.std**2, "correlation": self.correlation, "scale": self.scale,
-            "dof": 1.0 / (1.0 / self.dof + 1.0 / self.tails), "start": FIRST_OF_HEAVY if self.tails < HEAVY else 1,
-        }  # fmt: skip
+            "between": self.std**2,
+            "correlation": self.correlation,
+            "scale": self.scale,
+            "dof": 1.0 / (1.0 / self.dof + 1.0 / self.tails),
+            "start": FIRST_OF_HEAVY if self.tails < HEAVY else 1,
+        }
 
     def describe(self) -> tuple[str, str, str, str]:
         """Return what stands under `BETWEEN_HEAD`."""
@@ -111,10 +114,7 @@ class Between:
 def estimate_between_runs(runs: Sequence[tuple[Runs, Runs]]) -> Between | None:
     """Return how much values differ from run to run beyond the variances of their fits; None of too few runs.
 
-    Parameters
-    ----------
-    runs : sequence of (values, variances)
-        A row an actuator in the order of time, nan where there is no run.
+    `runs`: a row an actuator in the order of time, nan where there is no run.
 
     Examples
     --------
@@ -157,13 +157,9 @@ def _find_variance(squares: Float[np.ndarray, " n"], fits: Float[np.ndarray, " n
         ratios = squares / np.maximum(2.0 * variance + fits, 1e-300)
         return float(np.mean(np.minimum(ratios, CLIP_SQUARE)) - CLIPPED)
 
-    return 0.0 if exceed(0.0) <= 0.0 else _find_root(exceed, float(squares.max()))
-
-
-def _find_root(function: Callable[[float], float], largest: float) -> float:
-    """Return where a falling function is zero, between zero and `largest`."""
     solver: Any = brentq
-    return float(solver(function, 0.0, largest, xtol=1e-12 * largest))
+    largest = float(squares.max())
+    return 0.0 if exceed(0.0) <= 0.0 else float(solver(exceed, 0.0, largest, xtol=1e-12 * largest))
 
 
 def _fit_variogram(variogram: Float[np.ndarray, " n"], fit: float, pairs: int) -> tuple[float, float]:
@@ -197,10 +193,7 @@ def _count_freedom(fits: Float[np.ndarray, " n"], variance: float) -> float:
 def estimate_tails(ratios: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """Return degrees of freedom and scale of Student's t; infinite and 1 where ratios may as well be normal.
 
-    Parameters
-    ----------
-    ratios : array
-        Standardised innovations of healthy runs, before they are clipped.
+    `ratios`: standardised innovations of healthy runs, before they are clipped.
 
     Examples
     --------
@@ -212,16 +205,16 @@ def estimate_tails(ratios: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """
     if ratios.size < FEWEST_OF_SHAPE:
         return np.inf, 1.0
-    own = ratios[:: -(-ratios.size // MOST_OF_TAILS)]
+    chosen = ratios[:: -(-ratios.size // MOST_OF_TAILS)]
 
     def miss(unknown: Float[np.ndarray, " two"]) -> float:
         dof, scale = 1.0 / unknown[0], np.exp(unknown[1])
-        return float(own.size * np.log(scale) - np.sum(t.logpdf(own / scale, dof)))
+        return float(chosen.size * np.log(scale) - np.sum(t.logpdf(chosen / scale, dof)))
 
     solver: Any = minimize
     bounds = [(1.0 / LIGHTEST, 1.0 / HEAVIEST), (-3.0, 3.0)]
     found = solver(miss, np.array([0.1, 0.0]), bounds=bounds, method="L-BFGS-B")
-    normal = own.size * np.log(np.std(own)) - float(np.sum(norm.logpdf(own / np.std(own))))
+    normal = chosen.size * np.log(np.std(chosen)) - float(np.sum(norm.logpdf(chosen / np.std(chosen))))
     if 2.0 * (normal - found.fun) < CHANCE:
         return np.inf, 1.0
     return float(1.0 / found.x[0]), float(np.exp(found.x[1]))
@@ -232,34 +225,22 @@ def differ_in_scatter(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bo
 
     What differs shows in both halves of an actuator's history alike, chance does not.
 
-    Parameters
-    ----------
-    runs : sequence of (values, variances)
-        As in `estimate_between_runs`.
-    between : Between
-        Of all of them.
-
+    `runs`: as in `estimate_between_runs`. `between`: of all of them.
     """
     halves = np.concatenate([_measure_halves(values, variances, between) for values, variances in runs])
     halves = halves[np.isfinite(halves).all(axis=1)]
     if len(halves) < FEWEST_ACTUATORS:
         return False
     covariance = np.cov(halves.T)
-    own = covariance[0, 1] / halves.mean() ** 2  # variance of the actuators' own scatter, a square, over its mean
+    unlike = covariance[0, 1] / halves.mean() ** 2  # variance of the actuators' own scatter, a square, over its mean
     chance = (covariance[0, 0] * covariance[1, 1] / len(halves)) ** 0.5
-    return bool(own > (2.0 * UNLIKE) ** 2 and covariance[0, 1] > 3.0 * chance)
+    return bool(unlike > (2.0 * UNLIKE) ** 2 and covariance[0, 1] > 3.0 * chance)
 
 
 def wander(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bool:
     """Return whether the halves of histories differ by more than chance, and by enough to matter to a chart.
 
-    Parameters
-    ----------
-    runs : sequence of (values, variances)
-        As in `estimate_between_runs`, of actuators that have not changed.
-    between : Between
-        Of all of them.
-
+    `runs`: as in `estimate_between_runs`, of actuators that have not changed. `between`: of all of them.
     """
     squares = np.concatenate([_compare_halves(values, variances, between) for values, variances in runs])
     squares = _select(squares)
@@ -271,21 +252,21 @@ def wander(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bool:
 
 def _compare_halves(values: Runs, variances: Runs, between: Between) -> Float[np.ndarray, " actuators"]:
     """Return the clipped square of the difference of the halves' means, over its variance; nan of short histories."""
-    known, later = _split_halves(values)
-    halves = [known & part for part in (~later, later)]
+    present, later = _split_halves(values)
+    halves = [present & part for part in (~later, later)]
     first, second = (half / np.maximum(half.sum(axis=1, keepdims=True), 1) for half in halves)
     weights, apart = second - first, np.arange(values.shape[1])
     alike = between.std**2 * ((weights @ between.correlation ** np.abs(apart[:, None] - apart)) * weights).sum(axis=1)
-    variance = between.inflation * (alike + (weights**2 * np.where(known, variances, 0.0)).sum(axis=1))
-    difference = (weights * np.where(known, values, 0.0)).sum(axis=1)
-    enough = known.sum(axis=1) >= FEWEST_OF_HALVES
+    variance = between.inflation * (alike + (weights**2 * np.where(present, variances, 0.0)).sum(axis=1))
+    difference = (weights * np.where(present, values, 0.0)).sum(axis=1)
+    enough = present.sum(axis=1) >= FEWEST_OF_HALVES
     return np.where(enough, np.minimum(difference**2 / np.where(enough, variance, 1.0), CLIP_SQUARE), np.nan)
 
 
 def _split_halves(values: Runs) -> tuple[Bool[np.ndarray, "actuators runs"], Bool[np.ndarray, "actuators runs"]]:
     """Return where there are runs (or differences of them), and which are of the second half of a history."""
-    known = np.isfinite(values)
-    return known, np.cumsum(known, axis=1) > known.sum(axis=1, keepdims=True) / 2
+    present = np.isfinite(values)
+    return present, np.cumsum(present, axis=1) > present.sum(axis=1, keepdims=True) / 2
 
 
 def _measure_halves(values: Runs, variances: Runs, between: Between) -> Float[np.ndarray, "actuators 2"]:
@@ -293,8 +274,10 @@ def _measure_halves(values: Runs, variances: Runs, between: Between) -> Float[np
     fits = variances[:, 1:] + variances[:, :-1]
     expected = 2.0 * between.std**2 * (1.0 - between.correlation) + fits
     squares = np.minimum(np.diff(values, axis=1) ** 2 / expected, CLIP_SQUARE)
-    known, later = _split_halves(squares)
-    halves = [np.where(known & part, squares, 0.0).sum(axis=1) / (known & part).sum(axis=1) for part in (~later, later)]
+    present, later = _split_halves(squares)
+    halves = [
+        np.where(present & part, squares, 0.0).sum(axis=1) / (present & part).sum(axis=1) for part in (~later, later)
+    ]
     return np.stack(halves, axis=1)
 
 

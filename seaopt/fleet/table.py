@@ -58,10 +58,16 @@ def make_schema(columns: Columns, identity: Sequence[str]) -> dict[str, Any]:
     for output in columns.outputs:
         schema |= {f"fit_percent_{output}": pl.Float64, f"rms_residual_{output}": pl.Float64}
     return schema | {
-        "findings": pl.List(_FINDING), "fit_status": pl.String, "samples": pl.Int64, "iterations": pl.Int64,
-        "fit_s": pl.Float64, "total_s": pl.Float64, "log_sha256": pl.String, "problem_sha256": pl.String,
+        "findings": pl.List(_FINDING),
+        "fit_status": pl.String,
+        "samples": pl.Int64,
+        "iterations": pl.Int64,
+        "fit_s": pl.Float64,
+        "total_s": pl.Float64,
+        "log_sha256": pl.String,
+        "problem_sha256": pl.String,
         "version": pl.String,
-    }  # fmt: skip
+    }
 
 
 def make_frame(rows: Sequence[Row], schema: Mapping[str, Any], plan: Plan) -> pl.DataFrame:
@@ -73,7 +79,7 @@ def make_frame(rows: Sequence[Row], schema: Mapping[str, Any], plan: Plan) -> pl
     )
 
 
-class Table:
+class FleetTable:
     """A table that rows are added to.
 
     Parameters
@@ -182,7 +188,7 @@ class Table:
 
     def _merge_small(self) -> None:
         """Put the rows of all small parts into one, in order of their logs."""
-        small = [path for path in self.parts() if _count_rows(path) < LARGE]
+        small = [path for path in self.parts() if pl.scan_parquet(path).select(pl.len()).collect().item() < LARGE]
         if len(small) > 1:
             rows = pl.concat([_read(path) for path in small], how="diagonal_relaxed")
             self._write_merged(rows, small)
@@ -200,9 +206,9 @@ class Table:
             if len(mine := newer.join(logs, on="log", how="semi")):
                 self._write_merged(_put(rows, mine), [path])
                 found = pl.concat([found, mine.select("log")])
-        rest = newer.join(found, on="log", how="anti")
-        if len(rest):  # somebody has deleted the file with the older ones
-            self._write_merged(rest, [])
+        orphans = newer.join(found, on="log", how="anti")
+        if len(orphans):  # somebody has deleted the file with the older ones
+            self._write_merged(orphans, [])
         for path in waiting:
             path.unlink()
         self.waiting = 0
@@ -252,18 +258,10 @@ def _put(rows: pl.DataFrame, newer: pl.DataFrame) -> pl.DataFrame:
     return pl.concat([kept, newer], how="diagonal_relaxed")
 
 
-def _count_rows(path: Path) -> int:
-    return int(pl.scan_parquet(path).select(pl.len()).collect().item())
-
-
 def read_rows(folder: Path) -> pl.DataFrame:
     """Return the rows of a table that nobody writes, in order of their logs.
 
-    Raises
-    ------
-    FileError
-        There is none, or a file of it is damaged.
-
+    Raises FileError: there is none, or a file of it is damaged.
     """
     parts = [_read(path) for path in sorted((folder / "fleet").glob("part-*.parquet"))]
     if not parts:
@@ -281,8 +279,8 @@ def note_short_logs(rows: pl.DataFrame) -> pl.DataFrame:
     for row, is_short in zip(picked.iter_rows(named=True), picked.select(short).to_series(), strict=True):
         text = f"{row['samples']} samples, where half the logs have {median:g} or more: cut off, or another test?"
         note = {"severity": "warning", "kind": SHORT, "where": "", "text": text}
-        others = [one for one in row["findings"] or [] if one["kind"] != SHORT]
-        findings.append([*others, note] if is_short else others)
+        kept = [finding for finding in row["findings"] or [] if finding["kind"] != SHORT]
+        findings.append([*kept, note] if is_short else kept)
     changed = [now != before for now, before in zip(findings, picked["findings"].to_list(), strict=True)]
     noted = picked.with_columns(pl.Series("findings", findings, dtype=pl.List(_FINDING)))
     return noted.filter(pl.Series(changed, dtype=pl.Boolean))
@@ -310,11 +308,7 @@ def _read(path: Path) -> pl.DataFrame:
 def _lock(path: Path) -> int:
     """Return the open lock of a table, which ends with the process.
 
-    Raises
-    ------
-    FileError
-        Another process has it.
-
+    Raises FileError: another process has it.
     """
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:

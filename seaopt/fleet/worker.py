@@ -14,7 +14,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import lru_cache
 from itertools import combinations
@@ -50,20 +50,8 @@ def name_process() -> str:
 def fit_batch(plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> list[Row]:
     """Return a row for each log.
 
-    Parameters
-    ----------
-    plan : Plan
-        The same for all.
-    logs : sequence of FleetLog
-        The batch.
-    known : mapping of path to SHA-256
-        The contents that are fitted already; a log that still has it is not fitted again.
-
-    Returns
-    -------
-    list of dict
-        With status "met", "not met", "failed" or "unchanged".
-
+    `logs`: the batch. `known`: the contents that are fitted already; a log that still has it is not fitted again.
+    Returned: rows with status "met", "not met", "failed" or "unchanged".
     """
     return [_fit_log(plan, log, known.get(log.path)) for log in logs]
 
@@ -123,51 +111,49 @@ def _find_gaps(experiment: Experiment) -> list[dict[str, str]]:
     """Return the finding of a log with gaps, in the words of `seaopt inspect`; a fit alone bears them."""
     log = experiment.log
     return [
-        {"severity": one.severity, "kind": one.kind, "where": experiment.name, "text": one.sentence}
-        for one in find_clock_faults(assess_clock(log.time, log.source), log.time)
-        if one.kind == GAP
+        {"severity": finding.severity, "kind": finding.kind, "where": experiment.name, "text": finding.sentence}
+        for finding in find_clock_faults(assess_clock(log.time, log.source), log.time)
+        if finding.kind == GAP
     ]
 
 
 def describe(fitted: Fit, name: str) -> Row:
     """Return a fit as a row: values, standard deviations and units of its unknowns and figures, verdict and findings.
 
-    Parameters
-    ----------
-    fitted : Fit
-        Of one experiment.
-    name : str
-        Of its experiment, which the names of what is of this log alone begin with.
-
+    `fitted`: of one experiment. `name`: of its experiment, which the names of what is of this log alone begin with.
     """
     row: Row = {"status": MET if fitted.met else NOT_MET, "reason": None if fitted.met else fitted.verdict}
     for parameter in fitted.parameters.values():
         if parameter.free:
-            own = parameter.name.removeprefix(f"{name}.")
-            row |= {own: parameter.value, f"{own}_std": parameter.std}
+            short = parameter.name.removeprefix(f"{name}.")
+            row |= {short: parameter.value, f"{short}_std": parameter.std}
     row |= _describe_correlations(fitted, name)
     nuisance = fitted.nuisance[name]
     for key, std in nuisance.std.items():
         value = nuisance.delay_s if key == "delay_s" else nuisance.gain[key.removeprefix("gain.")]
         row |= {key.replace(".", "_"): value, f"{key.replace('.', '_')}_std": std}
     for key, figure in fitted.derived.items():
-        own = key.removeprefix(f"{name}.")
-        row |= {own: figure.value, f"{own}_std": figure.std}
-    for output, one in fitted.outputs[name].items():
-        row |= {f"fit_percent_{output}": one.fit_percent, f"rms_residual_{output}": one.rms_residual}
+        short = key.removeprefix(f"{name}.")
+        row |= {short: figure.value, f"{short}_std": figure.std}
+    for output, figures in fitted.outputs[name].items():
+        row |= {f"fit_percent_{output}": figures.fit_percent, f"rms_residual_{output}": figures.rms_residual}
     findings = [
-        {"severity": one.severity, "kind": one.kind, "where": one.where, "text": one.text} for one in fitted.findings
+        {"severity": finding.severity, "kind": finding.kind, "where": finding.where, "text": finding.text}
+        for finding in fitted.findings
     ]
     return row | {
-        "findings": findings, "fit_status": fitted.status, "samples": fitted.samples, "iterations": fitted.iterations,
+        "findings": findings,
+        "fit_status": fitted.status,
+        "samples": fitted.samples,
+        "iterations": fitted.iterations,
         "fit_s": fitted.wall_s,
-    }  # fmt: skip
+    }
 
 
 def _describe_correlations(fitted: Fit, name: str) -> Row:
     """Return the correlations of the free parameters' errors, each pair once, in the order of the covariance."""
     covariance = fitted.covariance
-    names = [one.removeprefix(f"{name}.") for one in covariance.names]
+    names = [parameter.removeprefix(f"{name}.") for parameter in covariance.names]
     with np.errstate(invalid="ignore", divide="ignore"):
         scales = np.sqrt(np.diag(covariance.matrix))
         correlations = covariance.matrix / np.outer(scales, scales)
@@ -182,7 +168,8 @@ def _limit_time(plan: Plan) -> Generator[None]:
     if plan.time_limit_s is None:
         yield
         return
-    interrupt = _interrupt_by_signal if _may_signal() else _interrupt_thread
+    may_signal = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
+    interrupt = _interrupt_by_signal if may_signal else _interrupt_thread
     may_end = name_process() != plan.client
     with _end_process(plan.time_limit_s + GRACE_S) if may_end else nullcontext(), interrupt(plan.time_limit_s):
         yield
@@ -199,17 +186,20 @@ def _end_process(seconds: float) -> Generator[None]:
             finally:
                 faulthandler.cancel_dump_traceback_later()
         return
-    end = threading.Timer(seconds, os._exit, [ENDED])
-    end.daemon = True
-    end.start()
+    with _call_after(seconds, lambda: os._exit(ENDED)):
+        yield
+
+
+@contextmanager
+def _call_after(seconds: float, function: Callable[[], None]) -> Generator[None]:
+    """Call a function in another thread after so many seconds, unless what is within is done."""
+    timer = threading.Timer(seconds, function)
+    timer.daemon = True
+    timer.start()
     try:
         yield
     finally:
-        end.cancel()
-
-
-def _may_signal() -> bool:
-    return threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
+        timer.cancel()
 
 
 def _stop(*_: Any) -> None:
@@ -238,12 +228,9 @@ def _interrupt_thread(seconds: float) -> Generator[None]:
             if not over:
                 ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(_TimeLimitError))
 
-    timer = threading.Timer(seconds, interrupt)
-    timer.daemon = True
-    timer.start()
     try:
-        yield
+        with _call_after(seconds, interrupt):
+            yield
     finally:
-        timer.cancel()
         with lock:
             over = True

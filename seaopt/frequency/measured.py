@@ -1,12 +1,12 @@
 r"""A measured frequency response with its uncertainty: at every line a disc that holds the truth, at a confidence.
 
-With :math:`n_d` averages of stretches the error of the H1 estimate of a log with a known input is a complex normal one,
+With :math:`n_d` averages of segments the error of the H1 estimate of a log with a known input is a complex normal one,
 and at one line (Goodman 1965; Bendat and Piersol, Random Data, 4th ed., ch. 9)
 
 .. math:: P\Big(|H - H_1|^2 > |H_1|^2\,\frac{1-\gamma^2}{\gamma^2}\,\big(\alpha^{-1/(n_d-1)} - 1\big)\Big) = \alpha .
 
 All discs together hold the truth with the confidence stated: :math:`\alpha = (1 - \text{confidence})/m` at each of m
-lines (Bonferroni), those of all lengths of stretches that are compared. To the radius is added what the estimate
+lines (Bonferroni), those of all lengths of segments that are compared. To the radius is added what the estimate
 cannot see: Hann's window takes the mean of three lines, which is off by :math:`|\Delta^2 H|/6`, and a straight line
 from one frequency to the next by :math:`|\Delta^2 H|/8`, with :math:`\Delta^2` the second difference over neighbouring
 lines. A resonance narrower than a line is not seen.
@@ -26,21 +26,21 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import LogError, require_number
-from seaopt.frequency.response import FrequencyResponse, h1
+from seaopt.frequency.response import FrequencyResponse, find_band, h1
 from seaopt.frequency.survey import check_record
 from seaopt.logs import Log
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.simulation import Clock
+from seaopt.welch import INDEPENDENT
 
 LARGEST_DISC = 0.5  # radius over response: where it is larger, nothing is known
 HIGHEST = 0.9  # of the log's Nyquist frequency: above, what is sampled is folded
 SMOOTH = 5  # lines of which the median radius decides where the band ends
 LEAST_LINES = 8
 UNSEEN = 1.0 / 6.0 + 1.0 / 8.0  # of the second difference: window and interpolation
-LONGEST, SHORTEST = 16, 64  # stretches in a log; samples in a stretch
-OVERLAPPING = 0.947  # averages that a stretch counts as, with Hann's window and half overlap (Welch 1967)
-PARTS, OCTAVES = 3, 20  # stretches are chosen anew in every third of an octave
+LONGEST, SHORTEST = 16, 64  # segments in a log; samples in a segment
+PARTS, OCTAVES = 3, 20  # segments are chosen anew in every third of an octave
 
 
 @record(eq=False)
@@ -66,7 +66,7 @@ class MeasuredResponse:
     confidence : float
         Between 0 and 1.
     averages : array, shape (m,)
-        Stretches averaged: many short ones where the response is smooth, few long ones where it is not.
+        Segments averaged: many short ones where the response is smooth, few long ones where it is not.
 
     Examples
     --------
@@ -110,17 +110,32 @@ class MeasuredResponse:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         return {
-            "experiment": self.name, "input": self.source, "output": self.output, "confidence": self.confidence,
-            "averages": self.averages, "period_s": self.clock.period, "hold": self.clock.hold,
-            "delay_s": self.clock.delay_s, "frequency_hz": self.frequency_hz, "real": np.real(self.response),
-            "imag": np.imag(self.response), "radius": self.radius,
-        }  # fmt: skip
+            "experiment": self.name,
+            "input": self.source,
+            "output": self.output,
+            "confidence": self.confidence,
+            "averages": self.averages,
+            "period_s": self.clock.period,
+            "hold": self.clock.hold,
+            "delay_s": self.clock.delay_s,
+            "frequency_hz": self.frequency_hz,
+            "real": np.real(self.response),
+            "imag": np.imag(self.response),
+            "radius": self.radius,
+        }
 
 
 def measure_response(
-    plant: Plant, log: Log, output: str, *, source: str | None = None, name: str = "log", clock: Clock | None = None,
-    confidence: float = 0.95, stretch_s: float | None = None,
-) -> MeasuredResponse:  # fmt: skip
+    plant: Plant,
+    log: Log,
+    output: str,
+    *,
+    source: str | None = None,
+    name: str = "log",
+    clock: Clock | None = None,
+    confidence: float = 0.95,
+    stretch_s: float | None = None,
+) -> MeasuredResponse:
     """Estimate a frequency response with discs that hold the truth.
 
     Parameters
@@ -128,7 +143,7 @@ def measure_response(
     plant : Plant
         Its input and output names are those of the log's channels.
     log : Log
-        One stretch without gaps, taken in open loop.
+        One segment without gaps, taken in open loop.
     output : str
         What a controller would measure.
     source : str, optional
@@ -140,7 +155,7 @@ def measure_response(
     confidence : float
         Of all discs together.
     stretch_s : float, optional
-        Length of a stretch; if left out, in every third of an octave the one of n/16, n/32, ... samples whose discs
+        Length of a segment; if left out, in every third of an octave the one of n/16, n/32, ... samples whose discs
         are smallest.
 
     Raises
@@ -157,14 +172,14 @@ def measure_response(
     check_record(log, (source, output))
     if np.ptp(log[source]) == 0.0:
         raise LogError(f"{log.source}: {source} is constant; a frequency response needs excitation")
-    others = [one for one in plant.inputs if one != source and one in log.signals and np.ptp(log[one]) > 0.0]
-    if others:
+    moving = [rival for rival in plant.inputs if rival != source and rival in log.signals and np.ptp(log[rival]) > 0.0]
+    if moving:
         raise LogError(
-            f"{log.source}: {', '.join(others)} moves besides {source}, which counts as noise, and not as even noise; "
+            f"{log.source}: {', '.join(moving)} moves besides {source}, which counts as noise, and not as even noise; "
             f"take a log in which {source} alone is excited"
         )
     chosen = Clock(period=log.period) if clock is None else clock
-    lengths = [stretch_s] if stretch_s is not None else _list_stretches(len(log), log.period)
+    lengths = [stretch_s] if stretch_s is not None else _list_segments(len(log), log.period)
     estimates = [h1(log[source], log[output], log.period, stretch_s=length) for length in lengths]
     f, response, radius, averages = _choose_discs(estimates, confidence, HIGHEST * 0.5 / log.period)
     if f.size < LEAST_LINES:
@@ -173,18 +188,24 @@ def measure_response(
             "excite more, or longer"
         )
     return MeasuredResponse(
-        name=name, plant=plant, source=source, output=output, clock=replace(chosen, delay_free=False), frequency_hz=f,
-        response=response, radius=radius, confidence=float(confidence), averages=averages,
-    )  # fmt: skip
+        name=name,
+        plant=plant,
+        source=source,
+        output=output,
+        clock=replace(chosen, delay_free=False),
+        frequency_hz=f,
+        response=response,
+        radius=radius,
+        confidence=float(confidence),
+        averages=averages,
+    )
 
 
-Discs = tuple[
-    Float[np.ndarray, " m"], Complex[np.ndarray, " m"], Float[np.ndarray, " m"], Int[np.ndarray, " m"]
-]  # fmt: skip
+Discs = tuple[Float[np.ndarray, " m"], Complex[np.ndarray, " m"], Float[np.ndarray, " m"], Int[np.ndarray, " m"]]
 
 
-def _list_stretches(samples: int, period: float) -> list[float]:
-    """Return lengths of stretches to try, in seconds, each half of the one before."""
+def _list_segments(samples: int, period: float) -> list[float]:
+    """Return lengths of segments to try, in seconds, each half of the one before."""
     lengths = [samples // LONGEST]
     while lengths[-1] // 2 >= SHORTEST:
         lengths.append(lengths[-1] // 2)
@@ -196,22 +217,22 @@ def _choose_discs(estimates: Sequence[FrequencyResponse], confidence: float, hig
 
     As the discs of all estimates hold the truth together, any choice among them does.
     """
-    lines = sum(np.count_nonzero(one.frequency_hz < highest_hz) for one in estimates)
+    lines = sum(np.count_nonzero(estimate.frequency_hz < highest_hz) for estimate in estimates)
     discs: list[Discs] = []
     for _ in range(2):  # of all lines, then of those in the bands alone
-        discs = [_place_discs(one, (1.0 - confidence) / max(lines, 1), highest_hz) for one in estimates]
+        discs = [_place_discs(estimate, (1.0 - confidence) / max(lines, 1), highest_hz) for estimate in estimates]
         lines = sum(f.size for f, *_ in discs)
-    discs = [one for one in discs if one[0].size]
+    discs = [disc for disc in discs if disc[0].size]
     parts: list[Discs] = []
     for low, high in pairwise(highest_hz * 2.0 ** (-np.arange(PARTS * OCTAVES, -1, -1) / PARTS)):
         inside = [(f >= low) & (f < high) for f, *_ in discs]
-        own = [
+        candidates = [
             (at[chosen], centre[chosen], radius[chosen], averages[chosen])
             for (at, centre, radius, averages), chosen in zip(discs, inside, strict=True)
             if chosen.any()
         ]
-        if own:
-            parts.append(min(own, key=lambda one: float(np.mean(np.log(one[2] / np.abs(one[1]))))))
+        if candidates:
+            parts.append(min(candidates, key=lambda part: float(np.mean(np.log(part[2] / np.abs(part[1]))))))
     if not parts:
         none = np.zeros(0)
         return none, none.astype(complex), none, none.astype(int)
@@ -227,7 +248,7 @@ def _place_discs(estimate: FrequencyResponse, alpha: float, highest_hz: float) -
     from scipy.ndimage import median_filter  # deferred: 0.2 s
 
     f, response = estimate.frequency_hz, estimate.response
-    gamma, effective = np.clip(estimate.coherence, 1e-9, 1.0 - 1e-12), OVERLAPPING * estimate.averages
+    gamma, effective = np.clip(estimate.coherence, 1e-9, 1.0 - 1e-12), INDEPENDENT * estimate.averages
     spread = np.expm1(-np.log(alpha) / max(effective - 1.0, 0.1))
     bend = np.zeros(f.size)
     bend[1:-1] = np.abs(response[2:] - 2.0 * response[1:-1] + response[:-2])
@@ -235,8 +256,6 @@ def _place_discs(estimate: FrequencyResponse, alpha: float, highest_hz: float) -
     radius = np.abs(response) * np.sqrt((1.0 - gamma) / gamma * spread) + unseen
     inside = (f < highest_hz) & (np.arange(f.size) > 1)  # beside the mean, which is taken out, lines are off
     size = np.maximum(np.abs(response), 1e-300)
-    known = inside & (median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(int), [0]]))).reshape(-1, 2)
-    low, high = max(edges, key=lambda run: f[run[1] - 1] / f[run[0]], default=(0, 0))
-    band = slice(int(low), int(high))
+    sharp = inside & (median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC)
+    band = find_band(f, sharp)
     return f[band], response[band], radius[band], np.full(f[band].size, estimate.averages)

@@ -22,25 +22,9 @@ def sampled_response(
 ) -> tuple[Complex[np.ndarray, "m ny"], Complex[np.ndarray, "nd m ny"]]:
     """Return the response from one input to every output of a linear model, and its derivatives.
 
-    Parameters
-    ----------
-    model : Model
-        Linear; see `seaopt.simulation.linearise`.
-    theta : array, shape (np,)
-        Its free parameters.
-    clock : Clock
-        Period, hold and delay.
-    f : array, shape (m,)
-        Frequencies in Hz.
-    source : int
-        Number of the input.
-
-    Returns
-    -------
-    response : complex array, shape (m, ny)
-    derivatives : complex array, shape (nd, m, ny)
-        With respect to theta, then to the delay where ``clock.delay_free``.
-
+    `model`: linear; see `seaopt.simulation.linearise`. `theta`: its free parameters. `clock`: period, hold and delay.
+    `f`: frequencies in Hz. `source`: number of the input. Returned: with respect to theta, then to the delay where
+    ``clock.delay_free``.
     """
     blocks = transition(model, theta, clock)
     nx, nu = model.nx, model.nu

@@ -259,13 +259,18 @@ def second_order(
     count = slopes.shape[1]
     covariance[:count, :count] = _invert(slopes.T @ slopes) * HANN_LINES * max(1.0, misfit) ** 2
     return SecondOrder(
-        values=values, covariance=covariance, clock=replace(clock, delay_s=float(values[3]), delay_free=False),
-        unit=unit, band_hz=(float(f[0]), float(f[-1])), lines=int(f.size), misfit=misfit,
-    )  # fmt: skip
+        values=values,
+        covariance=covariance,
+        clock=replace(clock, delay_s=float(values[3]), delay_free=False),
+        unit=unit,
+        band_hz=(float(f[0]), float(f[-1])),
+        lines=int(f.size),
+        misfit=misfit,
+    )
 
 
 def coherent_lines(estimate: FrequencyResponse) -> Bool[np.ndarray, " m"]:
-    """Return which lines have a coherence above 0.8; never the first, beside the mean that stretches are rid of."""
+    """Return which lines have a coherence above 0.8; never the first, beside the mean that segments are rid of."""
     lines = estimate.coherence > MIN_COHERENCE
     lines[0] = False
     return lines
@@ -301,9 +306,11 @@ def _start(
 
 
 def _fit_linear(
-    s: Complex[np.ndarray, " m"], measured: Complex[np.ndarray, " m"], sigma: Float[np.ndarray, " m"],
+    s: Complex[np.ndarray, " m"],
+    measured: Complex[np.ndarray, " m"],
+    sigma: Float[np.ndarray, " m"],
     hold: Complex[np.ndarray, " m"],
-) -> tuple[float, Float[np.ndarray, "3"]]:  # fmt: skip
+) -> tuple[float, Float[np.ndarray, "3"]]:
     """Return the cost and K, a, b of the best step of K - a s G - b G = s^2 G, weighted by the step before it."""
     g, scatter = measured / hold, sigma / np.abs(hold)
     scale = float(np.sqrt(np.abs(s[0]) * np.abs(s[-1])))
@@ -328,9 +335,12 @@ def _stack(values: Complex[np.ndarray, "m ..."]) -> Float[np.ndarray, "n ..."]:
 
 
 def _refine(
-    estimate: FrequencyResponse, chosen: Int[np.ndarray, " m"], sigma: Float[np.ndarray, " m"], clock: Clock,
+    estimate: FrequencyResponse,
+    chosen: Int[np.ndarray, " m"],
+    sigma: Float[np.ndarray, " m"],
+    clock: Clock,
     start: Float[np.ndarray, "4"],
-) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "n c"], Float[np.ndarray, " n"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "n c"], Float[np.ndarray, " n"]]:
     """Return the least-squares values, and derivatives and residuals there, in standard deviations."""
     from scipy.optimize import least_squares  # deferred: 0.3 s
 

@@ -7,7 +7,7 @@ the source paper reads (16) where the plant says so: two poles, no zero, b = k/m
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import casadi as ca
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from seaopt.errors import LogError
-from seaopt.frequency.response import FrequencyResponse, h1
+from seaopt.frequency.response import FrequencyResponse, find_band, h1
 from seaopt.frequency.sampled import sampled_response
 from seaopt.frequency.second_order import (
     MIN_COHERENCE,
@@ -192,7 +192,7 @@ def survey(
     plant : Plant
         Its input and output names are those of the log's channels.
     log : Log
-        One stretch without gaps. Inputs excited together count as noise to one another.
+        One segment without gaps. Inputs excited together count as noise to one another.
     outputs : sequence of str, optional
         Every output of the plant that the log has, if left out.
     clock : Clock, optional
@@ -201,7 +201,7 @@ def survey(
     gain : mapping of output to float, optional
         Of the sensors; 1 where left out.
     stretch_s : float, optional
-        Length of a stretch, as of `h1`.
+        Length of a segment, as of `h1`.
 
     Raises
     ------
@@ -236,17 +236,10 @@ def _excited_inputs(plant: Plant, log: Log) -> list[str]:
 
 
 def check_record(log: Log, names: Sequence[str]) -> None:
-    """Refuse a log that has gaps, is too short for a frequency response, or lacks samples of some channels.
-
-    Raises
-    ------
-    LogError
-        As said.
-
-    """
+    """Refuse a log that has gaps, is too short for a frequency response, or lacks samples of some channels."""
     if len(log.segments) != 1:
         raise LogError(
-            f"{log.source}: the log has {len(log.segments)} stretches between gaps and a frequency response takes one; "
+            f"{log.source}: the log has {len(log.segments)} segments between gaps and a frequency response takes one; "
             "choose one with slice_s"
         )
     if len(log) < MIN_RESPONSE_SAMPLES:
@@ -259,24 +252,26 @@ def check_record(log: Log, names: Sequence[str]) -> None:
         if lost:
             raise LogError(
                 f"{log.source}: {lost} samples of {name} are missing or masked and a frequency response takes all; "
-                "choose a stretch with slice_s"
+                "choose a segment with slice_s"
             )
 
 
 def _pair(plant: Plant, log: Log, clock: Clock, source: str, output: str, stretch_s: float | None) -> Pair:
     estimate = h1(log[source], log[output], log.period, stretch_s=stretch_s)
-    unit = f"{plant.outputs[output]}/{_divisor(plant.inputs[source])}"
+    divisor = plant.inputs[source]
+    unit = f"{plant.outputs[output]}/" + (f"({divisor})" if " " in divisor or "/" in divisor else divisor)
     used = coherent_lines(estimate)
     form = second_order(estimate, clock, unit=unit, use=used) if np.count_nonzero(used) >= MIN_LINES else None
     band = _good_band(estimate)
     return Pair(
-        source=source, output=output, unit=unit, estimate=estimate, good_band_hz=band, peak=_peak(estimate, band),
+        source=source,
+        output=output,
+        unit=unit,
+        estimate=estimate,
+        good_band_hz=band,
+        peak=_peak(estimate, band),
         second_order=form,
-    )  # fmt: skip
-
-
-def _divisor(unit: str) -> str:
-    return f"({unit})" if " " in unit or "/" in unit else unit
+    )
 
 
 def _good_band(estimate: FrequencyResponse) -> tuple[float, float] | None:
@@ -284,9 +279,8 @@ def _good_band(estimate: FrequencyResponse) -> tuple[float, float] | None:
     from scipy.ndimage import median_filter  # deferred: 0.2 s
 
     good = median_filter(estimate.coherence, SMOOTH, mode="nearest") > MIN_COHERENCE
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
-    runs = [(float(estimate.frequency_hz[a]), float(estimate.frequency_hz[b - 1])) for a, b in edges.reshape(-1, 2)]
-    return max(runs, key=lambda run: run[1] / run[0], default=None)
+    band = estimate.frequency_hz[find_band(estimate.frequency_hz, good)]
+    return (float(band[0]), float(band[-1])) if band.size else None
 
 
 def _peak(estimate: FrequencyResponse, band: tuple[float, float] | None) -> Peak | None:
@@ -337,9 +331,9 @@ def _pair_dict(measured: Survey, pair: Pair, params: ParameterSet) -> dict[str, 
         "unit": pair.unit,
         "averages": estimate.averages,
         "good_band_hz": pair.good_band_hz,
-        "peak": _fields(pair.peak) if pair.peak is not None else None,
+        "peak": asdict(pair.peak) if pair.peak is not None else None,
         "second_order": _form_dict(pair.second_order) if pair.second_order is not None else None,
-        "actuator": {name: _fields(figure) for name, figure in _fields(drive).items()} if drive is not None else None,
+        "actuator": asdict(drive) if drive is not None else None,
         "model_misfit": pair.misfit(measured.model(pair, params)),
         "frequency_hz": estimate.frequency_hz,
         "real": np.real(estimate.response),
@@ -352,12 +346,8 @@ def _pair_dict(measured: Survey, pair: Pair, params: ParameterSet) -> dict[str, 
 def _form_dict(form: SecondOrder) -> dict[str, Any]:
     names = ("K", "a", "b", "delay_s", "static_gain", "natural_frequency_hz", "damping_ratio")
     return {
-        **{name: _fields(getattr(form, name)) for name in names},
+        **{name: asdict(getattr(form, name)) for name in names},
         "band_hz": form.band_hz,
         "lines": form.lines,
         "misfit": form.misfit,
     }
-
-
-def _fields(data: Any) -> dict[str, Any]:
-    return {name: getattr(data, name) for name in data.__dataclass_fields__}

@@ -115,45 +115,29 @@ class Link:
 
 @record(eq=False)
 class Transmission:
-    """A screw or a gear, in units of its own coordinate y (q of a screw, theta of a gear's motor).
+    """A screw or a gear, in units of its own coordinate y (q of a screw, theta of a gear's motor)."""
 
-    Parameters
-    ----------
-    coordinate, rate : str
-        The states y and dy/dt.
-    place_unit, effort_unit : str
-        Along the axis: m and N, or rad and N m.
-    direction, carry : float
-        sigma and kappa.
-    travel, inertia, damping, per_ampere, sprung : callable ``p -> expression``
-        g, J, b_r and eta K_tau as y sees them, and m_l.
-    stiffness, spring_damping : str
-        Names of the spring's parameters.
-    friction : str
-        Name of the dry friction.
-    parameters : tuple of Parameter
-        Of motor, transmission and spring.
-    part_parameters : mapping of part to parameters
-        What the parts inside add.
-
-    """
-
+    # coordinate, rate: the states y and dy/dt
     coordinate: str
     rate: str
+    # place_unit, effort_unit: along the axis: m and N, or rad and N m
     place_unit: str
     effort_unit: str
+    # direction, carry: sigma and kappa
     direction: float
     carry: float
+    # travel, inertia, damping, per_ampere, sprung: g, J, b_r and eta K_tau as y sees them, and m_l
     travel: Expression
     inertia: Expression
     damping: Expression
     per_ampere: Expression
     sprung: Expression
+    # stiffness, spring_damping: names of the spring's parameters
     stiffness: str
     spring_damping: str
-    friction: str
-    parameters: tuple[Parameter, ...]
-    part_parameters: Mapping[str, tuple[Parameter, ...]]
+    friction: str  # name of the dry friction
+    parameters: tuple[Parameter, ...]  # of motor, transmission and spring
+    part_parameters: Mapping[str, tuple[Parameter, ...]]  # what the parts inside add
 
 
 @record(eq=False)
@@ -169,8 +153,8 @@ class Actuator:
     @property
     def damped_spring(self) -> bool:
         """Whether the spring has a damper: a part, or among the transmission's own parameters."""
-        own = {parameter.name for parameter in self.transmission.parameters}
-        return "spring_damping" in self.parts or self.transmission.spring_damping in own
+        names = {parameter.name for parameter in self.transmission.parameters}
+        return "spring_damping" in self.parts or self.transmission.spring_damping in names
 
     @property
     def housing_rides(self) -> bool:
@@ -243,9 +227,13 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
     motor = drive.per_ampere(p) * u.I - drive.damping(p) * yd[0] - getattr(u, drive.friction)
     # Along the positions' gradients, not the gradient of a work: a force may depend on the state (a spring outside).
     external = sum(
-        (getattr(u, link.effort, 0.0) * ca.gradient(place, y) for link, place in zip(links, (x_1, x_2), strict=True)
-         if link.effort is not None), ca.SX(y.numel(), 1),
-    )  # fmt: skip
+        (
+            getattr(u, link.effort, 0.0) * ca.gradient(place, y)
+            for link, place in zip(links, (x_1, x_2), strict=True)
+            if link.effort is not None
+        ),
+        ca.SX(y.numel(), 1),
+    )
     damping = ca.vertcat(0.0, *([bolt] if screw else []), *(link.damping(x, p) for link in moving))
     generalised = external - ca.gradient(potential, y) - damping - tension * ca.gradient(deflection, y)
     generalised[0] += motor
@@ -266,23 +254,23 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
 
     return Motion(
         rates={name: value for k, pair in enumerate(names) for name, value in zip(pair, (yd[k], ydd[k]), strict=True)},
-        forces=forces, places=(x_1, x_2), deflection=deflection, deflection_rate=speed(deflection),
-        spring_force=tension, energy=energy,
-    )  # fmt: skip
+        forces=forces,
+        places=(x_1, x_2),
+        deflection=deflection,
+        deflection_rate=speed(deflection),
+        spring_force=tension,
+        energy=energy,
+    )
 
 
 def check_choices(*choices: tuple[str, object, tuple[str, ...]]) -> None:
     """Refuse an option that is not among those known, each given as (name, choice, known).
 
-    Raises
-    ------
-    PlantError
-        It is not; the message names it.
-
+    Raises PlantError: it is not; the message names it.
     """
-    for what, choice, known in choices:
-        if choice not in known:
-            raise PlantError(f'{what} = "{choice}" is not known; use ' + " or ".join(f'"{name}"' for name in known))
+    for what, choice, valid in choices:
+        if choice not in valid:
+            raise PlantError(f'{what} = "{choice}" is not known; use ' + " or ".join(f'"{name}"' for name in valid))
 
 
 def make_plant(
@@ -298,21 +286,9 @@ def make_plant(
 ) -> Plant:
     """Return the plant of an actuator: its equations and roles, then the parts that wrap any plant.
 
-    Parameters
-    ----------
-    actuator : Actuator
-        What it is made of.
-    name : str
-        Of the plant.
-    outputs : mapping of name to (unit, callable ``(motion, x) -> expression``)
-        What can be measured.
-    derived, sensing, ports
-        As in `Plant`.
-    second_order : (str, str), optional
-        The derived figures that are mass and damping of the second-order response with the links fixed.
-    inputs : tuple of str
-        Efforts of the world on the links, which a log may leave out.
-
+    `outputs`: what can be measured. `derived`, `sensing`, `ports`: as in `Plant`. `second_order`: the derived figures
+    that are mass and damping of the second-order response with the links fixed. `inputs`: efforts of the world on the
+    links, which a log may leave out.
     """
     drive, parts = actuator.transmission, actuator.parts
     place, effort = drive.place_unit, drive.effort_unit
@@ -324,10 +300,10 @@ def make_plant(
 
     states = {state: unit for pair in pairs for state, unit in zip(pair[:2], (pair[2], f"{pair[2]}/s"), strict=True)}
     frictions = _list_frictions(actuator, states, [parameter.name for parameter in parameters])
-    bristled = [one for one in frictions.values() if one.bristles is not None]
+    bristled = [friction for friction in frictions.values() if friction.bristles is not None]
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        slips = {_get_bristles(one).state: one.find_rate(x, u, p) for one in bristled}
+        slips = {_get_bristles(friction).state: friction.find_rate(x, u, p) for friction in bristled}
         return {**solve_motion(actuator, x, u, p).rates, **slips}
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
@@ -335,15 +311,17 @@ def make_plant(
         return {output: read(motion, x) for output, (_, read) in outputs.items()}
 
     def energy(x: Any, p: Any) -> Any:
-        held = (0.5 * one.stiffness(p) * getattr(x, one.state) ** 2 for one in map(_get_bristles, bristled))
-        return solve_motion(actuator, x, _rest(actuator), p).energy() + sum(held)
+        stored = (
+            0.5 * bristles.stiffness(p) * getattr(x, bristles.state) ** 2 for bristles in map(_get_bristles, bristled)
+        )
+        return solve_motion(actuator, x, _rest(actuator), p).energy() + sum(stored)
 
     def deflection(x: Any, p: Any) -> Any:
         return solve_motion(actuator, x, _rest(actuator), p).deflection
 
     plant = Plant(
         name=name,
-        states=states | {_get_bristles(one).state: place for one in bristled},
+        states=states | {_get_bristles(friction).state: place for friction in bristled},
         inputs={"I": "A"} | dict.fromkeys(inputs, effort),
         outputs={output: unit for output, (unit, _) in outputs.items()},
         parameters={parameter.name: parameter for parameter in parameters},
@@ -353,19 +331,25 @@ def make_plant(
         optional_inputs=frozenset({"I", *inputs}) if inputs else frozenset(),
         energy=energy if part_laws.stores_in_closed_form(parts) else None,
         actuation=Actuation(
-            input="I", effort=lambda p: drive.per_ampere(p) / drive.travel(p), unit=effort, efficiency="eta",
+            input="I",
+            effort=lambda p: drive.per_ampere(p) / drive.travel(p),
+            unit=effort,
+            efficiency="eta",
             speed=lambda x, p: drive.travel(p) * getattr(x, drive.rate),
         ),
         sensing=sensing,
         spring=SeriesSpring(
-            deflection=deflection, unit=place, stiffness=drive.stiffness,
-            mass=second_order[0] if second_order else None, damping=second_order[1] if second_order else None,
+            deflection=deflection,
+            unit=place,
+            stiffness=drive.stiffness,
+            mass=second_order[0] if second_order else None,
+            damping=second_order[1] if second_order else None,
             play="g_b" if "backlash" in parts else None,
         ),
         ports=ports,
         friction=frictions,
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in parts else None,
-    )  # fmt: skip
+    )
     return part_laws.wrapped(plant, [part for part in parts if part not in part_laws.INSIDE])
 
 
@@ -390,10 +374,12 @@ def _list_frictions(actuator: Actuator, states: Collection[str], names: Sequence
     # Stored, it takes expressions for the states, which the derivatives in `solve_motion` do not.
     loads = store_function(read_loads, (*states, *slips), ("I",), names) if "load_friction" in parts else None
     bristles = Bristles(
-        state=BRISTLES, coordinate=lambda x, p: getattr(x, drive.coordinate),
-        stiffness=lambda p: p.sigma_0, damping=lambda p: p.sigma_1,
+        state=BRISTLES,
+        coordinate=lambda x, p: getattr(x, drive.coordinate),
+        stiffness=lambda p: p.sigma_0,
+        damping=lambda p: p.sigma_1,
         rate=lambda z, v, p: part_laws.lugre_rate(parts, z, v, p),
-    )  # fmt: skip
+    )
     frictions = {
         drive.friction: Friction(
             velocity=lambda x, p: getattr(x, drive.rate),
@@ -417,9 +403,12 @@ def _list_frictions(actuator: Actuator, states: Collection[str], names: Sequence
 
     spring = store_function(read_spring, states, names)
     within = Bristles(
-        state=SLIPPING, coordinate=lambda x, p: spring(x, p)[0], stiffness=lambda p: p.k_h, damping=lambda p: 0.0,
+        state=SLIPPING,
+        coordinate=lambda x, p: spring(x, p)[0],
+        stiffness=lambda p: p.k_h,
+        damping=lambda p: 0.0,
         rate=part_laws.hysteresis_rate,
-    )  # fmt: skip
+    )
     return frictions | {
         SPRING_SLIP: Friction(
             velocity=lambda x, p: spring(x, p)[1],

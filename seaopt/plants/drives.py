@@ -29,7 +29,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,8 +37,8 @@ import casadi as ca
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants.motor.thermal import RESISTANCE, find_resistance
-from seaopt.plants.plant import Plant
-from seaopt.plants.roles import Actuation, PlantMaker, put_behind
+from seaopt.plants.plant import Plant, refuse_clash
+from seaopt.plants.roles import Actuation, Port, change_ports, put_behind, with_values
 from seaopt.records import record
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
@@ -93,32 +92,29 @@ class _Drive:
 def check(parts: Collection[str]) -> None:
     """Refuse parts that do not go together.
 
-    Raises
-    ------
-    PlantError
-        One excludes another, or needs one that is not there.
-
+    Raises PlantError: one excludes another, or needs one that is not there.
     """
     electric = [part for part in INPUTS if part in parts]
     if len(electric) > 1:
         raise PlantError('parts "voltage_input" and "duty_input" are both given; the motor has one input: give one')
     if electric and "current_loop" in parts:
         raise PlantError(f'parts "{electric[0]}" and "current_loop" are both given; a current loop takes a current')
-    needs = {"inductance": tuple(INPUTS), "servo_integral": ("position_servo",), "servo_limit": ("position_servo",),
-             "servo_delay": ("position_servo",)}  # fmt: skip
-    for part, others in needs.items():
-        if part in parts and not any(other in parts for other in others):
-            raise PlantError(f'part "{part}" needs {" or ".join(others)}; add it')
+    needs = {
+        "inductance": tuple(INPUTS),
+        "servo_integral": ("position_servo",),
+        "servo_limit": ("position_servo",),
+        "servo_delay": ("position_servo",),
+    }
+    for part, needed in needs.items():
+        if part in parts and not any(helper in parts for helper in needed):
+            raise PlantError(f'part "{part}" needs {" or ".join(needed)}; add it')
 
 
 def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
     """Return a plant whose input is the voltage or the duty of its motor.
 
-    Raises
-    ------
-    PlantError
-        The plant does not state its actuation, or not the speed on which its effort works; or has such an input.
-
+    Raises PlantError: the plant does not state its actuation, or not the speed on which its effort works; or has such
+    an input.
     """
     part = "duty_input" if "duty_input" in parts else "voltage_input"
     actuation, inductive = plant.actuation, "inductance" in parts
@@ -131,7 +127,7 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
     winding = plant.winding  # one that warms up brings its resistance
 
     def find_emf(x: Any, p: Any) -> Any:
-        lossless = p if actuation.efficiency is None else SimpleNamespace(**{**vars(p), actuation.efficiency: 1.0})
+        lossless = p if actuation.efficiency is None else with_values(p, {actuation.efficiency: 1.0})
         return actuation.effort(lossless) * speed(x, p)
 
     def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
@@ -143,25 +139,30 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
         flows = (applied - find_emf(x, p)) / find_resistance(winding, x, p)
         return flows, {}, {current: flows}
 
-    own = (*PARTS[part], *(PARTS["inductance"] if inductive else ()))
-    own = tuple(item for item in own if winding is None or item is not RESISTANCE)
+    added = (*PARTS[part], *(PARTS["inductance"] if inductive else ()))
+    added = tuple(item for item in added if winding is None or item is not RESISTANCE)
     unit_of_current = plant.inputs[current]
-    return _put_before(plant, _Drive(
-        name=part, input=name, unit=unit, states={current: unit_of_current} if inductive else {},
-        outputs={current: unit_of_current}, parameters=own, solve=solve,
-        effort=lambda p: (1.0 if part == "voltage_input" else p.V_s) / find_resistance(winding, None, p),
-        largest=(lambda p: 1.0) if part == "duty_input" else None,
-    ), partial(_drive_again, drive_electrically, tuple(parts)))  # fmt: skip
+    return _put_before(
+        plant,
+        _Drive(
+            name=part,
+            input=name,
+            unit=unit,
+            states={current: unit_of_current} if inductive else {},
+            outputs={current: unit_of_current},
+            parameters=added,
+            solve=solve,
+            effort=lambda p: (1.0 if part == "voltage_input" else p.V_s) / find_resistance(winding, None, p),
+            largest=(lambda p: 1.0) if part == "duty_input" else None,
+        ),
+        change_ports(plant.ports, drive_electrically, tuple(parts)),
+    )
 
 
 def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     """Return a plant whose input is the goal of a position that a firmware holds.
 
-    Raises
-    ------
-    PlantError
-        The plant's sensing names no position.
-
+    Raises PlantError: the plant's sensing names no position.
     """
     sensing = plant.sensing
     position = sensing and (sensing.motor_position or sensing.link_position)
@@ -176,41 +177,46 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     commanded = {} if source in plant.outputs else {source: plant.inputs[source]}  # a log may hold it, too
 
     def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
-        without = SimpleNamespace(**{**vars(u), source: 0.0})
         reading = getattr(x, position, None)
-        error = u.goal - (plant.h(t, x, without, p)[position] if reading is None else reading)
+        error = u.goal - (plant.h(t, x, with_values(u, {source: 0.0}), p)[position] if reading is None else reading)
         command = p.g_s * (p.k_p * error - (p.k_d * getattr(x, rate) if rate else 0.0))
         command += p.g_s * p.k_i * x.error_sum if integral else 0.0
-        held = ca.fmin(ca.fmax(command, -p.c_max), p.c_max) if limited else command
-        winds_up = ca.logic_and(held != command, command * error > 0.0)
-        return held, {"error_sum": ca.if_else(winds_up, 0.0, error)} if integral else {}, dict.fromkeys(commanded, held)
+        limited_command = ca.fmin(ca.fmax(command, -p.c_max), p.c_max) if limited else command
+        winds_up = ca.logic_and(limited_command != command, command * error > 0.0)
+        return (
+            limited_command,
+            {"error_sum": ca.if_else(winds_up, 0.0, error)} if integral else {},
+            dict.fromkeys(commanded, limited_command),
+        )
 
-    own = [
+    added = [
         item for part in ("position_servo", "servo_integral", "servo_limit") if part in parts for item in PARTS[part]
     ]
     unit = plant.outputs.get(position) or plant.states[position]
-    return _put_before(plant, _Drive(
-        name="position_servo", input="goal", unit=unit, states={"error_sum": f"{unit} s"} if integral else {},
-        outputs=commanded, parameters=tuple(item for item in own if rate or item.name != "k_d"), solve=solve,
-        effort=lambda p: p.g_s * p.k_p,
-    ), partial(_drive_again, add_servo, tuple(parts)))  # fmt: skip
+    return _put_before(
+        plant,
+        _Drive(
+            name="position_servo",
+            input="goal",
+            unit=unit,
+            states={"error_sum": f"{unit} s"} if integral else {},
+            outputs=commanded,
+            parameters=tuple(item for item in added if rate or item.name != "k_d"),
+            solve=solve,
+            effort=lambda p: p.g_s * p.k_p,
+        ),
+        change_ports(plant.ports, add_servo, tuple(parts)),
+    )
 
 
-def _drive_again(drive: Callable[[Plant, Collection[str]], Plant], parts: Collection[str], make: PlantMaker) -> Plant:
-    return drive(make(), parts)
-
-
-def _put_before(plant: Plant, drive: _Drive, again: Callable[[PlantMaker], Plant]) -> Plant:
-    """Return a plant behind a drive; `again` puts it before the plants that its ports make, too."""
+def _put_before(plant: Plant, drive: _Drive, ports: tuple[Port, ...]) -> Plant:
+    """Return a plant behind a drive, with ports whose plants are behind it, too."""
     source = next(iter(plant.inputs))
-    taken = {*plant.inputs, *plant.outputs, *plant.states, *plant.parameters} - {source}
-    clash = [name for name in (drive.input, *drive.outputs, *(item.name for item in drive.parameters)) if name in taken]
-    if clash:
-        raise PlantError(f'plant {plant.name}: part "{drive.name}" has "{clash[0]}", which the plant has, too')
+    refuse_clash(plant, drive.name, (drive.input, *drive.outputs, *(item.name for item in drive.parameters)), source)
 
     def solve_inside(t: Any, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, Mapping[str, Any], Mapping[str, Any]]:
         inside, rates, outputs = drive.solve(t, x, u, p)
-        return SimpleNamespace(**{**vars(u), source: inside}), rates, outputs
+        return with_values(u, {source: inside}), rates, outputs
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         inside, rates, _ = solve_inside(t, x, u, p)
@@ -220,19 +226,28 @@ def _put_before(plant: Plant, drive: _Drive, again: Callable[[PlantMaker], Plant
         inside, _, outputs = solve_inside(t, x, u, p)
         return {**plant.h(t, x, inside, p), **outputs}
 
-    own = {item.name: item.unit if item.name in STATED else item for item in drive.parameters}
+    added = {item.name: item.unit if item.name in STATED else item for item in drive.parameters}
     before = plant.actuation
     actuation = before and Actuation(
-        input=drive.input, effort=lambda p: before.effort(p) * drive.effort(p), unit=before.unit,
-        efficiency=before.efficiency, largest=drive.largest,
-    )  # fmt: skip
-    others = {name: unit for name, unit in plant.inputs.items() if name != source}
+        input=drive.input,
+        effort=lambda p: before.effort(p) * drive.effort(p),
+        unit=before.unit,
+        efficiency=before.efficiency,
+        largest=drive.largest,
+    )
+    remaining = {name: unit for name, unit in plant.inputs.items() if name != source}
     optional = plant.optional_inputs - {source} | ({drive.input} if source in plant.optional_inputs else set())
     return replace(
-        plant, name=f"{plant.name} with {drive.name}", f=f, h=h, actuation=actuation,
-        states={**plant.states, **drive.states}, inputs={drive.input: drive.unit, **others},
-        outputs={**plant.outputs, **drive.outputs}, optional_inputs=frozenset(optional),
-        parameters={**plant.parameters, **own},
+        plant,
+        name=f"{plant.name} with {drive.name}",
+        f=f,
+        h=h,
+        actuation=actuation,
+        states={**plant.states, **drive.states},
+        inputs={drive.input: drive.unit, **remaining},
+        outputs={**plant.outputs, **drive.outputs},
+        optional_inputs=frozenset(optional),
+        parameters={**plant.parameters, **added},
         friction=put_behind(plant.friction, lambda x, u, p: solve_inside(0.0, x, u, p)[0]),
-        ports=tuple(port.change_makers(again) for port in plant.ports),
-    )  # fmt: skip
+        ports=ports,
+    )

@@ -43,9 +43,14 @@ def to_control(plant: Plant, params: ParameterSet) -> Any:
         return np.array(h(t, x, u, p)).ravel()
 
     return control.NonlinearIOSystem(
-        update, output, states=list(plant.states), inputs=list(plant.inputs), outputs=list(plant.outputs),
-        name=plant.name.replace(" ", "_") + ("_without_drive_delay" if _find_drive_delay(params) else ""), dt=0,
-    )  # fmt: skip
+        update,
+        output,
+        states=list(plant.states),
+        inputs=list(plant.inputs),
+        outputs=list(plant.outputs),
+        name=plant.name.replace(" ", "_") + ("_without_drive_delay" if _find_drive_delay(params) else ""),
+        dt=0,
+    )
 
 
 def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include: Path | str | None = None) -> Path:
@@ -102,8 +107,8 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
         remark = f"<fmiModelDescription description={quoteattr(_describe(plant, _find_drive_delay(params)))} "
         described.write_text(text.replace("<fmiModelDescription ", remark, 1), encoding="utf-8")
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
-            for source, place in content.items():
-                packed.write(source, str(Path(place)))
+            for source, name_inside in content.items():
+                packed.write(source, str(Path(name_inside)))
     return write_bytes(target, archive.getvalue())
 
 

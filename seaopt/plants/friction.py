@@ -12,11 +12,10 @@ either state, and those that are curves of the velocity together.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -34,7 +33,7 @@ from seaopt.plants.plant import (
     name_symbols,
     state_space,
 )
-from seaopt.plants.roles import Friction, PlantMaker
+from seaopt.plants.roles import Friction, change_ports, with_values
 from seaopt.records import record
 
 SLIDING, STUCK = "sliding", "stuck"
@@ -143,20 +142,14 @@ def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, "
     With A of the sliding plant, B the effect of the friction forces and C the rows of their velocities, a force that
     keeps C x at zero leaves A - B (C B)^-1 C A. Where bristles hold it, the plant is the stuck one.
     """
-    if not can_stick(plant):
-        poles = np.linalg.eigvals(state_space(friction_states(plant)[STUCK], params)[0])
-        return np.sort(np.abs(poles[np.imag(poles) > 0.0])) / (2 * np.pi)
-    sliding = friction_states(plant)[SLIDING]
-    a = state_space(sliding, params)[0]
-    effects, _, rows = (
-        np.array(block)
-        for block in friction_matrices(plant)(
-            np.zeros(len(plant.states)), np.zeros(len(plant.inputs)), plant.complete(params).vector
-        )
-    )
-    sticks = [friction.jumps for friction in plant.friction.values()]
-    effects, rows = effects[:, sticks], rows[sticks]
-    poles = np.linalg.eigvals(a - effects @ np.linalg.solve(rows @ effects, rows @ a))
+    a = state_space(friction_states(plant)[SLIDING if can_stick(plant) else STUCK], params)[0]
+    if can_stick(plant):
+        at = np.zeros(len(plant.states)), np.zeros(len(plant.inputs)), plant.complete(params).vector
+        effects, _, rows = (np.array(block) for block in friction_matrices(plant)(*at))
+        sticks = [friction.jumps for friction in plant.friction.values()]
+        effects, rows = effects[:, sticks], rows[sticks]
+        a = a - effects @ np.linalg.solve(rows @ effects, rows @ a)
+    poles = np.linalg.eigvals(a)
     return np.sort(np.abs(poles[np.imag(poles) > 0.0])) / (2 * np.pi)
 
 
@@ -167,7 +160,7 @@ def friction_states(plant: Plant) -> Mapping[str, Plant]:
     Beside others a friction with bristles is in either state by itself: "NAME stuck" is where it sticks alone. The
     sliding plant is the first.
     """
-    curves = [name for name, one in plant.friction.items() if one.bristles is None]
+    curves = [name for name, friction in plant.friction.items() if friction.bristles is None]
     groups = [*([curves] if curves else []), *([name] for name in plant.friction if name not in curves)]
     states: dict[str, Plant] = {}
     for choice in product((False, True), repeat=len(groups)):
@@ -178,25 +171,26 @@ def friction_states(plant: Plant) -> Mapping[str, Plant]:
 
 
 def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()) -> dict[str, Plant]:
-    """Return the plants, one with friction in each of its states, as NAME sliding and NAME stuck.
+    """Return the plants, one with friction in each of its states, as NAME sliding and NAME stuck (`name_states`)."""
+    return {
+        label: friction_states(plants[name])[state] if state else plants[name]
+        for label, (name, state) in name_states(plants, params, varied).items()
+    }
 
-    Parameters
-    ----------
-    plants : mapping of name to Plant
-        The plants as they are.
-    params : ParameterSet
-        Values; a plant whose friction is nothing there has none.
-    varied : collection of str
-        Parameters that may take other values: friction that depends on one of them is there.
 
+def name_states(
+    plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()
+) -> dict[str, tuple[str, str]]:
+    """Return plant and state of friction, "" without, behind each name of `split_friction`.
+
+    `params`: a plant whose friction is nothing there has none. `varied`: parameters that may take other values:
+    friction that depends on one of them is there.
     """
-    split: dict[str, Plant] = {}
-    for name, plant in plants.items():
-        if has_friction(plant, params, varied):
-            split |= {f"{name} {state}": variant for state, variant in friction_states(plant).items()}
-        else:
-            split[name] = plant
-    return split
+    return {
+        (f"{name} {state}" if state else name): (name, state)
+        for name, plant in plants.items()
+        for state in (friction_states(plant) if has_friction(plant, params, varied) else ("",))
+    }
 
 
 def take_sliding(plant: Plant, params: ParameterSet) -> Plant:
@@ -249,7 +243,7 @@ def let_stick(plant: Plant) -> Plant:
 
     """
     if not can_stick(plant):
-        if any(friction.bristles is not None for friction in plant.friction.values()):
+        if remembers(plant):
             raise PlantError(
                 f"plant {plant.name} has friction with bristles (part lugre), which sticks by itself; leave out "
                 "sticks = true, or the part"
@@ -265,34 +259,37 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
     """Tell whether a plant's friction differs between sticking and sliding."""
     if not plant.friction:
         return False
-    flattest, steepest = friction_slopes(plant, params)
-    held = any(stiffness != 0.0 for stiffness in find_bristle_stiffness(plant, params))
-    return bool(np.any(flattest != steepest)) or held or bool(_friction_parameters(plant) & set(varied))
+    values = plant.complete(params)
+    flattest, steepest = friction_slopes(plant, values)
+    holds = bool(np.any(flattest != steepest)) or any(find_bristle_stiffness(plant, values))
+    return holds or bool(_friction_parameters(plant) & set(varied))
 
 
 def find_bristle_stiffness(plant: Plant, params: ParameterSet) -> list[float]:
     """Return the stiffness of each friction's bristles, zero without any."""
     p = plant.complete(params).by_attribute
     bristles = [friction.bristles for friction in plant.friction.values()]
-    return [0.0 if one is None else float(one.stiffness(p)) for one in bristles]
+    return [0.0 if each is None else float(each.stiffness(p)) for each in bristles]
 
 
 @memo
 def remove_friction(plant: Plant) -> Plant:
     """Return the plant as it moves at speed, where dry friction no longer changes with the velocity."""
-    friction = {
-        name: replace(
-            friction,
-            force=lambda v, p: 0.0 * v,
-            slopes=lambda p: (0.0, 0.0),
-            jump=None,
-            loads=None,
-            rated={},
-            bristles=None,
-        )
-        for name, friction in plant.friction.items()
-    }
+    friction = {name: _take_viscous(friction, lambda p: 0.0) for name, friction in plant.friction.items()}
     return replace(plant, name=f"{plant.name} at speed", friction=friction)
+
+
+def _take_viscous(friction: Friction, slope: Callable[[Any], Any]) -> Friction:
+    """Return friction of one slope, an expression of p, with the velocity and effort of another."""
+    return replace(
+        friction,
+        force=lambda v, p: slope(p) * v,
+        slopes=lambda p: (slope(p),) * 2,
+        jump=None,
+        loads=None,
+        rated={},
+        bristles=None,
+    )
 
 
 @memo
@@ -301,7 +298,9 @@ def _friction_parameters(plant: Plant) -> frozenset[str]:
     p = name_parameters(plant, plant.p)
     bounds = [bound_slopes(friction, p) for friction in plant.friction.values()]
     spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]
-    spans += [ca.SX(one.bristles.stiffness(p)) for one in plant.friction.values() if one.bristles is not None]
+    spans += [
+        ca.SX(friction.bristles.stiffness(p)) for friction in plant.friction.values() if friction.bristles is not None
+    ]
     return frozenset(_list_parameters(plant, ca.vertcat(*spans)))
 
 
@@ -328,45 +327,46 @@ def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:
 
 def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
     """Return the plant with viscous friction in the place of each curve, and springs for bristles that stick."""
-    bristled = {name: one.bristles for name, one in plant.friction.items() if one.bristles is not None}
+    bristled = {name: friction.bristles for name, friction in plant.friction.items() if friction.bristles is not None}
 
     def choose_slope(name: str, friction: Friction, p: Any) -> Any:
         if name not in sticking:
             return bound_slopes(friction, p)[0]
         return bristled[name].damping(p) if name in bristled else bound_slopes(friction, p)[1]
 
-    def viscous(name: str, friction: Friction) -> Friction:
-        return replace(
-            friction,
-            force=lambda v, p: choose_slope(name, friction, p) * v,
-            slopes=lambda p: (choose_slope(name, friction, p),) * 2,
-            jump=None, loads=None, rated={}, bristles=None,
-        )  # fmt: skip
-
     def hold(x: Any, u: Any, p: Any) -> Any:
-        held = {name: one.stiffness(p) * one.coordinate(x, p) for name, one in bristled.items() if name in sticking}
-        return SimpleNamespace(**{**vars(u), **{name: getattr(u, name) + force for name, force in held.items()}})
+        forces = {
+            name: bristles.stiffness(p) * bristles.coordinate(x, p)
+            for name, bristles in bristled.items()
+            if name in sticking
+        }
+        return with_values(u, {name: getattr(u, name) + force for name, force in forces.items()})
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         rates = {
-            one.state: plant.friction[name].velocity(x, p) - FORGETTING * getattr(x, one.state)
-            for name, one in bristled.items()
-        }  # fmt: skip
+            bristles.state: plant.friction[name].velocity(x, p) - FORGETTING * getattr(x, bristles.state)
+            for name, bristles in bristled.items()
+        }
         return {**plant.f(t, x, hold(x, u, p), p), **rates}
 
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return plant.h(t, x, hold(x, u, p), p)
 
-    change = partial(_make_with_slopes, state=state)
     return replace(
-        plant, name=f"{plant.name} {state}", ports=tuple(port.change_makers(change) for port in plant.ports),
-        friction={name: viscous(name, friction) for name, friction in plant.friction.items()},
-        f=f if bristled else plant.f, h=h if bristled else plant.h,
-    )  # fmt: skip
+        plant,
+        name=f"{plant.name} {state}",
+        ports=change_ports(plant.ports, _choose_state, state),
+        friction={
+            name: _take_viscous(friction, partial(choose_slope, name, friction))
+            for name, friction in plant.friction.items()
+        },
+        f=f if bristled else plant.f,
+        h=h if bristled else plant.h,
+    )
 
 
-def _make_with_slopes(maker: PlantMaker, state: str) -> Plant:
-    return friction_states(maker())[state]
+def _choose_state(plant: Plant, state: str) -> Plant:
+    return friction_states(plant)[state]
 
 
 @record(eq=False)

@@ -43,25 +43,9 @@ HeldState = Float[np.ndarray, " m"]
 def strike(plant: Plant, params: CompletedParameters, state: State, output: str, impulse: float) -> State:
     """Return the state after a blow along an output, a position such as x_2.
 
-    Parameters
-    ----------
-    plant, params
-        A plant that declares its energy.
-    state : array, shape (n,)
-        Before the blow.
-    output : str
-        The position that is struck.
-    impulse : float
-        N s (N m s along an angle), positive along the output.
-
-    Returns
-    -------
-    array, shape (n,)
-
-    Raises
-    ------
-    PlantError
-        The plant has no such output or no energy, or the output depends on more than positions.
+    `state`: before the blow. `output`: the position that is struck. `impulse`: N s (N m s along an angle), positive
+    along the output. Raises PlantError: the plant has no such output or no energy, or the output depends on more than
+    positions.
 
     Examples
     --------
@@ -82,40 +66,21 @@ def strike(plant: Plant, params: CompletedParameters, state: State, output: str,
 def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -> tuple[HeldState, float, float]:
     """Return the state of the plant with a port held after its link is stopped where it is.
 
-    Parameters
-    ----------
-    plant, params
-        The plant with the moving link; it declares its energy.
-    state : array, shape (n,)
-        Before the contact.
-    port : Port
-        Of the link that is caught.
-
-    Returns
-    -------
-    state : array
-        Of the plant with the port held, the drive's coordinate counted from where the link is held.
-    impulse : float
-        What stops the link, along its coordinate: N m s of a pendulum, N s of a mass.
-    loss : float
-        Kinetic energy (J) that is lost.
-
-    Raises
-    ------
-    PlantError
-        The port does not move, or the plant declares no energy.
-
+    `plant`: with the moving link; it declares its energy. `state`: before the contact. `port`: of the link that is
+    caught. Returned: the state of the plant with the port held, the drive's coordinate counted from where the link is
+    held; what stops the link, along its coordinate (N m s of a pendulum, N s of a mass); the kinetic energy (J) that is
+    lost. Raises PlantError: the port does not move, or the plant declares no energy.
     """
     motion, coordinate, rate = _read_motion(plant, port)
     inertia = np.array(_inertia(plant, motion)(state, params.vector)[0])
     places, rates = _find_pairs(plant)
     names = list(plant.states)
     link = places.index(names.index(coordinate))
-    others = [k for k in range(len(places)) if k != link]
+    moving = [k for k in range(len(places)) if k != link]
     before, after = state[rates], state[rates].copy()
     after[link] = 0.0
-    coupling = inertia[others][:, [link]].ravel()
-    after[others] += np.linalg.solve(inertia[others][:, others], coupling * before[link])
+    coupling = inertia[moving][:, [link]].ravel()
+    after[moving] += np.linalg.solve(inertia[moving][:, moving], coupling * before[link])
     impulse = float(inertia[link] @ (after - before))
     loss = 0.5 * float(before @ inertia @ before - after @ inertia @ after)
     moved = state.copy()
@@ -127,22 +92,9 @@ def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -
 def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldState, link: Mapping[str, float]) -> State:
     """Return the state of a plant after the link at a port is let go at the position `link`, as the reverse of `catch`.
 
-    Parameters
-    ----------
-    plant, params
-        The actuator with the link free.
-    port : Port
-        Of the link that is let go.
-    held : array
-        The state of the plant with the port held.
-    link : mapping of name to float
-        The link's coordinate when it is let go, such as {"phi": 0.3}; zero where left out. Its rate is zero.
-
-    Raises
-    ------
-    PlantError
-        The port does not move, or `link` names no state of its link.
-
+    `plant`: with the link free. `port`: of the link that is let go. `held`: the state of the plant with the port held.
+    `link`: the link's coordinate when it is let go, such as {"phi": 0.3}; zero where left out, as its rate is. Raises
+    PlantError: the port does not move, or `link` names no state of its link.
     """
     _, *link_states = _read_motion(plant, port)
     for name in link:
@@ -150,8 +102,10 @@ def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldSta
             raise PlantError(
                 f'link = {{"{name}": ...}} is not a state of the link of {plant.name}; {suggestion(name, link_states)}'
             )
-    rest = iter(held)
-    after = np.array([link.get(name, 0.0) if name in link_states else next(rest) for name in plant.states], dtype=float)
+    remaining = iter(held)
+    after = np.array(
+        [link.get(name, 0.0) if name in link_states else next(remaining) for name in plant.states], dtype=float
+    )
     return after - offset(plant, params, after, port)
 
 
@@ -169,11 +123,7 @@ def check_held(plant: Plant, held: Plant) -> None:
 
     It is compared with the one that the port makes; where the port makes none, only the names of the states tell.
 
-    Raises
-    ------
-    PlantError
-        The states are not the same but for the link's.
-
+    Raises PlantError: the states are not the same but for the link's.
     """
     port = plant.port
     if port is not None and port.held is not None:
@@ -187,18 +137,18 @@ def check_held(plant: Plant, held: Plant) -> None:
         )
 
 
-def _is_same(one: Plant, other: Plant) -> bool:
+def _is_same(first: Plant, second: Plant) -> bool:
     """Tell whether two plants have the same names, and f and (of outputs that both have) h agree at a random point."""
-    if list(one.states) != list(other.states) or list(one.inputs) != list(other.inputs):
+    if list(first.states) != list(second.states) or list(first.inputs) != list(second.inputs):
         return False
-    if set(one.parameters) != set(other.parameters):
+    if set(first.parameters) != set(second.parameters):
         return False
     rng = np.random.default_rng(1)
-    x, u = rng.normal(size=len(one.states)), rng.normal(size=len(one.inputs))
-    p = {name: rng.uniform(0.5, 1.5) for name in one.parameters}
+    x, u = rng.normal(size=len(first.states)), rng.normal(size=len(first.inputs))
+    p = {name: rng.uniform(0.5, 1.5) for name in first.parameters}
     rates: list[Float[np.ndarray, " n"]] = []
     outputs: list[dict[str, float]] = []
-    for plant in (one, other):
+    for plant in (first, second):
         values = [p[name] for name in plant.parameters]
         rates.append(np.array(dynamics_function(plant)(x, u, values)).ravel())
         y = np.array(output_function(plant)(0.0, x, u, values)).ravel()

@@ -125,9 +125,12 @@ def modes(
 
 
 def _compute_static_gain(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float,
+    a: Float[np.ndarray, "n n"],
+    b: Float[np.ndarray, " n"],
+    c: Float[np.ndarray, " n"],
+    d: float,
     poles: Complex[np.ndarray, " n"],
-) -> float:  # fmt: skip
+) -> float:
     """Return the limit of c (s - a)^-1 b + d at s = 0; a pole there may cancel in one transfer function only."""
     if np.linalg.cond(a) < 1e14:
         return float(d - c @ np.linalg.solve(a, b))

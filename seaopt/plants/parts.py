@@ -68,7 +68,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -79,17 +78,36 @@ from seaopt.parameters import Parameter
 from seaopt.plants import drives
 from seaopt.plants.motor.thermal import PARAMETERS, add_heat
 from seaopt.plants.plant import Plant
-from seaopt.plants.roles import PlantMaker, put_behind
+from seaopt.plants.roles import change_ports, put_behind
 from seaopt.plants.sensors.deflection import PARTS as SENSOR_PARTS
 from seaopt.plants.sensors.deflection import keep_weights, read_deflection
 from seaopt.records import record
 
 Part = Literal[
-    "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
-    "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay",
-    "voltage_input", "duty_input", "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay",
-    "deflection_sensor", "thermal",
-]  # fmt: skip
+    "stribeck",
+    "load_friction",
+    "load_stribeck",
+    "load_square",
+    "lugre",
+    "hysteresis",
+    "backlash",
+    "hardening",
+    "spring_damping",
+    "screw_mode",
+    "current_loop",
+    "load_cell",
+    "command_delay",
+    "measurement_delay",
+    "voltage_input",
+    "duty_input",
+    "inductance",
+    "position_servo",
+    "servo_integral",
+    "servo_limit",
+    "servo_delay",
+    "deflection_sensor",
+    "thermal",
+]
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "stribeck": (
@@ -166,21 +184,17 @@ def parameters(parts: Sequence[str], of_part: Mapping[str, tuple[Parameter, ...]
     Bristles slip at the friction's own level, so that with them breakaway friction is above zero, as f_c is.
     """
     chosen = [parameter for part in parts if part in INSIDE for parameter in of_part[part]]
-    sliding = next((one for one in chosen if one.name == "f_c"), None)
+    sliding = next((parameter for parameter in chosen if parameter.name == "f_c"), None)
     if sliding is None:
         return chosen
     breakaway = {"value": BREAKAWAY * sliding.value, "min": sliding.min}
-    return [replace(one, **breakaway) if one.name == "f_s" else one for one in chosen]
+    return [replace(parameter, **breakaway) if parameter.name == "f_s" else parameter for parameter in chosen]
 
 
 def check_parts(parts: Sequence[str]) -> None:
     """Refuse an unknown part, and a part given twice.
 
-    Raises
-    ------
-    PlantError
-        A part is unknown, or given twice.
-
+    Raises PlantError: a part is unknown, or given twice.
     """
     if isinstance(parts, str) or not isinstance(parts, Sequence):
         raise PlantError(f"parts = {parts!r} is not a list of names; give a list such as ['load_cell']")
@@ -383,28 +397,22 @@ def list_dead_times(plant: Plant) -> tuple[str, ...]:
     ('T_c',)
 
     """
-    own = [parameter for part in _DEAD_TIMES for parameter in PARTS[part]]
-    return tuple(parameter.name for parameter in own if plant.parameters.get(parameter.name) == parameter)
-
-
-def _make_filtered(make: PlantMaker, part: str, signals: Sequence[str]) -> Plant:
-    """Return what `make` makes, with one filter on each of the named signals that it has."""
-    inner = make()
-    known = inner.inputs if _FILTERS[part][2] == "input" else inner.outputs
-    return _add_filter(inner, part, [signal for signal in signals if signal in known])
+    delays = [parameter for part in _DEAD_TIMES for parameter in PARTS[part]]
+    return tuple(parameter.name for parameter in delays if plant.parameters.get(parameter.name) == parameter)
 
 
 def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
-    """Return a plant with one filter on each of the named inputs or outputs."""
+    """Return a plant with one filter on each of the named inputs or outputs that it has."""
     law, parameter, where, order = _FILTERS[part]
+    units = plant.inputs if where == "input" else plant.outputs
+    signals = [signal for signal in signals if signal in units]
     if parameter in plant.parameters:
         raise PlantError(f"plant {plant.name} has {part} already; each part goes on once")
-    own = {signal: [f"{signal}_{part}_{i}" for i in range(1, order + 1)] for signal in signals}
-    units = plant.inputs if where == "input" else plant.outputs
-    added = {state: units[signal] for signal in signals for state in own[signal]}
+    states = {signal: [f"{signal}_{part}_{i}" for i in range(1, order + 1)] for signal in signals}
+    added = {state: units[signal] for signal in signals for state in states[signal]}
 
     def state(x: Any, signal: str) -> Any:
-        return ca.vertcat(*(getattr(x, name) for name in own[signal]))
+        return ca.vertcat(*(getattr(x, name) for name in states[signal]))
 
     def replace_signals(sources: Mapping[str, Any], x: Any, p: Any) -> dict[str, Any]:
         """Return inputs or outputs with those that are filtered in place of their sources."""
@@ -419,7 +427,7 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         rates = dict(plant.f(t, x, find_inputs(x, u, p), p))
         for s in signals:
             rate = ca.mtimes(filters.a, state(x, s)) + filters.b * sources[s]
-            rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
+            rates |= dict(zip(states[s], ca.vertsplit(rate), strict=True))
         return rates
 
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
@@ -433,7 +441,7 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         parameters={**plant.parameters, **{parameter.name: parameter for parameter in PARTS[part]}},
         f=f,
         h=h,
-        ports=tuple(port.change_makers(partial(_make_filtered, part=part, signals=signals)) for port in plant.ports),
+        ports=change_ports(plant.ports, _add_filter, part, signals),
         friction=put_behind(plant.friction, find_inputs) if where == "input" else plant.friction,
         sensing=keep_weights(plant) if where == "output" else plant.sensing,
     )

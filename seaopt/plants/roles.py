@@ -7,7 +7,7 @@ inputs, outputs and parameters, whose units the plant knows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from functools import partial
 from types import SimpleNamespace
@@ -121,25 +121,14 @@ class Bristles:
 
     The bristles' deflection z is a state of the plant, whose rate stands in `f`, and the force is
     :math:`\\sigma_0 z + \\sigma_1 \\dot z`. While they hold, z follows the coordinate whose rate the velocity is.
-
-    Parameters
-    ----------
-    state : str
-        The deflection z, the plant's own.
-    coordinate : callable ``(x, p) -> expression``
-        What z follows.
-    stiffness, damping : callable ``p -> expression``
-        sigma_0 and sigma_1.
-    rate : callable ``(z, velocity, p) -> expression``
-        dz/dt, the velocity until they slip.
-
     """
 
-    state: str
-    coordinate: StateExpression
+    state: str  # the deflection z, the plant's own
+    coordinate: StateExpression  # what z follows
+    # stiffness, damping: sigma_0 and sigma_1
     stiffness: Expression
     damping: Expression
-    rate: Callable[[Any, Any, Any], Any]
+    rate: Callable[[Any, Any, Any], Any]  # dz/dt, the velocity until they slip
 
 
 @record(eq=False)
@@ -204,8 +193,8 @@ class Friction:
         """Return the force of a state, inputs and parameters."""
         if self.bristles is None:
             return self.force(self.velocity(x, p), self.add_loads(x, u, p))
-        held = self.bristles.stiffness(p) * getattr(x, self.bristles.state)
-        return held + self.bristles.damping(p) * self.find_rate(x, u, p)
+        spring = self.bristles.stiffness(p) * getattr(x, self.bristles.state)
+        return spring + self.bristles.damping(p) * self.find_rate(x, u, p)
 
     def find_rate(self, x: Any, u: Any, p: Any) -> Any:
         """Return the rate of the bristles' deflection."""
@@ -214,11 +203,11 @@ class Friction:
 
     def add_loads(self, x: Any, u: Any, p: Any) -> Any:
         """Return the parameters, and the loads of a state and inputs among them."""
-        return p if self.loads is None else SimpleNamespace(**vars(p), **self.loads(x, u, p))
+        return p if self.loads is None else with_values(p, self.loads(x, u, p))
 
     def add_rated(self, p: Any) -> Any:
         """Return the parameters, and the rated loads among them."""
-        return SimpleNamespace(**vars(p), **self.rated) if self.rated else p
+        return with_values(p, self.rated) if self.rated else p
 
     @property
     def jumps(self) -> bool:
@@ -235,15 +224,13 @@ def put_behind(frictions: Mapping[str, Friction], find_inputs: Callable[[Any, An
     """Return the frictions of a plant whose own inputs follow from others, by (x, u, p): their loads see its own."""
     still = dict.fromkeys(frictions, 0.0)  # loads do not depend on friction
 
-    def put(one: Friction) -> Friction:
-        loads = one.loads
+    def put(friction: Friction) -> Friction:
+        loads = friction.loads
         if loads is None:
-            return one
-        return replace(
-            one, loads=lambda x, u, p: loads(x, find_inputs(x, SimpleNamespace(**{**vars(u), **still}), p), p)
-        )
+            return friction
+        return replace(friction, loads=lambda x, u, p: loads(x, find_inputs(x, with_values(u, still), p), p))
 
-    return {name: put(one) for name, one in frictions.items()}
+    return {name: put(friction) for name, friction in frictions.items()}
 
 
 @record(eq=False)
@@ -281,10 +268,23 @@ class Port:
     ratio: Expression = _one
     probe: PlantMaker | None = None
 
-    def change_makers(self, change: Callable[[PlantMaker], Any]) -> Port:
-        """Return the port with makers that make what `change` does of each: a function that pickles by its name."""
-        makers = {"held": self.held, "probe": self.probe}
-        return replace(self, **{name: partial(change, make) for name, make in makers.items() if make is not None})
+
+def change_ports(ports: Iterable[Port], change: Callable[..., Any], *arguments: Any) -> tuple[Port, ...]:
+    """Return ports whose makers make what `change`, which pickles by its name, makes of their plants."""
+
+    def remake(make: PlantMaker | None) -> PlantMaker | None:
+        return None if make is None else partial(_make_changed, make, change, arguments)
+
+    return tuple(replace(port, held=remake(port.held), probe=remake(port.probe)) for port in ports)
+
+
+def _make_changed(make: PlantMaker, change: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    return change(make(), *arguments)
+
+
+def with_values(space: Any, values: Mapping[str, Any]) -> SimpleNamespace:
+    """Return a namespace with other values, or further ones."""
+    return SimpleNamespace(**{**vars(space), **values})
 
 
 @record(eq=False)
@@ -312,22 +312,12 @@ class Winding:
 
 @record(eq=False)
 class Sampling:
-    """States that stand still between samples, and are set at each: memories of a device that samples.
+    """States that stand still between samples, and are set at each: memories of a device that samples."""
 
-    Parameters
-    ----------
-    period_s : float
-        Between samples; such a plant is simulated with this period alone.
-    sets : mapping of state to mapping of state to float
-        What each becomes after a sample: a combination of states as they were at the sample.
-    differences : mapping of output to Difference
-        The speeds that these memories are for.
-
-    """
-
-    period_s: float
+    period_s: float  # between samples; such a plant is simulated with this period alone
+    # what each becomes after a sample: a combination of states as they were at the sample
     sets: Mapping[str, Mapping[str, float]]
-    differences: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    differences: Mapping[str, Any] = field(default_factory=dict[str, Any])  # the speeds that these memories are for
 
     def matrix(self, states: Sequence[str]) -> tuple[list[int], Float[np.ndarray, "m nx"]]:
         """Return which states are set, and their combinations of all."""

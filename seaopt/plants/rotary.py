@@ -231,9 +231,12 @@ def rotary(
 def _actuator(name: str, link: str, drive: Drive, spring: Spring, parts: tuple[Part, ...], external: bool) -> Plant:
     """Return the plant of options that are checked; its link may be the probe's bare one."""
     actuator = Actuator(
-        transmission=_GEAR if spring == "link2" else _HANGING_GEAR, links=(Link(), _LINK_OF[link]), drive=drive,
-        spring=spring, parts=parts,
-    )  # fmt: skip
+        transmission=_GEAR if spring == "link2" else _HANGING_GEAR,
+        links=(Link(), _LINK_OF[link]),
+        drive=drive,
+        spring=spring,
+        parts=parts,
+    )
     moves = link != "locked"
     outputs: dict[str, tuple[str, Any]] = {
         "tau_s": ("N m", lambda motion, x: motion.spring_force),

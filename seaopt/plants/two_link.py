@@ -122,11 +122,13 @@ def _make_link(kind: LinkKind, number: int, suffix: str) -> Link:
 
 def _actuator(name: str, build: _Build, external: bool) -> Plant:
     """Return the plant of a build."""
-    known = ("fixed", "mass", "pendulum")
+    kinds = ("fixed", "mass", "pendulum")
     check_choices(
-        ("drive", build.drive, DRIVES), ("spring", build.spring, SPRINGS), ("link1", build.links[0], known),
-        ("link2", build.links[1], known),
-    )  # fmt: skip
+        ("drive", build.drive, DRIVES),
+        ("spring", build.spring, SPRINGS),
+        ("link1", build.links[0], kinds),
+        ("link2", build.links[1], kinds),
+    )
     part_laws.check_parts(build.parts)
     links = tuple(_make_link(build.links[i], i + 1, build.suffixes[i]) for i in (0, 1))
     if "pendulum" in build.links:  # one gravity for both, the last parameter

@@ -16,14 +16,11 @@ from pydantic import (
     model_validator,
 )
 
+from seaopt.bench import Chirp, Multisine, Noise, Sensors
 from seaopt.documents import Flag, Number, Whole
-
-
-class StrictTable(BaseModel):
-    """A table of a problem file: no other keys, no numbers that are not finite."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
-
+from seaopt.logs import Counter
+from seaopt.plants import Difference
+from seaopt.problem.option_tables import StrictTable, key, table_of
 
 NotNegative = Annotated[Number, Field(ge=0)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=64)]
@@ -33,12 +30,14 @@ PlantOrResponse = Annotated[str, StringConstraints(pattern=r"^(frf:)?[A-Za-z][A-
 class ParameterTable(StrictTable):
     """A value with its unit, and what a fit may do with it."""
 
-    value: Number
-    unit: str | None = None
-    free: Flag | None = None
-    min: Number | None = None
-    max: Number | None = None
-    prior_std: Number | None = None
+    value: Number = key("In `unit`, else in the parameter's own.")
+    unit: str | None = key('Such as "N/mm", "kg m^2", "mN m".', default=None)
+    free: Flag | None = key("Whether it is fitted; also where prior_std is given.", default=None)
+    min: Number | None = key("Least value of a fit.", default=None)
+    max: Number | None = key("Largest value of a fit.", default=None)
+    prior_std: Number | None = key(
+        "Known within this standard deviation: a prior of the fit, and drawn by the certificate.", default=None
+    )
 
 
 class PlantTable(BaseModel):
@@ -46,121 +45,127 @@ class PlantTable(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
-    kind: str
+    kind: str = key("high_impedance, moving_output, two_link, rotary, winding, or one of an installed package.")
 
 
 Formula = Annotated[
     Annotated[str, Strict()] | Number,
-    Field(description="Numbers, names, + - * / ^, brackets, sin, cos, tan, tanh, exp, log, sqrt, abs, min, max, atan2, "
-          "if_else(a > b, then, else), pi."),
-]  # fmt: skip
+    Field(
+        description="Numbers, names, + - * / ^, brackets, sin, cos, tan, tanh, exp, log, sqrt, abs, min, max, atan2, "
+        "if_else(a > b, then, else), pi."
+    ),
+]
 
 
 class DefaultTable(StrictTable):
     """A parameter of a plant of the user's own, with what it is where [parameters] does not say."""
 
-    unit: str
-    value: Number
-    min: Number | None = None
-    max: Number | None = None
-    description: str = ""
+    unit: str = key("SI.")
+    value: Number = key("Where [parameters] does not say.")
+    min: Number | None = key("Least value.", default=None)
+    max: Number | None = key("Largest value.", default=None)
+    description: str = key("In words, for tables.", default="")
 
 
 class DerivedTable(StrictTable):
     """A figure that follows from the parameters."""
 
-    value: Formula
-    unit: str
+    value: Formula = key("The figure, in terms of the parameters.")
+    unit: str = key("SI.")
 
 
 class ActuationTable(StrictTable):
     """What a controller commands, and the effort that one unit of it makes, of the parameters."""
 
-    input: str
-    effort: Formula
-    unit: str = "N"
-    efficiency: str | None = None
-    speed: Formula | None = None
-    largest: Formula | None = None
+    input: str = key("The input that a controller commands.")
+    effort: Formula = key("Force or torque that one unit of it makes, of the parameters.")
+    unit: str = key("N, or N m.", default="N")
+    efficiency: str | None = key("Parameter that is the transmission's efficiency.", default=None)
+    speed: Formula | None = key("On which the effort works, of states and parameters.", default=None)
+    largest: Formula | None = key("End of the command's range: 1 for a duty.", default=None)
 
 
 class SensingTable(StrictTable):
     """Regulated and sensed signals: names of outputs, or of states."""
 
-    regulated: list[str] = []
-    motor_position: str | None = None
-    motor_speed: str | None = None
-    link_position: str | None = None
-    from_encoders: list[str] = []
+    regulated: list[str] = key("Forces or torques that may be controlled.", default=[])
+    motor_position: str | None = key("Output or state.", default=None)
+    motor_speed: str | None = key("Output or state.", default=None)
+    link_position: str | None = key("Output or state.", default=None)
+    from_encoders: list[str] = key("Outputs that a device computes from the encoders.", default=[])
 
 
 class SpringTable(StrictTable):
     """The elastic element; its deflection is of states and parameters."""
 
-    deflection: Formula
-    unit: str
-    stiffness: str | None = None
-    mass: str | None = None
-    damping: str | None = None
+    deflection: Formula = key("Deflection in terms of states and parameters.")
+    unit: str = key("m or rad.")
+    stiffness: str | None = key("Parameter.", default=None)
+    mass: str | None = key("Derived figure: what swings on the spring.", default=None)
+    damping: str | None = key("Derived figure.", default=None)
 
 
 class PortTable(StrictTable):
     """Where the world touches the plant; `held` and `probe` are other plants of the file."""
 
-    motion: str | None = None
-    coordinate: str | None = None
-    rate: str | None = None
-    effort: str | None = None
-    payload: list[str] = []
-    drive: str | None = None
-    ratio: Formula = 1.0
-    held: Name | None = None
-    probe: Name | None = None
+    motion: str | None = key("Output that is the link's motion.", default=None)
+    coordinate: str | None = key("State.", default=None)
+    rate: str | None = key("State.", default=None)
+    effort: str | None = key("Input: the external force or torque.", default=None)
+    payload: list[str] = key("Parameters that are the link's own.", default=[])
+    drive: str | None = key("State of the motor.", default=None)
+    ratio: Formula = key("Motion of the motor for that of the link.", default=1.0)
+    held: Name | None = key("Plant of this file in which the port is held.", default=None)
+    probe: Name | None = key("Plant of this file with a bare inertia on the port.", default=None)
 
 
 class FrictionTable(StrictTable):
     """A dissipative force: of v, the velocity that it opposes, of the parameters, and of loads that it grows with."""
 
-    velocity: Formula
-    force: Formula
-    unit: str = "N"
-    effort: Formula = 1.0
-    slopes: tuple[Formula, Formula] | None = None
-    jump: Formula | None = None
-    smoothing: str | None = None
-    loads: dict[str, Formula] = {}
-    rated: dict[str, Number] = {}
+    velocity: Formula = key("The velocity that it opposes, in terms of states.")
+    force: Formula = key("The force, in terms of v, the velocity, and the parameters.")
+    unit: str = key("N, or N m.", default="N")
+    effort: Formula = key("Effort at the actuation for one unit of the force.", default=1.0)
+    slopes: tuple[Formula, Formula] | None = key("Flattest and steepest slope of the curve.", default=None)
+    jump: Formula | None = key("Jump of the force where the velocity changes its sign.", default=None)
+    smoothing: str | None = key("Parameter: speed over which the curve is rounded.", default=None)
+    loads: dict[str, Formula] = key("Efforts that it grows with, by name.", default={})
+    rated: dict[str, Number] = key("Sizes of these loads at which the slopes hold.", default={})
 
 
 class ModeTable(StrictTable):
     """A mode whose frequency one parameter sets."""
 
-    name: str
-    parameter: str
-    state: str
+    name: str = key("Name of the range that sets it.")
+    parameter: str = key("Parameter that sets it.")
+    state: str = key("State that moves most in it.")
 
 
 class EquationsTable(StrictTable):
-    """A plant of the user's own: names with their SI units, equations as text, roles."""
+    """A plant of the user's own: names with their SI units, equations as text, roles.
 
-    states: dict[str, str]
-    inputs: dict[str, str] = {}
-    outputs: dict[str, str]
-    parameters: dict[str, str | DefaultTable] = {}
-    optional_inputs: list[str] = []
-    definitions: dict[str, Formula] = {}
-    f: dict[str, Formula]
-    h: dict[str, Formula]
-    derived: dict[str, DerivedTable] = {}
-    energy: Formula | None = None
-    actuation: ActuationTable | None = None
-    sensing: SensingTable | None = None
-    spring: SpringTable | None = None
-    ports: list[PortTable] = []
-    friction: dict[str, FrictionTable] = {}
-    mode: ModeTable | None = None
-    sticks: Flag = False
-    parts: list[str] = []
+    Text may have numbers, names, + - * / ^, brackets, sin, cos, tan, tanh, exp, log, sqrt, abs, min, max, atan2,
+    if_else(a > b, then, else) and pi.
+    """
+
+    states: dict[str, str] = key("Names with units.")
+    inputs: dict[str, str] = key("Names with units.", default={})
+    outputs: dict[str, str] = key("Names with units.")
+    parameters: dict[str, str | DefaultTable] = key("Names with a unit, or with unit and default.", default={})
+    optional_inputs: list[str] = key("Inputs that are zero where a log leaves them out.", default=[])
+    definitions: dict[str, Formula] = key("Abbreviations, in order.", default={})
+    f: dict[str, Formula] = key("Rate of each state.")
+    h: dict[str, Formula] = key("Each output.")
+    derived: dict[str, DerivedTable] = key("Figures that follow from the parameters.", default={})
+    energy: Formula | None = key("Energy in terms of states and parameters, to check the equations by.", default=None)
+    actuation: ActuationTable | None = key("What a controller commands.", default=None)
+    sensing: SensingTable | None = key("What is regulated and sensed.", default=None)
+    spring: SpringTable | None = key("The elastic element.", default=None)
+    ports: list[PortTable] = key("Where the world touches the plant.", default=[])
+    friction: dict[str, FrictionTable] = key("Dissipative forces by name; f uses them by it.", default={})
+    mode: ModeTable | None = key("A mode whose frequency one parameter sets.", default=None)
+    sticks: Flag = key("Simulate and fit friction as it jumps at rest, in place of its smoothed curve.", default=False)
+    parts: list[str] = key("Effects around the plant: load_cell, current_loop, position_servo, ...", default=[])
 
 
 def _choose_plant(table: Any) -> str:
@@ -177,30 +182,50 @@ AnyPlant = Annotated[
 ]
 
 
+class CounterTable(table_of(Counter)):
+    """A column that counts samples; where it skips, gaps are opened."""
+
+
+class DifferenceTable(table_of(Difference)):
+    """A measured speed that a device computed from a position, sample by sample."""
+
+
+class ChirpTable(table_of(Chirp)):
+    """A logarithmic chirp over the whole duration."""
+
+
+class NoiseTable(table_of(Noise)):
+    """Band-limited Gaussian noise."""
+
+
+class MultisineTable(table_of(Multisine)):
+    """A sum of sines; phases are zero where left out."""
+
+
 class HoldTable(StrictTable):
     """The last sample at or before each instant."""
 
-    max_age_s: Annotated[Number, Field(gt=0)] | None = None
+    max_age_s: Number | None = key("Oldest sample that still holds.", default=None, gt=0)
 
 
 class LinearTable(StrictTable):
     """The straight line between the samples on either side."""
 
-    max_gap_s: Annotated[Number, Field(gt=0)] | None = None
+    max_gap_s: Number | None = key("Longest step that is interpolated across.", default=None, gt=0)
 
 
 class NearestTable(StrictTable):
     """The nearest sample."""
 
-    tolerance_s: Annotated[Number, Field(gt=0)]
+    tolerance_s: Number = key("Farthest sample that counts.", gt=0)
 
 
 class AlignTable(StrictTable):
     """How a channel of another clock comes to the log's: exactly one of these."""
 
-    hold: HoldTable | None = None
-    linear: LinearTable | None = None
-    nearest: NearestTable | None = None
+    hold: HoldTable | None = key("The last sample at or before each instant.", default=None)
+    linear: LinearTable | None = key("Interpolation between neighbours.", default=None)
+    nearest: NearestTable | None = key("The nearest sample.", default=None)
 
     @model_validator(mode="after")
     def _one(self) -> AlignTable:
@@ -215,158 +240,134 @@ Header = Annotated[str, Strict()] | Annotated[Whole, Field(ge=1)]  # or the colu
 class ClockTable(StrictTable):
     """A time column."""
 
-    column: Header
-    unit: str | None = None
-    file: str | None = None
-    clock_offset_s: Number = 0.0
-    where: dict[str, Annotated[str, Strict()] | Number] | None = None
+    column: Header = key("Header, or number from 1.")
+    unit: str | None = key('"s", "ms", "us"; left out: that in the header\'s brackets.', default=None)
+    file: str | None = key("Which of several logs has it.", default=None)
+    clock_offset_s: Number = key("Added to its times.", default=0.0)
+    where: dict[str, Annotated[str, Strict()] | Number] | None = key("Rows that count: column and value.", default=None)
 
 
 class ColumnTable(StrictTable):
     """A column of a log, the way from its numbers to its unit, and for an output its noise."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, strict=False, populate_by_name=True
-    )  # fmt: skip
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False, populate_by_name=True)
 
-    column: Header
-    unit: str | None = None
-    scale: Number = 1.0
-    offset: Number = 0.0
-    wrap_bits: Annotated[Whole, Field(ge=2, le=53)] | None = None
-    file: str | None = None
-    time: Header | ClockTable | None = None
-    clock_offset_s: Number = 0.0
-    align: AlignTable | None = None
-    where: dict[str, Annotated[str, Strict()] | Number] | None = None
-    source: Annotated[Literal["header"] | None, Field(alias="from")] = None
-    shared: Flag = False
-    sigma: Number | None = None
-
-
-class CounterTable(StrictTable):
-    """A column that counts samples; where it skips, gaps are opened."""
-
-    column: str
-    samples_per_count: Annotated[Whole, Field(ge=1)] = 1
-
-
-class DifferenceTable(StrictTable):
-    """A measured speed that a device computed from a position, sample by sample."""
-
-    of: str
-    samples: Annotated[Whole, Field(ge=1, le=100)] = 1
-    lag_hz: Annotated[Number, Field(gt=0)] | None = None
+    column: Header = key("Header, or number from 1.")
+    unit: str | None = key("Left out: that in the header's brackets.", default=None)
+    scale: Number = key("Numbers are multiplied with it before their unit.", default=1.0)
+    offset: Number = key("Added after the scale, in the unit.", default=0.0)
+    wrap_bits: Whole | None = key("Numbers are two's complement of so many bits.", default=None, ge=2, le=53)
+    file: str | None = key("Which of several logs has it.", default=None)
+    time: Header | ClockTable | None = key("Its own clock, where it has one.", default=None)
+    clock_offset_s: Number = key("Added to that clock's times.", default=0.0)
+    align: AlignTable | None = key("How it comes to the log's clock.", default=None)
+    where: dict[str, Annotated[str, Strict()] | Number] | None = key("Rows that count: column and value.", default=None)
+    source: Literal["header"] | None = key(
+        '"header": a constant that the log\'s header states.', default=None, alias="from"
+    )
+    shared: Flag = key("Whether another channel is this column, too.", default=False)
+    sigma: Number | None = key("Standard deviation of the noise, SI; estimated where left out.", default=None)
 
 
 class UnknownTable(StrictTable):
     """A value of an experiment that may be estimated."""
 
-    value: Number
-    free: Flag | None = None
-    min: Number | None = None
-    max: Number | None = None
-    prior_std: Number | None = None
-
-
-class ChirpTable(StrictTable):
-    """A logarithmic chirp over the whole duration."""
-
-    amplitude: Number
-    f0_hz: Number
-    f1_hz: Number
-
-
-class NoiseTable(StrictTable):
-    """Band-limited Gaussian noise."""
-
-    std: Number
-    band_hz: Number
-
-
-class MultisineTable(StrictTable):
-    """A sum of sines; phases are zero where left out."""
-
-    amplitudes: list[Number]
-    frequencies_hz: list[Number]
-    phases_rad: list[Number] = []
+    value: Number = key("Start of the fit, or the value.")
+    free: Flag | None = key("Whether it is fitted.", default=None)
+    min: Number | None = key("Least value.", default=None)
+    max: Number | None = key("Largest value.", default=None)
+    prior_std: Number | None = key("Known within this.", default=None)
 
 
 class ExcitationTable(StrictTable):
     """What drives a virtual experiment; the parts are summed."""
 
-    chirp: ChirpTable | None = None
-    noise: NoiseTable | None = None
-    multisine: MultisineTable | None = None
+    chirp: ChirpTable | None = key("Logarithmic, over the whole duration.", default=None)
+    noise: NoiseTable | None = key("Gaussian and band-limited.", default=None)
+    multisine: MultisineTable | None = key("A sum of sines.", default=None)
 
 
-class SensorsTable(StrictTable):
+class SensorsTable(table_of(Sensors)):
     """What sensors do to outputs, by name."""
-
-    noise_std: dict[str, NotNegative] = {}
-    offset: dict[str, Number] = {}
-    quantisation: dict[str, NotNegative] = {}
-    saturation: dict[str, NotNegative] = {}
 
 
 class VirtualTable(SensorsTable):
     """A virtual experiment in place of a log."""
 
-    seed: Annotated[Whole, Field(ge=0)]
-    duration_s: Annotated[Number, Field(gt=0, le=1e6)]
-    rate_hz: Annotated[Number, Field(gt=0, le=1e6)]
-    truth: dict[str, Number] = {}
-    excitation: ExcitationTable
-    outputs: list[str] = []
+    seed: Whole = key("Seed of noise and excitation.", ge=0)
+    duration_s: Number = key("Length.", gt=0, le=1e6)
+    rate_hz: Number = key("Samples per second.", gt=0, le=1e6)
+    truth: dict[str, Number] = key("Parameters that differ from the file's.", default={})
+    excitation: ExcitationTable = key("What drives it.")
+    outputs: list[str] = key("That are measured; those with noise where left out.", default=[])
 
 
 class ResampleTable(StrictTable):
     """A uniform clock that a log is interpolated to, by lines where no rule is given."""
 
-    rate_hz: Annotated[Number, Field(gt=0, le=1e9)]
-    rule: AlignTable | Literal["restamp"] | None = None
-    bridge_s: Annotated[Number, Field(gt=0)] | None = None
+    rate_hz: Number = key("Sample rate of the uniform clock.", gt=0, le=1e9)
+    rule: AlignTable | Literal["restamp"] | None = key(
+        'How; linear where left out, "restamp" for samples that were taken evenly.', default=None
+    )
+    bridge_s: Number | None = key("Longest step of time that is interpolated across.", default=None, gt=0)
 
 
 class ExperimentTable(StrictTable):
     """One log, or one virtual experiment, of one plant."""
 
-    name: Name
-    plant: Name
-    use: Literal["fit", "validate"] = "fit"
-    log: str | list[str] | None = None
-    virtual: VirtualTable | None = None
-    time: Header | ClockTable | None = None
-    rate_hz: Annotated[Number, Field(gt=0, le=1e9)] | None = None
-    inputs: dict[str, Header | ColumnTable] = {}
-    outputs: dict[str, Header | ColumnTable] = {}
-    differences: dict[str, DifferenceTable] = {}
-    align: AlignTable | None = None
-    window_s: tuple[Number, Number] | None = None
-    counter: CounterTable | None = None
-    duplicates: Literal["first", "mean"] | None = None
-    sigma: dict[str, Number] = {}
-    initial_state: Literal["estimate", "rest"] | dict[str, Number] = "estimate"
-    offset: Flag | dict[str, Number] = True
-    parameters: dict[str, Number | UnknownTable | ColumnTable] = {}
-    delay_s: Number | UnknownTable = 0.0
-    gain: dict[str, Number | UnknownTable] = {}
-    hold: Literal["zero", "first"] = "zero"
-    drift: Annotated[Whole, Field(ge=0, le=5)] = 0
-    shots: Annotated[Whole, Field(ge=1, le=100_000)] = 1
-    slice_s: tuple[Number, Number] | None = None
-    resample: Literal["restamp"] | ResampleTable | None = None
-    decimate: Annotated[Whole, Field(ge=1, le=10_000)] = 1
-    saturation: dict[str, tuple[Number, Number]] = {}
-    mask: Literal["auto", "declared", "none"] = "auto"
-    gaps: Literal["split", "error"] = "split"
+    name: Name = key("For results: letters, digits, _ and -.")
+    plant: Name = key("A [plant.NAME] of this file.")
+    use: Literal["fit", "validate"] = key('"validate": not fitted, only scored.', default="fit")
+    log: str | list[str] | None = key("File, or files, relative to this one and below its folder.", default=None)
+    virtual: VirtualTable | None = key("In place of a log: a simulated one.", default=None)
+    time: Header | ClockTable | None = key("Column of the clock.", default=None)
+    rate_hz: Number | None = key("Samples per second of a log without a clock.", default=None, gt=0, le=1e9)
+    inputs: dict[str, Header | ColumnTable] = key("The plant's inputs, and their columns.", default={})
+    outputs: dict[str, Header | ColumnTable] = key(
+        "The plant's outputs that were measured, and their columns.", default={}
+    )
+    differences: dict[str, DifferenceTable] = key("Speeds that a device computed from a position.", default={})
+    align: AlignTable | None = key("How columns of other clocks come to the log's.", default=None)
+    window_s: tuple[Number, Number] | None = key("Read only what lies between these times.", default=None)
+    counter: CounterTable | None = key("A column that counts samples, which shows lost ones.", default=None)
+    duplicates: Literal["first", "mean"] | None = key("Which of several samples at one time counts.", default=None)
+    sigma: dict[str, Number] = key("Noise by output, SI; estimated where left out.", default={})
+    initial_state: Literal["estimate", "rest"] | dict[str, Number] = key(
+        '"estimate", "rest", or states with values.', default="estimate"
+    )
+    offset: Flag | dict[str, Number] = key(
+        "One unknown offset per output (true), none (false), or known ones.", default=True
+    )
+    parameters: dict[str, Number | UnknownTable | ColumnTable] = key(
+        "Values, or free ones, of this log alone.", default={}
+    )
+    delay_s: Number | UnknownTable = key("From the input's column to its effect.", default=0.0)
+    gain: dict[str, Number | UnknownTable] = key("Gain of each output's sensor.", default={})
+    hold: Literal["zero", "first"] = key(
+        '"first" for a measured input: straight lines between its samples.', default="zero"
+    )
+    drift: Whole = key("Order of a polynomial that each output may drift by.", default=0, ge=0, le=5)
+    shots: Whole = key("Pieces with initial states of their own.", default=1, ge=1, le=100_000)
+    slice_s: tuple[Number, Number] | None = key("What is used, from the log's start.", default=None)
+    resample: Literal["restamp"] | ResampleTable | None = key(
+        '"restamp" for rounded timestamps; a rate for uneven ones.', default=None
+    )
+    decimate: Whole = key("Keep every n-th sample, behind a filter.", default=1, ge=1, le=10_000)
+    saturation: dict[str, tuple[Number, Number]] = key(
+        "Range of each sensor; samples at its ends have no weight.", default={}
+    )
+    mask: Literal["auto", "declared", "none"] = key("Whether flat tops lose their weight.", default="auto")
+    gaps: Literal["split", "error"] = key('Cut the log at gaps, or refuse it ("error").', default="split")
 
 
 class FitTable(StrictTable):
     """How the fit is made."""
 
-    method: Literal["output_error", "multiple_shooting", "prediction_error"] = "output_error"
-    segments: Annotated[Whole, Field(ge=1, le=100_000)] | None = None
-    loss: Literal["linear", "huber", "soft_l1"] = "linear"
-    band_hz: tuple[Number, Number] | None = None
-    holdout: Annotated[Number, Field(ge=0, lt=1)] = 0.0
+    method: Literal["output_error", "multiple_shooting", "prediction_error"] = key(
+        "output_error first; multiple_shooting where it fails; prediction_error with process noise.",
+        default="output_error",
+    )
+    segments: Whole | None = key("Number of segments of multiple shooting.", default=None, ge=1, le=100_000)
+    loss: Literal["linear", "huber", "soft_l1"] = key('"huber" or "soft_l1" with outliers.', default="linear")
+    band_hz: tuple[Number, Number] | None = key("Residuals count in this band only.", default=None)
+    holdout: Number = key("Last share of each log that is kept back, to judge the fit by.", default=0.0, ge=0, lt=1)

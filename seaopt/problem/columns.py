@@ -20,11 +20,7 @@ def list_log_files(table: ExperimentTable) -> list[str]:
 def check_inside(place: str, table: ExperimentTable) -> None:
     """Refuse a file outside the problem file's folder.
 
-    Raises
-    ------
-    ProblemError
-        A path is absolute, or climbs out.
-
+    Raises ProblemError: a path is absolute, or climbs out.
     """
     for name in list_log_files(table):
         for kind in (PurePosixPath, PureWindowsPath):  # a problem file reads the same on every system
@@ -35,11 +31,7 @@ def check_inside(place: str, table: ExperimentTable) -> None:
 def check_links(folder: Path, names: list[str]) -> None:
     """Refuse a log that a symbolic link puts outside the problem file's folder.
 
-    Raises
-    ------
-    ProblemError
-        The file that is meant lies elsewhere.
-
+    Raises ProblemError: the file that is meant lies elsewhere.
     """
     for name in names:
         try:
@@ -58,13 +50,22 @@ def make_column(table: str | int | ClockTable | ColumnTable, folder: Path) -> Co
     if isinstance(table, ClockTable):
         return Column(
             column=table.column, unit=table.unit, file=file, clock_offset_s=table.clock_offset_s, where=table.where
-        )  # fmt: skip
+        )
     time = table.time if table.time is None or isinstance(table.time, str | int) else make_column(table.time, folder)
     return Column(
-        column=table.column, unit=table.unit, scale=table.scale, offset=table.offset, wrap_bits=table.wrap_bits,
-        file=file, time=time, clock_offset_s=table.clock_offset_s, align=make_rule(table.align),
-        where=table.where, from_header=table.source == "header", shared=table.shared,
-    )  # fmt: skip
+        column=table.column,
+        unit=table.unit,
+        scale=table.scale,
+        offset=table.offset,
+        wrap_bits=table.wrap_bits,
+        file=file,
+        time=time,
+        clock_offset_s=table.clock_offset_s,
+        align=make_rule(table.align),
+        where=table.where,
+        from_header=table.source == "header",
+        shared=table.shared,
+    )
 
 
 def make_rule(table: AlignTable | None) -> Hold | Linear | Nearest | None:

@@ -35,11 +35,7 @@ Read = Callable[[str, Formula], Any]  # returns the expression of a formula, giv
 def order_plants(tables: Mapping[str, AnyPlant]) -> list[str]:
     """Return the names of a file's plants, those that others name as held or probe before these.
 
-    Raises
-    ------
-    PlantError
-        A plant that is named is not there, or plants name each other in a circle.
-
+    Raises PlantError: a plant that is named is not there, or plants name each other in a circle.
     """
     named = {name: set(list_partners(table)) for name, table in tables.items()}
     for name, partners in named.items():
@@ -58,22 +54,9 @@ def list_partners(table: AnyPlant) -> list[str]:
 def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) -> Plant:
     """Return the plant of a table.
 
-    Parameters
-    ----------
-    name : str
-        Of the plant.
-    table : EquationsTable
-        As the problem file has it.
-    partners : mapping of name to Plant
-        The plants that its ports name.
-
-    Raises
-    ------
-    PlantError
-        A name, an equation or a role is not as it must be; the message names the place.
-    UnitError
-        A unit is unknown, or not SI.
-
+    `name`: of the plant. `partners`: the plants that its ports name.
+    Raises PlantError: a name, an equation or a role is not as it must be; the message names the place. Raises
+    UnitError: a unit is unknown, or not SI.
     """
     _check_names(table)
     _check_units(table)
@@ -90,16 +73,24 @@ def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) 
         return {key: read(f"h.{key}", text) for key, text in table.h.items()}
 
     plant = Plant(
-        name=name, states=table.states, inputs=table.inputs, outputs=table.outputs,
+        name=name,
+        states=table.states,
+        inputs=table.inputs,
+        outputs=table.outputs,
         parameters={key: _declare(key, declared) for key, declared in table.parameters.items()},
-        f=texts.store(write_rates, *everything), h=texts.store(write_outputs, *everything),
-        derived=texts.derive(), energy=texts.of_states("energy", table.energy),
+        f=texts.store(write_rates, *everything),
+        h=texts.store(write_outputs, *everything),
+        derived=texts.derive(),
+        energy=texts.of_states("energy", table.energy),
         optional_inputs=frozenset(table.optional_inputs),
-        actuation=texts.actuate(), sensing=_sense(table), spring=texts.spring(),
+        actuation=texts.actuate(),
+        sensing=_sense(table),
+        spring=texts.spring(),
         ports=tuple(texts.port(f"ports.{number}", port, partners) for number, port in enumerate(table.ports, 1)),
-        friction={key: texts.rub(f"friction.{key}", one) for key, one in table.friction.items()},
-        mode=None if table.mode is None else Mode(**table.mode.model_dump()), sticks=table.sticks,
-    )  # fmt: skip
+        friction={key: texts.rub(f"friction.{key}", curve) for key, curve in table.friction.items()},
+        mode=None if table.mode is None else Mode(**table.mode.model_dump()),
+        sticks=table.sticks,
+    )
     _check_outputs(plant)
     _check_held(plant)
     return wrapped(plant, table.parts)
@@ -134,21 +125,11 @@ def _list_texts(content: Any) -> Iterator[str]:
 
 @record
 class _Texts:
-    """A table's formulas as functions.
-
-    Parameters
-    ----------
-    table : EquationsTable
-    definitions : list of str
-        Their names, in an order in which each uses only earlier ones.
-    names : mapping of name to text
-        What each name of the plant is, in words.
-
-    """
+    """A table's formulas as functions."""
 
     table: EquationsTable
-    definitions: list[str]
-    names: Mapping[str, str]
+    definitions: list[str]  # their names, in an order in which each uses only earlier ones
+    names: Mapping[str, str]  # what each name of the plant is, in words
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -163,8 +144,8 @@ class _Texts:
 
         def function(*given: Any) -> Any:
             symbols: dict[str, Any] = {}
-            for names, one in zip(arguments, given, strict=True):
-                symbols |= {names: one} if isinstance(names, str) else vars(one)
+            for names, argument in zip(arguments, given, strict=True):
+                symbols |= {names: argument} if isinstance(names, str) else vars(argument)
             known = {name: symbol for name, symbol in symbols.items() if name != VELOCITY or VELOCITY not in arguments}
 
             def read(place: str, text: Formula) -> Any:
@@ -211,27 +192,47 @@ class _Texts:
     def derive(self) -> StoredFunction | None:
         """Return the function of the derived figures."""
         figures = self.table.derived
-        return self.store(
-            lambda read: {key: (read(f"derived.{key}", one.value), one.unit) for key, one in figures.items()},
-            self.parameters,
-        ) if figures else None  # fmt: skip
+        return (
+            self.store(
+                lambda read: {
+                    key: (read(f"derived.{key}", figure.value), figure.unit) for key, figure in figures.items()
+                },
+                self.parameters,
+            )
+            if figures
+            else None
+        )
 
     def actuate(self) -> Actuation | None:
         """Return what a controller commands."""
         role = self.table.actuation
-        return None if role is None else Actuation(
-            input=role.input, effort=self.of_parameters("actuation.effort", role.effort), unit=role.unit,
-            efficiency=role.efficiency, speed=self.of_states("actuation.speed", role.speed),
-            largest=None if role.largest is None else self.of_parameters("actuation.largest", role.largest),
-        )  # fmt: skip
+        return (
+            None
+            if role is None
+            else Actuation(
+                input=role.input,
+                effort=self.of_parameters("actuation.effort", role.effort),
+                unit=role.unit,
+                efficiency=role.efficiency,
+                speed=self.of_states("actuation.speed", role.speed),
+                largest=None if role.largest is None else self.of_parameters("actuation.largest", role.largest),
+            )
+        )
 
     def spring(self) -> SeriesSpring | None:
         """Return the elastic element."""
         role = self.table.spring
-        return None if role is None else SeriesSpring(
-            deflection=self.of_states("spring.deflection", role.deflection), unit=role.unit,
-            stiffness=role.stiffness, mass=role.mass, damping=role.damping,
-        )  # fmt: skip
+        return (
+            None
+            if role is None
+            else SeriesSpring(
+                deflection=self.of_states("spring.deflection", role.deflection),
+                unit=role.unit,
+                stiffness=role.stiffness,
+                mass=role.mass,
+                damping=role.damping,
+            )
+        )
 
     def port(self, place: str, role: PortTable, partners: Mapping[str, Plant]) -> Port:
         """Return a port; the plants that it names are made already."""
@@ -240,10 +241,15 @@ class _Texts:
             for what, name in (("held", role.held), ("probe", role.probe))
         }
         return Port(
-            motion=role.motion, coordinate=role.coordinate, rate=role.rate, effort=role.effort,
-            payload=tuple(role.payload), drive=role.drive, ratio=self.of_parameters(f"{place}.ratio", role.ratio),
+            motion=role.motion,
+            coordinate=role.coordinate,
+            rate=role.rate,
+            effort=role.effort,
+            payload=tuple(role.payload),
+            drive=role.drive,
+            ratio=self.of_parameters(f"{place}.ratio", role.ratio),
             **makers,
-        )  # fmt: skip
+        )
 
     def rub(self, place: str, role: FrictionTable) -> Friction:
         """Return a friction."""
@@ -257,15 +263,18 @@ class _Texts:
 
         slopes = role.slopes
         return Friction(
-            velocity=self.of_states(f"{place}.velocity", role.velocity), force=curve("force", role.force),
-            unit=role.unit, effort=self.of_parameters(f"{place}.effort", role.effort),
-            slopes=None if slopes is None else self.store(
-                lambda read: tuple(read(f"{place}.slopes", text) for text in slopes), known
-            ),
-            jump=None if role.jump is None else curve("jump", role.jump), smoothing=role.smoothing,
+            velocity=self.of_states(f"{place}.velocity", role.velocity),
+            force=curve("force", role.force),
+            unit=role.unit,
+            effort=self.of_parameters(f"{place}.effort", role.effort),
+            slopes=None
+            if slopes is None
+            else self.store(lambda read: tuple(read(f"{place}.slopes", text) for text in slopes), known),
+            jump=None if role.jump is None else curve("jump", role.jump),
+            smoothing=role.smoothing,
             loads=self.store(load, self.states, tuple(self.table.inputs), self.parameters) if role.loads else None,
             rated=role.rated,
-        )  # fmt: skip
+        )
 
 
 def _list_kinds(table: EquationsTable) -> dict[str, str]:
@@ -281,9 +290,12 @@ def _sense(table: EquationsTable) -> Sensing | None:
         return None
     given = table.sensing
     return Sensing(
-        regulated=tuple(given.regulated), motor_position=given.motor_position, motor_speed=given.motor_speed,
-        link_position=given.link_position, from_encoders=tuple(given.from_encoders),
-    )  # fmt: skip
+        regulated=tuple(given.regulated),
+        motor_position=given.motor_position,
+        motor_speed=given.motor_speed,
+        link_position=given.link_position,
+        from_encoders=tuple(given.from_encoders),
+    )
 
 
 def _declare(name: str, declared: Any) -> str | Parameter:
@@ -338,13 +350,16 @@ def _check_names(table: EquationsTable) -> None:
 
 def _check_units(table: EquationsTable) -> None:
     """Refuse units that are unknown or not SI, for the equations are in SI and nothing converts inside them."""
-    units = {f"{group}.{name}": unit for group in ("states", "inputs", "outputs")
-             for name, unit in getattr(table, group).items()}  # fmt: skip
+    units = {
+        f"{group}.{name}": unit
+        for group in ("states", "inputs", "outputs")
+        for name, unit in getattr(table, group).items()
+    }
     for name, declared in table.parameters.items():
         units[f"parameters.{name}"] = declared if isinstance(declared, str) else declared.unit
     roles = {"actuation": table.actuation, "spring": table.spring}
-    roles |= {f"friction.{name}": one for name, one in table.friction.items()}
-    roles |= {f"derived.{name}": one for name, one in table.derived.items()}
+    roles |= {f"friction.{name}": curve for name, curve in table.friction.items()}
+    roles |= {f"derived.{name}": figure for name, figure in table.derived.items()}
     units |= {f"{place}.unit": role.unit for place, role in roles.items() if role is not None}
     for place, unit in units.items():
         try:
@@ -365,8 +380,11 @@ def _check_equations(table: EquationsTable) -> None:
         for name in names:
             if name not in written:
                 raise PlantError(f'{kind} "{name}" has no equation; write {what}.{name}')
-    used = {name for text in (*table.f.values(), *table.h.values(), *table.definitions.values())
-            for name in list_names(str(text))}  # fmt: skip
+    used = {
+        name
+        for text in (*table.f.values(), *table.h.values(), *table.definitions.values())
+        for name in list_names(str(text))
+    }
     for name in table.friction:
         if name not in used:
             raise PlantError(f'friction.{name} is in no equation; write "- {name}" in f, in place of its force')

@@ -36,12 +36,12 @@ from seaopt.problem.bench_tables import (
     EquationsTable,
     ExperimentTable,
     FitTable,
-    SensorsTable,
     UnknownTable,
     VirtualTable,
 )
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.equations import list_partners, list_unused, order_plants
+from seaopt.problem.option_tables import make_record
 from seaopt.problem.references import RESPONSE, guess_remarks, range_remarks
 from seaopt.problem.schema import ProblemTable, RobustnessTable, ScheduleTable
 from seaopt.records import record
@@ -113,7 +113,7 @@ class Problem:
         """The plant that the controller is designed on; of a measured response, what was on the bench."""
         if self.table.controller is None:
             raise ProblemError(self._ask_for_controller())
-        name = self.table.controller.plant
+        name: str = self.table.controller.plant
         on_bench = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in self.table.experiment}
         return self.plants[on_bench.get(name, name)]
 
@@ -130,8 +130,8 @@ class Problem:
     @property
     def response_names(self) -> tuple[str, ...]:
         """The measured responses that the controller is tuned on, such as frf:chirp."""
-        asked = self.table.controller
-        names = [] if asked is None else [asked.plant, *asked.robust_to]
+        controller = self.table.controller
+        names = [] if controller is None else [controller.plant, *controller.robust_to]
         return tuple(dict.fromkeys(name for name in names if name.startswith(RESPONSE)))
 
     def measure_responses(self, source: Fit | ParameterSet) -> dict[str, MeasuredResponse]:
@@ -147,7 +147,7 @@ class Problem:
         """
         out: dict[str, MeasuredResponse] = {}
         for name in self.response_names:
-            table = next(one for one in self.table.experiment if f"{RESPONSE}{one.name}" == name)
+            table = next(experiment for experiment in self.table.experiment if f"{RESPONSE}{experiment.name}" == name)
             try:
                 out[name] = self._measure_response(self._make_experiment(table), source)
             except SeaoptError as error:
@@ -155,18 +155,21 @@ class Problem:
         return out
 
     def _measure_response(self, experiment: Experiment, source: Fit | ParameterSet) -> MeasuredResponse:
-        asked, given = self.table.controller, experiment.delay_s
-        assert asked is not None
+        controller, given = self.table.controller, experiment.delay_s
+        assert controller is not None
         known = given.value if isinstance(given, Parameter) else given
         if isinstance(given, Parameter) and given.free:
             known = 0.0
         if isinstance(source, Fit) and experiment.name in source.nuisance:
             known = source.nuisance[experiment.name].delay_s
         return measure_response(
-            experiment.plant, experiment.log, list_names(asked.measured)[0], name=experiment.name,
-            confidence=asked.frf_confidence,
+            experiment.plant,
+            experiment.log,
+            list_names(controller.measured)[0],
+            name=experiment.name,
+            confidence=controller.frf_confidence,
             clock=Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known),
-        )  # fmt: skip
+        )
 
     @property
     def notes(self) -> list[str]:
@@ -204,7 +207,7 @@ class Problem:
     @property
     def sensors(self) -> Sensors:
         """What the certificate's simulations read the measured output with."""
-        return _make_sensors(self.robustness.sensors)
+        return make_record(Sensors, self.robustness.sensors)
 
     def certified_plants(self) -> dict[str, Plant]:
         """Return the design plant and those of [robustness], by name; none where all is measured."""
@@ -225,24 +228,24 @@ class Problem:
             *guess_remarks(self.table.guessed, self.ranges, plants, parameters),
         ]
 
-    def values(self, source: Fit | ParameterSet, asked: DelayedSpec | None = None) -> ParameterSet:
+    def values(self, source: Fit | ParameterSet, spec: DelayedSpec | None = None) -> ParameterSet:
         """Return the values to design with: a fit's, the file's for what it does not have.
 
         The drive's delay is as the file's specification says, or another that is asked.
         """
         values = self.parameters.with_parameters(*source.parameters.values()) if isinstance(source, Fit) else source
-        asked = asked or self.spec or self.mpc
-        return values if asked is None else add_drive_delay(values, find_drive_delay(asked, self.design_plant, source))
+        spec = spec or self.spec or self.mpc
+        return values if spec is None else add_drive_delay(values, find_drive_delay(spec, self.design_plant, source))
 
     def robust_to(
-        self, source: Fit | ParameterSet, asked: DelayedSpec | None = None
+        self, source: Fit | ParameterSet, spec: DelayedSpec | None = None
     ) -> dict[str, tuple[Plant, ParameterSet]]:
         """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges.
 
         Each is behind the drive of its own experiments; the delays are as in `values`.
         """
         out: dict[str, tuple[Plant, ParameterSet]] = {}
-        parameters, spec = self.values(source, asked), asked or self.spec or self.mpc
+        parameters, spec = self.values(source, spec), spec or self.spec or self.mpc
         if spec is None:
             return out
         plants = take_own_delays(spec, self.design_plant, self.plants, source)
@@ -307,11 +310,7 @@ class Problem:
     def repeat_experiment(self, log: Path, like: str | None = None) -> Experiment:
         """Return another log of the same test as an experiment, which is named after its file and keeps the slice.
 
-        Raises
-        ------
-        SeaoptError
-            As `experiment_like`.
-
+        Raises SeaoptError: as `experiment_like`.
         """
         table = self.choose_template(like).model_copy(update={"name": name_after(log.stem), "log": str(log.resolve())})
         return self._make_experiment(table, anywhere=True)
@@ -319,11 +318,7 @@ class Problem:
     def choose_template(self, like: str | None = None) -> ExperimentTable:
         """Return the experiment of a name that has a log; the first, if no name is given.
 
-        Raises
-        ------
-        ProblemError
-            There is none.
-
+        Raises ProblemError: there is none.
         """
         tables = {table.name: table for table in self.table.experiment if table.virtual is None}
         if not tables or (like is not None and like not in tables):
@@ -347,14 +342,26 @@ class Problem:
                 sigma[name] = column.sigma
         measured = tuple(table.outputs) if not table.virtual else _virtual_outputs(plant, table.virtual)
         own = {name: self._make_own(plant, table, name, log) for name in table.parameters}
-        differences = {name: Difference(**one.model_dump()) for name, one in table.differences.items()}
+        differences = {name: make_record(Difference, difference) for name, difference in table.differences.items()}
         return Experiment(
-            plant=plant, log=log, name=table.name, outputs=measured, sigma=sigma, initial_state=table.initial_state,
-            offset=table.offset, gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},
-            delay_s=_make_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
-            drift=table.drift, shots=table.shots, saturation=table.saturation, mask=table.mask, parameters=own,
+            plant=plant,
+            log=log,
+            name=table.name,
+            outputs=measured,
+            sigma=sigma,
+            initial_state=table.initial_state,
+            offset=table.offset,
+            gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},
+            delay_s=_make_unknown("delay_s", "s", table.delay_s),
+            hold=table.hold,
+            gaps=table.gaps,
+            drift=table.drift,
+            shots=table.shots,
+            saturation=table.saturation,
+            mask=table.mask,
+            parameters=own,
             differences=differences,
-        )  # fmt: skip
+        )
 
     def _make_own(self, plant: Plant, table: ExperimentTable, name: str, log: Log) -> float | Parameter:
         """Return a parameter of one log alone: a value, a free one, or the constant of a column or the header."""
@@ -394,30 +401,31 @@ class Problem:
             channels={name: make_column(item, self.folder) for name, item in channels.items()},
             align=make_rule(table.align),
             window_s=table.window_s,
-            counter=None if table.counter is None else Counter(**table.counter.model_dump()),
+            counter=None if table.counter is None else make_record(Counter, table.counter),
             rate_hz=table.rate_hz,
             duplicates=table.duplicates,
         )
 
     def _simulate_bench(self, plant: Plant, table: VirtualTable, own: Mapping[str, float]) -> Log:
-        parts: list[Chirp | Noise | Multisine] = []
-        if table.excitation.chirp:
-            parts.append(Chirp(**table.excitation.chirp.model_dump()))
-        if table.excitation.noise:
-            parts.append(Noise(**table.excitation.noise.model_dump()))
-        if table.excitation.multisine:
-            lines = table.excitation.multisine.model_dump()
-            parts.append(Multisine(**{name: tuple(values) for name, values in lines.items()}))
-        excitation: Excitation = tuple(parts)
+        kinds = {"chirp": Chirp, "noise": Noise, "multisine": Multisine}
+        given = {name: getattr(table.excitation, name) for name in kinds}
+        excitation: Excitation = tuple(
+            make_record(kinds[name], part) for name, part in given.items() if part is not None
+        )
         truth = {**plant.complete(self.parameters)}
         for name, value in {**own, **table.truth}.items():
             if name not in truth:
                 raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, truth)}')
             truth[name] = replace(truth[name], value=value)
         return virtual_log(
-            plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
-            seed=table.seed, sensors=_make_sensors(table),
-        )  # fmt: skip
+            plant,
+            ParameterSet(truth.values()),
+            excitation,
+            duration_s=table.duration_s,
+            rate_hz=table.rate_hz,
+            seed=table.seed,
+            sensors=make_record(Sensors, table),
+        )
 
 
 def name_after(stem: str) -> str:
@@ -436,13 +444,12 @@ def name_after(stem: str) -> str:
 def _compute_speeds(log: Log, table: ExperimentTable) -> Log:
     """Return a virtual log with the speeds that a device computes from the positions as they were read."""
     speeds: dict[str, Signal] = {}
-    for name, one in table.differences.items():
-        if one.of not in log.signals:
-            raise ProblemError(
-                f'experiment {table.name}: differences: {name} is of "{one.of}"; {suggestion(one.of, log.signals)}'
-            )
-        values = Difference(**one.model_dump()).read(log[one.of], log.period)
-        speeds[name] = Signal(name=name, values=values, unit=f"{log.signals[one.of].unit}/s")
+    for name, difference in table.differences.items():
+        if difference.of not in log.signals:
+            near = suggestion(difference.of, log.signals)
+            raise ProblemError(f'experiment {table.name}: differences: {name} is of "{difference.of}"; {near}')
+        values = make_record(Difference, difference).read(log[difference.of], log.period)
+        speeds[name] = Signal(name=name, values=values, unit=f"{log.signals[difference.of].unit}/s")
     return replace(log, signals={**log.signals, **speeds}) if speeds else log
 
 
@@ -482,10 +489,6 @@ def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:
     noisy = tuple(name for name in plant.outputs if name in table.noise_std)
     forces = plant.sensing.regulated if plant.sensing is not None else ()
     return noisy or forces or tuple(plant.outputs)
-
-
-def _make_sensors(table: SensorsTable) -> Sensors:
-    return Sensors(**{name: getattr(table, name) for name in SensorsTable.model_fields})
 
 
 def _make_unknown(name: str, unit: str, table: float | UnknownTable) -> float | Parameter:

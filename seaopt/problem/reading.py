@@ -10,18 +10,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from seaopt.control import ControllerSpec, LinkFeedforward, Notch, Prefilter
+from seaopt.control import ControllerSpec
 from seaopt.documents import check_table
 from seaopt.errors import FileError, ProblemError, SeaoptError, require_type
 from seaopt.files import check_regular, exists, parse_file
 from seaopt.plants import Plant, plant_of_kind
 from seaopt.problem.bench_tables import AnyPlant, EquationsTable, PlantTable
 from seaopt.problem.equations import make_plant, order_plants
+from seaopt.problem.option_tables import make_record
 from seaopt.problem.parameters import make_parameters, name_guesses
 from seaopt.problem.predictive import make_mpc_spec
 from seaopt.problem.problem import Problem
 from seaopt.problem.references import check_references
-from seaopt.problem.schema import PrefilterTable, ProblemTable
+from seaopt.problem.schema import ProblemTable
 from seaopt.robustness.certificate.predictive import linear_spec
 
 OF_DESIGN = ("controller", "impedance", "mpc", "robustness", "expect")  # tables that a fit does not read
@@ -80,20 +81,8 @@ def _make(content: Mapping[str, Any], source: str) -> Problem:
 def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
     """Make the objects that a validated problem file stands for.
 
-    Parameters
-    ----------
-    table : ProblemTable
-        The file.
-    source : str
-        Its path, for messages.
-    folder : Path
-        Where relative paths of logs start.
-
-    Raises
-    ------
-    SeaoptError
-        As `read_problem`.
-
+    `folder`: where relative paths of logs start.
+    Raises SeaoptError: as `read_problem`.
     """
     try:
         plants = _make_plants(table.plant)
@@ -141,18 +130,11 @@ def _make_plant_of_kind(table: PlantTable) -> Plant:
 def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    built = {"notch", "prefilter", "link_feedforward", "compensate", "schedule", "gate"}
-    fields = table.controller.model_dump(exclude={"plant", "robust_to", "frf_confidence", "draws", *built})
-    low_pass = table.controller.prefilter
-    prefilter = Prefilter(**low_pass.model_dump()) if isinstance(low_pass, PrefilterTable) else low_pass
-    fed = table.controller.link_feedforward
-    link = (LinkFeedforward() if fed else None) if isinstance(fed, bool) else LinkFeedforward(**fed.model_dump())
-    notch = table.controller.notch
-    tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
+    asked: dict[str, Any] = {}
     if table.robustness is not None and table.robustness.min_friction_margin is not None:
-        designed, certified = fields["min_friction_margin"], table.robustness.min_friction_margin
-        fields["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
-    return ControllerSpec(**fields, notch=tuned, prefilter=prefilter, link_feedforward=link)
+        designed, certified = table.controller.min_friction_margin, table.robustness.min_friction_margin
+        asked["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
+    return make_record(ControllerSpec, table.controller, **asked)
 
 
 def _read_toml(source: Path) -> dict[str, Any]:

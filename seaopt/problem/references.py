@@ -32,11 +32,7 @@ RESPONSE = "frf:"  # before the name of an experiment whose frequency response i
 def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
     """Refuse names of plants, inputs, outputs and ranges that the file's plants do not have, and ranges out of bounds.
 
-    Raises
-    ------
-    ProblemError
-        The message names the key.
-
+    Raises ProblemError: the message names the key.
     """
     places = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
     if table.controller:
@@ -79,27 +75,27 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
 
 def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     """Refuse a schedule over what no plant has, and what is not made of a schedule."""
-    asked = None if table.controller is None else table.controller.schedule
-    if asked is None or table.controller is None:
+    schedule = None if table.controller is None else table.controller.schedule
+    if schedule is None or table.controller is None:
         return
     named = [table.controller.plant, *table.controller.robust_to]
     responses = [name for name in named if name.startswith(RESPONSE)]
     if responses:
         raise ProblemError(
             f"controller.schedule is there, and {responses[0]} is a measured response, which stands at one value of "
-            f"{asked.over}; name plants, or leave the schedule out"
+            f"{schedule.over}; name plants, or leave the schedule out"
         )
     try:
-        check_points(asked.over, np.array(asked.points))
-        find_unit(asked.over, {name: plants[name] for name in named})
+        check_points(schedule.over, np.array(schedule.points))
+        find_unit(schedule.over, {name: plants[name] for name in named})
     except ControlError as error:
         raise ProblemError(f"controller.schedule: {error}") from error
-    if asked.bandwidth_hz is not None and len(asked.bandwidth_hz) != len(asked.points):
+    if schedule.bandwidth_hz is not None and len(schedule.bandwidth_hz) != len(schedule.points):
         raise ProblemError(
-            f"controller.schedule.bandwidth_hz has {len(asked.bandwidth_hz)} values and points {len(asked.points)}; "
-            "give one per point, or leave it out"
+            f"controller.schedule.bandwidth_hz has {len(schedule.bandwidth_hz)} values and points "
+            f"{len(schedule.points)}; give one per point, or leave it out"
         )
-    _check_beside_schedule(table, asked.over)
+    _check_beside_schedule(table, schedule.over)
 
 
 def _check_beside_schedule(table: ProblemTable, over: str) -> None:
@@ -138,8 +134,8 @@ def _check_responses(table: ProblemTable, controller: ControllerTable) -> None:
                 raise ProblemError(
                     f'controller.{place} = "{name}" is of no [[experiment]] of this file; {suggestion(of, experiments)}'
                 )
-            one = experiments[of]
-            if one.virtual is None and controller.measured not in one.outputs:
+            experiment = experiments[of]
+            if experiment.virtual is None and controller.measured not in experiment.outputs:
                 raise ProblemError(
                     f'controller.{place} = "{name}" is of an experiment that does not measure {controller.measured}; '
                     f"name its column in experiment.{of}.outputs"
@@ -153,12 +149,12 @@ def _check_expected(
     experiments = {experiment.name: experiment for experiment in table.experiment}
     of_fit = [name for name in ("parameters", "fit_percent") if getattr(expect, name)]
     of_design = [name for name in ("controller", "certificate") if getattr(expect, name) is not None]
-    for asked, needed, there in (
+    for keys, needed, there in (
         (of_fit, "[[experiment]]", table.experiment),
         (of_design, "[controller]", table.controller),
     ):
-        if asked and not there:
-            raise ProblemError(f"expect.{asked[0]} is there, and no {needed} is; add one, or leave it out")
+        if keys and not there:
+            raise ProblemError(f"expect.{keys[0]} is there, and no {needed} is; add one, or leave it out")
     derived = {name: unit for plant in plants.values() for name, (_, unit) in plant.derived_values().items()}
     units = {name: parameter.unit for name, parameter in parameters.items()} | derived
     certified = expect.certificate.plants if expect.certificate is not None else {}
@@ -175,8 +171,8 @@ def _check_expected(
             except UnitError as error:
                 raise UnitError(f"expect.parameters.{name}: {error}") from error
     for name, limits in expect.fit_percent.items():
-        one = experiments[name]
-        known = {**plants[one.plant].outputs, **one.differences}
+        experiment = experiments[name]
+        known = {**plants[experiment.plant].outputs, **experiment.differences}
         _check_names(f"expect.fit_percent.{name}", limits if isinstance(limits, dict) else (), known)
 
 
@@ -190,16 +186,16 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     if table.controller is None:
         return
     measured, *others = list_names(table.controller.measured)
-    named = [table.controller.plant, *table.controller.robust_to]
+    named: list[str] = [table.controller.plant, *table.controller.robust_to]
     named += table.robustness.plants if table.robustness else []
     named += [table.impedance.plant] if table.impedance else []
     by_experiment = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in table.experiment}
-    for name in (by_experiment.get(name, name) for name in named):
+    for name in [by_experiment.get(name, name) for name in named]:
         if measured not in plants[name].outputs:
             given = "measured" in table.controller.model_fields_set
             sensing = plants[name].sensing
             regulated = sensing.regulated if sensing is not None else ()
-            known = [*regulated, *(one for one in plants[name].outputs if one not in regulated)]
+            known = [*regulated, *(output for output in plants[name].outputs if output not in regulated)]
             raise ProblemError(
                 f'controller.measured{"" if given else ", which is left out,"} = "{measured}" is not an output of '
                 f'plant.{name}, which has {", ".join(known)}; write measured = "{_nearest(measured, known)}" in '
@@ -312,15 +308,7 @@ def range_remarks(
 
     A nominal value outside its range is among the notes of the certificate.
 
-    Parameters
-    ----------
-    ranges : mapping of name to (low, high)
-        Good ones: `seaopt.robustness.check_ranges`.
-    plants : mapping of name to Plant
-        What is certified.
-    nominal : ParameterSet
-        Its values.
-
+    `ranges`: those that `seaopt.robustness.check_ranges` takes. `plants`: what is certified. `nominal`: its values.
     """
     remarks: list[str] = []
     modes = find_modes(plants)
@@ -336,26 +324,23 @@ def range_remarks(
 
 
 def guess_remarks(
-    guessed: Sequence[str], ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant],
+    guessed: Sequence[str],
+    ranges: Mapping[str, tuple[float, float]],
+    plants: Mapping[str, Plant],
     nominal: ParameterSet,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Return a sentence that names the guesses of which nothing is drawn, with ranges to draw them from.
 
-    Parameters
-    ----------
-    guessed : sequence of str
-        Names of parameters, among words for other entries.
-    ranges, plants, nominal
-        As in `range_remarks`; what has a std, of a fit or as a prior, is drawn.
-
+    `guessed`: names of parameters, among words for other entries. What has a std in `nominal`, of a fit or as a prior,
+    is drawn.
     """
-    used = {name for plant in plants.values() for name in plant.parameters} - {one.name for one in HEAT}
+    used = {name for plant in plants.values() for name in plant.parameters} - {parameter.name for parameter in HEAT}
     unknown = [nominal[name] for name in guessed if name in used and name not in ranges]
-    fixed = [one for one in unknown if one.std is None and one.prior_std is None]
+    fixed = [parameter for parameter in unknown if parameter.std is None and parameter.prior_std is None]
     if not fixed:
         return []
     wide = ", ".join(filter(None, map(_propose_range, fixed)))
-    names, are = join_words([one.name for one in fixed]), "is a guess" if len(fixed) == 1 else "are guesses"
+    names, are = join_words([parameter.name for parameter in fixed]), "is a guess" if len(fixed) == 1 else "are guesses"
     return [
         f"nothing is drawn of {names}, which {are}: give each a range that holds the truth, in [robustness]"
         + (f": parameters = {{ {wide} }}" if wide else "")

@@ -10,17 +10,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
-    Field,
     StringConstraints,
     Tag,
     model_validator,
 )
 
-from seaopt.control.laws.limits import BY_NAME
-from seaopt.control.loops.compensation.ripple_term import MOST_CYCLES, RIPPLE_FRACTION
-from seaopt.control.loops.compensation.terms import DEFAULT_FRACTION, FrictionSource
+from seaopt.control import CompensateFriction, CompensateGravity, CompensateRipple, ControllerSpec, Impedance, MPCSpec
+from seaopt.control.laws.plausibility import GateSpec
 from seaopt.documents import Flag, Number, Whole
 from seaopt.problem.bench_tables import (
     AnyPlant,
@@ -33,72 +32,27 @@ from seaopt.problem.bench_tables import (
     SensorsTable,
     StrictTable,
 )
-from seaopt.problem.key_descriptions import KEYS
+from seaopt.problem.option_tables import key, table_of
 
-
-class NotchTable(StrictTable):
-    """A notch in series; what is left out is tuned."""
-
-    frequency_hz: Number | None = None
-    width: Number | None = None
-    depth: Number | None = None
-
-
-class PrefilterTable(StrictTable):
-    """A low-pass of the reference alone; what is left out is tuned."""
-
-    order: Literal["first_order", "second_order"]
-    corner_hz: Number | None = None
-    damping: Number | None = None
-
-
-class LinkFeedforwardTable(StrictTable):
-    """The effort that the link's measured motion needs."""
-
-    measured: str | None = None
-    fraction: Number | None = None
-    corner_hz: Number | None = None
-    high_pass_hz: Number | None = None
-
-
-def _limit(name: str) -> Any:
-    """Return the field of a limit, with default and description of its row."""
-    return Field(default=BY_NAME[name].default, description=BY_NAME[name].description)
-
-
-Level = Number | Literal[False] | None  # of a limit: false lifts it
 MPC = "mpc"  # the structure that plans
 
 
-class FrictionCompensationTable(StrictTable):
+class FrictionCompensationTable(table_of(CompensateFriction)):
     """Compensation of friction."""
 
-    fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = DEFAULT_FRACTION
-    source: Annotated[FrictionSource, Field(alias="from")] = "reference"
-    speed: Annotated[Number, Field(gt=0.0)] | None = None
 
-
-class GravityCompensationTable(StrictTable):
+class GravityCompensationTable(table_of(CompensateGravity)):
     """Compensation of gravity."""
 
-    fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = 1.0
-    plant: Name | None = None
+    plant: Name | None = key("Whose link it is; the design plant where left out.", default=None)
 
 
-class RippleCompensationTable(StrictTable):
+class RippleCompensationTable(table_of(CompensateRipple)):
     """Compensation of torque ripple and cogging."""
-
-    cycles: Annotated[
-        tuple[Annotated[Whole, Field(ge=1, le=MOST_CYCLES)], ...], Field(min_length=1, max_length=MOST_CYCLES)
-    ]
-    cos: tuple[Number, ...]
-    sin: tuple[Number, ...]
-    fraction: Annotated[Number, Field(gt=0.0, le=1.5)] = RIPPLE_FRACTION
-    period: Annotated[Number, Field(gt=0.0)] | None = None
 
     @model_validator(mode="after")
     def _require_series(self) -> RippleCompensationTable:
-        if not len(set(self.cycles)) == len(self.cycles) == len(self.cos) == len(self.sin):
+        if not 0 < len(set(self.cycles)) == len(self.cycles) == len(self.cos) == len(self.sin):
             raise ValueError("should have each of cycles once, and one cos and one sin for each")
         return self
 
@@ -106,9 +60,9 @@ class RippleCompensationTable(StrictTable):
 class CompensationTable(StrictTable):
     """What is compensated, and how much of it."""
 
-    friction: FrictionCompensationTable | None = None
-    gravity: GravityCompensationTable | None = None
-    ripple: RippleCompensationTable | None = None
+    friction: FrictionCompensationTable | None = key("Coulomb friction at the motor.", default=None)
+    gravity: GravityCompensationTable | None = key("The weight of a link that hangs, by its position.", default=None)
+    ripple: RippleCompensationTable | None = key("Torque ripple and cogging, by the motor's position.", default=None)
 
 
 _NAMES = "list[names]"  # as pydantic names branches of unions, which messages leave out
@@ -129,61 +83,54 @@ Compensated = Annotated[
 class ScheduleTable(StrictTable):
     """Gains over a state that is measured, or over a parameter that is known as the law runs."""
 
-    over: Name
-    points: Annotated[list[Number], Field(min_length=2, max_length=100)]
-    bandwidth_hz: list[Number] | None = None
-    min_rate: Annotated[Number, Field(gt=0)] | None = None
+    over: Name = key(
+        "A state that is measured, such as an angle; or a parameter known as the law runs, such as a load."
+    )
+    points: list[Number] = key(
+        "Its values, ascending, in its SI unit; the ends are the range.", min_length=2, max_length=100
+    )
+    bandwidth_hz: list[Number] | None = key("One per point, in place of the controller's.", default=None)
+    min_rate: Number | None = key(
+        "Its units per second that sweeps, and plants that move it, must reach; stated only if left out.",
+        default=None,
+        gt=0,
+    )
 
 
-class GateTable(StrictTable):
+class GateTable(table_of(GateSpec)):
     """Which readings the exported law believes."""
 
-    range_N: tuple[Number, Number]
-    max_step_N: Annotated[Number, Field(gt=0.0)] | None = None
-    max_held: Annotated[Whole, Field(ge=0)] = 5
-    ramp_s: Annotated[Number, Field(gt=0.0)] = 0.1
-    margin: Annotated[Number, Field(gt=0.0)] = 3.0
 
-
-class ControllerTable(StrictTable):
+class ControllerTable(table_of(ControllerSpec, leave_out=("bandwidth_tolerance",))):
     """What is asked of the controller."""
 
-    plant: PlantOrResponse
-    measured: str | tuple[str, ...] = "F1"
-    structure: Literal["pd", "pid", "pid_dob", "cascade", "mpc"] = "pid"
-    speed_loop: Literal["P", "PI"] = "P"
-    notch: Flag | NotchTable = False
-    link_feedforward: Flag | LinkFeedforwardTable = False
-    prefilter: Literal["first_order", "second_order"] | PrefilterTable | None = None
-    compensate: Compensated = []
-    reference_weights: Literal["tuned", "error", "measurement"] = "tuned"
-    bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
-    bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
-    sample_rate_hz: Number = 1000.0
-    compute_delay_samples: Whole | None = None
-    drive_delay_s: Number | None = None
-    delay_samples: Whole | None = None
-    max_sensitivity: Level = _limit("max_sensitivity")
-    max_complementary: Level = _limit("max_complementary")
-    min_disk_margin: Level = _limit("min_disk_margin")
-    max_reference_peak: Level = _limit("max_reference_peak")
-    max_droop_db: Level = _limit("max_droop_db")
-    max_noise_gain: Level = _limit("max_noise_gain")
-    max_other_noise_gain: Level = _limit("max_other_noise_gain")
-    min_filter_samples: Level = _limit("min_filter_samples")
-    min_friction_margin: Level = _limit("min_friction_margin")
-    min_sensitivity_bandwidth_hz: Level = _limit("min_sensitivity_bandwidth_hz")
-    passive_band_hz: tuple[Number, Number] | None = _limit("passive_band_hz")
-    objective: Literal["disturbance", "noise"] = "disturbance"
-    robust_to: list[PlantOrResponse] = []
-    frf_confidence: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.95
-    draws: Annotated[Whole, Field(ge=0, le=200)] = 0
-    current_limit_A: Number | None = None
-    command_limit: Number | None = None
-    step_N: Number | None = None
-    reserve: Number = 0.005
-    schedule: ScheduleTable | None = None
-    gate: GateTable | None = None
+    plant: PlantOrResponse = key(
+        'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.'
+    )
+    structure: Literal["pd", "pid", "pid_dob", "cascade", "mpc"] = key(
+        "pid_dob has a disturbance observer, cascade a loop on the motor's speed; mpc plans, see [mpc].", default="pid"
+    )
+    compensate: Compensated = key(
+        'What is added because the plant is known, ["friction", "gravity"]; or a table: how much.', default=[]
+    )
+    robust_to: list[PlantOrResponse] = key(
+        'Plants on which stability, Ms and Mt hold too; "frf:NAME" for a measured frequency response.', default=[]
+    )
+    frf_confidence: Number = key(
+        "That the discs about measured frequency responses hold the truth, all of them.", default=0.95, gt=0.0, lt=1.0
+    )
+    draws: Whole = key(
+        "How many draws of the uncertain parameters must keep stability, Ms and Mt while it is tuned.",
+        default=0,
+        ge=0,
+        le=200,
+    )
+    schedule: ScheduleTable | None = key(
+        "One controller per point of a variable, with lines between their gains, in place of one for all.", default=None
+    )
+    gate: GateTable | None = key(
+        "Which readings the exported law believes, and what it does about the others.", default=None
+    )
 
     @property
     def compensation(self) -> CompensationTable:
@@ -196,54 +143,43 @@ class ControllerTable(StrictTable):
         )
 
 
-class NoiseModelTable(StrictTable):
-    """What the Kalman filter of predictive control counts on, by name of output and input."""
-
-    sensor_std: dict[str, NotNegative]
-    input_noise: dict[str, NotNegative] = {}
-    input_drift: dict[str, NotNegative] = {}
-    offset: dict[str, Number] = {}
-
-
-class MPCTable(StrictTable):
+class MPCTable(table_of(MPCSpec, leave_out=frozenset(ControllerTable.model_fields))):
     """What only predictive control has; the rest is in [controller]."""
 
-    current_slew_A_per_s: Number | None = None
-    decay: Number = 0.8
-    horizon_s: Number = 0.05
-    moves: Whole = 12
-    largest_force_N: Number | None = None
-    bounds: dict[str, tuple[Number, Number]] = {}
-    preview_samples: Whole = 0
-    max_iterations: Whole = 100
-    noise: NoiseModelTable | None = None
 
-
-class ImpedanceTable(StrictTable):
+class ImpedanceTable(table_of(Impedance, leave_out=("damping",))):
     """Stiffness and damping at the link, around the force loop."""
 
-    plant: Name
-    stiffness: NotNegative
-    damping: Number | Literal["critical"]
-    velocity_filter_s: NotNegative | None = None
+    plant: Name = key("Whose link is moved: a plant that does not hold it.")
+    damping: Number | Literal["critical"] = key(
+        'D_v, N s/m or N m s/rad; "critical": what makes the stiffness critically damped.'
+    )
 
 
 class RobustnessTable(StrictTable):
     """What the controller must survive."""
 
-    plants: list[Name] = []
-    parameters: dict[str, tuple[Number, Number]] = {}
-    samples: Annotated[Whole, Field(ge=1, le=10_000_000)] = 1375
-    seed: Annotated[Whole, Field(ge=0)] = 1
-    retune: Annotated[Whole, Field(ge=0, le=20)] = 0
-    bounds: Flag = False
-    max_failure_probability: Annotated[Number, Field(gt=0, le=1)] | None = None
-    min_friction_margin: Annotated[Number, Field(gt=0)] | None = None
-    constrained_runs: Annotated[Whole, Field(ge=1, le=100_000)] = 100
-    bound_tolerance: NotNegative = 0.1
-    sensors: SensorsTable = SensorsTable()
-    current_step_A: NotNegative = 0.0
-    command_step: NotNegative = 0.0
+    plants: list[Name] = key("Plants that are certified, besides the design plant and those of robust_to.", default=[])
+    parameters: dict[str, tuple[Number, Number]] = key("Ranges of what the fit does not tell.", default={})
+    samples: Whole = key(
+        "Draws; 1375 without failure mean below 1 % at a confidence of 1 - 1e-6.", default=1375, ge=1, le=10_000_000
+    )
+    seed: Whole = key("Seed of draws and simulations.", default=1, ge=0)
+    retune: Whole = key("Rounds of tuning for the worst case that was found.", default=0, ge=0, le=20)
+    bounds: Flag = key("Whether the worst case is enclosed, and not only searched for.", default=False)
+    max_failure_probability: Number | None = key(
+        "Bound on the probability of a failure that the draws must show.", default=None, gt=0, le=1
+    )
+    min_friction_margin: Number | None = key("Steepest friction for which stability must be shown.", default=None, gt=0)
+    constrained_runs: Whole = key(
+        "Runs of predictive control that are simulated with its limits active.", default=100, ge=1, le=100_000
+    )
+    bound_tolerance: NotNegative = key(
+        "By how much they may leave the bounds of [mpc], as a share of half their width.", default=0.1
+    )
+    sensors: SensorsTable = key("With which loops are simulated.", default=SensorsTable())
+    current_step_A: NotNegative = key("What the current is rounded to.", default=0.0)
+    command_step: NotNegative = key("The same of another command.", default=0.0)
 
     @property
     def step(self) -> float:
@@ -270,9 +206,9 @@ Bound = Range | Number  # a number is the end on the bad side of the figure: an 
 class RangeTable(StrictTable):
     """The ends of a range, either of which may be left out, in a unit of one's own."""
 
-    min: Number | None = Field(None, description="The low end.")
-    max: Number | None = Field(None, description="The high end.")
-    unit: str | None = Field(None, description="Of both; that of the figure where it is left out.")
+    min: Number | None = key("The low end.", default=None)
+    max: Number | None = key("The high end.", default=None)
+    unit: str | None = key("Unit of both; that of the figure where it is left out.", default=None)
 
     @model_validator(mode="after")
     def _check_range(self) -> RangeTable:
@@ -286,54 +222,60 @@ class RangeTable(StrictTable):
 class FiguresTable(StrictTable):
     """Figures of a loop: a number is the limit on the bad side, [low, high] a range."""
 
-    bandwidth_hz: Bound | None = Field(None, description="At least, where a number.")
-    tracking_band_hz: Range | None = Field(None, description="The loop follows its reference from here to here.")
-    crossover_hz: Bound | None = Field(None, description="At least, where a number.")
-    sensitivity_bandwidth_hz: Bound | None = Field(None, description="At least, where a number.")
-    ms: Bound | None = Field(None, description="Peak of the sensitivity; at most, where a number.")
-    mt: Bound | None = Field(None, description="Peak of the complementary sensitivity; at most, where a number.")
-    reference_peak: Bound | None = Field(None, description="At most, where a number.")
-    droop_db: Bound | None = Field(None, description="At most, where a number.")
-    gain_margin_db: Bound | None = Field(None, description="At least, where a number.")
-    phase_margin_deg: Bound | None = Field(None, description="At least, where a number.")
-    delay_margin_s: Bound | None = Field(None, description="At least, where a number.")
-    disk_margin: Bound | None = Field(None, description="At least, where a number.")
-    noise_gain: Bound | None = Field(None, description="At most, where a number.")
+    bandwidth_hz: Bound | None = key("At least, where a number.", default=None)
+    tracking_band_hz: Range | None = key("The loop follows its reference from here to here.", default=None)
+    crossover_hz: Bound | None = key("At least, where a number.", default=None)
+    sensitivity_bandwidth_hz: Bound | None = key("At least, where a number.", default=None)
+    ms: Bound | None = key("Peak of the sensitivity; at most, where a number.", default=None)
+    mt: Bound | None = key("Peak of the complementary sensitivity; at most, where a number.", default=None)
+    reference_peak: Bound | None = key("At most, where a number.", default=None)
+    droop_db: Bound | None = key("At most, where a number.", default=None)
+    gain_margin_db: Bound | None = key("At least, where a number.", default=None)
+    phase_margin_deg: Bound | None = key("At least, where a number.", default=None)
+    delay_margin_s: Bound | None = key("At least, where a number.", default=None)
+    disk_margin: Bound | None = key("At least, where a number.", default=None)
+    noise_gain: Bound | None = key("At most, where a number.", default=None)
 
 
 class ExpectedControllerTable(FiguresTable):
     """What the tuned controller is to be on its design plant."""
 
-    feasible: Flag = Field(True, description="Every limit of [controller] is met.")
+    feasible: Flag = key("Every limit of [controller] is met.", default=True)
 
 
 class ExpectedPlantTable(FiguresTable):
     """What a certified plant's loop is to be, at the nominal parameters and at the worst case; sliding and stuck."""
 
-    worst_ms: Bound | None = Field(None, description="Ms at the worst case found; at most, where a number.")
-    worst_mt: Bound | None = Field(None, description="Mt at the worst case found; at most, where a number.")
+    worst_ms: Bound | None = key("Ms at the worst case found; at most, where a number.", default=None)
+    worst_mt: Bound | None = key("Mt at the worst case found; at most, where a number.", default=None)
 
 
 class ExpectedCertificateTable(StrictTable):
     """What the certificate is to say."""
 
-    passed: Flag = Field(True, description="Every requirement is met.")
-    failure_probability: Number | None = Field(None, description="Its bound; at most.")
-    plants: dict[Name, ExpectedPlantTable] = Field({}, description="Figures of a certified plant's loop, by its name.")
+    passed: Flag = key("Every requirement is met.", default=True)
+    failure_probability: Number | None = key("Its bound; at most.", default=None)
+    plants: dict[Name, ExpectedPlantTable] = key("Figures of a certified plant's loop, by its name.", default={})
 
 
 class ExpectTable(StrictTable):
     """What `seaopt run` and the pytest plugin check of the results."""
 
-    fit_met: Flag = Field(True, description="The fit is met; where there are experiments.")
-    parameters: dict[str, Range | RangeTable] = Field(
-        {}, description="Ranges of fitted parameters, and of figures that follow from them, in their own units."
+    fit_met: Flag = key("The fit is met; where there are experiments.", default=True)
+    parameters: dict[str, Range | RangeTable] = key(
+        "Ranges of fitted parameters, and of figures that follow from them, in their own units.", default={}
     )
-    fit_percent: dict[Name, Bound | dict[str, Bound]] = Field(
-        {}, description="Of an experiment, fitted or not, or of its outputs; at least, where a number."
+    fit_percent: dict[Name, Bound | dict[str, Bound]] = key(
+        "Fit percent of an experiment, fitted or not, or of its outputs; at least, where a number.", default={}
     )
-    controller: ExpectedControllerTable | None = Field(None, description="The tuned controller, on its design plant.")
-    certificate: ExpectedCertificateTable | None = Field(None, description="The certificate.")
+    controller: ExpectedControllerTable | None = key("The tuned controller, on its design plant.", default=None)
+    certificate: ExpectedCertificateTable | None = key("The certificate.", default=None)
+
+
+def _require_whole(value: object) -> object:
+    if type(value) is not int:  # true == 1 for Python
+        raise ValueError("should be 1")
+    return value
 
 
 class ProblemTable(StrictTable):
@@ -341,24 +283,36 @@ class ProblemTable(StrictTable):
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
-    version: Annotated[Literal[1], Field(alias="schema")]
-    title: str = "untitled"
-    guessed: list[Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]] = []
-    parameters: dict[str, Number | ParameterTable] = {}
-    plant: dict[Name, AnyPlant]
-    experiment: list[ExperimentTable] = []
-    fit: FitTable = FitTable()
-    controller: ControllerTable | None = None
-    impedance: ImpedanceTable | None = None
-    mpc: MPCTable | None = None
-    robustness: RobustnessTable | None = None
-    expect: ExpectTable | None = Field(None, description="What `seaopt run` and pytest check of the results.")
+    version: Annotated[Literal[1], BeforeValidator(_require_whole)] = key("Version of this format: 1.", alias="schema")
+    title: str = key("Heading of the report.", default="untitled")
+    guessed: list[Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]] = key(
+        "What of this file nobody knew: names of parameters, or words for other entries. Every "
+        "verdict names them; take a name out once its value is known.",
+        default=[],
+    )
+    parameters: dict[str, Number | ParameterTable] = key(
+        "Values of the plants' parameters, in their own SI units where no unit is given; what is left out "
+        "has the plant's default.",
+        default={},
+    )
+    plant: dict[Name, AnyPlant] = key("Plants by name: a kind with its options, or equations.")
+    experiment: list[ExperimentTable] = key("Logs, or virtual experiments, each of one plant.", default=[])
+    fit: FitTable = key("How parameters are estimated.", default=FitTable())
+    controller: ControllerTable | None = key(
+        "What is asked of the controller; without it nothing is tuned.", default=None
+    )
+    impedance: ImpedanceTable | None = key(
+        "Stiffness and damping at the link, rendered around the force loop.", default=None
+    )
+    mpc: MPCTable | None = key(
+        'What only predictive control has, of a [controller] with structure = "mpc".', default=None
+    )
+    robustness: RobustnessTable | None = key(
+        "What the certificate covers besides what the fit leaves open.", default=None
+    )
+    expect: ExpectTable | None = key("What `seaopt run` and pytest check of the results.", default=None)
 
 
 def json_schema() -> dict[str, Any]:
     """Return the problem file's JSON Schema, for editors, with what each key means."""
-    schema = ProblemTable.model_json_schema(by_alias=True)
-    for name, table in (("ProblemTable", schema), *schema["$defs"].items()):
-        for key, text in KEYS.get(name, {}).items():
-            table["properties"][key].setdefault("description", text)
-    return schema
+    return ProblemTable.model_json_schema(by_alias=True)

@@ -49,6 +49,7 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.logs import Log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.problem.option_tables import make_record
 from seaopt.problem.problem import WRITE_ONE, Problem
 from seaopt.progress import Progress, ignore
 from seaopt.robustness import (
@@ -96,24 +97,18 @@ def fit_problem(
     if not fitted:
         raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them: use = "fit"')
     result = fit(
-        fitted, problem.parameters, progress=progress, alternatives=tuple(problem.plants.values()),
+        fitted,
+        problem.parameters,
+        progress=progress,
+        alternatives=tuple(problem.plants.values()),
         **problem.fit_options,
-    )  # fmt: skip
+    )
     guesses = find_guesses(problem.table.guessed)
     return replace(result, findings=order_findings((*result.findings, *guesses))) if guesses else result
 
 
 def simulate_experiment(problem: Problem, experiment: Experiment) -> Log:
-    """Simulate the stretches of an experiment, each from its initial state (zero where that is to be estimated).
-
-    Parameters
-    ----------
-    problem : Problem
-        Whose values are taken.
-    experiment : Experiment
-        One of it.
-
-    """
+    """Simulate the stretches of an experiment, each from its initial state (zero where that is to be estimated)."""
     delay, start = experiment.delay_s, experiment.initial_state
     options: dict[str, Any] = {
         "delay_s": delay.value if isinstance(delay, Parameter) else delay,
@@ -146,16 +141,7 @@ def can_design(problem: Problem, result: Fit) -> bool:
 
 
 def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
-    """Design the predictive controller that a problem asks for.
-
-    Parameters
-    ----------
-    problem : Problem
-        With `mpc`.
-    source : Fit or ParameterSet
-        The fit; or values, of a problem without experiments.
-
-    """
+    """Design the predictive controller that a problem asks for."""
     assert problem.mpc is not None
     if problem.designs_on_response:
         raise ProblemError(
@@ -170,22 +156,7 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
 def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:
     """Refuse a file that is not the controller.json of the predictive controller that a problem asks for.
 
-    Parameters
-    ----------
-    problem : Problem
-        With `mpc`.
-    mpc : ForceMPC
-        What `design_mpc` returned.
-    path : Path
-        The file.
-    remedy : str
-        What to do, for messages.
-
-    Raises
-    ------
-    SeaoptError
-        The file cannot be read, or is of something else.
-
+    Raises SeaoptError: the file cannot be read, or is of something else.
     """
     is_json = path.suffix.lower() == ".json"
     content = parse_file(path, json.loads, "JSON", remedy="give a controller.json") if is_json else None
@@ -232,36 +203,42 @@ def tune_problem(
             f"{problem.response_names[0]} is a measured response; leave retune out"
         )
     return tune_certified(
-        problem.design_plant, source, spec, problem.certified_plants(), ranges=problem.ranges,
-        robust_to=problem.robust_to(source), draws=draws, others=problem.parameters,
-        samples=table.samples, seed=table.seed + 1, rounds=table.retune,
-        complete=partial(complete_controller, problem, source=source), executor=executor, progress=progress,
-    )  # fmt: skip
+        problem.design_plant,
+        source,
+        spec,
+        problem.certified_plants(),
+        ranges=problem.ranges,
+        robust_to=problem.robust_to(source),
+        draws=draws,
+        others=problem.parameters,
+        samples=table.samples,
+        seed=table.seed + 1,
+        rounds=table.retune,
+        complete=partial(complete_controller, problem, source=source),
+        executor=executor,
+        progress=progress,
+    )
 
 
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
     """Return a controller with the problem's outer loop, its plausibility gate, and with what it compensates.
 
-    Raises
-    ------
-    SeaoptError
-        As `add_outer_loop` and `seaopt.control.add_compensation`.
-
+    Raises SeaoptError: as `add_outer_loop` and `seaopt.control.add_compensation`.
     """
     controller = add_outer_loop(problem, controller, source)
     controller = replace(controller, gate=_make_gate(problem, controller))
     assert problem.table.controller is not None
-    asked = problem.table.controller.compensation
-    if asked.friction is None and asked.gravity is None and asked.ripple is None:
+    compensation = problem.table.controller.compensation
+    if compensation.friction is None and compensation.gravity is None and compensation.ripple is None:
         return controller
     link = None
-    if asked.gravity is not None and asked.gravity.plant is not None:
-        link = problem.plants[asked.gravity.plant], problem.values(source)
+    if compensation.gravity is not None and compensation.gravity.plant is not None:
+        link = problem.plants[compensation.gravity.plant], problem.values(source)
     return add_compensation(
         controller,
-        friction=None if asked.friction is None else CompensateFriction(**asked.friction.model_dump()),
-        gravity=None if asked.gravity is None else CompensateGravity(fraction=asked.gravity.fraction),
-        ripple=None if asked.ripple is None else CompensateRipple(**asked.ripple.model_dump()),
+        friction=None if compensation.friction is None else make_record(CompensateFriction, compensation.friction),
+        gravity=None if compensation.gravity is None else make_record(CompensateGravity, compensation.gravity),
+        ripple=None if compensation.ripple is None else make_record(CompensateRipple, compensation.ripple),
         link=link,
     )
 
@@ -290,97 +267,79 @@ def _refuse_schedule(problem: Problem, done: str) -> None:
 def tune_schedule_problem(
     problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore
 ) -> ScheduledController:
-    """Tune the problem's schedule, as `seaopt tune` does where there is a [controller.schedule].
-
-    Parameters
-    ----------
-    problem : Problem
-        With a schedule.
-    source : Fit or ParameterSet
-        The fit; or values, of a problem without experiments.
-    progress : callable, optional
-        As in `seaopt.control.tune_schedule`.
-
-    """
+    """Tune the problem's schedule, as `seaopt tune` does where there is a [controller.schedule]."""
     assert problem.spec is not None and problem.schedule is not None
-    (spec, _), asked = settle_delays(problem.spec, problem.design_plant, source), problem.schedule
+    (spec, _), schedule = settle_delays(problem.spec, problem.design_plant, source), problem.schedule
     values = problem.values(source)
     return tune_schedule(
-        problem.design_plant, values, spec, asked.over, asked.points, problem.robust_to(source),
-        bandwidths_hz=asked.bandwidth_hz, draws=problem.draws(source), progress=progress,
-    )  # fmt: skip
+        problem.design_plant,
+        values,
+        spec,
+        schedule.over,
+        schedule.points,
+        problem.robust_to(source),
+        bandwidths_hz=schedule.bandwidth_hz,
+        draws=problem.draws(source),
+        progress=progress,
+    )
 
 
 def certify_schedule_problem(
-    problem: Problem, schedule: ScheduledController, source: Fit | ParameterSet, progress: Progress = ignore,
+    problem: Problem,
+    schedule: ScheduledController,
+    source: Fit | ParameterSet,
+    progress: Progress = ignore,
     executor: Executor | None = None,
-) -> ScheduleCertificate:  # fmt: skip
-    """Certify a schedule on the problem's plants, simulations included, as `seaopt certify` does.
-
-    Parameters
-    ----------
-    problem : Problem
-        With a schedule.
-    schedule : ScheduledController
-        The gains.
-    source : Fit or ParameterSet
-        The fit; or values, of a problem without experiments.
-    progress, executor
-        As in `seaopt.robustness.certify_schedule`.
-
-    """
+) -> ScheduleCertificate:
+    """Certify a schedule on the problem's plants, simulations included, as `seaopt certify` does."""
     table = problem.robustness
     assert problem.schedule is not None
     plants = problem.certified_plants()
     return certify_schedule(
-        schedule, plants, source, ranges=problem.ranges, others=problem.parameters,
-        samples=table.samples, seed=table.seed, max_failure_probability=table.max_failure_probability,
-        min_rate=problem.schedule.min_rate, current_step_A=table.step, executor=executor,
+        schedule,
+        plants,
+        source,
+        ranges=problem.ranges,
+        others=problem.parameters,
+        samples=table.samples,
+        seed=table.seed,
+        max_failure_probability=table.max_failure_probability,
+        min_rate=problem.schedule.min_rate,
+        current_step_A=table.step,
+        executor=executor,
         sensors=problem.sensors.of(list_readings(schedule.controllers[0], plants)),
         progress=progress,
-    )  # fmt: skip
+    )
 
 
 def add_outer_loop(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
     """Return a controller with the outer loop of the problem's [impedance]; as it is where there is none.
 
-    Raises
-    ------
-    SeaoptError
-        The stiffness has no critically damped impedance.
-
+    Raises SeaoptError: the stiffness has no critically damped impedance.
     """
     table = problem.table.impedance
     if table is None:
         return controller
     plant, values, filter_s = problem.plants[table.plant], problem.values(source), table.velocity_filter_s
     if table.damping == "critical":
-        asked = critical_impedance(controller, plant, values, table.stiffness, velocity_filter_s=filter_s)
+        impedance = critical_impedance(controller, plant, values, table.stiffness, velocity_filter_s=filter_s)
     else:
-        asked = Impedance(stiffness=table.stiffness, damping=table.damping, velocity_filter_s=filter_s)
-    return add_impedance(controller, plant, values, asked, name=table.plant)
+        impedance = Impedance(stiffness=table.stiffness, damping=table.damping, velocity_filter_s=filter_s)
+    return add_impedance(controller, plant, values, impedance, name=table.plant)
 
 
 def list_plants(
-    problem: Problem, source: Fit | ParameterSet, asked: DelayedSpec | None = None
+    problem: Problem, source: Fit | ParameterSet, spec: DelayedSpec | None = None
 ) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
     """Return what the controller is designed on, and what it must be robust to, models and measured responses.
 
-    Parameters
-    ----------
-    problem : Problem
-        With a [controller].
-    source : Fit or ParameterSet
-        The fit; or values, of a problem without experiments.
-    asked : ControllerSpec, optional
-        Whose delays count in place of the problem's.
-
+    `spec`: whose delays count in place of the problem's.
     """
     measured = problem.measure_responses(source)
-    others: dict[str, Any] = problem.robust_to(source, asked)
+    others: dict[str, Any] = problem.robust_to(source, spec)
     assert problem.table.controller is not None
     named = problem.table.controller.robust_to
-    others |= {name: one for name, one in measured.items() if name in named}
+    others |= {name: response for name, response in measured.items() if name in named}
     design = measured[problem.table.controller.plant] if problem.designs_on_response else problem.design_plant
     return design, others
 
@@ -388,20 +347,8 @@ def list_plants(
 def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet) -> Controller:
     """Measure a law of one's own against the problem's limits, as `seaopt certify --controller` does.
 
-    Parameters
-    ----------
-    problem : Problem
-        What `read_problem` returned.
-    given : GivenLaw
-        What `seaopt.control.read_law` returned; its rate and its delay are the loop's.
-    source : Fit or ParameterSet
-        The fit; or values, of a problem without experiments.
-
-    Raises
-    ------
-    ProblemError
-        The problem has no [controller], or the law measures something else than it does.
-
+    `given`: what `seaopt.control.read_law` returned; its rate and its delay are the loop's.
+    Raises ProblemError: the problem has no [controller], or the law measures something else than it does.
     """
     _refuse_schedule(problem, "measured")
     if problem.spec is None:
@@ -420,8 +367,8 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
             f"{problem.source}: a law of one's own is measured on a model, and [controller] is designed on "
             f"{problem.response_names[0]}; name a plant there, and the response in robust_to"
         )
-    asked = replace(problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, measured=measured)
-    spec = replace(asked, **_choose_delays(problem.spec, given))
+    at_its_rate = replace(problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, measured=measured)
+    spec = replace(at_its_rate, **_choose_delays(problem.spec, given))
     _check_drive_delay(problem, given, spec, source)
     design, values = problem.design_plant, problem.values(source, spec)
     _, robust_to = list_plants(problem, source, spec)
@@ -441,15 +388,15 @@ def _choose_delays(spec: DelayedSpec, given: GivenLaw) -> dict[str, Any]:
 def _check_drive_delay(problem: Problem, given: GivenLaw, spec: DelayedSpec, source: Fit | ParameterSet) -> None:
     """Refuse a law whose loop is shorter than the problem says, and of which nobody tells how long the drive takes."""
     assert problem.spec is not None
-    asked, drive = problem.spec, find_drive_delay(spec, problem.design_plant, source)
-    if given.delays.get("drive_delay_s") is not None or (asked.delay_samples is not None and drive):
+    in_file, drive = problem.spec, find_drive_delay(spec, problem.design_plant, source)
+    if given.delays.get("drive_delay_s") is not None or (in_file.delay_samples is not None and drive):
         return
     counted = count_loop_samples(spec) / spec.sample_rate_hz + drive
-    if asked.delay_samples is not None and spec.delay_samples is None:
-        least = asked.delay_samples / asked.sample_rate_hz
-        said = f"delay_samples = {asked.delay_samples}, the whole loop"
+    if in_file.delay_samples is not None and spec.delay_samples is None:
+        least = in_file.delay_samples / in_file.sample_rate_hz
+        said = f"delay_samples = {in_file.delay_samples}, the whole loop"
     else:
-        least = asked.drive_delay_s or 0.0
+        least = in_file.drive_delay_s or 0.0
         said = f"drive_delay_s = {least:g} of the drive alone"
     if counted < least - NEGLIGIBLE / spec.sample_rate_hz:
         raise ProblemError(
@@ -495,9 +442,13 @@ def certify_problem(
         certificate = certify(controller, plants, source, measured=measured, **options)
     else:
         certificate = certify_mpc(
-            design_mpc(problem, source), plants, source, runs=table.constrained_runs,
-            bound_tolerance=table.bound_tolerance, **options,
-        )  # fmt: skip
+            design_mpc(problem, source),
+            plants,
+            source,
+            runs=table.constrained_runs,
+            bound_tolerance=table.bound_tolerance,
+            **options,
+        )
     unread = [name for name in problem.sensors.names if name not in read]
     if not unread:
         return certificate
@@ -555,6 +506,11 @@ class Stages:
     def _experiments(self) -> tuple[Experiment, ...]:
         return self._keep("experiments", self.problem.experiments)
 
+    @property
+    def _source(self) -> Fit | ParameterSet:
+        """What is designed with: the fit, or the file's values of a problem without experiments."""
+        return self.problem.parameters if self.fit is None else self.fit
+
     def _tune(self) -> Controller | None:
         if (
             self.problem.spec is None
@@ -562,13 +518,13 @@ class Stages:
             or (self.fit is not None and not can_design(self.problem, self.fit))
         ):
             return None
-        tuned = tune_problem(self.problem, self.fit or self.problem.parameters)
+        tuned = tune_problem(self.problem, self._source)
         return tuned.controller if isinstance(tuned, JointTuning) else tuned
 
     def _certify(self) -> Certificate | None:
         if self.controller is None:
             return None
-        return certify_problem(self.problem, self.controller, self.fit or self.problem.parameters)
+        return certify_problem(self.problem, self.controller, self._source)
 
     def _keep(self, name: str, make: Callable[[], Any]) -> Any:
         if name not in self._made:

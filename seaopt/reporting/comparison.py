@@ -46,9 +46,13 @@ def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s:
     """
     view = view_sensors(experiment, fit)
     estimate = survey(
-        experiment.plant, experiment.log, outputs=experiment.outputs, clock=view.clock, gain=view.gain,
+        experiment.plant,
+        experiment.log,
+        outputs=experiment.outputs,
+        clock=view.clock,
+        gain=view.gain,
         stretch_s=stretch_s,
-    )  # fmt: skip
+    )
     return replace(estimate, adapt=experiment.apply_own)
 
 
@@ -127,10 +131,17 @@ def _pair_outputs(log: Log, measured: Survey) -> list[Pair]:
         if units[first] == units[second] and np.ptp(log[second]) > 0.0:
             unit = divide_units(units[first], units[second])
             estimate = h1(log[second], log[first], log.period)
-            pairs.append(Pair(
-                source=second, output=first, unit=unit, estimate=estimate, good_band_hz=None, peak=None,
-                second_order=None,
-            ))  # fmt: skip
+            pairs.append(
+                Pair(
+                    source=second,
+                    output=first,
+                    unit=unit,
+                    estimate=estimate,
+                    good_band_hz=None,
+                    peak=None,
+                    second_order=None,
+                )
+            )
     return pairs
 
 

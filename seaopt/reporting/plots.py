@@ -150,9 +150,13 @@ class FitPlots(Plots):
         return [_select(self._fit.predict(one), output) for one in chosen]
 
     def outputs(
-        self, experiment: str | None = None, output: str | None = None, *,
-        span_s: tuple[float, float] | None = None, ax: Place = None,
-    ) -> Axes | PlainFigure:  # fmt: skip
+        self,
+        experiment: str | None = None,
+        output: str | None = None,
+        *,
+        span_s: tuple[float, float] | None = None,
+        ax: Place = None,
+    ) -> Axes | PlainFigure:
         """Draw measured and model outputs.
 
         Parameters
@@ -343,9 +347,13 @@ class ControllerPlots(Plots):
         return "the controller does not know its design plant; read it with Controller.from_dict"
 
     def step(
-        self, *, plants: loops.Plants | None = None, size: float = 1.0, duration_s: float | None = None,
+        self,
+        *,
+        plants: loops.Plants | None = None,
+        size: float = 1.0,
+        duration_s: float | None = None,
         ax: Place = None,
-    ) -> PlainFigure:  # fmt: skip
+    ) -> PlainFigure:
         """Draw what is measured, and what is commanded, after a step of the reference.
 
         Parameters

@@ -2,11 +2,12 @@
 
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.bounds.stretch import StretchBound
-from seaopt.robustness.certificate.certificate import Certificate, Requirement
+from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
 from seaopt.robustness.certificate.predictive import certify_mpc, linear_controller
+from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.scheduled import PlaceCertificate, ScheduleCertificate, certify_schedule
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures

@@ -12,7 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
@@ -31,20 +31,57 @@ LOSSES = ("square", "huber", "soft_l1")
 def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     """Return seaopt_pass_args of pass.c, field by field; pointers are whole numbers."""
     pointer, whole, real = np.uint64, np.int64, np.float64
-    return np.dtype([
-        ("from", whole), ("to", whole), ("length", whole), ("lead", whole), ("u", pointer, (nu,)),
-        ("y", pointer, (ny,)), ("keep", pointer, (ny,)),
-        ("shared", whole), ("drift_terms", whole), ("z_columns", whole), ("v_columns", whole),
-        ("lag_a", whole), ("lag_b", whole), ("lag_c", whole), ("settle", whole), ("start", whole),
-        ("output_rows", whole), ("t0", real), ("tau0", real), ("dtau", real),
-        ("model", pointer), ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer),
-        ("drift", pointer),
-        ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
-        ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
-        ("last", pointer), ("carry", pointer), ("lags", whole), ("parts", whole),
-        ("outputs_of", whole), ("columns_in", whole), ("into", pointer), ("correlation", pointer), ("ring", pointer),
-        ("form", pointer), ("warm", whole),
-    ])  # fmt: skip
+    return np.dtype(
+        [
+            ("from", whole),
+            ("to", whole),
+            ("length", whole),
+            ("lead", whole),
+            ("u", pointer, (nu,)),
+            ("y", pointer, (ny,)),
+            ("keep", pointer, (ny,)),
+            ("shared", whole),
+            ("drift_terms", whole),
+            ("z_columns", whole),
+            ("v_columns", whole),
+            ("lag_a", whole),
+            ("lag_b", whole),
+            ("lag_c", whole),
+            ("settle", whole),
+            ("start", whole),
+            ("output_rows", whole),
+            ("t0", real),
+            ("tau0", real),
+            ("dtau", real),
+            ("model", pointer),
+            ("correction", pointer),
+            ("x0", pointer),
+            ("offset", pointer),
+            ("gain", pointer),
+            ("drift", pointer),
+            ("sos", pointer),
+            ("sections", whole),
+            ("loss", whole),
+            ("knee", pointer),
+            ("gram", pointer),
+            ("rho", pointer),
+            ("count", pointer),
+            ("outputs", pointer),
+            ("columns", pointer),
+            ("states", pointer),
+            ("last", pointer),
+            ("carry", pointer),
+            ("lags", whole),
+            ("parts", whole),
+            ("outputs_of", whole),
+            ("columns_in", whole),
+            ("into", pointer),
+            ("correlation", pointer),
+            ("ring", pointer),
+            ("form", pointer),
+            ("warm", whole),
+        ]
+    )
 
 
 @memo
@@ -254,8 +291,9 @@ class Program:
 
     def run(
         self,
-        edges: Int[np.ndarray, " shots1"],
-        x0: Float[np.ndarray, "shots nx"],
+        first: int,
+        last: int,
+        x0: Float[np.ndarray, " nx"],
         *,
         sums: bool = True,
         outputs: bool = False,
@@ -264,48 +302,44 @@ class Program:
         states: bool = False,
         resume: Float[np.ndarray, " m"] | None = None,
         room: Pass | None = None,
-        warm: Int[np.ndarray, " shots"] | int = 0,
     ) -> Pass:
-        """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped.
+        """Run the samples from `first` to before `last`; with `resume`, go on where the samples before them stopped.
 
         Outputs are those of the first `output_rows` samples, of all if it is left out. Outputs and columns are written
-        into the `room` of a pass that is not needed any more, if there is one. A shot starts so many samples ahead of
-        its edge as `warm` says.
+        into the `room` of a pass that is not needed any more, if there is one.
         """
-        alone = len(edges) == 2 and resume is None and sums and not (outputs or columns or states)
-        if alone and self.run_up and edges[1] - edges[0] >= max(PARALLEL, 4 * self.run_up):
-            halves, starts, ahead = self._halves(int(edges[0]), int(edges[1]), x0)
-            parts = self.run(halves, starts, warm=ahead)
-            gram, loss, count = (np.sum(half, axis=0)[None] for half in (parts.gram, parts.loss, parts.count))
-            return Pass(gram=gram, loss=loss, count=count, last=parts.last[1:])
-        shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
-        n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
+        nx, ny, nc, n = self.model.nx, self.model.ny, self.layout.columns, last - first
         rows = n if output_rows is None else min(output_rows, n)
-        if x0.shape != (shots, nx) or first < 0 or edges[-1] > self.segment.n or np.any(np.diff(edges) < 0):
-            raise SimulationError(f"{shots} shots of {nx} states over {self.segment.n} samples: x0 or edges do not fit")
-        result = Pass(
-            gram=np.zeros((shots, ny, nc, nc)), loss=np.zeros((shots, ny)), count=np.zeros((shots, ny)),
-            last=np.zeros((shots, nx, layout.states)),
-            outputs=_reuse_or_make(room.outputs if room else None, (rows, ny)) if outputs else None,
-            columns=_reuse_or_make(room.columns if room else None, (n, ny, nc)) if columns and self.segment.y else None,
-            states=np.empty((n, nx)) if states else None,
-        )  # fmt: skip
-        start = np.ascontiguousarray(x0, dtype=float)
-        arguments = np.repeat(self.base, shots)
+        if x0.shape != (nx,) or not 0 <= first <= last <= self.segment.n:
+            raise SimulationError(
+                f"{nx} states, samples {first} to {last} of {self.segment.n}: x0 or the samples do not fit"
+            )
+        sums_alone = sums and resume is None and not (outputs or columns or states)
+        edges, starts, warm = self._split(first, last, x0, halve=sums_alone and n >= max(PARALLEL, 4 * self.run_up))
+        parts = len(warm)
+        gram, loss, count = np.zeros((parts, ny, nc, nc)), np.zeros((parts, ny)), np.zeros((parts, ny))
+        kept = {
+            "outputs": _reuse_or_make(room.outputs if room else None, (rows, ny)) if outputs else None,
+            "columns": _reuse_or_make(room.columns if room else None, (n, ny, nc))
+            if columns and self.segment.y
+            else None,
+            "states": np.empty((n, nx)) if states else None,
+        }
+        arguments = np.repeat(self.base, parts)
         arguments["from"], arguments["to"], arguments["output_rows"] = edges[:-1] - warm, edges[1:], rows
         arguments["start"], arguments["warm"] = edges[:-1] - warm if resume is None else 0, warm
-        arguments["x0"] = row_addresses(start)
-        sums_of = {"rho": result.loss, "count": result.count, "last": result.last}
-        for name, array in (sums_of | {"gram": result.gram} if sums else sums_of).items():
+        for name, array in {"x0": starts, "rho": loss, "count": count}.items():
             arguments[name] = row_addresses(array)
-        for name in ("outputs", "columns", "states"):
-            array = getattr(result, name)
+        if sums:
+            arguments["gram"] = row_addresses(gram)
+        for name, array in kept.items():
             if array is not None:
-                arguments[name] = array.ctypes.data + array.strides[0] * (edges[:-1] - first)
+                arguments[name] = array.ctypes.data
         if resume is not None:
             arguments["carry"] = resume.ctypes.data
-        self.kernel.run(arguments, (self.memory, result, start, resume), parallel=n >= PARALLEL)
-        return result
+        buffers = (self.memory, gram, loss, count, kept, starts, resume)
+        self.kernel.run(arguments, buffers, parallel=n >= PARALLEL)
+        return Pass(gram=np.sum(gram, axis=0), loss=np.sum(loss, axis=0), count=np.sum(count, axis=0), **kept)
 
     def double_sum(
         self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
@@ -319,10 +353,8 @@ class Program:
         padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
         padded[:, :, :p] = into.transpose(0, 2, 1)
         halved[0] *= 0.5
-        edges, starts, warm = np.array([0, self.segment.n]), np.array(x0[None], dtype=float), np.zeros(1, dtype=int)
-        if self.run_up:
-            edges, starts, warm = self._halves(0, self.segment.n, starts)
-            warm[1:] += len(r)  # influences reach so far back
+        edges, starts, warm = self._split(0, self.segment.n, x0, halve=True)
+        warm[1:] += len(r)  # influences reach so far back
         ring, form = np.zeros((len(warm), 2 * len(r), ny, width)), np.zeros((len(warm), 2, width, width))
         arguments = np.repeat(self.base, len(warm))
         arguments["from"], arguments["start"], arguments["to"] = edges[:-1] - warm, edges[:-1] - warm, edges[1:]
@@ -336,11 +368,16 @@ class Program:
         total = np.sum(form, axis=0)
         return (total + total.transpose(0, 2, 1))[:, :p, :p]
 
-    def _halves(self, first: int, last: int, x0: Float[np.ndarray, "1 nx"]) -> tuple[Any, Any, Any]:
-        """Return edges, starts and run-up of two halves; the second starts at zero and forgets it before it counts."""
+    def _split(self, first: int, last: int, x0: Float[np.ndarray, " nx"], *, halve: bool) -> tuple[Any, Any, Any]:
+        """Return edges, starts and run-up of what runs at once: two halves where the state is soon forgotten, or one.
+
+        The second half starts at zero and forgets it before it counts.
+        """
+        if not (halve and self.run_up):
+            return np.array([first, last]), np.array(x0[None], dtype=float), np.zeros(1, dtype=int)
         starts = np.vstack([x0, np.zeros_like(x0)])
         return np.array([first, (first + last) // 2, last]), starts, np.array([0, self.run_up])
 
     def carry(self) -> Float[np.ndarray, " m"]:
-        """Return room for what a stretch hands from one call to the next."""
+        """Return room for what a shot hands from one call to the next."""
         return np.zeros(int(self.kernel.library.carry_size()))

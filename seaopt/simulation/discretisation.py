@@ -62,8 +62,8 @@ class Clock:
     @property
     def fraction_s(self) -> float:
         """The rest of the delay, in seconds; zero to rounding."""
-        rest = self.delay_s - self.whole * self.period
-        return rest if rest > 1e-9 * self.period else 0.0
+        left = self.delay_s - self.whole * self.period
+        return left if left > 1e-9 * self.period else 0.0
 
     @property
     def split(self) -> bool:
@@ -99,24 +99,17 @@ def expm_with_derivatives(
     x = np.zeros((len(dn) + 1, 2 * m, 2 * m))  # [n, dn; 0, n]: powers of it are [n^k, d(n^k); 0, n^k]
     x[:, :m, :m] = x[:, m:, m:] = n * 2.0**-squarings
     x[1:, :m, m:] = dn * 2.0**-squarings
-    one = np.eye(2 * m)
-    e = np.broadcast_to(one, x.shape)
+    identity = np.eye(2 * m)
+    e = np.broadcast_to(identity, x.shape)
     for k in range(DEGREE, 0, -1):
-        e = one + x @ e / k
+        e = identity + x @ e / k
     for _ in range(squarings):
         e = e @ e
     return e[0, :m, :m], e[1:, :m, m:]
 
 
 def check_period(model: Model, clock: Clock) -> None:
-    """Refuse a plant that holds samples of another period.
-
-    Raises
-    ------
-    SimulationError
-        It does.
-
-    """
+    """Refuse a plant that holds samples of another period."""
     sampling = model.plant.sampling
     if sampling is not None and abs(sampling.period_s / clock.period - 1.0) > SAME_PERIOD:
         raise SimulationError(
@@ -184,23 +177,28 @@ def _make_lines(nx: int, nu: int, clock: Clock) -> tuple[Float[np.ndarray, "2 m 
     newer = older.copy()
     u, slope = slice(nx, nx + nu), slice(nx + nu, nx + 2 * nu)
     ua, ub, uc = (slice(nx + i * nu, nx + (i + 1) * nu) for i in range(3))
-    one, rate = np.eye(nu), np.eye(nu) / clock.period
-    newer[0, u, ua] = one
+    identity, rate = np.eye(nu), np.eye(nu) / clock.period
+    newer[0, u, ua] = identity
     if not joined:
-        older[0, u, ub] = one
+        older[0, u, ub] = identity
         return older, newer
     newer[0, slope, ua], newer[0, slope, ub] = -rate, rate
     if clock.split:  # the line from u_c to u_a, which it reaches where the newer one begins
-        older[0, u, ua], older[0, u, uc] = one - rate * clock.fraction_s, rate * clock.fraction_s
+        older[0, u, ua], older[0, u, uc] = identity - rate * clock.fraction_s, rate * clock.fraction_s
         older[1, u, ua], older[1, u, uc] = -rate, rate
         older[0, slope, ua], older[0, slope, uc] = rate, -rate
     return older, newer
 
 
 def _advance(
-    generator: Float[np.ndarray, "nd m m"], duration: float, line: Float[np.ndarray, "2 m v"], nx: int, growth: float,
-    *, free: bool,
-) -> Float[np.ndarray, "nd2 nx v"]:  # fmt: skip
+    generator: Float[np.ndarray, "nd m m"],
+    duration: float,
+    line: Float[np.ndarray, "2 m v"],
+    nx: int,
+    growth: float,
+    *,
+    free: bool,
+) -> Float[np.ndarray, "nd2 nx v"]:
     """Return x at the end of a stretch from w, and its derivatives; the duration grows so fast with the delay."""
     whole, slopes = expm_with_derivatives(generator[0] * duration, generator[1:] * duration)
     steps = np.concatenate([whole[None], slopes])[:, :nx] @ line[0]

@@ -75,23 +75,14 @@ def output_function(model: Model) -> ca.Function:
 
 @record(eq=False)
 class Rates:
-    """Right-hand side and outputs for compiled code, with what depends on parameters alone taken out.
+    """Right-hand side and outputs for compiled code, with what depends on parameters alone taken out."""
 
-    Parameters
-    ----------
-    prepare : Function
-        p -> c, once per pass.
-    rate, output : Function
-        (t, x, u, du, c) -> f or h, and the nonzeros of its derivatives by x and by theta; where inputs move with the
-        delay, by du each second, then by the delay too.
-    rate_pattern, output_pattern : tuple of lists of (row, column)
-        Where those nonzeros stand.
-
-    """
-
-    prepare: Any
+    prepare: Any  # p -> c, once per pass
+    # rate, output: (t, x, u, du, c) -> f or h, and the nonzeros of its derivatives by x and by theta; where inputs move
+    # with the delay, by du each second, then by the delay too
     rate: Any
     output: Any
+    # rate_pattern, output_pattern: where those nonzeros stand
     rate_pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]]
     output_pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]]
 
@@ -115,13 +106,11 @@ def rate_functions(model: Model, *, moving: bool = False) -> Rates:
     arguments, names = [model.t, model.x, model.u, du, c], ["seaopt_rate", "seaopt_output"]
     rate, output = (ca.Function(names[i], arguments, columns[3 * i : 3 * i + 3]) for i in range(2))
     prepare = ca.Function("seaopt_prepare", [model.p], [ca.vertcat(*values)])
-    pattern = [_nonzeros(part) for part in dense]
+    pattern = [list(zip(*part.sparsity().get_triplet(), strict=True)) for part in dense]
     return Rates(
-        prepare=prepare, rate=rate, output=output, rate_pattern=(pattern[1], pattern[2]),
+        prepare=prepare,
+        rate=rate,
+        output=output,
+        rate_pattern=(pattern[1], pattern[2]),
         output_pattern=(pattern[4], pattern[5]),
-    )  # fmt: skip
-
-
-def _nonzeros(part: Any) -> list[tuple[int, int]]:
-    rows, columns = part.sparsity().get_triplet()
-    return list(zip(rows, columns, strict=True))
+    )

@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from seaopt.plants.memo import memo
 from seaopt.records import record
@@ -23,66 +23,46 @@ from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layo
 LIFTED_SAMPLES = 32  # that are one matrix product
 FOLDED_SAMPLES = 4096  # that CasADi's virtual machine chains in one call
 
-Trajectory = tuple[
-    Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n1 nx"], Float[np.ndarray, "nx nj"]
-]
+# Outputs, their derivatives, and states.
+Trajectory = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n nx"]]
 
 
 @np.errstate(all="ignore")  # a plant that overflows gives numbers that are not finite, as the compiled pass does
-def interpreted_passes(
+def interpret_pass(
     model: Model,
     segment: Segment,
     point: Point,
     weights: Weights,
-    edges: Int[np.ndarray, " shots1"],
-    x0: Float[np.ndarray, "shots nx"],
+    stop: int,
+    x0: Float[np.ndarray, " nx"],
     *,
     outputs: bool = False,
     columns: bool = False,
     states: bool = False,
 ) -> Pass:
-    """Run the shots between neighbouring `edges` in NumPy and CasADi's virtual machine."""
-    inputs = _inputs_in_force(segment, point)
-    shots = [
-        _run_shot(model, segment, point, weights, inputs, (int(a), int(b)), start)
-        for a, b, start in zip(edges[:-1], edges[1:], x0, strict=True)
-    ]
-
-    def join(name: str, wanted: bool) -> Any:
-        return np.concatenate([shot[name] for shot in shots]) if wanted else None
-
-    return Pass(
-        gram=np.stack([shot["gram"] for shot in shots]),
-        loss=np.stack([shot["loss"] for shot in shots]),
-        count=np.stack([shot["count"] for shot in shots]),
-        last=np.stack([shot["last"] for shot in shots]),
-        outputs=join("outputs", outputs),
-        columns=join("columns", columns and bool(segment.y)),
-        states=join("states", states),
-    )
-
-
-def _run_shot(
-    model: Model, segment: Segment, point: Point, weights: Weights, forcing: Float[np.ndarray, "all w"],
-    rows: tuple[int, int], x0: Float[np.ndarray, " nx"],
-) -> dict[str, Any]:  # fmt: skip
-    layout = layout_of(model.nx, model.ny, model.np, point)
+    """Run the samples before `stop` in NumPy and CasADi's virtual machine."""
+    layout, forcing = layout_of(model.nx, model.ny, model.np, point), _inputs_in_force(segment, point)[:stop]
     if model.linear and point.correction is None:
-        y, dy, x, last = _linear_trajectory(model, point, forcing[rows[0] : rows[1]], x0)
+        y, dy, x = _linear_trajectory(model, point, forcing, x0)
     else:
-        y, dy, x, last = _folded_trajectory(model, segment, point, forcing, rows, x0)
-    ny, nc = model.ny, layout.columns
-    shot: dict[str, Any] = {"outputs": y, "states": x[:-1], "last": last}
-    shot |= {"gram": np.zeros((ny, nc, nc)), "loss": np.zeros(ny), "count": np.zeros(ny)}
+        y, dy, x = _folded_trajectory(model, segment, point, forcing, x0)
+    ny, nc, v = model.ny, layout.columns, None
+    gram, loss, count = np.zeros((ny, nc, nc)), np.zeros(ny), np.zeros(ny)
     if segment.y:
-        v, present = _columns(segment, point, weights, layout, rows, y, dy)
-        shot["columns"] = v
+        v, present = _columns(segment, point, weights, layout, y, dy)
         for o in range(ny):
             kept = v[present[:, o], o]
-            loss, weight = _loss_and_weight(kept[:, 0], weights.loss, float(weights.knee[o]))
-            shot["gram"][o] = (kept * weight[:, None]).T @ kept
-            shot["loss"][o], shot["count"][o] = float(np.sum(loss)), float(len(kept))
-    return shot
+            losses, weight = _loss_and_weight(kept[:, 0], weights.loss, float(weights.knee[o]))
+            gram[o] = (kept * weight[:, None]).T @ kept
+            loss[o], count[o] = float(np.sum(losses)), float(len(kept))
+    return Pass(
+        gram=gram,
+        loss=loss,
+        count=count,
+        outputs=y if outputs else None,
+        columns=v if columns else None,
+        states=x if states else None,
+    )
 
 
 def _loss_and_weight(
@@ -161,20 +141,7 @@ def _linear_trajectory(
     stacked = starts @ observe.T + inputs @ _toeplitz(impulse).T
     x = (starts @ state_rows.T + inputs @ _toeplitz(state_impulse).T).reshape(count * LIFTED_SAMPLES, nx)
     all_outputs = stacked.reshape(count * LIFTED_SAMPLES, nt + 1, ny)[:n]
-    last = _run_on(starts[-1], forcing[(count - 1) * LIFTED_SAMPLES :], f, b).reshape(nt + 1, nx).T
-    return all_outputs[:, 0], all_outputs[:, 1:].transpose(0, 2, 1), np.vstack([x[:n], last[:, 0]]), last
-
-
-def _run_on(
-    z: Float[np.ndarray, " m"],
-    forcing: Float[np.ndarray, "k w"],
-    f: Float[np.ndarray, "m m"],
-    b: Float[np.ndarray, "m w"],
-) -> Float[np.ndarray, " m"]:
-    """Return the recursion's state after the rest of the last block."""
-    for w in forcing:
-        z = f @ z + b @ w
-    return z
+    return all_outputs[:, 0], all_outputs[:, 1:].transpose(0, 2, 1), x[:n]
 
 
 def _toeplitz(impulse: list[Float[np.ndarray, "a w"]]) -> Float[np.ndarray, "la lw"]:
@@ -212,9 +179,12 @@ class _Scheme:
     def of(cls, point: Point) -> _Scheme:
         clock = point.clock
         return cls(
-            hold=clock.hold, delay_free=clock.delay_free, fractional=clock.fraction_s > 0.0, inputs=len(clock.lags),
+            hold=clock.hold,
+            delay_free=clock.delay_free,
+            fractional=clock.fraction_s > 0.0,
+            inputs=len(clock.lags),
             substeps=point.substeps,
-        )  # fmt: skip
+        )
 
 
 def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
@@ -222,10 +192,10 @@ def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
     steps, nx, nu = scheme.substeps, model.nx, model.nu
     t, inputs = _split(model, scheme, w)
     x, s = z[:, 0], z[:, 1:]
-    rest = ca.MX.zeros(nx, layout.states - 1 - model.np - scheme.delay_free)
+    padding = ca.MX.zeros(nx, layout.states - 1 - model.np - scheme.delay_free)
     if model.linear:
         blocks, v = [block[:nx, :] for block in _blocks(model, scheme, data)], ca.vertcat(x, *inputs, 1.0)
-        forced = ca.horzcat(*(ca.mtimes(block, v) for block in blocks[1:]), rest)
+        forced = ca.horzcat(*(ca.mtimes(block, v) for block in blocks[1:]), padding)
         return ca.horzcat(ca.mtimes(blocks[0], v), ca.mtimes(blocks[0][:, :nx], s) + forced)
     step, p, period = step_function(model), data[:-2], data[-2] + data[-1]
     joined = scheme.hold == "first"
@@ -239,7 +209,7 @@ def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
             if scheme.delay_free:
                 along = ca.vertcat(dh, slope * dh * i, slope * dh * (i + 1))
                 forced.append(ca.mtimes(b[:, model.np :], along))
-            s = ca.mtimes(a, s) + ca.horzcat(*forced, rest)
+            s = ca.mtimes(a, s) + ca.horzcat(*forced, padding)
             t = t + h
     after, sampling = ca.horzcat(x, s), model.plant.sampling
     if sampling is not None:
@@ -267,23 +237,23 @@ def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
     return ca.horzcat(y, ca.mtimes(c, s) + ca.horzcat(*direct, ca.MX.zeros(model.ny, layout.states - 1 - count)))
 
 
-def _correct(layout: Layout, z: Any, y: Any, w: Any, known: Any) -> Any:
+def _correct(layout: Layout, z: Any, y: Any, w: Any, sensors: Any) -> Any:
     """Return what the prediction errors take off the next state and its derivatives.
 
     w ends in [measured, present, drift basis]; known is [offset, gain, drift, correction and its derivatives].
     """
     nx, ny, nd = layout.nx, layout.ny, layout.drift_terms
     measured, present, basis = ca.vertsplit(w, [0, ny, 2 * ny, 2 * ny + nd])
-    offset, gain, drift, correction = ca.vertsplit(known, [0, ny, 2 * ny, (2 + nd) * ny, known.numel()])
+    offset, gain, drift, correction = ca.vertsplit(sensors, [0, ny, 2 * ny, (2 + nd) * ny, sensors.numel()])
     coefficients = ca.reshape(drift, nd, ny).T
     gains = [ca.reshape(part, ny, nx).T for part in ca.vertsplit(correction, nx * ny)]
     rows = []
     for o in range(ny):
         value = gain[o] * y[o, 0] + offset[o] + ca.mtimes(coefficients[o, :], basis) - measured[o]
-        own = ca.vertcat(1.0, basis, y[o, 0])
+        sensor_columns = ca.vertcat(1.0, basis, y[o, 0])
         before = ca.MX.zeros(layout.shared + nx + o * layout.own)
         after = ca.MX.zeros((ny - 1 - o) * layout.own)
-        derivative = gain[o] * y[o, 1:] + ca.vertcat(before, own, after).T
+        derivative = gain[o] * y[o, 1:] + ca.vertcat(before, sensor_columns, after).T
         rows.append(present[o] * ca.horzcat(value, derivative))
     v = ca.vertcat(*rows)
     moved = ca.horzcat(*(ca.mtimes(g, v[:, 0]) for g in gains[1:]), ca.MX.zeros(nx, layout.states - len(gains)))
@@ -313,21 +283,6 @@ def _output_map(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int,
     return _program(model, layout, scheme, sizes)[1].map(n)
 
 
-def _data(model: Model, point: Point) -> Float[np.ndarray, " m"]:
-    clock = point.clock
-    if model.linear:
-        return transition(model, point.theta, clock).ravel()
-    return np.concatenate([model.parameters(point.theta), [clock.fraction_s, clock.period - clock.fraction_s]])
-
-
-def _start_of_shot(x0: Float[np.ndarray, " nx"], layout: Layout) -> Float[np.ndarray, "nx nj"]:
-    """Return the state and its derivatives at a shot's first sample."""
-    z = np.zeros((x0.size, layout.states))
-    z[:, 0] = x0
-    z[:, 1 + layout.shared : 1 + layout.shared + x0.size] = np.eye(x0.size)
-    return z
-
-
 def _fold(
     function: Any, z: Float[np.ndarray, "nx nj"], w: Float[np.ndarray, "n w"], data: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "n1 nx nj"]:
@@ -344,58 +299,65 @@ def _fold(
     return path
 
 
-def _times(segment: Segment, point: Point, rows: tuple[int, int]) -> Float[np.ndarray, " n"]:
-    return segment.start_s + point.clock.period * np.arange(rows[0], rows[1])
-
-
 def _folded_trajectory(
-    model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "all w"], rows: tuple[int, int],
+    model: Model,
+    segment: Segment,
+    point: Point,
+    forcing: Float[np.ndarray, "n w"],
     x0: Float[np.ndarray, " nx"],
-) -> Trajectory:  # fmt: skip
+) -> Trajectory:
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
     layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(point)
-    piece = slice(*rows)
-    w, data = np.column_stack([_times(segment, point, rows), forcing[piece, :-1]]), _data(model, point)
-    plant_size = data.size
+    clock, time = point.clock, segment.start_s + point.clock.period * np.arange(len(forcing))
+    if model.linear:
+        data = transition(model, point.theta, clock).ravel()
+    else:
+        data = np.append(model.parameters(point.theta), (clock.fraction_s, clock.period - clock.fraction_s))
+    w, plant_size = np.column_stack([time, forcing[:, :-1]]), data.size
     if point.correction is not None:
-        measured, present = _read_measured(segment, rows)
-        w = np.hstack([w, measured, present, segment.drift_basis(piece, layout.drift_terms)])
-        known = (point.offset, point.gain, point.drift, point.correction)
-        data = np.concatenate([data, *(np.asarray(values).ravel() for values in known)])
+        measured, present = _read_measured(segment, len(forcing))
+        w = np.hstack([w, measured, present, segment.drift_basis(slice(0, len(forcing)), layout.drift_terms)])
+        sensors = (point.offset, point.gain, point.drift, point.correction)
+        data = np.concatenate([data, *(np.asarray(values).ravel() for values in sensors)])
     sizes, n = (w.shape[1], plant_size, data.size), len(w)
-    path = _fold(_program(model, layout, scheme, sizes)[0], _start_of_shot(x0, layout), w, data)
+    start = np.zeros((model.nx, layout.states))
+    start[:, 0] = x0
+    start[:, 1 + layout.shared : 1 + layout.shared + model.nx] = np.eye(model.nx)
+    path = _fold(_program(model, layout, scheme, sizes)[0], start, w, data)
     flat = path[:-1].transpose(1, 0, 2).reshape(model.nx, n * layout.states)
     outputs = _output_map(model, layout, scheme, sizes, n)(flat, w.T, np.repeat(data[:, None], n, 1))
     y = np.array(outputs).reshape(model.ny, n, layout.states).transpose(1, 0, 2)
-    return y[:, :, 0], y[:, :, 1:], path[:, :, 0], path[-1]
+    return y[:, :, 0], y[:, :, 1:], path[:-1, :, 0]
 
 
-def _read_measured(segment: Segment, rows: tuple[int, int]) -> tuple[Float[np.ndarray, "n ny"], Any]:
+def _read_measured(segment: Segment, stop: int) -> tuple[Float[np.ndarray, "n ny"], Any]:
     """Return the measured outputs, zero where missing, and which are present."""
-    piece = slice(*rows)
-    measured = np.column_stack([channel[piece] for channel in segment.y])
+    measured = np.column_stack([channel[:stop] for channel in segment.y])
     present = np.isfinite(measured)
     if segment.keep:
-        present &= np.column_stack([mask[piece] for mask in segment.keep]).astype(bool)
+        present &= np.column_stack([mask[:stop] for mask in segment.keep]).astype(bool)
     return np.where(present, measured, 0.0), present
 
 
 def _columns(
-    segment: Segment, point: Point, weights: Weights, layout: Layout, rows: tuple[int, int],
-    y: Float[np.ndarray, "n ny"], dy: Float[np.ndarray, "n ny nt"],
-) -> tuple[Float[np.ndarray, "n ny nc"], Any]:  # fmt: skip
+    segment: Segment,
+    point: Point,
+    weights: Weights,
+    layout: Layout,
+    y: Float[np.ndarray, "n ny"],
+    dy: Float[np.ndarray, "n ny nt"],
+) -> tuple[Float[np.ndarray, "n ny nc"], Any]:
     """Return v of every sample, and which samples count."""
-    measured, present = _read_measured(segment, rows)
-    basis = segment.drift_basis(slice(*rows), point.drift_terms)
-    drift = basis @ point.drift.T if point.drift_terms else 0.0
+    measured, present = _read_measured(segment, len(y))
+    basis = segment.drift_basis(slice(0, len(y)), point.drift_terms)
     v = np.zeros((len(y), layout.ny, layout.columns))
-    v[:, :, 0] = point.gain * y + point.offset + drift - measured
+    v[:, :, 0] = point.read(y.T, segment, slice(0, len(y))).T - measured
     v[:, :, 1 : 1 + dy.shape[2]] = point.gain[:, None] * dy
     for o in range(layout.ny):
-        own = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
-        v[:, o, own] += 1.0
-        v[:, o, own + 1 : own + 1 + point.drift_terms] += basis
-        v[:, o, own + layout.own - 1] += y[:, o]
+        first = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
+        v[:, o, first] += 1.0
+        v[:, o, first + 1 : first + 1 + point.drift_terms] += basis
+        v[:, o, first + layout.own - 1] += y[:, o]
     v[~present] = 0.0
     if len(weights.sections):
         from scipy.signal import sosfilt

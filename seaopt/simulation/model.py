@@ -83,9 +83,9 @@ class Model:
         return len(self.free)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        known = [str(symbol) for symbol in ca.vertsplit(self.p)]
+        names = [str(symbol) for symbol in ca.vertsplit(self.p)]
         stored = ca.Function("model", [self.t, self.x, self.u, self.p], [self.f, self.h])
-        content = (self.plant, self.free, self.outputs, known, self.constants, stored, self.linear, self.sticks)
+        content = (self.plant, self.free, self.outputs, names, self.constants, stored, self.linear, self.sticks)
         return _restore_model, content
 
     def __copy__(self) -> Model:
@@ -148,8 +148,8 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
     names = tuple(name for name in free if name in values)
     zero = tuple(name for name in values if name not in names and values[name] == 0.0)
     model = _structure(plant, names, chosen, zero)
-    known = [name for name in values if name not in names and name not in zero]
-    return replace(model, constants=np.array([values[name] for name in known]))
+    fixed = [name for name in values if name not in names and name not in zero]
+    return replace(model, constants=np.array([values[name] for name in fixed]))
 
 
 @lru_cache(maxsize=64)
@@ -157,7 +157,7 @@ def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], z
     """Return a model without its constants; models that differ in those alone share what is made of it."""
     symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if plant.parameters else {}
     theta = ca.vertcat(*(symbols[name] for name in names)) if names else ca.SX(0, 1)
-    known = [symbol for name, symbol in symbols.items() if name not in names and name not in zero]
+    fixed = [symbol for name, symbol in symbols.items() if name not in names and name not in zero]
     rows = [list(plant.outputs).index(name) for name in outputs]
     f, h, levels = plant.dynamics, plant.output[rows], ca.SX(0)
     if plant.sticks and can_stick(plant):
@@ -169,32 +169,59 @@ def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], z
     sticks = not ca.simplify(levels).is_zero()
     u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
     return Model(
-        plant=plant, free=names, outputs=outputs, t=plant.t, x=plant.x, u=u, theta=theta,
-        p=ca.vertcat(theta, *known), constants=np.zeros(len(known)),
-        f=f, h=h, linear=not sticks and _is_linear(f, h, plant.t, plant.x, u), sticks=sticks,
-    )  # fmt: skip
+        plant=plant,
+        free=names,
+        outputs=outputs,
+        t=plant.t,
+        x=plant.x,
+        u=u,
+        theta=theta,
+        p=ca.vertcat(theta, *fixed),
+        constants=np.zeros(len(fixed)),
+        f=f,
+        h=h,
+        linear=not sticks and _is_linear(f, h, plant.t, plant.x, u),
+        sticks=sticks,
+    )
 
 
 def _restore_model(
-    plant: Plant, free: tuple[str, ...], outputs: tuple[str, ...], known: list[str],
-    constants: Float[np.ndarray, " nc"], stored: Any, linear: bool, sticks: bool,
-) -> Model:  # fmt: skip
+    plant: Plant,
+    free: tuple[str, ...],
+    outputs: tuple[str, ...],
+    fixed: list[str],
+    constants: Float[np.ndarray, " nc"],
+    stored: Any,
+    linear: bool,
+    sticks: bool,
+) -> Model:
     """Return a pickled model, in its plant's symbols."""
     symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if plant.parameters else {}
     theta = ca.vertcat(*(symbols[name] for name in free)) if free else ca.SX(0, 1)
     u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
-    p = ca.vertcat(theta, *(symbols[name] for name in known[len(free) :]))
+    p = ca.vertcat(theta, *(symbols[name] for name in fixed[len(free) :]))
     f, h = stored(plant.t, plant.x, u, p)
     return Model(
-        plant=plant, free=free, outputs=outputs, t=plant.t, x=plant.x, u=u, theta=theta, p=p, constants=constants,
-        f=f, h=h, linear=linear, sticks=sticks,
-    )  # fmt: skip
+        plant=plant,
+        free=free,
+        outputs=outputs,
+        t=plant.t,
+        x=plant.x,
+        u=u,
+        theta=theta,
+        p=p,
+        constants=constants,
+        f=f,
+        h=h,
+        linear=linear,
+        sticks=sticks,
+    )
 
 
 def fill_parameters(model: Model, p: Any) -> Any:
     """Return the plant's vector of parameters from the model's; zeros are put in."""
-    known = dict(zip(map(str, ca.vertsplit(model.p)), ca.vertsplit(p), strict=True)) if model.p.numel() else {}
-    return ca.vertcat(*(known.get(name, ca.SX(0)) for name in model.plant.parameters))
+    values = dict(zip(map(str, ca.vertsplit(model.p)), ca.vertsplit(p), strict=True)) if model.p.numel() else {}
+    return ca.vertcat(*(values.get(name, ca.SX(0)) for name in model.plant.parameters))
 
 
 def depends_on_time(model: Model) -> bool:

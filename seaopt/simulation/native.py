@@ -219,16 +219,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _run_compiler(command: list[str], source: str, name: str, library: Path) -> bool:
-    """Compile a source, load what comes of it, and move it into its place once all of it is on the disk.
-
-    Raises
-    ------
-    OSError
-        A file cannot be written, or the compiler not started.
-    subprocess.TimeoutExpired
-        The compiler hangs; it is killed with all that it started.
-
-    """
+    """Compile a source, load what comes of it, and move it into its place once all of it is on the disk."""
     with tempfile.TemporaryDirectory(dir=library.parent, prefix=BUILD, ignore_cleanup_errors=True) as folder:
         code, built, beside = (Path(folder) / file for file in ("kernel.c", "kernel.so", "kernel.sha256"))
         code.write_text(source, encoding="utf-8")
@@ -302,22 +293,11 @@ class Kernel:
     def run(self, jobs: Shaped[np.ndarray, " jobs"], buffers: object, *, parallel: bool = True) -> None:
         """Do all jobs, in threads of their own if `parallel`; ctypes lets go of the interpreter's lock.
 
-        Parameters
-        ----------
-        jobs : structured array
-            One row per job, laid out as the C structure; pointers are whole numbers.
-        buffers : object
-            Whatever owns the memory that the jobs point to.
-        parallel : bool
-            Whether the jobs are long enough for threads to pay.
+        `jobs`: one row per job, laid out as the C structure; pointers are whole numbers; `buffers`: whatever owns the
+        memory that the jobs point to; `parallel`: whether the jobs are long enough for threads to pay.
 
-        Raises
-        ------
-        KeyboardInterrupt
-            Once no thread works on these jobs any more; those that none has begun are left.
-        MemoryError
-            There is no room for the stack that a plant of many states needs.
-
+        Raises KeyboardInterrupt: once no thread works on these jobs any more; those that none has begun are left.
+        Raises MemoryError: there is no room for the stack that a plant of many states needs.
         """
         inside = threading.current_thread().name.startswith(
             THREAD_NAME

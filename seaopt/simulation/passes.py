@@ -1,4 +1,4 @@
-"""What a pass over a stretch of a log needs and finds: outputs, sensitivities, Gram matrices of weighted residuals.
+"""What a pass over a segment of a log needs and finds: outputs, sensitivities, Gram matrices of weighted residuals.
 
 The same pass runs in two ways with the same numbers: compiled (`seaopt.simulation.compiled`), which accumulates in
 O(1) memory, and without a compiler (`seaopt.simulation.interpreted`).
@@ -55,7 +55,7 @@ class Weights:
 
 @record(eq=False)
 class Segment:
-    """A gap-free stretch of a log: one array per channel, in the order of a model's inputs and outputs.
+    """A gap-free part of a log: one array per channel, in the order of a model's inputs and outputs.
 
     Parameters
     ----------
@@ -132,6 +132,14 @@ class Point:
         """Drift coefficients per output."""
         return self.drift.shape[1]
 
+    def read(self, outputs: Float[np.ndarray, "ny m"], segment: Segment, rows: slice) -> Float[np.ndarray, "ny m"]:
+        """Return what the sensors read of model outputs over rows of a segment: gain * output + offset + drift."""
+        readings = np.multiply(outputs, self.gain[:, None], order="C")  # an output's samples side by side
+        readings += self.offset[:, None]
+        if self.drift_terms:
+            readings += self.drift @ segment.drift_basis(rows, self.drift_terms).T
+        return readings
+
 
 @record
 class Layout:
@@ -165,34 +173,14 @@ class Layout:
 
 @record(eq=False)
 class Pass:
-    """What passes over shots of one segment found; a shot starts from a state of its own.
+    """What a pass over one segment, or its first samples, found."""
 
-    Parameters
-    ----------
-    gram : array, shape (shots, ny, nc, nc)
-        Sums over samples of v v', weighted as the loss asks; columns as in `Layout`.
-    loss : array, shape (shots, ny)
-        Sums of the losses.
-    count : array, shape (shots, ny)
-        Samples that counted.
-    last : array, shape (shots, nx, nj)
-        One step after each shot's last sample: the state, then its derivatives in the order of v.
-    outputs : array, shape (n, ny), or None
-        Model outputs, without gain and offset.
-    columns : array, shape (n, ny, nc), or None
-        The v of every sample.
-    states : array, shape (n, nx), or None
-        State trajectory.
-
-    """
-
-    gram: Float[np.ndarray, "shots ny nc nc"]
-    loss: Float[np.ndarray, "shots ny"]
-    count: Float[np.ndarray, "shots ny"]
-    last: Float[np.ndarray, "shots nx nj"]
-    outputs: Float[np.ndarray, "n ny"] | None = None
-    columns: Float[np.ndarray, "n ny nc"] | None = None
-    states: Float[np.ndarray, "n nx"] | None = None
+    gram: Float[np.ndarray, "ny nc nc"]  # sums over samples of v v', weighted as the loss asks; columns as in `Layout`
+    loss: Float[np.ndarray, " ny"]  # sums of the losses
+    count: Float[np.ndarray, " ny"]  # samples that counted
+    outputs: Float[np.ndarray, "n ny"] | None = None  # model outputs, without gain and offset
+    columns: Float[np.ndarray, "n ny nc"] | None = None  # the v of every sample
+    states: Float[np.ndarray, "n nx"] | None = None  # state trajectory
 
 
 def layout_of(nx: int, ny: int, np_: int, point: Point) -> Layout:

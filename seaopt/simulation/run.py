@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from seaopt.simulation.compiled import Program
 from seaopt.simulation.discretisation import check_period
-from seaopt.simulation.interpreted import interpreted_passes
+from seaopt.simulation.interpreted import interpret_pass
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Pass, Point, Segment, Weights
 
@@ -21,33 +21,33 @@ def run_passes(
     model: Model,
     segment: Segment,
     point: Point,
-    x0: Float[np.ndarray, "shots nx"],
+    x0: Float[np.ndarray, " nx"],
     weights: Weights | None = None,
     *,
-    edges: Int[np.ndarray, " shots1"] | None = None,
+    stop: int | None = None,
     sums: bool = True,
     outputs: bool = False,
     output_rows: int | None = None,
     columns: bool = False,
     states: bool = False,
 ) -> Pass:
-    """Run a segment, or shots of it that each start from a state of their own.
+    """Run a segment, or its first samples, from a state.
 
     Parameters
     ----------
     model, segment, point, weights
         What is simulated, on which data, with which unknowns, and how residuals are weighted (not at all if None).
-    x0 : array, shape (shots, nx)
-        State at each shot's first sample.
-    edges : array of int, shape (shots + 1,), optional
-        First rows of the shots, and one past the last; the whole segment in one shot if left out.
+    x0 : array, shape (nx,)
+        State at the first sample.
+    stop : int, optional
+        Run so many first samples; all if left out.
     sums : bool
         Whether Gram matrices, losses, counts and derivatives are wanted: a simulation alone is several times quicker.
         Without measured outputs compiled code makes none.
     outputs, columns, states : bool
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
     output_rows : int, optional
-        Keep the outputs of so many first samples only; of one shot.
+        Keep the outputs of so many first samples only.
 
     Returns
     -------
@@ -57,15 +57,13 @@ def run_passes(
     """
     check_period(model, point.clock)
     chosen = weights if weights is not None else Weights.plain(model.ny)
-    rows = edges if edges is not None else np.array([0, segment.n])
+    last = segment.n if stop is None else stop
     program = Program.make(model, segment, point, chosen)
     if program is not None:
         return program.run(
-            rows, x0, sums=sums, outputs=outputs, output_rows=output_rows, columns=columns, states=states
+            0, last, x0, sums=sums, outputs=outputs, output_rows=output_rows, columns=columns, states=states
         )
-    result = interpreted_passes(
-        model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states
-    )
+    result = interpret_pass(model, segment, point, chosen, last, x0, outputs=outputs, columns=columns, states=states)
     if output_rows is None or result.outputs is None:
         return result
     return replace(result, outputs=result.outputs[:output_rows].copy())
@@ -89,16 +87,14 @@ def stream(
     program = Program.make(model, segment, point, chosen)
     if program is None:
         yield from _split_into_chunks(
-            interpreted_passes(
-                model, segment, point, chosen, np.array([0, segment.n]), x0[None], outputs=True, columns=columns
-            ),
+            interpret_pass(model, segment, point, chosen, segment.n, x0, outputs=True, columns=columns),
             chunk,
         )
         return
     carry, part = program.carry(), None
     for start in range(0, segment.n, chunk):
-        rows = np.array([start, min(start + chunk, segment.n)])
-        part = program.run(rows, x0[None], sums=False, outputs=True, columns=columns, resume=carry, room=part)
+        end = min(start + chunk, segment.n)
+        part = program.run(start, end, x0, sums=False, outputs=True, columns=columns, resume=carry, room=part)
         yield part
 
 
@@ -132,8 +128,6 @@ def double_sum(
 def _split_into_chunks(whole: Pass, chunk: int) -> Iterator[Pass]:
     assert whole.outputs is not None
     for start in range(0, len(whole.outputs), chunk):
-        piece = slice(start, start + chunk)
-        yield Pass(
-            gram=whole.gram, loss=whole.loss, count=whole.count, last=whole.last, outputs=whole.outputs[piece],
-            columns=None if whole.columns is None else whole.columns[piece],
-        )  # fmt: skip
+        rows = slice(start, start + chunk)
+        columns = None if whole.columns is None else whole.columns[rows]
+        yield replace(whole, outputs=whole.outputs[rows], columns=columns)

@@ -26,11 +26,7 @@ ROUNDING = 1e-6  # of an output: below it an error is not held against the outpu
 def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
     """Return the plant's inputs from a log's channels of the same names, in the plant's order; zeros if it has none.
 
-    Raises
-    ------
-    LogError
-        An input is missing from the log, or has missing samples.
-
+    Raises LogError: an input is missing from the log, or has missing samples.
     """
     columns: list[Float[np.ndarray, " n"]] = []
     if plant.inputs and not any(name in log.signals for name in plant.inputs):
@@ -146,7 +142,7 @@ def _run_to_tolerance(model: Model, segment: Segment, x0: Float[np.ndarray, " nx
             clock=clock,
             substeps=substeps,
         )
-        return run_passes(model, segment, point, x0[None], sums=False, outputs=True, states=True)
+        return run_passes(model, segment, point, x0, sums=False, outputs=True, states=True)
 
     result, least = run(1), np.full(model.ny, 1e-300)
     substeps = 1

@@ -116,7 +116,7 @@ class _Joints:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.jumps = [(one.jump, one.add_loads) for one in plant.friction.values() if one.jump and one.jumps]
+        self.jumps = [(force.jump, force.add_loads) for force in plant.friction.values() if force.jump and force.jumps]
         equations, spaces = separate_friction(plant), name_symbols(plant, plant.x, plant.u, plant.p)
         chosen: list[Any] = []
         velocities: list[Any] = []
@@ -161,8 +161,8 @@ def _push_each(levels: Any) -> list[Any]:
     return ca.horzsplit(ca.diag(ca.if_else(levels > 0.0, levels, 1.0)))
 
 
-def _find_holding(speeds: Any, effects: Any, held: Any, limits: Any) -> Any:
-    """Return the forces (in their units) that stop the joints in `held`, or their limits; the others' are zero.
+def _find_holding(speeds: Any, effects: Any, stopped: Any, limits: Any) -> Any:
+    """Return the forces (in their units) that stop the joints in `stopped`, or their limits; the others' are zero.
 
     `speeds` are those without them, `effects` [i, j] what a unit of force j takes from speed i. Of several joints each
     is solved in turn, by Gauss' and Seidel's projected sweeps.
@@ -172,6 +172,6 @@ def _find_holding(speeds: Any, effects: Any, held: Any, limits: Any) -> Any:
     for _ in range(SWEEPS if count > 1 else 1):
         for i in range(count):
             left = speeds[i] - sum(effects[i, j] * forces[j] for j in range(count) if j != i)
-            own = ca.if_else(held[i], effects[i, i], 1.0)
-            forces[i] = ca.if_else(held[i], ca.fmin(ca.fmax(left / own, -limits[i]), limits[i]), 0.0)
+            effect = ca.if_else(stopped[i], effects[i, i], 1.0)
+            forces[i] = ca.if_else(stopped[i], ca.fmin(ca.fmax(left / effect, -limits[i]), limits[i]), 0.0)
     return ca.vertcat(*forces)

@@ -156,11 +156,7 @@ def assert_certified(certificate: Certificate, *, failure_probability: float | N
     require_type(certificate, Certificate, "certificate", "give what seaopt.certify returned")
     if failure_probability is not None:
         _require_positive(failure_probability, "failure_probability")
-    broken = [
-        f"  {row.name} = {row.value:.4g}, must be {row.sense} {row.limit:.4g} ({row.where})"
-        for row in certificate.requirements
-        if not row.met
-    ]
+    broken = [f"  {row}" for row in certificate.requirements if not row.met]
     draws = certificate.monte_carlo
     if failure_probability is not None and not draws.failure_probability_bound <= failure_probability:
         broken.append(

@@ -160,11 +160,7 @@ def _judge_feasible(results: Stages, wanted: bool) -> Judgement:
 
 def _judge_passed(results: Stages, wanted: bool) -> Judgement:
     assert results.certificate is not None
-    broken = [
-        f"{row.name} = {row.value:.4g}, must be {row.sense} {row.limit:.4g} ({row.where})"
-        for row in results.certificate.requirements
-        if not row.met
-    ]
+    broken = [str(row) for row in results.certificate.requirements if not row.met]
     more = [f"{len(broken) - SHOWN} more in robustness.json"] if len(broken) > SHOWN else []
     return _judge_flag(results.certificate.passed, wanted, "; ".join([*broken[:SHOWN], *more]))
 

@@ -61,9 +61,7 @@ def virtual_experiment(
     """
 
     def record_log(sensors: Sensors) -> Log:
-        return virtual_log(
-            plant, truth, excitation, duration_s=duration_s, rate_hz=rate_hz, seed=seed, sensors=sensors
-        )  # fmt: skip
+        return virtual_log(plant, truth, excitation, duration_s=duration_s, rate_hz=rate_hz, seed=seed, sensors=sensors)
 
     if noise_std is None:
         ideal = record_log(Sensors())

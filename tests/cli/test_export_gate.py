@@ -157,7 +157,7 @@ def test_an_edited_gate_is_refused(tuned, folder):
     content["guards"]["gate"]["range_N"] = [10.0, -10.0]
     content = seal(content)
     del content["made_from"]  # whose digest tells any edit
-    with pytest.raises(FileError, match=r"controller\.json: guards\.gate is none: range_N"):
+    with pytest.raises(FileError, match=r"controller\.json: guards\.gate: range_N"):
         read_controller(content)
 
 

@@ -48,7 +48,7 @@ def test_what_is_to_be_looked_at_is_said_and_the_exit_code_is_0(seaopt):
     assert (done.returncode, done.stderr) == (0, "")
     for words in (
         "3900 samples", "1 gap, 100 samples lost", "F2 lacks 30 samples", "F1 is flat at its largest value, 300 N",
-        "I is answered to from",
+        "the outputs respond to I between",
     ):  # fmt: skip
         assert words in done.stdout
 

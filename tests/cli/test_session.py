@@ -157,7 +157,7 @@ def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, cap
     assert session.results["certify"].monte_carlo.samples == 60
     session.show(False, ["certify"])
     told = capsys.readouterr()
-    remark = "note: the nominal I_p = 0.36 lies outside its range of 0.4 to 0.5"
+    remark = "note the nominal I_p = 0.36 lies outside its range of 0.4 to 0.5"
     assert remark in " ".join(told.out.split())
     assert (folder / "controller.json").read_bytes() == held
     with pytest.raises(so.SeaoptError, match=r"robustness.json: was made from another.*run seaopt certify"):

@@ -15,31 +15,30 @@ import seaopt as so
 from seaopt.cli.main import app
 from seaopt.cli.progress import TimeLeft
 from seaopt.cli.terminal import Terminal
-from seaopt.reporting.verdict import explain_failure
-from seaopt.robustness.certificate.certificate import Requirement
-from seaopt.robustness.certificate.failures import group_failures
+from seaopt.reporting.sections.kinds.certificate import explain_failure
+from seaopt.robustness.certificate.requirement import Requirement, group_failures
 
 
-def broken(name, value, limit, where):
-    return Requirement(name=name, limit=limit, value=value, met=False, where=where)
+def broken(name, value, limit, plant, **fields):
+    return Requirement(name=name, limit=limit, value=value, met=False, plant=plant, **fields)
 
 
 def test_the_same_failure_in_twelve_runs_is_said_once():
-    rows = [broken("step_overshoot", 1.4 + 0.01 * k, 1.3, f"plant {k}, step") for k in range(12)]
+    rows = [broken("step_overshoot", 1.4 + 0.01 * k, 1.3, f"plant {k}", scenario="step") for k in range(12)]
     (reason,) = map(explain_failure, group_failures(rows))
     assert (reason.count, reason.where) == (12, "plant 11, step")
     assert "1.51" in reason.what and "1.3" in reason.what
 
 
 def test_what_must_be_large_is_worst_where_it_is_least():
-    rows = [broken("min_disk_margin", value, 0.7, str(value)) for value in (0.6, 0.2, 0.5)]
+    rows = [broken("min_disk_margin", value, 0.7, str(value), sense="≥") for value in (0.6, 0.2, 0.5)]
     (reason,) = map(explain_failure, group_failures(rows))
     assert reason.where == "0.2"
 
 
 def test_of_an_unstable_plant_only_that_is_said():
     rows = [
-        broken("spectral_radius", 1.2, 1.0, "swing: the loop is UNSTABLE"),
+        broken("spectral_radius", 1.2, 1.0, "swing"),
         broken("max_sensitivity", np.inf, 1.6, "swing"),
         broken("max_complementary", np.inf, 1.3, "swing"),
         broken("max_noise_gain", 30.0, 25.0, "stand"),
@@ -47,6 +46,16 @@ def test_of_an_unstable_plant_only_that_is_said():
     unstable, other = map(explain_failure, group_failures(rows))
     assert "swing" in unstable.what and "2 more" in unstable.where
     assert other.what.startswith("max_noise_gain 30")
+
+
+@pytest.mark.parametrize(
+    ("fields", "subject"),
+    [({"plant": "frf:chirp", "text": "on measured points, at 95 %"}, "frf:chirp"),
+     ({"plant": "knee", "state": "stuck", "place": ("phi", 0.4)}, "phi = 0.4, knee stuck")],
+)  # fmt: skip
+def test_what_is_unstable_is_named_whatever_its_name_holds(fields, subject):
+    (reason,) = map(explain_failure, group_failures([broken("spectral_radius", 1.2, 1.0, **fields)]))
+    assert reason.what == f"unstable on {subject}"
 
 
 @pytest.mark.parametrize("width", [20, 40, 80])
@@ -84,7 +93,7 @@ def test_a_controller_fits_a_terminal_of_eighty_columns(copied, narrow):
     quiet = narrow("tune", "short.toml", "-o", "all", "--quiet")
     assert quiet.stdout.splitlines() == lines[:1] and quiet.returncode == 0
     loud = narrow("tune", "short.toml", "-o", "all", "--verbose")
-    assert len(loud.stdout) > len(quiet.stdout) and "limits met with nothing to spare" in " ".join(loud.stdout.split())
+    assert len(loud.stdout) > len(quiet.stdout) and "Active limits:" in " ".join(loud.stdout.split())
 
 
 def test_a_limit_that_cannot_be_met_ends_with_the_line_to_write(copied, narrow, short):

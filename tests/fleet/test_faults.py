@@ -126,6 +126,16 @@ def test_an_executor_that_is_broken_for_good_is_said(made):
         so.fit_fleet(made / "stand.toml", [made / "logs/*.csv"], executor=executor)
 
 
+@pytest.mark.parametrize(("number", "remedy"), [(errno.EMFILE, "ulimit -n 1024"), (errno.EAGAIN, "ulimit -u")])
+def test_a_limit_on_the_workers_is_named(made, number, remedy):
+    class Limited(ThreadPoolExecutor):
+        def submit(self, *args, **kwargs):
+            raise OSError(number, os.strerror(number))
+
+    with Limited(1) as executor, pytest.raises(so.SeaoptError, match=f"takes no more work.*{remedy}"):
+        so.fit_fleet(made / "stand.toml", [made / "logs/r0_j0.csv"], executor=executor)
+
+
 def test_a_thread_that_hangs_is_stopped(made, monkeypatch):
     def hang(*_):
         while True:

@@ -14,7 +14,7 @@ from seaopt.errors import FileError, LogError, ProblemError, SeaoptError
 from seaopt.files import write_json
 from seaopt.fleet import FleetLog, find_logs, read_fleet, read_manifest
 from seaopt.fleet.plan import make_plan
-from seaopt.fleet.table import Table
+from seaopt.fleet.table import FleetTable
 from seaopt.logs import assess_quality, read_table
 from tests.fleet.conftest import LOGS, PROBLEM, compare, write_log
 
@@ -192,7 +192,7 @@ def test_a_template_of_several_files_is_refused(stand, threads):
 
 def test_two_at_one_table_is_refused(stand, threads):
     problem = so.read_problem(stand / "stand.toml")
-    table = Table(stand / "out", {"log": pl.String}, make_plan(problem, None, None, "another"))
+    table = FleetTable(stand / "out", {"log": pl.String}, make_plan(problem, None, None, "another"))
     try:
         with pytest.raises(FileError, match="another fleet"):
             so.fit_fleet(stand / "stand.toml", [stand / "logs/r0_j0.csv"], stand / "out", executor=threads)

@@ -7,13 +7,13 @@ import pytest
 
 from seaopt.fleet import table
 from seaopt.fleet.plan import make_plan
-from seaopt.fleet.table import Table
+from seaopt.fleet.table import FleetTable
 from seaopt.problem import read_problem
 
 SCHEMA = {"log": pl.String, "status": pl.String, "J": pl.Float64}
 
 
-class Counting(Table):
+class Counting(FleetTable):
     """Counts the rows that it writes."""
 
     written = 0
@@ -68,13 +68,13 @@ def test_a_row_costs_the_same_in_a_longer_table(tmp_path, plan):
 
 
 def test_newer_rows_of_a_killed_client_are_found(tmp_path, plan):
-    one = Table(tmp_path, SCHEMA, plan)
+    one = FleetTable(tmp_path, SCHEMA, plan)
     fill(one, range(100), 1.0)
     fill(one, [7, 300, 8], 2.0)
     assert pl.read_parquet(one.folder).filter(pl.col("log") == "000007")["J"].to_list() == [1.0]  # whole, and older
     assert one.read().filter(pl.col("J") == 2.0)["log"].to_list() == ["000007", "000008", "000300"]
     one.close()  # as the end of its process does
-    again = Table(tmp_path, SCHEMA, plan)
+    again = FleetTable(tmp_path, SCHEMA, plan)
     rows = pl.read_parquet(again.folder)
     assert rows.filter(pl.col("J") == 2.0)["log"].sort().to_list() == ["000007", "000008", "000300"]
     assert len(rows) == 101 and [path.name for path in again.work.iterdir()] == ["lock"]
@@ -82,22 +82,22 @@ def test_newer_rows_of_a_killed_client_are_found(tmp_path, plan):
 
 
 def test_newer_rows_are_put_in_again_where_that_was_killed(tmp_path, plan, monkeypatch):
-    one = Table(tmp_path, SCHEMA, plan)
+    one = FleetTable(tmp_path, SCHEMA, plan)
     fill(one, range(300), 1.0, at_a_time=100)
-    merged = Table._write_merged
+    merged = FleetTable._write_merged
 
     def die(self, rows, parts):
         if len(one.parts()) and (pl.read_parquet(one.folder)["J"] == 2.0).any():
             raise KeyboardInterrupt
         merged(self, rows, parts)
 
-    monkeypatch.setattr(Table, "_write_merged", die)
+    monkeypatch.setattr(FleetTable, "_write_merged", die)
     with pytest.raises(KeyboardInterrupt):
         fill(one, range(0, 300, 3), 2.0, at_a_time=100)
     assert pl.read_parquet(one.folder)["log"].is_unique().all()
     one.close()
     monkeypatch.undo()
-    again = Table(tmp_path, SCHEMA, plan)
+    again = FleetTable(tmp_path, SCHEMA, plan)
     rows = pl.read_parquet(again.folder)
     assert len(rows) == 300 and (rows["J"] == 2.0).sum() == 100
     again.close()

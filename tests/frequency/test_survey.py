@@ -57,7 +57,7 @@ def test_a_swinging_output_peaks_where_its_poles_say_and_is_not_of_second_order(
     [
         (lambda t, i, f: (t, np.ones(t.size), f), "I is constant or absent"),
         (lambda t, i, f: (np.delete(t, range(900, 950)), np.delete(i, range(900, 950)), np.delete(f, range(900, 950))),
-         "2 stretches between gaps"),
+         "2 segments between gaps"),
         (lambda t, i, f: (t[:200], i[:200], f[:200]), "200 samples are too few"),
         (lambda t, i, f: (t, i, np.where(t < 0.1, np.nan, f)), "40 samples of F1 are missing"),
     ],

@@ -123,7 +123,7 @@ def test_decimation_passes_the_pass_band_and_stops_what_would_fold(factor):
     assert "pass band 0 to" in slow.notes[0]
 
 
-def test_decimation_filters_each_stretch_alone(gapped):
+def test_decimation_filters_each_segment_alone(gapped):
     slow = gapped.decimate(4)
     assert len(slow.segments) == 2
     np.testing.assert_allclose(slow["F1"], sine(slow.time), atol=2e-4)
@@ -200,7 +200,7 @@ def test_bad_arguments_are_refused(gapped, call, error, words):
 
 
 @pytest.mark.parametrize("n", [2, 99_999, 100_002, 450_001])
-def test_the_period_is_the_mean_step_within_stretches(n: int) -> None:
+def test_the_period_is_the_mean_step_within_segments(n: int) -> None:
     step = np.random.default_rng(n).uniform(0.9e-3, 1.1e-3, n - 1)
     kept = step.copy()
     if n > 2:

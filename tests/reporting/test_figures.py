@@ -371,3 +371,8 @@ def test_notebooks_show_tables_and_figures(fitted, controller, certificate, monk
         assert shown.count("<table>") >= 1 and shown.count('<img src="data:image/svg+xml;base64,') == 1
     assert f"{fitted.parameters['J'].value:.6g}" in fitted._repr_html_()
     assert controller.plot.sensitivity()._repr_html_().startswith("<img")
+
+
+def test_a_figure_is_a_picture_in_a_stored_notebook(controller):
+    figure = controller.plot.step()
+    assert figure._repr_png_().startswith(b"\x89PNG") and figure.axes[0]._repr_png_().startswith(b"\x89PNG")

@@ -89,7 +89,7 @@ def test_many_states_fit_on_any_stack(states, cubic):
         theta=np.array([K]), offset=np.zeros(1), gain=np.ones(1), clock=Clock(period=PERIOD), substeps=STEPS
     )  # fmt: skip
     found = run_in_small_thread(
-        lambda: run_passes(model, segment, point, x0[None], Weights.plain(1), outputs=True, columns=True)
+        lambda: run_passes(model, segment, point, x0, Weights.plain(1), outputs=True, columns=True)
     )
     step = 1e-30
     by_k = simulate_chain(masses, cubic, K + 1j * K * step, x0, drive)

@@ -15,7 +15,7 @@ import seaopt as so
 from seaopt.errors import LogError, SimulationError
 from seaopt.simulation import Clock, Layout, Point, Segment, Weights, layout_of, make_model, run_passes, stream
 from seaopt.simulation.compiled import Program
-from seaopt.simulation.interpreted import interpreted_passes
+from seaopt.simulation.interpreted import interpret_pass
 from seaopt.simulation.native import find_compiler
 from tests.casadi_functions import compile_expression
 
@@ -188,7 +188,7 @@ def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "
         sos = butter(4, [5, 100], "bandpass", fs=RATE, output="sos")
         sections = np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]])
         weights = replace(weights, sections=sections, settle=50)
-    return model, segment, point, weights, 1e-3 * rng.normal(size=(1, model.nx))
+    return model, segment, point, weights, 1e-3 * rng.normal(size=model.nx)
 
 
 SETTINGS = [
@@ -216,15 +216,14 @@ SETTINGS = [
 def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
     keep = {"outputs": True, "columns": True, "states": True}
     model, segment, point, weights, x0 = passes(case, thor, n=140, **options)
-    edges = np.array([0, 60, 140])
-    starts = np.vstack([x0, 2 * x0])
-    fast = Program.make(model, segment, point, weights).run(edges, starts, **keep)
-    slow = interpreted_passes(model, segment, point, weights, edges, starts, **keep)
-    for name in ("gram", "loss", "count", "outputs", "columns", "states", "last"):
-        a, b = getattr(fast, name), getattr(slow, name)
-        scale = np.max(np.abs(b), axis=0, keepdims=True)
-        np.testing.assert_allclose(a, b, atol=1e-10 * np.max(scale), rtol=1e-10, err_msg=name)
-        np.testing.assert_allclose(a / (scale + 1e-300), b / (scale + 1e-300), atol=1e-9, err_msg=name)
+    for stop, start in ((140, x0), (60, 2 * x0)):
+        fast = Program.make(model, segment, point, weights).run(0, stop, start, **keep)
+        slow = interpret_pass(model, segment, point, weights, stop, start, **keep)
+        for name in ("gram", "loss", "count", "outputs", "columns", "states"):
+            a, b = getattr(fast, name), getattr(slow, name)
+            scale = np.max(np.abs(b), axis=0, keepdims=True)
+            np.testing.assert_allclose(a, b, atol=1e-10 * np.max(scale), rtol=1e-10, err_msg=name)
+            np.testing.assert_allclose(a / (scale + 1e-300), b / (scale + 1e-300), atol=1e-9, err_msg=name)
 
 
 @pytest.mark.parametrize("case", ["stand", "swing friction"])
@@ -285,16 +284,16 @@ def test_gram_is_the_product_of_the_columns(thor):
     for o in range(2):
         v = found.columns[:, o]
         v = v[(segment.keep[o] > 0) & np.isfinite(segment.y[o])]
-        np.testing.assert_allclose(found.gram[0, o], v.T @ v, rtol=1e-9, atol=1e-9 * np.max(found.gram[0, o]))
-        assert found.count[0, o] == len(v)
-        assert found.loss[0, o] == pytest.approx(0.5 * np.sum(v[:, 0] ** 2))
+        np.testing.assert_allclose(found.gram[o], v.T @ v, rtol=1e-9, atol=1e-9 * np.max(found.gram[o]))
+        assert found.count[o] == len(v)
+        assert found.loss[o] == pytest.approx(0.5 * np.sum(v[:, 0] ** 2))
 
 
 @pytest.mark.parametrize("options", [{}, {"filtered": True}, {"corrected": True}])
 def test_a_stream_is_the_whole(options, thor):
     model, segment, point, weights, x0 = passes("stand", thor, **options)
     whole = run_passes(model, segment, point, x0, weights, outputs=True, columns=True)
-    parts = stream(model, segment, point, x0[0], weights, chunk=123, columns=True)
+    parts = stream(model, segment, point, x0, weights, chunk=123, columns=True)
     columns, outputs = zip(*((part.columns.copy(), part.outputs.copy()) for part in parts), strict=True)
     assert len(columns) == 6
     np.testing.assert_allclose(np.vstack(columns), whole.columns, rtol=1e-12)

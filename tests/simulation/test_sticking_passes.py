@@ -13,7 +13,7 @@ from seaopt.errors import PlantError
 from seaopt.plants.plant import state_space
 from seaopt.plants.roles import Friction
 from seaopt.simulation import Clock, Point, Segment, Weights, make_model, run_passes
-from seaopt.simulation.interpreted import interpreted_passes
+from seaopt.simulation.interpreted import interpret_pass
 from tests.stick_slip import Mass, simulate
 
 FREE = ("m", "k", "f_c")
@@ -56,7 +56,7 @@ def make_point(theta, hold="zero", *, free=False, delay_s=0.0):
     ],
 )
 def test_compiled_and_interpreted_passes_agree_and_their_derivatives_are_those_of_differences(drive, hold, free):
-    model, start, plain = make_model(BLOCK, VALUES, FREE), np.array([[0.01, 0.0]]), Weights.plain(2)
+    model, start, plain = make_model(BLOCK, VALUES, FREE), np.array([0.01, 0.0]), Weights.plain(2)
     segment = Segment(u=(drive,), y=(np.zeros(drive.size), np.zeros(drive.size)))
     theta, delay = np.array([2.0, 800.0, 3.0]), 0.7e-3
     assert model.sticks and not model.linear
@@ -66,8 +66,8 @@ def test_compiled_and_interpreted_passes_agree_and_their_derivatives_are_those_o
         return run_passes(model, segment, point, start, plain, outputs=True, columns=True)
 
     here = run(theta, delay)
-    there = interpreted_passes(
-        model, segment, make_point(theta, hold, free=free, delay_s=delay), plain, np.array([0, drive.size]), start,
+    there = interpret_pass(
+        model, segment, make_point(theta, hold, free=free, delay_s=delay), plain, drive.size, start,
         outputs=True, columns=True,
     )  # fmt: skip
     assert np.allclose(here.outputs, there.outputs, rtol=1e-10, atol=1e-13)
@@ -86,7 +86,7 @@ def test_compiled_and_interpreted_passes_agree_and_their_derivatives_are_those_o
 
 
 def test_a_free_delay_of_whole_samples_has_the_derivatives_of_one_beside_it(drive):
-    model, start, plain = make_model(BLOCK, VALUES, FREE), np.zeros((1, 2)), Weights.plain(2)
+    model, start, plain = make_model(BLOCK, VALUES, FREE), np.zeros(2), Weights.plain(2)
     segment = Segment(u=(drive,), y=(np.zeros(drive.size), np.zeros(drive.size)))
 
     def run(delay):

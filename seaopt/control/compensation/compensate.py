@@ -28,9 +28,13 @@ ENOUGH = 1.5  # times the slope asked for: at the nominal parameters no better m
 
 
 def add_compensation(
-    controller: Controller, *, friction: CompensateFriction | None = None, gravity: CompensateGravity | None = None,
-    ripple: CompensateRipple | None = None, link: tuple[Plant, ParameterSet] | None = None,
-) -> Controller:  # fmt: skip
+    controller: Controller,
+    *,
+    friction: CompensateFriction | None = None,
+    gravity: CompensateGravity | None = None,
+    ripple: CompensateRipple | None = None,
+    link: tuple[Plant, ParameterSet] | None = None,
+) -> Controller:
     """Return a controller that also compensates its design plant's friction, its ripple, and the weight of a link.
 
     The law, its figures and its friction margin stay what they are; what is added acts between the law and the limit
@@ -114,19 +118,9 @@ def find_compensation_margins(
 ) -> list[CompensationMargin]:
     """Return how steep a compensation from the measured speed stability is shown for, at sets of parameters.
 
-    Parameters
-    ----------
-    controller : Controller
-        With a compensation of friction from the measured speed.
-    plant : Plant
-        Any on which it runs, with its own friction.
-    sets : sequence of ParameterSet
-        All with the same conditions among them.
-    first : str, optional
-        A multiplier that is tried first.
-    enough : float
-        A margin of so many times what is asked ends the search for a better one.
-
+    `controller`: with a compensation of friction from the measured speed. `plant`: any on which it runs, with its own
+    friction. `sets`: all with the same conditions among them. `first`: a multiplier that is tried first. `enough`: a
+    margin of so many times what is asked ends the search for a better one.
     """
     term = None if controller.compensation is None else controller.compensation.friction
     assert term is not None

@@ -32,37 +32,19 @@ LINEAR_SPEEDS = {"N": "m/s", "N m": "rad/s"}  # of a friction force and of a tor
 
 @record(eq=False)
 class MotorFriction:
-    """The friction that the motor's effort can meet.
+    """The friction that the motor's effort can meet."""
 
-    Parameters
-    ----------
-    name : str
-        Of the plant's friction.
-    index : int
-        Among its frictions.
-    level : float
-        Coulomb friction as an effort at the spring, N or N m.
-    smoothing : float or None
-        The speed over which the plant smooths it.
-    unit : str
-        Of its velocity.
-
-    """
-
-    name: str
-    index: int
-    level: float
-    smoothing: float | None
-    unit: str
+    name: str  # of the plant's friction
+    index: int  # among its frictions
+    level: float  # Coulomb friction as an effort at the spring, N or N m
+    smoothing: float | None  # the speed over which the plant smooths it
+    unit: str  # of its velocity
 
 
 def find_motor_friction(plant: Plant, params: ParameterSet) -> MotorFriction:
     """Return the friction of a plant that acts where the motor's effort does.
 
-    Raises
-    ------
-    ControlError
-        There is none, or it is nothing at these values.
+    Raises ControlError: there is none, or it is nothing at these values.
 
     Examples
     --------
@@ -98,90 +80,72 @@ def _find_level(friction: Friction, values: CompletedParameters) -> float:
     return abs(float(friction.effort(p))) * min(float(friction.force(speed, unloaded)) for speed in speeds)
 
 
-def _is_parallel(one: Float[np.ndarray, " n"], other: Float[np.ndarray, " n"]) -> bool:
+def _is_parallel(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> bool:
     """Tell whether two vectors have one direction or its opposite."""
-    length = float(np.linalg.norm(other))
+    length = float(np.linalg.norm(second))
     if not length:
         return False
-    along = float(one @ other) / length**2
-    return bool(np.linalg.norm(one - along * other) <= PARALLEL * np.linalg.norm(one))
+    along = float(first @ second) / length**2
+    return bool(np.linalg.norm(first - along * second) <= PARALLEL * np.linalg.norm(first))
 
 
 def make_friction_term(
-    plant: Plant, params: ParameterSet, regulated: str, asked: CompensateFriction, loop: FrictionLoop | None
+    plant: Plant, params: ParameterSet, regulated: str, spec: CompensateFriction, loop: FrictionLoop | None
 ) -> FrictionTerm:
     """Return the compensation of a design plant's friction.
 
-    Parameters
-    ----------
-    plant, params
-        The design plant and its parameters.
-    regulated : str
-        The output that the reference is of.
-    asked : CompensateFriction
-        Fraction, source and smoothing.
-    loop : FrictionLoop or None
-        The design plant's, for the smoothing of the measured speed; unused of the reference's.
+    `plant`, `params`: the design plant and its parameters. `regulated`: the output that the reference is of. `loop`:
+    the design plant's, for the smoothing of the measured speed; unused of the reference's.
 
-    Raises
-    ------
-    ControlError
-        No friction is where the motor acts, no output is the motor's position, the reference asks for no velocity at
-        rest, or stability is shown for no smoothing at all.
-
+    Raises ControlError: no friction is where the motor acts, no output is the motor's position, the reference asks for
+    no velocity at rest, or stability is shown for no smoothing at all.
     """
     found = find_motor_friction(plant, params)
-    effort = asked.fraction * found.level
+    effort = spec.fraction * found.level
     reads = ""
-    if asked.source == "reference":
-        velocity, speed = find_velocity_per_rate(plant, params, regulated, found.name), asked.speed or found.smoothing
+    if spec.source == "reference":
+        velocity, speed = find_velocity_per_rate(plant, params, regulated, found.name), spec.speed or found.smoothing
     else:
         reads = find_motor_position(plant, "friction", 'take from = "reference", or ')
         velocity = find_reading(plant, params, reads, found)
-        speed = asked.speed or _choose_speed(found, effort, loop)
+        speed = spec.speed or _choose_speed(found, effort, loop)
     if speed is None:
         raise ControlError(
             f"compensate.friction: the friction {found.name} of {plant.name} states no smoothing; give the speed at "
             "which the compensation has its full size: compensate = { friction = { speed = 0.001 } }"
         )
     return FrictionTerm(
-        effort=effort, speed=speed, speed_unit=found.unit, fraction=asked.fraction, source=asked.source, reads=reads,
+        effort=effort,
+        speed=speed,
+        speed_unit=found.unit,
+        fraction=spec.fraction,
+        source=spec.source,
+        reads=reads,
         velocity_per_rate=velocity,
-    )  # fmt: skip
+    )
 
 
 def _choose_speed(found: MotorFriction, effort: float, loop: FrictionLoop | None) -> float:
     """Return the plant's own smoothing, or twice what stability is shown for where that is more."""
-    own = found.smoothing or 0.0
+    smoothing = found.smoothing or 0.0
     if loop is None:
-        return own
+        return smoothing
     reading = SpeedReading(velocity=loop.velocity[found.index], differenced=True)
-    margin = compensation_margin(loop, reading, effort / own if own else 1.0)
+    margin = compensation_margin(loop, reading, effort / smoothing if smoothing else 1.0)
     if not margin.slope:
         raise ControlError(
             "compensate.friction: no compensation from the measured speed is shown to be stable on the design plant "
             f'({margin.multiplier}); take from = "reference", or state the speed over which it rises yourself'
         )
-    return max(own, SAFETY * effort / margin.slope)
+    return max(smoothing, SAFETY * effort / margin.slope)
 
 
 def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
     """Return the output that is the motor's position.
 
-    Parameters
-    ----------
-    plant : Plant
-        Any.
-    wanted : str
-        What would be compensated by it, for the message.
-    otherwise : str
-        What else there is to do, for the message.
+    `wanted`: what would be compensated by it, for the message. `otherwise`: what else there is to do, for the message.
 
-    Raises
-    ------
-    ControlError
-        The plant has none.
-
+    Raises ControlError: the plant has none.
     """
     position = plant.sensing.motor_position if plant.sensing is not None else None
     if position is None or position not in plant.outputs:
@@ -195,11 +159,7 @@ def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
 def find_reading(plant: Plant, params: ParameterSet, output: str, found: MotorFriction) -> float:
     """Return the velocity at a friction per rate of an output that moves with it.
 
-    Raises
-    ------
-    ControlError
-        The output moves otherwise than the friction does.
-
+    Raises ControlError: the output moves otherwise than the friction does.
     """
     values = plant.complete(params)
     x, u = find_rest(plant, values)
@@ -220,10 +180,7 @@ def find_velocity_per_rate(plant: Plant, params: ParameterSet, regulated: str, n
     With the plant :math:`\dot x = A x + b u`, y = c x and the velocity v x, slowly
     :math:`v x / \dot y = v A^{-2} b / (c A^{-1} b)`: of a spring k between motor and link it is 1/k and the gear.
 
-    Raises
-    ------
-    ControlError
-        The plant with its link held has no stiffness, or its friction does not move.
+    Raises ControlError: the plant with its link held has no stiffness, or its friction does not move.
 
     Examples
     --------
@@ -232,17 +189,17 @@ def find_velocity_per_rate(plant: Plant, params: ParameterSet, regulated: str, n
     655000.0
 
     """
-    held = plant
-    while held.port is not None and held.port.held is not None:
-        held = held.port.held()
-    held = leave_out_drift(freeze_heat(held), regulated)
-    values = held.complete(params)
-    a, b, c, _ = state_space(friction_states(held)[SLIDING], values)
-    x, u = find_rest(held, values)
+    locked = plant
+    while locked.port is not None and locked.port.held is not None:
+        locked = locked.port.held()
+    locked = leave_out_drift(freeze_heat(locked), regulated)
+    values = locked.complete(params)
+    a, b, c, _ = state_space(friction_states(locked)[SLIDING], values)
+    x, u = find_rest(locked, values)
     try:
         first = np.linalg.solve(a, b[:, 0])
-        velocity = np.array(friction_matrices(held)(x, u, values.vector)[2])[list(held.friction).index(name)]
-        ratio = float(velocity @ np.linalg.solve(a, first) / (c[list(held.outputs).index(regulated)] @ first))
+        velocity = np.array(friction_matrices(locked)(x, u, values.vector)[2])[list(locked.friction).index(name)]
+        ratio = float(velocity @ np.linalg.solve(a, first) / (c[list(locked.outputs).index(regulated)] @ first))
     except (np.linalg.LinAlgError, ValueError, ZeroDivisionError):
         ratio = np.nan
     if not np.isfinite(ratio) or ratio == 0.0:

@@ -28,22 +28,12 @@ LEVERED = math.pi / 3  # how far a link on a lever arm is, which vanishes at 90 
 NOTHING = 1e-9  # of an effort, N or N m, that is none
 
 
-def make_gravity_term(plant: Plant, params: ParameterSet, regulated: str, asked: CompensateGravity) -> GravityTerm:
+def make_gravity_term(plant: Plant, params: ParameterSet, regulated: str, spec: CompensateGravity) -> GravityTerm:
     """Return the compensation of the weight of a plant's link.
 
-    Parameters
-    ----------
-    plant, params
-        A plant whose link moves, and its parameters.
-    regulated : str
-        The output that the reference is of.
-    asked : CompensateGravity
-        The fraction.
+    `plant`, `params`: a plant whose link moves, and its parameters. `regulated`: the output that the reference is of.
 
-    Raises
-    ------
-    ControlError
-        The plant holds its link, no output is its position, or it rests without effort.
+    Raises ControlError: the plant holds its link, no output is its position, or it rests without effort.
 
     Examples
     --------
@@ -79,8 +69,8 @@ def make_gravity_term(plant: Plant, params: ParameterSet, regulated: str, asked:
         if np.max(np.abs(chebval(scaled, shorter) - efforts)) <= ACCURACY * largest:
             series = shorter
             break
-    coefficients = tuple(float(asked.fraction * one) for one in series)
-    return GravityTerm(coefficients=coefficients, low=low, high=high, reads=reads, unit=unit, fraction=asked.fraction)
+    coefficients = tuple(float(spec.fraction * coefficient) for coefficient in series)
+    return GravityTerm(coefficients=coefficients, low=low, high=high, reads=reads, unit=unit, fraction=spec.fraction)
 
 
 def _rest_at(

@@ -10,22 +10,13 @@ from seaopt.errors import ControlError
 from seaopt.plants import Plant
 
 
-def make_ripple_term(plant: Plant, per_effort: float, asked: CompensateRipple) -> RippleTerm:
+def make_ripple_term(plant: Plant, per_effort: float, spec: CompensateRipple) -> RippleTerm:
     """Return the compensation of ripple over a plant's motor position.
 
-    Parameters
-    ----------
-    plant : Plant
-        Any whose motor position is an output.
-    per_effort : float
-        The command for one unit of effort.
-    asked : CompensateRipple
-        Coefficients in the command's unit.
+    `plant`: any whose motor position is an output. `per_effort`: the command for one unit of effort. `asked`:
+    coefficients in the command's unit.
 
-    Raises
-    ------
-    ControlError
-        No output is the motor's position, or it is not in rad and no period is given.
+    Raises ControlError: no output is the motor's position, or it is not in rad and no period is given.
 
     Examples
     --------
@@ -37,13 +28,13 @@ def make_ripple_term(plant: Plant, per_effort: float, asked: CompensateRipple) -
     """
     reads = find_motor_position(plant, "ripple")
     unit = plant.outputs[reads]
-    period = asked.period if asked.period is not None or unit != "rad" else 2.0 * math.pi
+    period = spec.period if spec.period is not None or unit != "rad" else 2.0 * math.pi
     if period is None:
         raise ControlError(
             f"compensate.ripple: {reads} of {plant.name} is in {unit}, of which no revolution is known; give what it "
             "moves in one: ripple = { period = 0.002, ... }"
         )
-    cos, sin = (tuple(asked.fraction * one / per_effort for one in values) for values in (asked.cos, asked.sin))
+    cos, sin = (tuple(spec.fraction * value / per_effort for value in values) for values in (spec.cos, spec.sin))
     return RippleTerm(
-        cycles=asked.cycles, cos=cos, sin=sin, period=period, reads=reads, unit=unit, fraction=asked.fraction
+        cycles=spec.cycles, cos=cos, sin=sin, period=period, reads=reads, unit=unit, fraction=spec.fraction
     )

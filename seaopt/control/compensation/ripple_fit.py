@@ -88,9 +88,7 @@ class RippleFit:
 
     def compensation(self, fraction: float = RIPPLE_FRACTION) -> CompensateRipple:
         """Return what to ask of `add_compensation`, with the log's period."""
-        return CompensateRipple(
-            cycles=self.cycles, cos=self.cos, sin=self.sin, fraction=fraction, period=self.period
-        )  # fmt: skip
+        return CompensateRipple(cycles=self.cycles, cos=self.cos, sin=self.sin, fraction=fraction, period=self.period)
 
     def to_toml(self, fraction: float = RIPPLE_FRACTION) -> str:
         """Return the line for [controller] of a problem file."""
@@ -100,14 +98,17 @@ class RippleFit:
 
     def __repr__(self) -> str:
         rows = zip(self.cycles, self.cos, self.cos_std, self.sin, self.sin_std, strict=True)
-        return "\n".join([
-            f"Ripple over {self.period:.6g} per revolution, {self.unit}, of {self.samples} samples",
-            *(
-                f"  {n} cycles: cos {cos:.4g} +- {cos_std:.2g}, sin {sin:.4g} +- {sin_std:.2g}"
-                for n, cos, cos_std, sin, sin_std in rows
-            ),
-            f"  Coulomb friction {self.coulomb:.4g} +- {self.coulomb_std:.2g}, left over {self.residual_std:.3g} rms",
-        ])  # fmt: skip
+        return "\n".join(
+            [
+                f"Ripple over {self.period:.6g} per revolution, {self.unit}, of {self.samples} samples",
+                *(
+                    f"  {n} cycles: cos {cos:.4g} +- {cos_std:.2g}, sin {sin:.4g} +- {sin_std:.2g}"
+                    for n, cos, cos_std, sin, sin_std in rows
+                ),
+                f"  Coulomb friction {self.coulomb:.4g} +- {self.coulomb_std:.2g}, "
+                f"left over {self.residual_std:.3g} rms",
+            ]
+        )
 
 
 @record(eq=False)
@@ -120,10 +121,16 @@ class _Solution:
 
 
 def identify_ripple(
-    log: Log, *, command: str = "I", angle: str = "theta_m", force: str | None = None,
-    cycles: Sequence[int] | None = None, highest: int = DEFAULT_HIGHEST, period: float | None = None,
+    log: Log,
+    *,
+    command: str = "I",
+    angle: str = "theta_m",
+    force: str | None = None,
+    cycles: Sequence[int] | None = None,
+    highest: int = DEFAULT_HIGHEST,
+    period: float | None = None,
     speed_window_s: float = 0.1,
-) -> RippleFit:  # fmt: skip
+) -> RippleFit:
     """Return the ripple over the motor's angle, of a log in which it turns slowly both ways.
 
     Parameters
@@ -180,15 +187,23 @@ def identify_ripple(
     stds = np.sqrt(np.diag(fit.covariance))
     first, harmonics = len(drag), slice(len(drag), None, 2)
     names = list(drag)
-    known = dict(zip(names, map(float, fit.values[:first]), strict=True))
+    value_of = dict(zip(names, map(float, fit.values[:first]), strict=True))
     return RippleFit(
-        cycles=tuple(wanted), cos=_floats(fit.values[harmonics]), sin=_floats(fit.values[first + 1 :: 2]),
-        cos_std=_floats(stds[harmonics]), sin_std=_floats(stds[first + 1 :: 2]), period=period,
-        unit=log.signal(command).unit, constant=known["constant"], coulomb=known["coulomb"],
+        cycles=tuple(wanted),
+        cos=_floats(fit.values[harmonics]),
+        sin=_floats(fit.values[first + 1 :: 2]),
+        cos_std=_floats(stds[harmonics]),
+        sin_std=_floats(stds[first + 1 :: 2]),
+        period=period,
+        unit=log.signal(command).unit,
+        constant=value_of["constant"],
+        coulomb=value_of["coulomb"],
         coulomb_std=float(stds[names.index("coulomb")]),
-        viscous=(known["forwards"], known["backwards"]) if "forwards" in known else None,
-        per_force=known.get("force"), residual_std=fit.residual_std, samples=int(np.count_nonzero(moves)),
-    )  # fmt: skip
+        viscous=(value_of["forwards"], value_of["backwards"]) if "forwards" in value_of else None,
+        per_force=value_of.get("force"),
+        residual_std=fit.residual_std,
+        samples=int(np.count_nonzero(moves)),
+    )
 
 
 def _floats(values: Float[np.ndarray, " n"]) -> tuple[float, ...]:
@@ -212,22 +227,25 @@ def _find_speed(log: Log, angle: str, window_s: float) -> tuple[Float[np.ndarray
     from scipy.signal import savgol_filter  # deferred: scipy is slow to load
 
     length = max(5, 2 * round(0.5 * require_number(window_s, "speed_window_s", ControlError) / log.period) + 1)
-    speed, known = np.zeros(len(log)), np.zeros(len(log), dtype=bool)
+    speed, has_speed = np.zeros(len(log)), np.zeros(len(log), dtype=bool)
     for stretch in log.segments:
         if stretch.stop - stretch.start > length:
             speed[stretch] = savgol_filter(log[angle][stretch], length, 2, deriv=1, delta=log.period)
-            known[stretch] = True
-    if not np.any(known):
+            has_speed[stretch] = True
+    if not np.any(has_speed):
         raise ControlError(
             f"speed_window_s = {window_s:g}: no stretch of {log.source} is as long; give a shorter window"
         )
-    return speed, known & (np.abs(speed) > SLOWEST * np.quantile(np.abs(speed[known]), 0.9))
+    return speed, has_speed & (np.abs(speed) > SLOWEST * np.quantile(np.abs(speed[has_speed]), 0.9))
 
 
 def _require_revolutions(
-    turns: Float[np.ndarray, " n"], speed: Float[np.ndarray, " n"], moves: Bool[np.ndarray, " n"], highest: int,
+    turns: Float[np.ndarray, " n"],
+    speed: Float[np.ndarray, " n"],
+    moves: Bool[np.ndarray, " n"],
+    highest: int,
     source: str,
-) -> None:  # fmt: skip
+) -> None:
     """Refuse a log that does not pass every part of a revolution in both directions."""
     bins = max(LEAST_BINS, BINS_PER_CYCLE * highest)
     for word, sign in (("forwards", 1.0), ("backwards", -1.0)):
@@ -247,16 +265,19 @@ def _list_drag(
     """Return the terms besides the ripple: a constant, friction by direction, and what is regulated."""
     forwards, backwards = np.maximum(speed, 0.0), np.minimum(speed, 0.0)
     drag = {"constant": np.ones_like(speed), "coulomb": np.sign(speed)}
-    ways = [one[moves & (one != 0.0)] for one in (forwards, backwards)]
+    ways = [direction[moves & (direction != 0.0)] for direction in (forwards, backwards)]
     if all(np.std(way) > VARIES * abs(np.mean(way)) for way in ways):
         drag |= {"forwards": forwards, "backwards": backwards}
     return drag if force is None else drag | {"force": log[force]}
 
 
 def _regress(
-    command: Float[np.ndarray, " n"], drag: dict[str, Float[np.ndarray, " n"]], turns: Float[np.ndarray, " n"],
-    cycles: Sequence[int], moves: Bool[np.ndarray, " n"],
-) -> _Solution:  # fmt: skip
+    command: Float[np.ndarray, " n"],
+    drag: dict[str, Float[np.ndarray, " n"]],
+    turns: Float[np.ndarray, " n"],
+    cycles: Sequence[int],
+    moves: Bool[np.ndarray, " n"],
+) -> _Solution:
     """Return least squares of the samples that move, with the covariance of a coloured residual."""
     angles = 2.0 * np.pi * (turns % 1.0)
     columns = [*drag.values(), *(wave(n * angles) for n in cycles for wave in (np.cos, np.sin))]
@@ -305,8 +326,8 @@ def _select(fit: _Solution, first: int, cycles: Sequence[int], source: str) -> l
     """Return the harmonics that differ from chance, by Wald's test at 1 % over all of them."""
     found: list[int] = []
     for i, n in enumerate(cycles):
-        own = slice(first + 2 * i, first + 2 * i + 2)
-        wald = fit.values[own] @ np.linalg.solve(fit.covariance[own, own], fit.values[own])
+        pair = slice(first + 2 * i, first + 2 * i + 2)
+        wald = fit.values[pair] @ np.linalg.solve(fit.covariance[pair, pair], fit.values[pair])
         if math.exp(-0.5 * wald) < CHANCE / len(cycles):
             found.append(n)
     if not found:

@@ -78,9 +78,13 @@ def _make_environment() -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
     return Environment(
-        autoescape=select_autoescape(default=False), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-        undefined=StrictUndefined, loader=PackageLoader("seaopt.control.deploy"),
-    )  # fmt: skip
+        autoescape=select_autoescape(default=False),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+        loader=PackageLoader("seaopt.control.deploy"),
+    )
 
 
 def describe_timing(stored: Mapping[str, Any]) -> dict[str, Any]:

@@ -126,10 +126,16 @@ def export(
                 "the reading, or lower the command's limit, before the step"
             )
         return export_schedule(
-            controller, folder, precision=precision, name=name, current_limit_A=current_limit_A,
-            command_limit=command_limit, tracking_time_s=tracking_time_s, allow_infeasible=allow_infeasible,
+            controller,
+            folder,
+            precision=precision,
+            name=name,
+            current_limit_A=current_limit_A,
+            command_limit=command_limit,
+            tracking_time_s=tracking_time_s,
+            allow_infeasible=allow_infeasible,
             fit_met=fit_met,
-        )  # fmt: skip
+        )
     if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
     prefix = check_prefix(name)
@@ -147,7 +153,7 @@ def export(
             )
         stored, figures, heat = read_controller(controller), _stated(controller), read_guard(controller)
         fit_met = controller.get("fit_met", True) is True if fit_met is None else fit_met
-    if not stored["feasible"] and not allow_infeasible:
+    if not stored["met"] and not allow_infeasible:
         missed = join_labels(stored["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
     check_command_limits(current_limit_A, command_limit)
@@ -180,13 +186,8 @@ def export(
 def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard | None:
     """Return the heat guard of a controller.json, where it has one, made again from its network with a margin.
 
-    Raises
-    ------
-    FileError
-        The file's own guard is not that of its network.
-    ControlError
-        A number is missing or out of range.
-
+    Raises FileError: the file's own guard is not that of its network.
+    Raises ControlError: a number is missing or out of range.
     """
     heat = content.get("heat")
     guard = heat.get("guard") if isinstance(heat, Mapping) else None
@@ -234,9 +235,12 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
 
 
 def _law(
-    stored: Mapping[str, Any], limit: float | None, tracking_time_s: float | None,
-    gate: PlausibilityGate | None, heat: HeatGuard | None,
-) -> RunnableLaw:  # fmt: skip
+    stored: Mapping[str, Any],
+    limit: float | None,
+    tracking_time_s: float | None,
+    gate: PlausibilityGate | None,
+    heat: HeatGuard | None,
+) -> RunnableLaw:
     return realise(
         stored["law"],
         per_effort=stored["command"].per_effort,
@@ -262,7 +266,7 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
         "suffix": re.sub("[^A-Za-z0-9]+", "_per_", command.reference_unit.replace(" ", "")).strip("_"),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
         **describe_timing(stored),
-        "feasible": stored["feasible"],
+        "feasible": stored["met"],
         "blocking": strip_markup(join_labels(stored["active_constraints"])),
         "limited": math.isfinite(law.current_limit_A),
         "order": law.c.size,
@@ -401,10 +405,15 @@ def _write_gravity(compensation: Compensation | None, number: Callable[[float], 
     term = compensation.gravity
     middle, scale, *coefficients = term.numbers
     return {
-        "middle": number(middle), "scale": number(scale), "terms": len(coefficients),
-        "coefficients": ", ".join(map(number, coefficients)), "read": f"read_{identifier(term.reads)}",
-        "output": strip_markup(term.reads), "unit": term.unit, "percent": f"{100.0 * term.fraction:.3g}",
-    }  # fmt: skip
+        "middle": number(middle),
+        "scale": number(scale),
+        "terms": len(coefficients),
+        "coefficients": ", ".join(map(number, coefficients)),
+        "read": f"read_{identifier(term.reads)}",
+        "output": strip_markup(term.reads),
+        "unit": term.unit,
+        "percent": f"{100.0 * term.fraction:.3g}",
+    }
 
 
 def _write_ripple(compensation: Compensation | None, number: Callable[[float], str]) -> dict[str, Any]:
@@ -415,14 +424,23 @@ def _write_ripple(compensation: Compensation | None, number: Callable[[float], s
     series = {n: (cos, sin) for n, cos, sin in zip(term.cycles, term.cos, term.sin, strict=True)}
     rows = [series.get(n, (0.0, 0.0)) for n in range(1, max(term.cycles) + 1)]
     return {
-        "terms": len(rows), "cos": ", ".join(number(one) for one, _ in rows),
-        "sin": ", ".join(number(one) for _, one in rows), "per_unit": number(1.0 / term.period),
-        "quarter": number(0.5 * math.pi), "most": number(MOST_TURNS), "sine": ", ".join(map(number, SINE)),
-        "cosine": ", ".join(map(number, COSINE)), "sine_terms": len(SINE), "cosine_terms": len(COSINE),
-        "cycles": ", ".join(map(str, term.cycles)), "read": f"read_{identifier(term.reads)}",
-        "output": strip_markup(term.reads), "unit": term.unit, "period": f"{term.period:.6g}",
+        "terms": len(rows),
+        "cos": ", ".join(number(one) for one, _ in rows),
+        "sin": ", ".join(number(one) for _, one in rows),
+        "per_unit": number(1.0 / term.period),
+        "quarter": number(0.5 * math.pi),
+        "most": number(MOST_TURNS),
+        "sine": ", ".join(map(number, SINE)),
+        "cosine": ", ".join(map(number, COSINE)),
+        "sine_terms": len(SINE),
+        "cosine_terms": len(COSINE),
+        "cycles": ", ".join(map(str, term.cycles)),
+        "read": f"read_{identifier(term.reads)}",
+        "output": strip_markup(term.reads),
+        "unit": term.unit,
+        "period": f"{term.period:.6g}",
         "percent": f"{100.0 * term.fraction:.3g}",
-    }  # fmt: skip
+    }
 
 
 def _list_resets(compensation: Compensation | None, others: Sequence[str]) -> list[str]:

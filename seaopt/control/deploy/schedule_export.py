@@ -59,25 +59,10 @@ def export_schedule(
 ) -> tuple[Path, ...]:
     """Write a scheduled controller as C99: NAME.h and NAME.c.
 
-    Parameters
-    ----------
-    schedule : ScheduledController or mapping
-        The schedule, or the content of its schedule.json.
-    folder, precision, name, current_limit_A, command_limit, tracking_time_s, allow_infeasible, fit_met
-        As in `seaopt.export`.
+    `schedule`: the schedule, or the content of its schedule.json.
 
-    Returns
-    -------
-    tuple of Path
-        The files.
-
-    Raises
-    ------
-    ControlError
-        The schedule is not feasible, or an argument is out of range.
-    FileError
-        The content is malformed or contradicts itself, or the folder cannot be written.
-
+    Raises ControlError: the schedule is not feasible, or an argument is out of range.
+    Raises FileError: the content is malformed or contradicts itself, or the folder cannot be written.
     """
     if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
@@ -94,9 +79,12 @@ def export_schedule(
     if not isinstance(schedule, ScheduledController):
         fit_met = content.get("fit_met", True) is True if fit_met is None else fit_met
     context = _describe(content, law, first, precision) | {
-        "name": prefix, "NAME": prefix.upper(), "precision": precision, "fit_met": fit_met,
+        "name": prefix,
+        "NAME": prefix.upper(),
+        "precision": precision,
+        "fit_met": fit_met,
         "raised_from": strip_markup(find_raised_limit(first["command"], first["spec"], limit)),
-    }  # fmt: skip
+    }
     texts = {pattern.format(prefix): render(template, context) for pattern, template in TEMPLATES.items()}
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
 
@@ -106,13 +94,8 @@ def read_runnable(
 ) -> tuple[RunnableSchedule, dict[str, Any]]:
     """Return the law of a schedule.json ready to run, and the fields of its first controller.
 
-    Raises
-    ------
-    ControlError
-        A number is out of range.
-    FileError
-        The content is malformed or contradicts itself.
-
+    Raises ControlError: a number is out of range.
+    Raises FileError: the content is malformed or contradicts itself.
     """
     from seaopt.control.laws.stored import read_controller  # deferred: pydantic
     from seaopt.control.scheduling.stored import read_schedule
@@ -129,13 +112,19 @@ def read_runnable(
             )
     law = make_runnable(
         GainTable(
-            over=table.over, unit=table.unit, points=np.array(table.points),
-            gains={name: np.array(table.gains[name]) for name in LAW_GAINS}, structure=first["structure"],
+            over=table.over,
+            unit=table.unit,
+            points=np.array(table.points),
+            gains={name: np.array(table.gains[name]) for name in LAW_GAINS},
+            structure=first["structure"],
             sample_time_s=first["sample_time_s"],
         ),
-        per_effort=command.per_effort, limit=choose_limit(command, first["spec"], limit), fallback=table.fallback,
-        tracking_time_s=tracking_time_s, command=(command.input, command.unit),
-    )  # fmt: skip
+        per_effort=command.per_effort,
+        limit=choose_limit(command, first["spec"], limit),
+        fallback=table.fallback,
+        tracking_time_s=tracking_time_s,
+        command=(command.input, command.unit),
+    )
     if tracking_time_s is None and not np.allclose(law.anti_windup, table.anti_windup, rtol=AGREES, atol=0.0):
         raise FileError("schedule.json: anti_windup is not what the gains give; tune again")
     return law, first
@@ -172,9 +161,7 @@ def _describe(
         "count": table.points.size,
         "points": ", ".join(number(float(value)) for value in table.points),
         "columns": [f"{key}{f' [{units[key]}]' if key in units else ''}" for key in COLUMNS],
-        "rows": [
-            ", ".join(number(float(rows[key][i])) for key in COLUMNS) for i in range(table.points.size)
-        ],
+        "rows": [", ".join(number(float(rows[key][i])) for key in COLUMNS) for i in range(table.points.size)],
         "fallback": number(law.fallback),
         "period": number(table.sample_time_s),
         "half_period": number(0.5 * table.sample_time_s),
@@ -182,4 +169,4 @@ def _describe(
         "effort_limit": number(min(most, largest)),
         "command_limit": number(min(law.limit, largest)),
         "per_effort": number(law.per_effort),
-    }  # fmt: skip
+    }

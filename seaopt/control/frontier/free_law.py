@@ -169,21 +169,26 @@ def bound_free_law(
         raise ControlError(f"functions = {functions!r} is not a number of functions; give 1 or more")
     if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) > GROWING:
         return FreeLaw(status="unstable plant", objective=spec.objective)
-    own = [law for law in laws if _is_stable(plant, law)]
+    stable = [law for law in laws if _is_stable(plant, law)]
     f = _place(spec)
-    terms = _make_terms(plant, spec, own, _add_rest(spec, f), functions)
+    terms = _make_terms(plant, spec, stable, _add_rest(spec, f), functions)
     nodes, weights = _place_nodes(spec, f)
-    integral = _Integral(terms=_make_terms(plant, spec, own, nodes, functions), weights=weights)
+    integral = _Integral(terms=_make_terms(plant, spec, stable, nodes, functions), weights=weights)
     answer = _Program(spec, terms, integral).solve()
     if isinstance(answer, str):
         return FreeLaw(status=answer, objective=spec.objective, functions=terms.basis.shape[1], frequencies=f.size)
     value, x = answer
     fine = np.unique(np.concatenate([f, *(f[:-1] + share * np.diff(f) for share in np.arange(1, FINER) / FINER)]))
-    reached, missed = _look_again(spec, _make_terms(plant, spec, own, _add_rest(spec, fine), functions), integral, x)
+    reached, missed = _look_again(spec, _make_terms(plant, spec, stable, _add_rest(spec, fine), functions), integral, x)
     return FreeLaw(
-        status="optimal", objective=spec.objective, bound=value, reached=reached, missed=missed,
-        functions=terms.basis.shape[1], frequencies=f.size,
-    )  # fmt: skip
+        status="optimal",
+        objective=spec.objective,
+        bound=value,
+        reached=reached,
+        missed=missed,
+        functions=terms.basis.shape[1],
+        frequencies=f.size,
+    )
 
 
 def _is_stable(plant: DigitalPlant, law: Law) -> bool:
@@ -255,13 +260,13 @@ class _Program:
         loop = -terms.p[:, None] * basis  # of S
         self.integrates = spec.structure != "pd"
         some = slice(1, None) if self.integrates else slice(None)
-        f, one = terms.f[some], np.ones(m - self.integrates)
-        self.limits = [_Modulus(constant=one + 0j, slope=loop[some], level=_s_level(spec, f))]
+        f, ones = terms.f[some], np.ones(m - self.integrates)
+        self.limits = [_Modulus(constant=ones + 0j, slope=loop[some], level=_s_level(spec, f))]
         mt, disk, noise = (spec.level(name) for name in ("max_complementary", "min_disk_margin", "max_noise_gain"))
         if mt is not None:
-            self.limits.append(_Modulus(constant=0j * one, slope=-loop[some], level=mt * one))
+            self.limits.append(_Modulus(constant=0j * ones, slope=-loop[some], level=mt * ones))
         if disk is not None:
-            self.limits.append(_Modulus(constant=one + 0j, slope=2.0 * loop[some], level=2.0 / disk * one))
+            self.limits.append(_Modulus(constant=ones + 0j, slope=2.0 * loop[some], level=2.0 / disk * ones))
         if noise is not None and not self.noise:
             self.limits.append(_Modulus(constant=np.zeros(m) + 0j, slope=basis, level=np.full(m, float(noise))))
         self.zero = loop[0].real if self.integrates else np.zeros(n)
@@ -269,8 +274,8 @@ class _Program:
             self.weights, self.owner = np.ones(1), np.zeros(m, dtype=int)
             self.aim = _Modulus(constant=np.zeros(m) + 0j, slope=basis, level=np.zeros(m))
         else:
-            self.weights, own = np.sum(integral.weights, axis=1), integral.terms
-            mean = integral.add_up(-own.p[:, None] * (own.basis @ self.turn)) / self.weights[:, None]
+            self.weights, objective = np.sum(integral.weights, axis=1), integral.terms
+            mean = integral.add_up(-objective.p[:, None] * (objective.basis @ self.turn)) / self.weights[:, None]
             self.owner = np.arange(self.weights.size)
             self.aim = _Modulus(constant=np.ones(self.weights.size) + 0j, slope=mean, level=0.0 * self.weights)
         self.rows: list[Float[np.ndarray, "r v"]] = []
@@ -279,9 +284,9 @@ class _Program:
     def solve(self) -> tuple[float, Float[np.ndarray, " n"]] | Literal["impossible", "no answer"]:
         """Return the optimum and the coefficients; or why there are none."""
         for psi in 2 * np.pi * np.arange(FIRST_DIRECTIONS) / FIRST_DIRECTIONS:
-            for one in (*self.limits, self.aim):
-                chosen = np.arange(0, one.level.size, 3)
-                self._cut(one, chosen, np.full(chosen.size, psi))
+            for limit in (*self.limits, self.aim):
+                chosen = np.arange(0, limit.level.size, 3)
+                self._cut(limit, chosen, np.full(chosen.size, psi))
         n, t = self.turn.shape[1], self.weights.size
         x, bound = np.zeros(n), np.zeros(t)
         for _ in range(MOST_CUTS):
@@ -303,9 +308,14 @@ class _Program:
         result: Any = None
         for method in ("highs-ds", "highs-ipm"):  # the simplex is quicker; where it loses its way, the other one
             result = linprog(
-                cost, A_ub=rows, b_ub=np.concatenate(ends), bounds=[(None, None)] * n + [(0.0, None)] * t,
-                method=method, options={"time_limit": LONGEST_S}, **equal,
-            )  # fmt: skip
+                cost,
+                A_ub=rows,
+                b_ub=np.concatenate(ends),
+                bounds=[(None, None)] * n + [(0.0, None)] * t,
+                method=method,
+                options={"time_limit": LONGEST_S},
+                **equal,
+            )
             if result.status == OPTIMAL:
                 return np.asarray(result.x)
         return "impossible" if result.status == INFEASIBLE else "no answer"
@@ -313,12 +323,12 @@ class _Program:
     def _add_cuts(self, x: Float[np.ndarray, " n"], bound: Float[np.ndarray, " t"]) -> bool:
         """Add the directions in which the answer breaks a limit, or its own objective; tell whether there are any."""
         added = False
-        for one in self.limits:
-            value = one.constant + one.slope @ x
-            beyond = np.flatnonzero(np.abs(value) > one.level * (1.0 + TOLERANCE))
+        for limit in self.limits:
+            value = limit.constant + limit.slope @ x
+            beyond = np.flatnonzero(np.abs(value) > limit.level * (1.0 + TOLERANCE))
             if beyond.size:
-                beyond = beyond[np.argsort(-np.abs(value[beyond]) / one.level[beyond])][:CUTS_AT_ONCE]
-                self._cut(one, beyond, np.angle(value[beyond]))
+                beyond = beyond[np.argsort(-np.abs(value[beyond]) / limit.level[beyond])][:CUTS_AT_ONCE]
+                self._cut(limit, beyond, np.angle(value[beyond]))
                 added = True
         value, total = self.aim.constant + self.aim.slope @ x, float(self.weights @ bound)
         short = np.abs(value) - bound[self.owner]
@@ -332,15 +342,15 @@ class _Program:
             self._cut(self.aim, beyond, np.angle(value[beyond]))
         return added or bool(beyond.size)
 
-    def _cut(self, one: _Modulus, at: Any, psi: Float[np.ndarray, " k"]) -> None:
+    def _cut(self, limit: _Modulus, at: Any, psi: Float[np.ndarray, " k"]) -> None:
         """Add Re exp(-j psi) (constant + slope x) <= level, in units of the level."""
         turn, t = np.exp(-1j * psi), self.weights.size
-        rows, ends = np.real(turn[:, None] * one.slope[at]), one.level[at] - np.real(turn * one.constant[at])
+        rows, ends = np.real(turn[:, None] * limit.slope[at]), limit.level[at] - np.real(turn * limit.constant[at])
         extra = np.zeros((psi.size, t))
-        if one is self.aim:
+        if limit is self.aim:
             extra[np.arange(psi.size), self.owner[at]] = -1.0
         else:
-            rows, ends = rows / one.level[at][:, None], ends / one.level[at]
+            rows, ends = rows / limit.level[at][:, None], ends / limit.level[at]
         self.rows.append(np.hstack([rows, extra]))
         self.ends.append(ends)
 
@@ -368,4 +378,4 @@ def _look_again(
         usage.append(np.abs(2.0 * s - 1.0) * disk / 2.0)
     noise = spec.objective == "noise"
     value = np.max(np.abs(every)) if noise else np.sum(integral.weights.ravel() * np.abs(integral.terms.s(x)))
-    return float(value), max(0.0, max(float(np.max(one)) for one in usage) - 1.0)
+    return float(value), max(0.0, max(float(np.max(curve)) for curve in usage) - 1.0)

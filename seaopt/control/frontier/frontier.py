@@ -13,7 +13,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
+from seaopt.control.laws.verdict import judge_all, list_broken
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
@@ -29,13 +29,12 @@ from seaopt.control.tuning.tuner import (
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor, map_ordered
-from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_table
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.progress import Progress, divide, ignore, prefix
-from seaopt.records import PlotAccessor, Result, record
+from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.units import LINEAR, Mechanics
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
@@ -44,90 +43,55 @@ CHAIN = 4  # bandwidths of which each starts from the one before: chains are ind
 
 
 @record
-class SlidingAlone:
-    """The best law for the sliding plants alone: feasible, its noise gain, and its disturbance, as in a row."""
+class SlidingAlone(Result):
+    """The best law for the sliding plants alone: whether limits are met, noise gain and disturbance, as in a row."""
 
-    feasible: bool
+    met: bool
     noise_gain: float
     disturbance: float
 
 
 @record
 class FrontierRow(Result):
-    """One bandwidth; what is not said to be of the worst plant is of the design plant.
-
-    Parameters
-    ----------
-    bandwidth_hz : float
-        Asked.
-    feasible : bool
-        Whether every limit is met; if not, the figures are those of the controller that misses them least.
-    noise_gain : float
-        N/N.
-    ms, ms_plant : float, str
-        Largest Ms of all plants, and whose it is.
-    disturbance : float
-        Integral over ln f of abs(S) from 0.1 Hz to the bandwidth, worst plant.
-    sensitivity_bandwidth_hz : float
-        abs(S) stays below -3 dB up to here.
-    phase_margin_deg, disk_margin
-        As in `LoopFigures`.
-    force_limit_N : float or None
-        Largest amplitude of the reference at the bandwidth before the current saturates; None without a limit.
-    blocked_by : tuple of str
-        The limits that are broken.
-    without_sticking : SlidingAlone or None
-        What could be had if no plant ever stuck; None where none has friction. The difference is what friction costs.
-    free_law : FreeLaw or None
-        The best that any linear law could do on the design plant; None where it was not asked for. The difference to
-        the disturbance, or with that objective to the noise gain, is what the structure costs, at most.
-
-    """
+    """One bandwidth; what is not said to be of the worst plant is of the design plant."""
 
     bandwidth_hz: float
-    feasible: bool
-    noise_gain: float
-    ms: float
+    met: bool  # whether every limit is met; if not, the figures are those of the controller that misses them least
+    noise_gain: float  # N/N
+    ms: float  # ms, ms_plant: largest Ms of all plants, and whose it is
     ms_plant: str
-    disturbance: float
-    sensitivity_bandwidth_hz: float
-    phase_margin_deg: float | None
+    disturbance: float  # integral over ln f of abs(S) from 0.1 Hz to the bandwidth, worst plant
+    sensitivity_bandwidth_hz: float  # abs(S) stays below -3 dB up to here
+    phase_margin_deg: float | None  # phase_margin_deg, disk_margin: as in `LoopFigures`
     disk_margin: float
+    # largest amplitude of the reference at the bandwidth before the current saturates; None without a limit
     force_limit_N: float | None
-    blocked_by: tuple[str, ...]
+    blocked_by: tuple[str, ...]  # the limits that are broken
+    # what could be had if no plant ever stuck; None where none has friction. The difference is what friction costs
     without_sticking: SlidingAlone | None = None
+    # the best that any linear law could do on the design plant; None where it was not asked for. The difference to the
+    # disturbance, or with that objective to the noise gain, is what the structure costs, at most
     free_law: FreeLaw | None = None
 
-    @property
-    def met(self) -> bool:
-        """Whether every limit is met."""
-        return self.feasible
-
-    def describe_structure_cost(self) -> str:
-        """Return a free law's value of the objective and by how much this is above, or that none keeps the limits."""
-        free = self.free_law
-        if free is None or free.bound is None:
-            return "impossible" if free is not None and free.status == "impossible" else MISSING
-        tuned = self.disturbance if free.objective == "disturbance" else self.noise_gain
-        above = f" ({100.0 * (tuned / free.bound - 1.0):+.0f} %)" if self.feasible else ""
-        return f"{format_number(free.bound)}{above}"
-
-    def describe_friction_cost(self) -> str:
-        """Return by how much friction raises the disturbance, or that it alone makes a bandwidth impossible."""
-        alone = self.without_sticking
-        if alone is None or not alone.feasible:
-            return MISSING
-        return f"{100.0 * (self.disturbance / alone.disturbance - 1.0):+.0f} %" if self.feasible else "all of it"
+    def to_dict(self) -> dict[str, Any]:
+        """Return the row of frontier.json."""
+        fields, alone = asdict(self) | {"feasible": self.met}, self.without_sticking
+        return fields if alone is None else fields | {"without_sticking": asdict(alone) | {"feasible": alone.met}}
 
 
-@record(eq=False)
-class Frontier:
+@record(eq=False, repr=False)
+class Frontier(Result, Worded):
     """The rows of a sweep, and their controllers."""
 
     plot = PlotAccessor("seaopt.reporting.plots:FrontierPlots")
 
     rows: tuple[FrontierRow, ...]
     controllers: tuple[Controller, ...]
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met at some bandwidth."""
+        return any(row.met for row in self.rows)
 
     @property
     def mechanics(self) -> Mechanics:
@@ -138,36 +102,10 @@ class Frontier:
         """Return the content of frontier.json (schema seaopt/frontier/1)."""
         return {
             "schema": FRONTIER_SCHEMA,
-            "rows": [asdict(row) for row in self.rows],
+            "met": self.met,
+            "rows": [row.to_dict() for row in self.rows],
             "controllers": [controller.to_dict() for controller in self.controllers],
         }
-
-    def _list_cells(self) -> tuple[tuple[str, ...], list[list[str]]]:
-        """Return the head and the rows of the table."""
-        head = ("Hz", "met", "noise gain", "Ms", "worst", "disturbance", "|S| < -3 dB", "phase margin")
-        called = self.mechanics
-        head = (*head, f"{called.word} limit")
-        sticks = any(row.without_sticking for row in self.rows)
-        free = any(row.free_law for row in self.rows)
-        cells = [
-            [
-                *_cells(row, called.unit),
-                *([row.describe_friction_cost()] if sticks else []),
-                *([row.describe_structure_cost()] if free else []),
-                shorten_blocked(row.blocked_by) if row.blocked_by else "",
-            ]
-            for row in self.rows
-        ]
-        friction = ("cost of friction",) if sticks else ()
-        structure = ("free law",) if free else ()
-        return (*head, *friction, *structure, "blocked by"), cells
-
-    def __repr__(self) -> str:
-        head, cells = self._list_cells()
-        return "\n".join(format_table(cells, head, "><>><>>>>" + ">" * (len(head) - 10)))
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._list_cells()) + self.plot.to_html()
 
 
 def sweep(
@@ -234,13 +172,14 @@ def sweep(
     robust_to = robust_to or {}
     swept = _Sweep(
         task=make_task(plant, params, specs[0], robust_to, draws),
-        sliding=_make_sliding_task(plant, params, specs[0], robust_to, draws), design=(plant, params),
+        sliding=_make_sliding_task(plant, params, specs[0], robust_to, draws),
+        design=(plant, params),
         free_law=free_law,
-    )  # fmt: skip
+    )
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
-    for one, solved in zip(specs, _solve_chains(swept, specs, executor, progress), strict=True):
-        task = feed_link(replace(swept.task, spec=one), solved.link)
+    for point, solved in zip(specs, _solve_chains(swept, specs, executor, progress), strict=True):
+        task = feed_link(replace(swept.task, spec=point), solved.link)
         controller = make_controller(task, solved.x, solved.loops, swept.design)
         row = _row(task, solved.x, solved.loops, controller)
         rows.append(replace(row, without_sticking=solved.without_sticking, free_law=solved.free_law))
@@ -298,31 +237,34 @@ def _solve_part(swept: Shared[_Sweep], chain: Sequence[ControllerSpec]) -> list[
 def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progress) -> Iterator[_Solved]:
     """Yield the solution of each specification; every one but the first also starts from the one before."""
     warm: tuple[LawNumbers, ...] = ()
-    for one, part in zip(chain, divide(progress, *(1.0 for _ in chain)), strict=True):
-        whole, sliding_alone = divide(prefix(part, f"{one.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
-        task = aim_task(swept.task, one)
+    for point, part in zip(chain, divide(progress, *(1.0 for _ in chain)), strict=True):
+        whole, sliding_alone = divide(prefix(part, f"{point.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
+        task = aim_task(swept.task, point)
         task, x, loops = lower_fraction(task, *solve(task, warm, whole))
         x, loops = search(task, x, loops)
-        sliding = feed_link(replace(swept.sliding, spec=one), task.link)
+        sliding = feed_link(replace(swept.sliding, spec=point), task.link)
         alone = _tune_sliding(sliding, x, sliding_alone) if swept.sticks else None
         free = None
         if swept.free_law and isinstance(task.plants[0], DigitalPlant):
-            free = bound_free_law(task.plants[0], one, [task.law_of(x).balanced()])
+            free = bound_free_law(task.plants[0], point, [task.law_of(x).balanced()])
         yield _Solved(x=x, loops=loops, link=task.link, without_sticking=alone, free_law=free)
         warm = (x,)
 
 
 def _make_sliding_task(
-    plant: Plant | MeasuredResponse, params: ParameterSet, spec: ControllerSpec,
-    robust_to: RobustTo, draws: Sequence[Mapping[str, float]],
-) -> Task:  # fmt: skip
+    plant: Plant | MeasuredResponse,
+    params: ParameterSet,
+    spec: ControllerSpec,
+    robust_to: RobustTo,
+    draws: Sequence[Mapping[str, float]],
+) -> Task:
     """Return the task on the sliding plants alone; measured ones are what they are."""
     sliding: dict[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse] = {}
-    for name, one in robust_to.items():
-        if isinstance(one, MeasuredResponse):
-            sliding[name] = one
+    for name, given in robust_to.items():
+        if isinstance(given, MeasuredResponse):
+            sliding[name] = given
             continue
-        model, values = one if isinstance(one, tuple) else (one, params)
+        model, values = given if isinstance(given, tuple) else (given, params)
         sliding[name] = (take_sliding(model, model.complete(values)), values)
     design = plant if isinstance(plant, MeasuredResponse) else take_sliding(plant, plant.complete(params))
     return make_task(design, params, spec, sliding, draws)
@@ -331,36 +273,29 @@ def _make_sliding_task(
 def _tune_sliding(task: Task, start: LawNumbers, progress: Progress) -> SlidingAlone:
     x, loops = solve(task, (start,), progress)
     return SlidingAlone(
-        feasible=not list_broken(judge_all(task.spec, loops)), noise_gain=loops[0].figures.noise_gain,
+        met=not list_broken(judge_all(task.spec, loops)),
+        noise_gain=loops[0].figures.noise_gain,
         disturbance=_worst_disturbance(task, x),
-    )  # fmt: skip
+    )
 
 
 def _worst_disturbance(task: Task, x: LawNumbers) -> float:
     return max(disturbance(task.loop(x, i), task.spec.bandwidth_hz) for i in range(len(task.plants)))
 
 
-def _cells(row: FrontierRow, unit: str) -> list[str]:
-    """Return a row of the table."""
-    return [
-        f"{row.bandwidth_hz:g}",
-        "yes" if row.feasible else "no",
-        *(format_number(value) for value in (row.noise_gain, row.ms)),
-        row.ms_plant,
-        format_number(row.disturbance),
-        format_figure(row.sensitivity_bandwidth_hz, "Hz", 3),
-        MISSING if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f} deg",
-        format_figure(row.force_limit_N, unit),
-    ]
-
-
 def _row(task: Task, x: LawNumbers, loops: list[MeasuredLoop], controller: Controller) -> FrontierRow:
     design, f_b = loops[0].figures, task.spec.bandwidth_hz
     worst = max(loops, key=lambda loop: loop.figures.ms)
     return FrontierRow(
-        bandwidth_hz=f_b, feasible=controller.feasible, noise_gain=design.noise_gain, ms=worst.figures.ms,
-        ms_plant=worst.name, disturbance=_worst_disturbance(task, x),
-        sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz, phase_margin_deg=design.phase_margin_deg,
-        disk_margin=design.disk_margin, force_limit_N=controller.force_limit(f_b),
+        bandwidth_hz=f_b,
+        met=controller.met,
+        noise_gain=design.noise_gain,
+        ms=worst.figures.ms,
+        ms_plant=worst.name,
+        disturbance=_worst_disturbance(task, x),
+        sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz,
+        phase_margin_deg=design.phase_margin_deg,
+        disk_margin=design.disk_margin,
+        force_limit_N=controller.force_limit(f_b),
         blocked_by=controller.blocked_by,
-    )  # fmt: skip
+    )

@@ -100,5 +100,5 @@ def assess(
     task = make_task(plant, plant.complete(values), spec, robust_to, draws)
     loops = task.measure_law(
         given, filter_samples=count_filter_samples(given), integral_rad_s=find_integral_rate(given)
-    )  # fmt: skip
+    )
     return describe_law(task, given, loops, (plant, values), gains={})

@@ -9,20 +9,30 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, Strict, model_validator
 
 from seaopt.control.given.pid_forms import Integral, ideal_pid, parallel_pid
-from seaopt.control.laws.stored import Finite, StoredTransferFunction
 from seaopt.control.laws.structures import AGREES, COMPARED
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import Measured
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.documents import Number, Whole, check_table
+from seaopt.documents import Number, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError
 from seaopt.files import parse_file
 from seaopt.records import record
 
+LARGEST = 1e50  # of a law's numbers: squares of larger ones, and products of three, are beyond a double
+Finite = Annotated[FiniteFloat, Strict()]
 Positive = Annotated[Finite, Field(gt=0.0)]
+
+
+def _bound(value: float) -> float:
+    if abs(value) > LARGEST:
+        raise ValueError(f"should be within ±{LARGEST:g}")
+    return value
+
+
+Bounded = Annotated[Finite, AfterValidator(_bound)]
 # A whole one, in one line.
 LAW_EXAMPLE = "sample_rate_hz = 1000, compute_delay_samples = 1, pid = { k_p = 2.0, k_i = 30.0 }"
 PID_GAINS = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
@@ -64,27 +74,27 @@ class _Strict(BaseModel):
 
 
 class _StateSpace(_Strict):
-    A: list[list[Finite]]
-    B: list[list[Finite]]
-    C: list[list[Finite]]
-    D: list[list[Finite]]
+    A: list[list[Bounded]]
+    B: list[list[Bounded]]
+    C: list[list[Bounded]]
+    D: list[list[Bounded]]
 
 
 class _Pid(_Strict):
     """The gains of a PID, with the names of its form."""
 
     form: Literal["parallel", "ideal"] = "parallel"
-    k_p: Finite | None = None
-    k_i: Finite | None = None
-    k_d: Finite | None = None
-    T_f: Finite | None = None
-    K: Finite | None = None
+    k_p: Bounded | None = None
+    k_i: Bounded | None = None
+    k_d: Bounded | None = None
+    T_f: Bounded | None = None
+    K: Bounded | None = None
     T_i: Positive | None = None
-    T_d: Finite | None = None
+    T_d: Bounded | None = None
     N: Positive | None = None
-    b: Finite = 1.0
-    c: Finite = 1.0
-    feedforward: Finite = 0.0
+    b: Bounded = 1.0
+    c: Bounded = 1.0
+    feedforward: Bounded = 0.0
     integral: Integral = "trapezoid"
 
     @model_validator(mode="after")
@@ -104,14 +114,25 @@ class _Pid(_Strict):
         gains = {name: value for name in names if (value := getattr(self, name)) is not None}
         make: Any = parallel_pid if self.form == "parallel" else ideal_pid
         return make(
-            **gains, sample_time_s=sample_time_s, b=self.b, c=self.c, feedforward=self.feedforward,
+            **gains,
+            sample_time_s=sample_time_s,
+            b=self.b,
+            c=self.c,
+            feedforward=self.feedforward,
             integral=self.integral,
-        )  # fmt: skip
+        )
 
 
 class _Command(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
     per_effort: Positive | None = None
+
+
+class FractionTable(ResultTable):
+    """num(q)/den(q), ascending powers of q = z^-1."""
+
+    num: Annotated[list[Finite], Field(min_length=1)]
+    den: Annotated[list[Finite], Field(min_length=1)]
 
 
 class LawFile(_Strict):
@@ -125,8 +146,8 @@ class LawFile(_Strict):
     output: Literal["effort", "command"] = "effort"
     measured: list[str] | str | None = None
     law: _StateSpace | None = None
-    reference: StoredTransferFunction | None = None
-    measurement: StoredTransferFunction | list[StoredTransferFunction] | None = None
+    reference: FractionTable | None = None
+    measurement: FractionTable | list[FractionTable] | None = None
     pid: _Pid | None = None
     command: _Command = _Command()
     # Of a controller.json; none of them is the law.
@@ -183,10 +204,10 @@ class LawFile(_Strict):
         if self.compute_delay_samples is None:
             whole = float(self.delay_samples or 0.0).is_integer()
             return {"delay_samples": int(self.delay_samples or 0) if whole else self.delay_samples}
-        asked = self.spec if isinstance(self.spec, dict) else {"drive_delay_s": self.drive_delay_s}
-        if asked.get("delay_samples") is not None:  # of a controller.json: its samples are the whole loop's
+        spec = self.spec if isinstance(self.spec, dict) else {"drive_delay_s": self.drive_delay_s}
+        if spec.get("delay_samples") is not None:  # of a controller.json: its samples are the whole loop's
             return {"delay_samples": self.compute_delay_samples}
-        return {"compute_delay_samples": self.compute_delay_samples, "drive_delay_s": asked.get("drive_delay_s")}
+        return {"compute_delay_samples": self.compute_delay_samples, "drive_delay_s": spec.get("drive_delay_s")}
 
     def build(self, source: str) -> GivenLaw:
         """Return the law."""
@@ -202,9 +223,12 @@ class LawFile(_Strict):
                 f"{source}: the law reads {law.d.size - 1} signals, and measured names {len(names)}; name each"
             )
         return GivenLaw(
-            law=law, delays=self.delays, measured=measured, to_command=self.output == "command",
+            law=law,
+            delays=self.delays,
+            measured=measured,
+            to_command=self.output == "command",
             per_effort=self.command.per_effort,
-        )  # fmt: skip
+        )
 
     def _build_law(self, source: str, ts: float) -> Law:
         if self.pid is not None:
@@ -212,10 +236,10 @@ class LawFile(_Strict):
         fractions: list[tuple[str, TransferFunction]] = []
         if self.reference is not None and self.measurement is not None:
             read = self.measurement if isinstance(self.measurement, list) else [self.measurement]
-            named = [("reference", self.reference), *(("measurement", one) for one in read)]
-            fractions = [(name, _normalise(source, name, one)) for name, one in named]
+            named = [("reference", self.reference), *(("measurement", fraction) for fraction in read)]
+            fractions = [(name, _normalise(source, name, fraction)) for name, fraction in named]
         if self.law is None:
-            return Law.from_transfer_functions(fractions[0][1], [one for _, one in fractions[1:]], ts)
+            return Law.from_transfer_functions(fractions[0][1], [fraction for _, fraction in fractions[1:]], ts)
         inputs = max(len(self.law.D[0]) if self.law.D else 0, 2)
         a, b, c, d = (
             _make_matrix(source, name, getattr(self.law, name), len(self.law.A), inputs)
@@ -271,11 +295,19 @@ def read_law(path: Path | str) -> GivenLaw:
     return check_table(LawFile, content, str(source)).build(str(source))
 
 
-def _normalise(source: str, name: str, fraction: StoredTransferFunction) -> TransferFunction:
+def _normalise(source: str, name: str, fraction: FractionTable) -> TransferFunction:
     num, den = np.array(fraction.num), np.array(fraction.den)
     if den[0] == 0.0:
         raise FileError(f"{source}: {name}.den begins with 0; give ascending powers of 1/z, the first not 0")
-    return TransferFunction(num=num / den[0], den=den / den[0])
+    with np.errstate(over="ignore", under="ignore"):
+        num, bottom = num / den[0], den / den[0]
+    largest = np.max(np.abs(num), initial=0.0)
+    if max(largest, np.max(np.abs(bottom))) > LARGEST or (np.any(fraction.num) and largest < 1.0 / LARGEST):
+        raise FileError(
+            f"{source}: {name}.den[0] = {den[0]:g} leaves, divided by it, coefficients beyond {LARGEST:g} or all of "
+            f"num below {1.0 / LARGEST:g}; correct {name}.den or {name}.num"
+        )
+    return TransferFunction(num=num, den=bottom)
 
 
 def _make_matrix(source: str, name: str, rows: list[list[float]], states: int, inputs: int) -> np.ndarray:

@@ -15,9 +15,17 @@ Integral = Literal["trapezoid", "backward", "forward"]
 
 
 def parallel_pid(
-    *, k_p: float, k_i: float = 0.0, k_d: float = 0.0, T_f: float = 0.0, sample_time_s: float, b: float = 1.0,
-    c: float = 1.0, feedforward: float = 0.0, integral: Integral = "trapezoid",
-) -> Law:  # fmt: skip
+    *,
+    k_p: float,
+    k_i: float = 0.0,
+    k_d: float = 0.0,
+    T_f: float = 0.0,
+    sample_time_s: float,
+    b: float = 1.0,
+    c: float = 1.0,
+    feedforward: float = 0.0,
+    integral: Integral = "trapezoid",
+) -> Law:
     r"""Return :math:`u = k_p (b r - y) + k_i \int (r - y) + k_d \frac{d}{dt}(c r - y) + k_{ff} r`, discrete.
 
     Parameters
@@ -63,9 +71,18 @@ def parallel_pid(
 
 
 def cascade_pid(
-    *, k_v: float, T_v: float = math.inf, k_p: float, k_i: float = 0.0, k_d: float = 0.0, T_f: float = 0.0,
-    sample_time_s: float, b: float = 1.0, c: float = 1.0, feedforward: float = 0.0,
-) -> Law:  # fmt: skip
+    *,
+    k_v: float,
+    T_v: float = math.inf,
+    k_p: float,
+    k_i: float = 0.0,
+    k_d: float = 0.0,
+    T_f: float = 0.0,
+    sample_time_s: float,
+    b: float = 1.0,
+    c: float = 1.0,
+    feedforward: float = 0.0,
+) -> Law:
     r"""Return a drive's cascade: a force loop that asks a speed loop of the motor for a speed.
 
     .. math::
@@ -122,9 +139,17 @@ def cascade_pid(
 
 
 def ideal_pid(
-    *, K: float, T_i: float = math.inf, T_d: float = 0.0, N: float = math.inf, sample_time_s: float, b: float = 1.0,
-    c: float = 1.0, feedforward: float = 0.0, integral: Integral = "trapezoid",
-) -> Law:  # fmt: skip
+    *,
+    K: float,
+    T_i: float = math.inf,
+    T_d: float = 0.0,
+    N: float = math.inf,
+    sample_time_s: float,
+    b: float = 1.0,
+    c: float = 1.0,
+    feedforward: float = 0.0,
+    integral: Integral = "trapezoid",
+) -> Law:
     r"""Return :math:`u = K [b r - y + \frac{1}{T_i}\int (r - y) + T_d \frac{d}{dt}(c r - y)] + k_{ff} r`, discrete.
 
     Parameters
@@ -152,15 +177,31 @@ def ideal_pid(
     if not (T_i > 0.0 and T_d >= 0.0 and N > 0.0):
         raise ControlError(f"T_i = {T_i:g}, T_d = {T_d:g}, N = {N:g}: give positive times and a positive N")
     return parallel_pid(
-        k_p=K, k_i=K / T_i, k_d=K * T_d, T_f=T_d / N, sample_time_s=sample_time_s, b=b, c=c, feedforward=feedforward,
+        k_p=K,
+        k_i=K / T_i,
+        k_d=K * T_d,
+        T_f=T_d / N,
+        sample_time_s=sample_time_s,
+        b=b,
+        c=c,
+        feedforward=feedforward,
         integral=integral,
-    )  # fmt: skip
+    )
 
 
 def drive_pid(
-    *, per_effort: float, k_p: float, k_i: float = 0.0, k_d: float = 0.0, T_f: float = 0.0, sample_time_s: float,
-    b: float = 1.0, c: float = 1.0, feedforward: float = 0.0, integral: Integral = "trapezoid",
-) -> Law:  # fmt: skip
+    *,
+    per_effort: float,
+    k_p: float,
+    k_i: float = 0.0,
+    k_d: float = 0.0,
+    T_f: float = 0.0,
+    sample_time_s: float,
+    b: float = 1.0,
+    c: float = 1.0,
+    feedforward: float = 0.0,
+    integral: Integral = "trapezoid",
+) -> Law:
     """Return `parallel_pid` of gains in a drive's own units: the command (A, V, duty) per measured unit.
 
     Parameters
@@ -186,6 +227,13 @@ def drive_pid(
     if not require_number(per_effort, "per_effort", ControlError) > 0.0:
         raise ControlError(f"per_effort = {per_effort:g} is not positive; give the command for one unit of effort")
     return parallel_pid(
-        k_p=k_p, k_i=k_i, k_d=k_d, T_f=T_f, sample_time_s=sample_time_s, b=b, c=c, feedforward=feedforward,
+        k_p=k_p,
+        k_i=k_i,
+        k_d=k_d,
+        T_f=T_f,
+        sample_time_s=sample_time_s,
+        b=b,
+        c=c,
+        feedforward=feedforward,
         integral=integral,
-    ).scaled(1.0 / per_effort)  # fmt: skip
+    ).scaled(1.0 / per_effort)

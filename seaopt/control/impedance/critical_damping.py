@@ -39,25 +39,21 @@ NEWTON_STEPS, SMALL_STEP = 4, 1e-6
 
 @record(eq=False)
 class CriticalImpedances:
-    """Stiffness and damping of links with a double real pole than which nothing slower oscillates, from soft to stiff.
-
-    Parameters
-    ----------
-    stiffness, damping : arrays, shape (n,)
-    rate : array, shape (n,)
-        The double pole, rad/s.
-
-    """
+    """Stiffness and damping of links with a double real pole and no slower oscillation, from soft to stiff."""
 
     stiffness: Float[np.ndarray, " n"]
     damping: Float[np.ndarray, " n"]
-    rate: Float[np.ndarray, " n"]
+    rate: Float[np.ndarray, " n"]  # the double pole, rad/s
 
 
 def critical_impedance(
-    controller: Controller, plant: Plant, parameters: ParameterSet, stiffness: float, *,
+    controller: Controller,
+    plant: Plant,
+    parameters: ParameterSet,
+    stiffness: float,
+    *,
     velocity_filter_s: float | None = None,
-) -> Impedance:  # fmt: skip
+) -> Impedance:
     """Return the damping that makes a stiffness at the link critically damped: two of its poles are one real one.
 
     Parameters
@@ -91,22 +87,14 @@ def critical_impedance(
     """
     require_number(stiffness, "stiffness", ControlError)
     link = find_link(controller, plant, parameters)
-    asked = Impedance(stiffness=stiffness, damping=0.0, velocity_filter_s=velocity_filter_s)
-    return find_critical(link, asked.filter_for(link.sample_time_s), stiffness)
+    undamped = Impedance(stiffness=stiffness, damping=0.0, velocity_filter_s=velocity_filter_s)
+    return find_critical(link, undamped.filter_for(link.sample_time_s), stiffness)
 
 
 def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
     """Return critically damped impedances up to the stiffest, beyond which something slower oscillates.
 
     A slow integral of the force law leaves a real pole that is slower, of next to no weight.
-
-    Parameters
-    ----------
-    link : Link
-        Actuator, law and link.
-    velocity_filter_s : float
-        T_v.
-
     """
     p = np.geomspace(SLOWEST_POLE, FASTEST_POLE, POLES)
     loop = close_link(link, velocity_filter_s)
@@ -124,36 +112,23 @@ def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
 def find_critical(link: Link, velocity_filter_s: float, stiffness: float) -> Impedance:
     """Return the critically damped impedance of a stiffness.
 
-    Parameters
-    ----------
-    link : Link
-        Actuator, law and link.
-    velocity_filter_s : float
-        T_v.
-    stiffness : float
-        K_v.
-
-    Raises
-    ------
-    ControlError
-        There is none of this stiffness; the error names those that there are.
-
+    Raises ControlError: there is none of this stiffness; the error names those that there are.
     """
     scan = scan_critical(link, velocity_filter_s)
-    known = scan.stiffness
+    stiffnesses = scan.stiffness
     unit = mechanics_of(link.port.place_unit).stiffness
-    if not known.size:
+    if not stiffnesses.size:
         raise ControlError(
             f"stiffness = {stiffness:g} {unit}: the link is critically damped at no stiffness, as something slower "
             "oscillates; give damping a number, or tune a faster force loop"
         )
-    if not known[0] <= stiffness <= known[-1]:
+    if not stiffnesses[0] <= stiffness <= stiffnesses[-1]:
         raise ControlError(
             f"stiffness = {stiffness:g} {unit} has no critically damped impedance; under this force law there is one "
-            f"from {known[0]:.4g} to {known[-1]:.4g} {unit}"
+            f"from {stiffnesses[0]:.4g} to {stiffnesses[-1]:.4g} {unit}"
         )
     loop = close_link(link, velocity_filter_s)
-    p = float(np.interp(stiffness, known, scan.rate)) * link.sample_time_s
+    p = float(np.interp(stiffness, stiffnesses, scan.rate)) * link.sample_time_s
     for _ in range(NEWTON_STEPS):  # the table is fine enough for Newton's method on K_v(p)
         k, _ = _place(loop, link, velocity_filter_s, np.array([p, p * (1.0 + SMALL_STEP)]))
         p += (stiffness - float(k[0])) * SMALL_STEP * p / float(k[1] - k[0])

@@ -41,28 +41,13 @@ class Load:
 
 @record(eq=False)
 class Link:
-    """An actuator under force control, and the link that it moves.
+    """An actuator under force control, and the link that it moves."""
 
-    Parameters
-    ----------
-    port : PortModel
-        The actuator without its link, sliding where it has friction.
-    load : Load
-        The link.
-    law : Law
-        The force law.
-    delay_samples : int
-        Of the law.
-    direction : float
-        The measured effort per effort on the link at rest.
-
-    """
-
-    port: PortModel
-    load: Load
-    law: Law
-    delay_samples: int
-    direction: float
+    port: PortModel  # the actuator without its link, sliding where it has friction
+    load: Load  # the link
+    law: Law  # the force law
+    delay_samples: int  # of the law
+    direction: float  # the measured effort per effort on the link at rest
 
     @property
     def sample_time_s(self) -> float:
@@ -74,34 +59,35 @@ class Link:
         a, b, c, d = (part[None] for part in self.port.link_held())
         a, b, c, d = (part[0] for part in hold(a, b, c, d, self.sample_time_s, np.array([self.port.delay_s])))
         return DigitalPlant(
-            a=a, b=b, c=c[0], d=float(d[0]), sample_time_s=self.sample_time_s, delay_samples=self.delay_samples,
-            static_gain=np.nan, others=(c[1:], d[1:]),
-        )  # fmt: skip
+            a=a,
+            b=b,
+            c=c[0],
+            d=float(d[0]),
+            sample_time_s=self.sample_time_s,
+            delay_samples=self.delay_samples,
+            static_gain=np.nan,
+            others=(c[1:], d[1:]),
+        )
 
     def outer(self, impedance: Impedance) -> OuterLoop:
         """Return the outer loop that renders an impedance here."""
         return OuterLoop(
-            stiffness=impedance.stiffness, damping=impedance.damping, direction=self.direction,
-            velocity_filter_s=impedance.filter_for(self.sample_time_s), sample_time_s=self.sample_time_s,
+            stiffness=impedance.stiffness,
+            damping=impedance.damping,
+            direction=self.direction,
+            velocity_filter_s=impedance.filter_for(self.sample_time_s),
+            sample_time_s=self.sample_time_s,
             place_unit=self.port.place_unit,
-        )  # fmt: skip
+        )
 
 
 def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Link:
     """Return the link of a plant under a controller.
 
-    Parameters
-    ----------
-    controller : Controller
-        Its law is closed around the port.
-    plant, params
-        A plant whose link moves, linearised at rest, sliding where it has friction.
+    `controller`: its law is closed around the port. `plant`, `params`: a plant whose link moves, linearised at rest,
+    sliding where it has friction.
 
-    Raises
-    ------
-    ControlError
-        The link is held, the plant has no port, or the link is not a mass on a spring and a damper.
-
+    Raises ControlError: the link is held, the plant has no port, or the link is not a mass on a spring and a damper.
     """
     if plant.port is None or plant.port.motion is None:
         raise ControlError(
@@ -121,9 +107,12 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
             "does"
         )
     return Link(
-        port=port, load=_read_load(port, linear, plant.name), law=controller.law,
-        delay_samples=controller.compute_delay_samples, direction=-1.0 / ratio.real,
-    )  # fmt: skip
+        port=port,
+        load=_read_load(port, linear, plant.name),
+        law=controller.law,
+        delay_samples=controller.compute_delay_samples,
+        direction=-1.0 / ratio.real,
+    )
 
 
 def _read_load(port: PortModel, linear: tuple[Float[np.ndarray, "..."], ...], name: str) -> Load:
@@ -133,9 +122,12 @@ def _read_load(port: PortModel, linear: tuple[Float[np.ndarray, "..."], ...], na
     s = 2j * np.pi * f
     response = port.response(f)
     drive = response.motor_to_port * np.exp(s * port.delay_s)  # `linear` has no delay
-    moved: Complex[np.ndarray, " m"] = np.linalg.solve(
-        s[:, None, None] * np.eye(b.size) - a, np.broadcast_to(b[:, None].astype(complex), (f.size, b.size, 1))
-    )[:, :, 0] @ c  # fmt: skip
+    moved: Complex[np.ndarray, " m"] = (
+        np.linalg.solve(
+            s[:, None, None] * np.eye(b.size) - a, np.broadcast_to(b[:, None].astype(complex), (f.size, b.size, 1))
+        )[:, :, 0]
+        @ c
+    )
     whole = -drive / (s * moved)
     load = whole - response.motion_to_port
     terms = np.column_stack([s, np.ones_like(s), 1.0 / s]) / np.abs(whole)[:, None]

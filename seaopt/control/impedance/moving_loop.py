@@ -22,24 +22,13 @@ Matrix = Float[np.ndarray, "n n"]
 
 @record(eq=False)
 class MovingLoop:
-    """x+ = (m_0 + K_v m_stiffness + D_v m_damping) x + b x_0 K_v, link position = c x.
+    """x+ = (m_0 + K_v m_stiffness + D_v m_damping) x + b x_0 K_v, link position = c x."""
 
-    Parameters
-    ----------
-    fixed, by_stiffness, by_damping : arrays, shape (n, n)
-    reference : array, shape (n,)
-        The effect of the force law's reference.
-    position : array, shape (n,)
-        The link's position.
-    direction, sample_time_s : float
-
-    """
-
-    fixed: Matrix
+    fixed: Matrix  # fixed, by_stiffness, by_damping: shape (n, n)
     by_stiffness: Matrix
     by_damping: Matrix
-    reference: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, " n"]
+    reference: Float[np.ndarray, " n"]  # the effect of the force law's reference
+    position: Float[np.ndarray, " n"]  # the link's position
     direction: float
     sample_time_s: float
 
@@ -70,15 +59,7 @@ class MovingLoop:
 def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -> MovingLoop:
     """Return the loop of a link, with an outer loop of any gains, against an environment.
 
-    Parameters
-    ----------
-    link : Link
-        Actuator, law and link.
-    velocity_filter_s : float
-        T_v.
-    load : Load, optional
-        What is on the port, the link's own inertia included; the link alone if left out.
-
+    `load`: what is on the port, the link's own inertia included; the link alone if left out.
     """
     load = link.load if load is None else load
     port, law, period = link.port, link.law, link.sample_time_s
@@ -93,9 +74,9 @@ def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -
     read = port.read
     c = read[:, :n] + np.outer(read[:, n + 1], taken)
     d = read[:, n] + read[:, n + 1] * pushed
-    place = np.zeros(n)
-    place[port.place] = 1.0
-    rows, direct = np.vstack([c, place]), np.append(d, 0.0)
+    position = np.zeros(n)
+    position[port.place] = 1.0
+    rows, direct = np.vstack([c, position]), np.append(d, 0.0)
     sampled = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
     return _assemble(link, velocity_filter_s, tuple(part[0] for part in sampled), law.c.size)
 
@@ -109,8 +90,8 @@ def _assemble(link: Link, velocity_filter_s: float, plant: Any, order: int) -> M
     size = n + wait + order + 1
     inner, speed = slice(n + wait, n + wait + order), size - 1
     # Over the states (plant, commands under way, law, filter): the command that acts now, what is read, effort, place.
-    acts, read, place = np.zeros(size), np.zeros((through.size, size)), np.zeros(size)
-    read[:, :n], place[:n] = rows[:-1], rows[-1]
+    acts, read, position = np.zeros(size), np.zeros((through.size, size)), np.zeros(size)
+    read[:, :n], position[:n] = rows[:-1], rows[-1]
     effort = np.zeros(size)
     effort[inner] = law.c
     if wait:
@@ -139,11 +120,15 @@ def _assemble(link: Link, velocity_filter_s: float, plant: Any, order: int) -> M
     matrix[inner, inner] = law.a
     matrix[inner] += law.b[:, 1:] @ read
     drive[inner] = law.b[:, 0] + law.b[:, 1:] @ read_per_reference
-    filtered = outer.rate * place
+    filtered = outer.rate * position
     filtered[speed] += 1.0
-    matrix[speed] = outer.pole * filtered - outer.rate * place
+    matrix[speed] = outer.pole * filtered - outer.rate * position
     return MovingLoop(
-        fixed=matrix, by_stiffness=-link.direction * np.outer(drive, place),
-        by_damping=-link.direction * np.outer(drive, filtered), reference=drive, position=place,
-        direction=link.direction, sample_time_s=link.sample_time_s,
-    )  # fmt: skip
+        fixed=matrix,
+        by_stiffness=-link.direction * np.outer(drive, position),
+        by_damping=-link.direction * np.outer(drive, filtered),
+        reference=drive,
+        position=position,
+        direction=link.direction,
+        sample_time_s=link.sample_time_s,
+    )

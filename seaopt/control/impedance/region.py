@@ -186,11 +186,11 @@ def passive_region(
         raise ControlError(f"points = {points!r} is not a size of the grid; give 2 to {MOST_POINTS}")
     filter_s = Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s).filter_for(link.sample_time_s)
     port = SampledPort(link=link, velocity_filter_s=filter_s)
-    held = port.held_stable()
+    held_stable = port.held_stable()
     terms = port.terms(port.angles(), link.load.damping)
     spring = _find_spring(plant, parameters)
     scales = _find_scales(link, spring)
-    box = _find_box(terms, scales) if terms is not None and held else None
+    box = _find_box(terms, scales) if terms is not None and held_stable else None
     stiffest = None if box is None or terms is None else _find_stiffest(port, terms, box)
     ranges = [
         _choose_range(name, given, None if box is None else box[i], scales[i])
@@ -201,11 +201,18 @@ def passive_region(
     margin = np.full(k_all.size, -np.inf) if terms is None else terms.least(k_all, d_all)
     loop = close_link(link, filter_s)
     return ImpedanceRegion(
-        stiffness=k, damping=d, margin=margin.reshape(points, points),
-        free_radius=loop.radius(k_all, d_all).reshape(points, points), held_stable=held, stiffest=stiffest,
-        spring=spring, link_damping=link.load.damping, velocity_filter_s=filter_s,
-        critical=scan_critical(link, filter_s), called=mechanics_of(link.port.place_unit),
-    )  # fmt: skip
+        stiffness=k,
+        damping=d,
+        margin=margin.reshape(points, points),
+        free_radius=loop.radius(k_all, d_all).reshape(points, points),
+        held_stable=held_stable,
+        stiffest=stiffest,
+        spring=spring,
+        link_damping=link.load.damping,
+        velocity_filter_s=filter_s,
+        critical=scan_critical(link, filter_s),
+        called=mechanics_of(link.port.place_unit),
+    )
 
 
 def needed_damper(port: SampledPort, impedance: Impedance) -> float:
@@ -284,10 +291,10 @@ def _find_stiffest(port: SampledPort, terms: PortTerms, box: tuple[Grid, Grid]) 
         for _ in range(EDGE_STEPS):
             middle = 0.5 * (low + high)
             margin = at.least(np.full(d.size, middle), d)
-            place = int(np.argmax(margin))
-            if margin[place] > 0.0:
+            best = int(np.argmax(margin))
+            if margin[best] > 0.0:
                 low = middle
-                about = Impedance(stiffness=middle, damping=float(d[place]), velocity_filter_s=port.velocity_filter_s)
+                about = Impedance(stiffness=middle, damping=float(d[best]), velocity_filter_s=port.velocity_filter_s)
             else:
                 high = middle
         if about is None:

@@ -36,30 +36,22 @@ LOWEST_BAND_HZ = 1e-3
 
 @record
 class BreakingEnvironment:
-    """A passive environment that makes the link oscillate.
+    """A passive environment that makes the link oscillate."""
 
-    Parameters
-    ----------
-    inertia, stiffness : float
-        Added to the link's own: a mass (kg, kg m^2) or a spring (N/m, N m/rad) to the ground, the other is zero.
-    frequency_hz : float
-        Of the oscillation.
-    spectral_radius : float
-        Of the sampled loop against it, above 1.
-
-    """
-
+    # inertia, stiffness: added to the link's own: a mass (kg, kg m^2) or a spring (N/m, N m/rad) to the ground, the
+    # other is zero
     inertia: float
     stiffness: float
-    frequency_hz: float
-    spectral_radius: float
+    frequency_hz: float  # of the oscillation
+    spectral_radius: float  # of the sampled loop against it, above 1
 
     def describe(self, called: Mechanics) -> str:
         """Return what it is and what it does, with units."""
         what = (
-            f"a spring of {self.stiffness:.4g} {called.stiffness}" if self.stiffness
+            f"a spring of {self.stiffness:.4g} {called.stiffness}"
+            if self.stiffness
             else f"{self.inertia:.4g} {called.inertia} more"
-        )  # fmt: skip
+        )
         return f"{what} at the link makes it oscillate at {self.frequency_hz:.4g} Hz"
 
 
@@ -153,9 +145,13 @@ class Rendering:
 
 
 def render(
-    controller: Controller, plant: Plant, parameters: ParameterSet, impedance: Impedance, *,
+    controller: Controller,
+    plant: Plant,
+    parameters: ParameterSet,
+    impedance: Impedance,
+    *,
     link_damping: float | None = None,
-) -> Rendering:  # fmt: skip
+) -> Rendering:
     """Measure an impedance that is rendered at the link, closed around a force loop.
 
     Parameters
@@ -203,13 +199,19 @@ def render(
     worst_hz = worst / (2 * np.pi * link.sample_time_s)
     radius = float(loop.radius(impedance.stiffness, impedance.damping))
     return Rendering(
-        impedance=impedance, outer=outer, passive=passive, needed_damper=needed_damper(port, impedance),
-        link_damping=load.damping, stable=radius <= GROWING, spectral_radius=radius,
+        impedance=impedance,
+        outer=outer,
+        passive=passive,
+        needed_damper=needed_damper(port, impedance),
+        link_damping=load.damping,
+        stable=radius <= GROWING,
+        spectral_radius=radius,
         breaking=None if passive else find_breaking(link, outer, port.find_failing_hz(impedance, load.damping)),
         worst_hz=worst_hz,
-        band_hz=_find_band(link, outer), overshoot=_find_overshoot(loop, impedance, radius),
+        band_hz=_find_band(link, outer),
+        overshoot=_find_overshoot(loop, impedance, radius),
         called=mechanics_of(link.port.place_unit),
-    )  # fmt: skip
+    )
 
 
 def add_impedance(
@@ -258,9 +260,9 @@ def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"])
     reference, feedback = link.law.reference_response(f), link.law.feedback_responses(f)
     s, z = 2j * np.pi * f, np.exp(2j * np.pi * f * link.sample_time_s)
     late = hold_response(f, link.sample_time_s, link.delay_samples)
-    asked = link.direction * reference * (outer.stiffness + outer.damping * outer.difference(z)) / s
+    commanded = link.direction * reference * (outer.stiffness + outer.damping * outer.difference(z)) / s
     closed = 1.0 + np.sum(link.held().responses(f) * feedback, axis=0)
-    motor = -(np.sum(feedback * response.motion_to_read, axis=0) + asked) * late / closed
+    motor = -(np.sum(feedback * response.motion_to_read, axis=0) + commanded) * late / closed
     return response.motion_to_port + response.motor_to_port * motor
 
 
@@ -272,16 +274,16 @@ def find_breaking(link: Link, outer: OuterLoop, frequencies_hz: Float[np.ndarray
         omega = 2 * np.pi * float(frequency)
         more = float(wanted) - (omega * load.inertia - load.stiffness / omega)
         inertia, stiffness = (more / omega, 0.0) if more > 0.0 else (0.0, -more * omega)
-        whole = Load(
-            inertia=load.inertia + inertia, damping=load.damping, stiffness=load.stiffness + stiffness
-        )  # fmt: skip
+        whole = Load(inertia=load.inertia + inertia, damping=load.damping, stiffness=load.stiffness + stiffness)
         poles = close_link(link, outer.velocity_filter_s, whole).eigenvalues(outer.stiffness, outer.damping)
         fastest = complex(poles[int(np.argmax(np.abs(poles)))])
         if best is None or abs(fastest) > best.spectral_radius:
             best = BreakingEnvironment(
-                inertia=inertia, stiffness=stiffness, spectral_radius=abs(fastest),
+                inertia=inertia,
+                stiffness=stiffness,
+                spectral_radius=abs(fastest),
                 frequency_hz=float(abs(np.angle(fastest)) / (2 * np.pi * link.sample_time_s)),
-            )  # fmt: skip
+            )
     return None if best is None or best.spectral_radius <= GROWING else best
 
 
@@ -290,14 +292,14 @@ def _find_band(link: Link, outer: OuterLoop) -> tuple[float, float] | None:
     if outer.stiffness == 0.0 and outer.damping == 0.0:
         return None
     f = np.geomspace(LOWEST_BAND_HZ, 0.5 / link.sample_time_s, BAND_POINTS)
-    asked = outer.stiffness / (2j * np.pi * f) + outer.damping
-    ratio = np.abs(apparent_impedance(link, outer, f) / asked)
+    wanted = outer.stiffness / (2j * np.pi * f) + outer.damping
+    ratio = np.abs(apparent_impedance(link, outer, f) / wanted)
     near = (ratio < NEAR_AS_ASKED) & (ratio > 1.0 / NEAR_AS_ASKED)
     if not np.any(near):
         return None
     first = int(np.argmax(near))
-    rest = near[first:]
-    last = first + (rest.size - 1 if np.all(rest) else int(np.argmin(rest)) - 1)
+    following = near[first:]
+    last = first + (following.size - 1 if np.all(following) else int(np.argmin(following)) - 1)
     return float(f[first]), float(f[last])
 
 

@@ -59,23 +59,14 @@ FAILING = 40  # frequencies at which an environment is looked for
 
 @record(eq=False)
 class PortTerms:
-    """c_k = p_k + W q_k at m angles and k aliases, for one damper at the link.
+    """c_k = p_k + W q_k at m angles and k aliases, for one damper at the link."""
 
-    Parameters
-    ----------
-    theta : array, shape (m,)
-        Angles.
-    by_force, by_place : array, shape (m, k)
-        p_k and q_k, the aliases in the order -N to N and then what is beyond on either side, as one each.
-    weights : array, shape (2, m)
-        W per stiffness and per damping.
-
-    """
-
-    theta: Angles
+    theta: Angles  # shape (m,); angles
+    # by_force, by_place: p_k and q_k, the aliases in the order -N to N and then what is beyond on either side, as one
+    # each
     by_force: Complex[np.ndarray, "m k"]
     by_place: Complex[np.ndarray, "m k"]
-    weights: Complex[np.ndarray, "2 m"]
+    weights: Complex[np.ndarray, "2 m"]  # W per stiffness and per damping
 
     def margin(self, stiffness: Points, damping: Points) -> Float[np.ndarray, "n m"]:
         """Return (|2 + sum c_k|^2 - (sum |c_k|)^2)/4 at every angle for n pairs of gains, positive where it is passive.
@@ -127,19 +118,10 @@ class PortResponses:
 
 @record(eq=False)
 class SampledPort:
-    """The port of a force-controlled link, with an outer loop of any gains and one filter of its speed.
+    """The port of a force-controlled link, with an outer loop of any gains and one filter of its speed."""
 
-    Parameters
-    ----------
-    link : Link
-        Actuator, law and link.
-    velocity_filter_s : float
-        T_v of the outer loop.
-
-    """
-
-    link: Link
-    velocity_filter_s: float
+    link: Link  # actuator, law and link
+    velocity_filter_s: float  # T_v of the outer loop
 
     def held_stable(self) -> bool:
         """Tell whether nothing grows with the link held, which the gains do not change."""
@@ -149,8 +131,8 @@ class SampledPort:
     def angles(self) -> Angles:
         """Return angles from nearly static to the Nyquist frequency, close about the modes of plant and loop."""
         period = self.link.sample_time_s
-        held = self.link.held()
-        closed = Loop(plant=held, law=self.link.law).eigenvalues()
+        locked = self.link.held()
+        closed = Loop(plant=locked, law=self.link.law).eigenvalues()
         closed = np.log(closed[np.abs(closed) > 1e-6]) / period
         at, width = self.link.port.modes_hz()
         at = 2 * np.pi * np.concatenate([at, np.abs(closed.imag) / (2 * np.pi)])
@@ -182,10 +164,13 @@ class SampledPort:
         outer = self.link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=self.velocity_filter_s))
         gain = link.direction * reference
         return PortResponses(
-            theta=theta, by_force=drive * moved, by_place=drive / s,
+            theta=theta,
+            by_force=drive * moved,
+            by_place=drive / s,
             weights=np.array([gain, gain * outer.difference(z)]),
-            resistance=np.maximum(np.real(at(response.motion_to_port)), 0.0), least_resistance=self._find_floor(),
-        )  # fmt: skip
+            resistance=np.maximum(np.real(at(response.motion_to_port)), 0.0),
+            least_resistance=self._find_floor(),
+        )
 
     def terms(self, theta: Angles, damping: float) -> PortTerms | None:
         """Return the terms at angles with a damper at the link; None where nothing takes energy between the samples."""
@@ -196,16 +181,16 @@ class SampledPort:
 
         Its filter is the port's.
         """
-        least, found, place = np.inf, float(theta[0]), theta
+        least, found, angles = np.inf, float(theta[0]), theta
         for _ in range(REFINEMENTS):
-            terms = self.terms(place, damper)
+            terms = self.terms(angles, damper)
             if terms is None:
                 return -np.inf, float(theta[0])
             margin = terms.margin(np.array([impedance.stiffness]), np.array([impedance.damping]))[0]
             at = int(np.argmin(margin))
             if margin[at] < least:
-                least, found = float(margin[at]), float(place[at])
-            place = _about_dips(place, margin)
+                least, found = float(margin[at]), float(angles[at])
+            angles = _about_dips(angles, margin)
         return least, found
 
     def find_failing_hz(self, impedance: Impedance, damper: float) -> Float[np.ndarray, " m"]:

@@ -8,11 +8,11 @@ output, the passivity of that impedance, and what sensor noise becomes. Here all
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
+from seaopt.codec import to_content
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.passivity import passivity
 from seaopt.control.loops.port import hold_response, port_of
@@ -69,16 +69,22 @@ class Score:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures, for JSON."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return to_content(self)
 
     def cells(self) -> tuple[str, ...]:
         """Return the figures as text, in the order of `HEADS`."""
         whole = "all" if self.passive_to_hz is None else f"{self.passive_to_hz:.3g} Hz"
         return (
-            f"{format_number(self.bandwidth_hz, missing='none')} Hz", f"{self.reference_peak:.3g}",
-            f"{self.impedance_1hz:.3g}", f"{self.impedance_largest:.3g}", f"{self.impedance_share:.3g}", whole,
-            f"{self.needed_damping:.3g}", f"{self.noise_gain:.3g}", f"{self.noise_rms:.3g}",
-        )  # fmt: skip
+            f"{format_number(self.bandwidth_hz, missing='none')} Hz",
+            f"{self.reference_peak:.3g}",
+            f"{self.impedance_1hz:.3g}",
+            f"{self.impedance_largest:.3g}",
+            f"{self.impedance_share:.3g}",
+            whole,
+            f"{self.needed_damping:.3g}",
+            f"{self.noise_gain:.3g}",
+            f"{self.noise_rms:.3g}",
+        )
 
 
 HEADS = (
@@ -104,7 +110,7 @@ class Scorecard:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scores, for JSON."""
-        return {name: score.to_dict() for name, score in self.scores.items()}
+        return to_content(self.scores)
 
     @property
     def unit(self) -> str:
@@ -183,13 +189,17 @@ def _score(controller: Controller, plant: Plant, parameters: ParameterSet) -> Sc
     size = np.abs(response.impedance(law))
     share = size / np.abs(response.impedance(np.zeros_like(law)))
     return Score(
-        bandwidth_hz=figures.bandwidth_hz, reference_peak=figures.reference_peak,
-        impedance_1hz=float(size[np.searchsorted(f, 1.0)]), impedance_largest=float(np.max(size)),
-        impedance_share=float(np.sqrt(np.mean(share**2))), passive_to_hz=found.violated_hz,
+        bandwidth_hz=figures.bandwidth_hz,
+        reference_peak=figures.reference_peak,
+        impedance_1hz=float(size[np.searchsorted(f, 1.0)]),
+        impedance_largest=float(np.max(size)),
+        impedance_share=float(np.sqrt(np.mean(share**2))),
+        passive_to_hz=found.violated_hz,
         needed_damping=max(-found.least_damping_N_s_per_m, 0.0) if found.held_stable else np.inf,
-        noise_gain=figures.noise_gain, noise_rms=_find_noise_rms(controller, plant, parameters),
+        noise_gain=figures.noise_gain,
+        noise_rms=_find_noise_rms(controller, plant, parameters),
         unit=mechanics_of(port.place_unit).damping,
-    )  # fmt: skip
+    )
 
 
 def _find_noise_rms(controller: Controller, plant: Plant, parameters: ParameterSet) -> float:

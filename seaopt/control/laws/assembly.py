@@ -63,7 +63,7 @@ class Assembly:
         a[:n, :n], a[n:, n:] = self.a, other.a
         return Assembly(
             chain=chain, a=a, b=np.vstack([self.b, other.b]), c=np.concatenate([self.c, other.c]), d=self.d + other.d
-        )  # fmt: skip
+        )
 
     def scaled(self, factor: float) -> Assembly:
         """Return this times a factor."""
@@ -74,7 +74,7 @@ class Assembly:
         more = ((0, 0), (0, count - self.d.size))
         return Assembly(
             chain=np.pad(self.chain, more), a=self.a, b=np.pad(self.b, more), c=self.c, d=np.pad(self.d, more[1])
-        )  # fmt: skip
+        )
 
     def through(self, part: TransferFunction) -> Assembly:
         """Return this in series with a stable part."""
@@ -90,28 +90,18 @@ class Assembly:
             through = through + direct * self.chain[order]
         whole = np.zeros((n + more, n + more))
         whole[:n, :n], whole[n:, n:], whole[n:, :n] = self.a, a, np.outer(b, self.c)
-        return Assembly(
-            chain=chain, a=whole, b=np.vstack([self.b, into]), c=np.concatenate([d * self.c, c]), d=through
-        )  # fmt: skip
+        return Assembly(chain=chain, a=whole, b=np.vstack([self.b, into]), c=np.concatenate([d * self.c, c]), d=through)
 
     def integrated(self, static: Columns) -> Assembly:
         """Return this over delta; `static` is its `static`, in which the caller may know a zero to be one."""
         inner = np.eye(self.c.size) - self.a
         row = np.linalg.solve(inner.T, self.c)
-        return Assembly(
-            chain=np.vstack([static, self.chain]), a=self.a, b=self.b, c=-row @ self.a, d=-row @ self.b
-        )  # fmt: skip
+        return Assembly(chain=np.vstack([static, self.chain]), a=self.a, b=self.b, c=-row @ self.a, d=-row @ self.b)
 
     def with_reference_behind(self, part: TransferFunction, rest: TransferFunction) -> Assembly:
         """Return this, the inputs being error, reference and further signals, with the reference behind a filter.
 
-        Parameters
-        ----------
-        part : TransferFunction
-            The filter F, stable and of unit static gain.
-        rest : TransferFunction
-            (F - 1)/delta, over the same denominator.
-
+        `part`: the filter F, stable and of unit static gain. `rest`: (F - 1)/delta, over the same denominator.
         """
         a, b, row, through = rest.state_space()
         n, more, chain, whole = self.c.size, b.size, self.chain.copy(), np.sum(self.chain[:, :2], axis=1)
@@ -131,9 +121,7 @@ class Assembly:
         direct_from[1] += onto * direct + d
         entry[:n], entry[n:, 1] = self.b, b
         entry[:n, 1] += into * direct
-        return Assembly(
-            chain=chain, a=states, b=entry, c=np.concatenate([self.c, onto * seen + c]), d=direct_from
-        )  # fmt: skip
+        return Assembly(chain=chain, a=states, b=entry, c=np.concatenate([self.c, onto * seen + c]), d=direct_from)
 
     def law(self, sample_time_s: float) -> Law:
         """Return the law of reference and measured signals, the inputs being error, reference and further signals."""

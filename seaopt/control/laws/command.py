@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 
+from seaopt.codec import Limits
 from seaopt.control.laws.structures import PREFILTER
 from seaopt.control.loops.sampled_plant import static_gain
 from seaopt.errors import ControlError
@@ -41,9 +43,9 @@ class Command:
 
     input: str
     unit: str
-    per_effort: float
+    per_effort: Annotated[float, Limits(gt=0.0)]
     effort_unit: str
-    largest: float | None = None
+    largest: Annotated[float, Limits(gt=0.0)] | None = None
     measured_unit: str = ""
 
     @property
@@ -148,9 +150,13 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
             )
     measured_unit = plant.outputs.get(measured, effort_unit)
     return Command(
-        input=source, unit=unit, per_effort=1.0 / effort, effort_unit=effort_unit, largest=find_range(plant, values),
+        input=source,
+        unit=unit,
+        per_effort=1.0 / effort,
+        effort_unit=effort_unit,
+        largest=find_range(plant, values),
         measured_unit="" if measured_unit == effort_unit else measured_unit,
-    )  # fmt: skip
+    )
 
 
 def limit_notes(command: Command, asked: float | None, *, in_amperes: bool = True) -> tuple[str, ...]:
@@ -191,16 +197,21 @@ def name_rates(unit: str, measured: str, mechanics: Mechanics) -> dict[str, str]
     """Return the units of gains from a measured signal, its integral and rate, and a motor's speed, to some unit."""
     ratio, seconds = divide_units(unit, measured), f"{unit_after(unit).strip()} s".strip()
     return {
-        "k_p": ratio, "k_i": divide_units(unit, f"{measured} s"), "k_d": divide_units(seconds, measured), "k_r": ratio,
-        "k_ff": ratio, "k_v": divide_units(seconds, mechanics.place),
-    }  # fmt: skip
+        "k_p": ratio,
+        "k_i": divide_units(unit, f"{measured} s"),
+        "k_d": divide_units(seconds, measured),
+        "k_r": ratio,
+        "k_ff": ratio,
+        "k_v": divide_units(seconds, mechanics.place),
+    }
 
 
 def describe_cascade(gains: Mapping[str, float], command: Command) -> str:
     """Return the gains of a cascade as a drive with a speed loop is set: speeds per force error."""
     called = command.mechanics
     units = name_rates(f"{called.place}/s", command.reference_unit, called)
-    drive = ", ".join(f"{name} = {gains[name] / gains['k_v']:.5g} {units[name]}"
-                      for name in ("k_p", "k_i", "k_d", "k_r"))  # fmt: skip
+    drive = ", ".join(
+        f"{name} = {gains[name] / gains['k_v']:.5g} {units[name]}" for name in ("k_p", "k_i", "k_d", "k_r")
+    )
     inside = f"a PI of T_v = {gains['T_v']:.4g} s" if "T_v" in gains else "a P"
     return f"as speeds asked of the motor's speed loop, {inside} of k_v: {drive}"

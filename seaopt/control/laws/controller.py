@@ -11,9 +11,7 @@ import numpy as np
 from seaopt.control.laws.command import (
     Command,
     actuation_notes,
-    describe_cascade,
     limit_notes,
-    name_gain_units,
     name_rates,
 )
 from seaopt.control.laws.delay import LoopDelays, place_drive_delay
@@ -23,16 +21,14 @@ from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Prefilter, SpeedLoop
 from seaopt.control.laws.verdict import (
     PossibleBandwidths,
-    join_labels,
     list_broken_figures,
-    list_design_figures,
     shorten_blocked,
 )
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath, multiply_out
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.friction_loop import make_friction_loops
-from seaopt.control.loops.law import Law, count_filter_samples, describe_integrators, find_integral_rate
+from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.measured.loop import DiscLoop
@@ -40,15 +36,6 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
-from seaopt.formatting import (
-    MISSING,
-    format_band,
-    format_figure,
-    format_number,
-    html_list,
-    html_paragraph,
-    html_table,
-)
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -56,7 +43,7 @@ from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
-from seaopt.records import PlotAccessor, Result, record
+from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.units import divide_units
 
 if TYPE_CHECKING:
@@ -65,14 +52,13 @@ if TYPE_CHECKING:
 # Among what controller.json says is achieved:
 FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
 CONTROLLER_SCHEMA = "seaopt/controller/3"
-NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
-@record(eq=False)
-class Controller(LoopDelays, Result):
+@record(eq=False, repr=False)
+class Controller(LoopDelays, Result, Worded):
     """A law from reference and measured force to an effort, commanded as the input of the plant that makes that effort.
 
     Parameters
@@ -95,7 +81,7 @@ class Controller(LoopDelays, Result):
         The specification that it was tuned for.
     achieved : LoopFigures
         Of the design plant.
-    feasible : bool
+    met : bool
         Whether every limit is met, as measured.
     active_constraints : tuple of str
         The limits that are broken; if none is, those that are just met.
@@ -139,7 +125,7 @@ class Controller(LoopDelays, Result):
     command: Command
     spec: ControllerSpec
     achieved: LoopFigures
-    feasible: bool
+    met: bool
     active_constraints: tuple[str, ...]
     robust_to: tuple[str, ...] = ()
     design: tuple[Plant, ParameterSet] | None = None
@@ -153,11 +139,6 @@ class Controller(LoopDelays, Result):
     reads: tuple[str, ...] = ()
     compensation: Compensation | None = None
     gate: PlausibilityGate | None = None
-
-    @property
-    def met(self) -> bool:
-        """Whether every limit is met, as measured."""
-        return self.feasible
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -187,9 +168,14 @@ class Controller(LoopDelays, Result):
         else:
             filter_samples, integral = count_filter_samples(law), find_integral_rate(law)
         return MeasuredLoop(
-            name=name, figures=figures, port=port, filter_samples=filter_samples, integral_rad_s=integral,
-            gain_unit=self.command.gain_unit, other_gain_unit=self._name_other_gain(),
-        )  # fmt: skip
+            name=name,
+            figures=figures,
+            port=port,
+            filter_samples=filter_samples,
+            integral_rad_s=integral,
+            gain_unit=self.command.gain_unit,
+            other_gain_unit=self._name_other_gain(),
+        )
 
     def _name_other_gain(self) -> str:
         """Return the unit of effort over what the law reads besides; empty where it is not known, or not one."""
@@ -252,7 +238,7 @@ class Controller(LoopDelays, Result):
     @property
     def explanation(self) -> str:
         """One line: the limits that block, and the bandwidths that are possible; empty where every limit is met."""
-        if self.feasible:
+        if self.met:
             return ""
         blocked = shorten_blocked(self.blocked_by or self.active_constraints)
         remedy = "" if self.possible is None else f"; {self.possible}"
@@ -273,18 +259,26 @@ class Controller(LoopDelays, Result):
         # What the plants of robust_to need is in the same set.
         vague = warn_unidentified(values, None if self.robust_to else plant.parameters)
         return (
-            *lifted, *vague, *self._friction_notes(), *actuation_notes(plant, self.command),
+            *lifted,
+            *vague,
+            *self._friction_notes(),
+            *actuation_notes(plant, self.command),
             *limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None),
-            *self._link_notes(), *self._noise_notes(), *self._slow_notes(),
-        )  # fmt: skip
+            *self._link_notes(),
+            *self._noise_notes(),
+            *self._slow_notes(),
+        )
 
     def _link_notes(self) -> tuple[str, ...]:
         """Say what is fed forward of the link's motion, and what noise on it makes."""
         if self.link is None:
             return ()
         called, noise = self.command.mechanics, self.achieved.other_noise_gains[-1:]
-        made = "".join(f"; 1e-6 {self.link.unit} of noise on it makes up to {1e-6 * gain:.3g} {called.unit} of motor "
-                       f"{called.word}, less with a lower corner_hz" for gain in noise)  # fmt: skip
+        made = "".join(
+            f"; 1e-6 {self.link.unit} of noise on it makes up to {1e-6 * gain:.3g} {called.unit} of motor "
+            f"{called.word}, less with a lower corner_hz"
+            for gain in noise
+        )
         return (f"{self.link.describe()}{made}",)
 
     def _slow_notes(self) -> tuple[str, ...]:
@@ -412,7 +406,7 @@ class Controller(LoopDelays, Result):
             | {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope}
             | self._prefilter_figures(),
             "met": self.met,
-            "feasible": self.feasible,
+            "feasible": self.met,
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
             "observer": None if self.observer is None else self.observer.to_dict(self.sample_time_s),
@@ -461,31 +455,30 @@ class Controller(LoopDelays, Result):
             plant = link.see(plant)
         measured = plant.outputs.get(stored["spec"].regulated, "")
         stored["command"] = replace(
-            stored["command"], largest=find_range(plant, params),
+            stored["command"],
+            largest=find_range(plant, params),
             measured_unit="" if measured == stored["command"].effort_unit else measured,
-        )  # fmt: skip
+        )
         gain, spec = stored["command"].per_effort, stored["spec"]
         sliding = take_sliding(plant, params)
         reads = stored["reads"] or list_names(spec.measured)
         params = place_drive_delay(spec, params, stored["drive_delay_s"])
         sampled = sample(sliding, params, reads, gain, stored["sample_time_s"], stored["compute_delay_samples"])
         achieved = Loop(plant=sampled, law=stored["law"]).figures()
-        (loop,) = make_friction_loops(
-            plant, [params], reads, gain, stored["compute_delay_samples"], stored["law"]
-        )  # fmt: skip
+        (loop,) = make_friction_loops(plant, [params], reads, gain, stored["compute_delay_samples"], stored["law"])
         friction = None if loop is None else friction_margin(loop)
         check_achieved(content.get("achieved"), _list_achieved(achieved))
         check_friction_margin(content["achieved"].get(FRICTION_MARGIN), friction)
         controller = cls(**stored, achieved=achieved, design=(plant, params), friction=friction)
         check_achieved(content["achieved"], controller._prefilter_figures())
         loops = [
-            controller.measure(f"design plant{name}", figures) for name, figures in controller._measure_states().items()
+            controller.measure(f"design plant{name}", figures) for name, figures in controller.measure_states().items()
         ]
         loops[0] = controller._add_friction(loops[0])
-        broken = tuple(list_broken_figures(controller.spec, loops) if controller.feasible else ())
+        broken = tuple(list_broken_figures(controller.spec, loops) if controller.met else ())
         if not broken:
             return controller
-        return replace(controller, feasible=False, active_constraints=broken, blocked_by=broken)
+        return replace(controller, met=False, active_constraints=broken, blocked_by=broken)
 
     @classmethod
     def _on_measured(
@@ -502,144 +495,18 @@ class Controller(LoopDelays, Result):
         stored["command"] = replace(command, largest=find_range(measured.plant, params))
         controller = cls(**stored, achieved=achieved)
         check_achieved(content["achieved"], controller._prefilter_figures())
-        broken = tuple(list_broken_figures(spec, [controller.design_loop]) if controller.feasible else ())
+        broken = tuple(list_broken_figures(spec, [controller.design_loop]) if controller.met else ())
         if not broken:
             return controller
-        return replace(controller, feasible=False, active_constraints=broken, blocked_by=broken)
+        return replace(controller, met=False, active_constraints=broken, blocked_by=broken)
 
-    def __repr__(self) -> str:
-        a, s = self.achieved, self.spec
-        verdict = "every limit met" if self.feasible else "NOT FEASIBLE"
-        return "\n".join(
-            [
-                f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, {self.delays}: {verdict}",
-                *self._gain_lines(),
-                f"  bandwidth {format_number(a.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}), "
-                f"tracking band {format_band(a.tracking_band_hz, 'Hz')}",
-                f"  {a.describe_peaks()}",
-                f"  {a.describe_margins()}",
-                *self._friction_lines(),
-                *self._force_lines(),
-                *([] if self.outer is None else [f"  {self.outer.describe()}"]),
-                *self._compensation_lines(),
-                *self._gate_lines(),
-                *(f"  {line}" for line in (self.rating.describe() if self.rating is not None else ())),
-                f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
-                if self.feasible
-                else f"  {self.explanation}",
-                *(f"  note: {note}" for note in self.notes),
-            ]
-        ).rstrip()
-
-    def _measure_states(self) -> dict[str, LoopFigures]:
+    def measure_states(self) -> dict[str, LoopFigures]:
         """Return the design plant's figures by its state, " sliding" and " stuck" where it has friction, else ""."""
         assert self.design is not None
         plant, params = self.design
         _, *others = split_friction({"": plant}, params).items()
         stuck = {name: Loop(plant=self.plant(one, params), law=self.law).figures() for name, one in others}
         return {" sliding" if stuck else "": self.achieved} | stuck
-
-    def _friction_lines(self) -> list[str]:
-        """Give the friction margin, of which state the figures are, and the other's; nothing without friction."""
-        if self.design is None:
-            return []
-        _, *stuck = self._measure_states().items()
-        margin = [] if self.friction is None else [self._describe_friction_margin(self.friction)]
-        heads = ["these are of the design plant sliding, on which the bandwidth is placed;", *[" "] * len(stuck)]
-        return margin + [
-            f"  {head}{state}: bandwidth {format_number(figures.bandwidth_hz, missing='none')} Hz, "
-            f"{figures.describe_peaks()}"
-            for head, (state, figures) in zip(heads, stuck, strict=False)
-        ]
-
-    def _describe_friction_margin(self, friction: FrictionMargin) -> str:
-        """Return the slope up to which friction is shown to be stable, in the design plant's unit, and how."""
-        loop, asked = self.design_loop, self.spec.level("min_friction_margin")
-        given = "" if asked is None else f" (asked {asked:g})"
-        return f"  friction margin {format_number(loop.friction_slope)} {loop.slope_unit}{given}: {friction.describe()}"
-
-    def _gain_lines(self) -> list[str]:
-        if not self.gains:
-            return [f"  a law of order {self.law.c.size} with {describe_integrators(self.law)}"]
-        law = {name: value for name, value in self.gains.items() if not name.startswith(("notch_", "prefilter_"))}
-        units = name_gain_units(self.command)
-        lines = [
-            "  " + ", ".join(f"{name} = {value:.5g} {units.get(name, '')}".rstrip() for name, value in law.items()),
-            f"  as {self.command.word}: " + ", ".join(
-                f"{name} = {value:.5g} {unit}" for name, (value, unit) in self.engineering.items()
-            ),
-        ]  # fmt: skip
-        if self.gains.get("k_v"):
-            lines.append(f"  {describe_cascade(self.gains, self.command)}")
-        if self.observer is not None:
-            lines.append(f"  disturbance observer: Q is 3 dB down at {self.observer.bandwidth_hz:.4g} Hz")
-        if "notch_depth" in self.gains:
-            f, width, depth = (self.gains[f"notch_{name}"] for name in ("frequency_hz", "width", "depth"))
-            use = "" if depth < NO_NOTCH else ": of no use, tune without it"
-            lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}{use}")
-        low_pass = self.prefilter
-        if low_pass is not None:
-            damping = "" if low_pass.damping is None else f", damping {low_pass.damping:.3g}"
-            bare = format_number(self.bandwidth_without_prefilter_hz, missing="none")
-            lines.append(
-                f"  prefilter of {low_pass.order.replace('_', ' ')}: {low_pass.corner_hz:.4g} Hz{damping}; without it "
-                f"the bandwidth is {bare} Hz"
-            )
-        return lines
-
-    def _compensation_lines(self) -> list[str]:
-        """Say what is compensated."""
-        if self.compensation is None:
-            return []
-        return [f"  compensates {line}" for line in self.compensation.describe(self.command.effort_unit)]
-
-    def _gate_lines(self) -> list[str]:
-        """Say which readings are believed."""
-        return [] if self.gate is None else [f"  {self.gate.describe(self.command.reference_unit)}"]
-
-    def _force_lines(self) -> list[str]:
-        slow, fast = self.force_limit(0.0), self.force_limit(self.spec.bandwidth_hz)
-        if slow is None or fast is None or self.command_limit is None:
-            return []
-        unit, band, most = self.command.reference_unit, self.spec.bandwidth_hz, self.command.show(self.command_limit)
-        return [f"  {most} allow a reference of {slow:.4g} {unit} at rest and {fast:.4g} {unit} at {band:g} Hz"]
-
-    def _repr_html_(self) -> str:
-        head, *_ = repr(self).splitlines()
-        current = {name: f"{value:.5g} {unit}" for name, (value, unit) in self.engineering.items()}
-        units = name_gain_units(self.command)
-        gains = [
-            (name, f"{value:.5g} {units.get(name, '')}".rstrip(), current.get(name, "–"))
-            for name, value in self.gains.items()
-        ]
-        explanation = [] if self.feasible else [self.explanation]
-        return (
-            html_paragraph(head) + (html_table(("gain", "", f"as {self.command.word}"), gains) if gains else "")
-            + html_table((f"on the {self.judged_on}", "achieved", "asked"), self.list_achieved())
-            + html_list([*explanation, *(line.strip() for line in self._force_lines())]) + self.plot.to_html()
-        )  # fmt: skip
-
-    def list_achieved(self) -> list[tuple[str, str, str]]:
-        """Return the figures of the design plant as text: what each is, what was achieved, what was asked."""
-        a = self.achieved
-        limited = [
-            (row.limit.label, format_figure(row.value, row.unit), row.allowed_text)
-            for row in list_design_figures(self.spec, self.design_loop)
-        ]
-        return [
-            *limited,
-            *self._prefilter_rows(),
-            ("tracking band", format_band(a.tracking_band_hz, "Hz", MISSING), ""),
-            ("gain margin", format_figure(a.gain_margin_db, "dB"), ""),
-            ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
-            ("delay margin", format_figure(a.delay_margin_ms, "ms"), ""),
-        ]
-
-    def _prefilter_rows(self) -> list[tuple[str, str, str]]:
-        """Return the row of the bandwidth without the prefilter, where there is one."""
-        if self.prefilter is None:
-            return []
-        return [("bandwidth without prefilter", format_figure(self.bandwidth_without_prefilter_hz, "Hz"), "")]
 
 
 def _list_achieved(figures: LoopFigures) -> dict[str, Any]:

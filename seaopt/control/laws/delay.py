@@ -138,14 +138,7 @@ NEGLIGIBLE = 0.01  # of a sample: a delay that is beyond another by less is as l
 
 
 def check_delays(spec: DelayedSpec, most: int) -> None:
-    """Refuse delays that are none, or two that say the same.
-
-    Raises
-    ------
-    ControlError
-        As said.
-
-    """
+    """Refuse delays that are none, or two that say the same."""
     for name in ("compute_delay_samples", "delay_samples"):
         value: Any = getattr(spec, name)
         if value is None:
@@ -177,11 +170,7 @@ def count_loop_samples(spec: DelayedSpec) -> int:
 def count_response_samples(spec: DelayedSpec, measured: MeasuredResponse) -> float:
     """Return the samples that a measured response is turned by: the program's, for the drive's delay is in it.
 
-    Raises
-    ------
-    ControlError
-        The older key is given, the whole loop, and the log alone has more.
-
+    Raises ControlError: the older key is given, the whole loop, and the log alone has more.
     """
     if spec.delay_samples is None:
         return count_loop_samples(spec)

@@ -18,21 +18,10 @@ def find_friction_margin(
 
     The linear plant of the test is the sliding one; what a curve's slope is above its flattest is in the sector.
 
-    Parameters
-    ----------
-    controller : Controller
-        Its measurement path closes the loop; the reference stands still.
-    plant, params
-        The plant with its friction, and parameters, conditions among them.
-    first, least
-        As in `friction_margin`.
-
-    Returns
-    -------
-    FrictionMargin or None
-        With a factor of zero where the sliding loop is not stable itself, where the loop has an
-        `seaopt.control.loops.friction_loop.FrictionLoop.obstacle`, or where nothing was shown: that does not show an
-        oscillation.
+    `controller`: its measurement path closes the loop; the reference stands still. `plant`, `params`: the plant with
+    its friction, and parameters, conditions among them. Returned: with a factor of zero where the sliding loop is not
+    stable itself, where the loop has an `seaopt.control.loops.friction_loop.FrictionLoop.obstacle`, or where nothing
+    was shown: that does not show an oscillation.
 
     Examples
     --------
@@ -56,11 +45,13 @@ def find_friction_margins(
     ]
 
 
-def take_friction_out(
-    controller: Controller, plant: Plant, sets: Sequence[ParameterSet]
-) -> list[FrictionLoop | None]:  # fmt: skip
+def take_friction_out(controller: Controller, plant: Plant, sets: Sequence[ParameterSet]) -> list[FrictionLoop | None]:
     """Return `make_friction_loops` of a controller."""
     return make_friction_loops(
-        plant, [controller.delay(params) for params in sets], controller.signals, controller.command.per_effort,
-        controller.compute_delay_samples, controller.law,
-    )  # fmt: skip
+        plant,
+        [controller.delay(params) for params in sets],
+        controller.signals,
+        controller.command.per_effort,
+        controller.compute_delay_samples,
+        controller.law,
+    )

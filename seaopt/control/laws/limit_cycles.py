@@ -39,27 +39,13 @@ DERIVATIVE = 1e-5  # relative step of frequency and amplitude
 
 @record
 class LimitCycle:
-    """A limit cycle that the describing function of friction predicts.
-
-    Parameters
-    ----------
-    frequency_hz : float
-    force_N : float
-        Amplitude of the measured output.
-    velocity : float
-        Amplitude of the velocity that the friction acts on, m/s or rad/s.
-    stable : bool
-        The loop comes back to it; an unstable one bounds what a loop recovers from.
-    state : tuple of float
-        The plant's states at the cycle's largest friction velocity.
-
-    """
+    """A limit cycle that the describing function of friction predicts."""
 
     frequency_hz: float
-    force_N: float
-    velocity: float
-    stable: bool
-    state: tuple[float, ...]
+    force_N: float  # amplitude of the measured output
+    velocity: float  # amplitude of the velocity that the friction acts on, m/s or rad/s
+    stable: bool  # the loop comes back to it; an unstable one bounds what a loop recovers from
+    state: tuple[float, ...]  # the plant's states at the cycle's largest friction velocity
 
 
 def describe_friction(
@@ -91,14 +77,9 @@ def describe_friction(
 def predict_limit_cycles(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[LimitCycle, ...]:
     """Return the limit cycles that the describing function of a plant's friction predicts, the fastest last.
 
-    Parameters
-    ----------
-    controller : Controller
-        Its measurement path closes the loop; the reference stands still.
-    plant, params
-        The plant with its friction. Where several of its frictions change with velocity nothing is predicted, nor
-        where one has bristles: before they slip they are a spring, which the curve of steady sliding knows nothing of.
-
+    `controller`: its measurement path closes the loop; the reference stands still. `plant`, `params`: the plant with
+    its friction. Where several of its frictions change with velocity nothing is predicted, nor where one has bristles:
+    before they slip they are a spring, which the curve of steady sliding knows nothing of.
     """
     if remembers(plant):
         return ()
@@ -119,11 +100,13 @@ def predict_limit_cycles(controller: Controller, plant: Plant, params: Parameter
             friction = wanted * velocity
             cycles.append(
                 LimitCycle(
-                    frequency_hz=f, force_N=float(abs(y[0]) * friction), velocity=velocity,
+                    frequency_hz=f,
+                    force_N=float(abs(y[0]) * friction),
+                    velocity=velocity,
                     stable=bool(rise * np.real(1.0 / slope) < 0.0),
                     state=tuple(float(value) for value in np.real(-x[0] * friction)),
                 )
-            )  # fmt: skip
+            )
     return tuple(cycles)
 
 

@@ -35,12 +35,12 @@ Under a sinusoidal motion the mean power into the sampled loop is then abs(v)^2 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.codec import to_content
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
@@ -120,7 +120,7 @@ class Passivity:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, for robustness.json."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return to_content(self)
 
     def __repr__(self) -> str:
         bands = ", ".join(f"{low:.4g} to {high:.4g} Hz" for low, high in self.bands_hz) or "nowhere"
@@ -271,9 +271,15 @@ def is_held_stable(port: PortModel, law: Law, sample_time_s: float, delay_sample
     delay_s = np.array([port.delay_s])
     a, b, c, d = hold(a[None], b[None], c[None], d[None], sample_time_s, delay_s)
     plant = DigitalPlant(
-        a=a[0], b=b[0], c=c[0, 0], d=float(d[0, 0]), sample_time_s=sample_time_s, delay_samples=delay_samples,
-        static_gain=np.nan, others=(c[0, 1:], d[0, 1:]),
-    )  # fmt: skip
+        a=a[0],
+        b=b[0],
+        c=c[0, 0],
+        d=float(d[0, 0]),
+        sample_time_s=sample_time_s,
+        delay_samples=delay_samples,
+        static_gain=np.nan,
+        others=(c[0, 1:], d[0, 1:]),
+    )
     poles = Loop(plant=plant, law=law).eigenvalues()
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError, require_number
+from seaopt.options import check_options, option
 from seaopt.records import record
 
 SETTLED = 1e-12  # of the largest term: a response below it is over
@@ -55,6 +56,42 @@ class GateState:
     def status(self) -> str:
         """Tell "ok", "held" or "fault"."""
         return "fault" if self.fault else "held" if self.held else "ok"
+
+
+@record(keywords=True)
+class GateSpec:
+    """What is asked of a gate: which readings a running law is to believe, and what it does about the others.
+
+    Raises
+    ------
+    ControlError
+        A value is out of range.
+
+    """
+
+    range_N: tuple[float, float] = option(
+        "Range of the sensor, in units of what is measured; readings outside are not believed."
+    )
+    max_step_N: float | None = option(
+        "Largest change of a reading in a sample; where left out, that of the design plant times margin.",
+        default=None,
+        above=0.0,
+    )
+    max_held: int = option(
+        "Readings in a row that are bridged; one more is a fault, and the command goes to zero.",
+        default=5,
+        least=0,
+        most=MOST_HELD,
+    )
+    ramp_s: float = option(
+        "Time in which the command goes from its limit to zero at a fault.", default=0.1, unit="s", above=0.0
+    )
+    margin: float = option(
+        "Factor on the design plant's largest step, for what the world does to it.", default=3.0, above=0.0
+    )
+
+    def __post_init__(self) -> None:
+        check_options(self, ControlError)
 
 
 @record
@@ -139,25 +176,18 @@ class PlausibilityGate:
 
     @classmethod
     def of_controller(
-        cls, controller: Any, *, range_N: tuple[float, float], max_step_N: float | None = None, max_held: int = 5,
-        ramp_s: float = 0.1, margin: float = 3.0,
-    ) -> PlausibilityGate:  # fmt: skip
+        cls,
+        controller: Any,
+        **asked: Any,
+    ) -> PlausibilityGate:
         """Return a gate with the step that the design plant makes at most, times a margin for what the world does.
 
         Parameters
         ----------
         controller : Controller or ForceMPC
             With its design plant and a current limit.
-        range_N : (low, high)
-            Of the sensor.
-        max_step_N : float, optional
-            In place of what is computed from the design plant.
-        max_held : int
-            Readings in a row that are bridged.
-        ramp_s : float
-            Time in which the command goes from the current limit to zero at a fault.
-        margin : float
-            On the step, for forces from outside.
+        **asked
+            Fields of `GateSpec`: range_N, and where they differ from its defaults max_step_N, max_held, ramp_s, margin.
 
         Raises
         ------
@@ -177,17 +207,17 @@ class PlausibilityGate:
         """
         if not hasattr(controller, "command_limit"):
             raise ControlError(f"controller = {controller!r:.80}: give a Controller, or a ForceMPC")
-        for name, value in (("ramp_s", ramp_s), ("margin", margin)):
-            _check_positive(value, name)
+        spec = GateSpec(**asked)
         limit = controller.command_limit
         if limit is None:
             raise ControlError("the controller has no current limit (or command_limit); give its specification one")
-        if max_step_N is None and controller.design is None:
+        if spec.max_step_N is None and controller.design is None:
             raise ControlError("the controller has no design plant to compute the largest step of; give max_step_N")
-        if max_step_N is None:
+        largest = spec.max_step_N
+        if largest is None:
             plant = controller.close(*controller.design).plant
-            max_step_N = margin * largest_step(plant, limit / controller.per_effort)
-        return cls(range_N=range_N, max_step_N=max_step_N, max_held=max_held, ramp_A_per_s=limit / ramp_s)
+            largest = spec.margin * largest_step(plant, limit / controller.per_effort)
+        return cls(range_N=spec.range_N, max_step_N=largest, max_held=spec.max_held, ramp_A_per_s=limit / spec.ramp_s)
 
     def describe(self, unit: str) -> str:
         """Return in one line which readings are believed."""
@@ -216,11 +246,7 @@ def _check_positive(value: Any, name: str) -> None:
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:
     """Return how far a plant's output moves at most between two samples while its effort is within a limit.
 
-    Raises
-    ------
-    ControlError
-        The plant does not come to rest by itself.
-
+    Raises ControlError: the plant does not come to rest by itself.
     """
     if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) >= 1.0:
         raise ControlError("the plant does not come to rest by itself, so that no step is the largest; give max_step_N")

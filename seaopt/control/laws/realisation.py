@@ -149,9 +149,10 @@ class RunnableLaw:
     def __repr__(self) -> str:
         tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
         limit = (
-            f"no limit of the {name_command(*self.command)}" if math.isinf(self.current_limit_A)
+            f"no limit of the {name_command(*self.command)}"
+            if math.isinf(self.current_limit_A)
             else f"limited to {show_command(self.current_limit_A, *self.command)}"
-        )  # fmt: skip
+        )
         return (
             f"RunnableLaw of order {self.c.size} ({self.integrators} of it integrators{tracking}) at "
             f"{1 / self.sample_time_s:.6g} Hz, {limit}"
@@ -166,9 +167,13 @@ class RunnableLaw:
         return out[:, 0], out[:, 1:].reshape(self.b_measurement.shape)
 
     def reset(
-        self, reference: float = 0.0, measurement: Reading | None = None, current_A: float = 0.0,
-        heat: tuple[float, float] = COLD, readings: Sequence[float] = (),
-    ) -> LawState:  # fmt: skip
+        self,
+        reference: float = 0.0,
+        measurement: Reading | None = None,
+        current_A: float = 0.0,
+        heat: tuple[float, float] = COLD,
+        readings: Sequence[float] = (),
+    ) -> LawState:
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
 
         A law without an integrator cannot be set: its next command follows from the inputs alone. A measurement that
@@ -284,9 +289,13 @@ class RunnableLaw:
 
 
 def runnable(
-    controller: Controller, *, current_limit_A: float | None = None, tracking_time_s: float | None = None,
-    gate: PlausibilityGate | None = None, heat: HeatGuard | None = None,
-) -> RunnableLaw:  # fmt: skip
+    controller: Controller,
+    *,
+    current_limit_A: float | None = None,
+    tracking_time_s: float | None = None,
+    gate: PlausibilityGate | None = None,
+    heat: HeatGuard | None = None,
+) -> RunnableLaw:
     """Return a controller's law ready to run.
 
     Parameters
@@ -347,10 +356,16 @@ def find_raised_limit(command: Command, spec: ControllerSpec, asked: float | Non
 
 
 def realise(
-    law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None,
-    gate: PlausibilityGate | None = None, command: tuple[str, str] = ("I", "A"), heat: HeatGuard | None = None,
+    law: Law,
+    *,
+    per_effort: float = 1.0,
+    current_limit_A: float | None = None,
+    tracking_time_s: float | None = None,
+    gate: PlausibilityGate | None = None,
+    command: tuple[str, str] = ("I", "A"),
+    heat: HeatGuard | None = None,
     compensation: Compensation | None = None,
-) -> RunnableLaw:  # fmt: skip
+) -> RunnableLaw:
     """Return a law with limit and anti-windup.
 
     Parameters
@@ -429,8 +444,5 @@ def _compute_tracking_time(law: Law) -> float:
     a_0 = law.b[m - 1, column]
     a, b, c = law.rest
     # The coefficient of w^(m-1), w = 1/(z - 1): the next one of the chain, or what is left at 0 Hz.
-    following = (
-        law.b[m - 2, column] if m > 1
-        else law.d[column] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, column])
-    )  # fmt: skip
+    following = law.b[m - 2, column] if m > 1 else law.d[column] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, column])
     return law.sample_time_s * max(abs(float(following / a_0) - m), 1.0)

@@ -15,8 +15,6 @@ from seaopt.control.laws.structures import (
     CASCADE,
     CUSTOM,
     PREFILTER_ORDERS,
-    REFERENCE_WEIGHTS,
-    STRUCTURES,
     Notch,
     Prefilter,
     PrefilterOrder,
@@ -31,94 +29,25 @@ from seaopt.control.loops.sampled_plant import Measured, list_names
 from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import join_words
 from seaopt.frequency import MeasuredResponse
+from seaopt.options import check_options, option
 from seaopt.records import record
 
 Level = float | Literal[False] | None  # of a limit: None is its default, False lifts it
 LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
 LIFTABLE = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz")
-OPTIONAL = ("current_limit_A", "command_limit", "step_N")
 MAX_DELAY_SAMPLES = 1000
 HIGHEST_CORNER = 0.45  # of the sample rate: of a filter that is part of the law
 LOWEST_HZ = 1e-3  # limits are kept from here
-FASTEST_HZ = 1e6  # of sampling
+
+
+def _limit(name: str, **described: Any) -> Any:
+    """Return the option of a limit, with default and text of its row."""
+    return option(BY_NAME[name].description, default=BY_NAME[name].default, **described)
 
 
 @record(keywords=True)
 class ControllerSpec:
     """A bandwidth and the limits of `seaopt.control.laws.limits`: left out, each has its default; False lifts one.
-
-    Parameters
-    ----------
-    measured : str or tuple of str
-        The output that is fed back, F1 as a rule; or several, the regulated one first.
-    bandwidth_hz : float
-        Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
-    bandwidth_range_hz : (low, high)
-        Allowed range of bandwidth_hz, 15 to 60 if left out; it has no say in what is found, or named as possible.
-    structure : {"pd", "pid", "pid_dob", "cascade", "custom"}
-        A pid_dob has a disturbance observer whose nominal plant is the design plant; a cascade closes a loop on the
-        motor's speed, the second of `measured`, inside the force loop; custom is a law that is given
-        (`seaopt.assess`), which may have more than bandwidth_hz.
-    speed_loop : {"P", "PI"}
-        Of a cascade: a PI is better at rejecting disturbances, and with the force loop's integral hunts where dry
-        friction sticks.
-    notch : Notch, optional
-        A notch in series; fields that are None are tuned.
-    link_feedforward : LinkFeedforward, optional
-        The effort that the link's measured motion needs, added to that of the law, from the model of the first plant
-        whose link moves (`seaopt.control.loops.compensation.link_feedforward`).
-    prefilter : {"first_order", "second_order"} or Prefilter, optional
-        A low-pass of the reference alone, tuned with the gains; of a `Prefilter` fields that are None are. bandwidth_hz
-        and all limits hold with it.
-    reference_weights : {"tuned", "error", "measurement"}
-        k_r and c of `seaopt.control.laws.structures`: tuned with the gains; feedforward and feedback of the error,
-        k_r = 1/P(0) + k_p and c = 1; or the derivative on the measurement alone, c = 0, with k_r tuned.
-    sample_rate_hz : float
-        Of the controller, at most 1e6.
-    compute_delay_samples : int, optional
-        Whole samples from a reading to the command being put out, besides the hold. Left out it is 0 where
-        `seaopt.tune` is given a fit whose experiments on the design plant show a delay, else 1
-        (`seaopt.control.laws.delay`).
-    drive_delay_s : float, optional
-        Seconds from the command to its effect, exact in fractions of a sample; left out, that of the fit.
-    delay_samples : int, optional
-        The older key: the whole loop in samples, the drive's delay among them. Not beside the other two.
-    max_sensitivity, max_complementary : float, optional
-        Ms and Mt, peaks of abs(S) and abs(L/(1+L)), on every plant.
-    min_disk_margin : float, optional
-        Symmetric disk margin, below 2, on every plant.
-    max_reference_peak : float, optional
-        Peak of abs(F/F_ref) over its static value, design plant.
-    max_droop_db : float, optional
-        How far abs(F/F_ref) falls below its static value up to a third of the bandwidth, design plant.
-    max_noise_gain : float, optional
-        Peak of abs(F_m / noise on F), N/N, design plant.
-    max_other_noise_gain : float, optional
-        The same of what the law reads besides, effort per unit of it as it is read (of an encoder per rad or m), the
-        largest, design plant.
-    min_filter_samples : float, optional
-        T_f in samples.
-    min_friction_margin : float, optional
-        Steepest friction, N s/m (N m s/rad), for which stability is to be shown on every plant that has friction
-        (`seaopt.control.loops.absolute_stability`).
-    min_sensitivity_bandwidth_hz : float, optional
-        abs(S) stays below -3 dB up to here on the design plant; bandwidth_hz/5 if left out.
-    passive_band_hz : (low, high), optional
-        From here to there the actuator of the design plant is passive at link 2 with link 1 held, Re Z >= 0
-        (`seaopt.control.laws.passivity`).
-    objective : {"disturbance", "noise"}
-        Least integral over log-frequency of abs(S) from 0.1 Hz to bandwidth_hz on the worst plant, or least noise gain.
-    current_limit_A : float, optional
-        Of the motor; it does not shape the gains. The controller says which force it leaves (`force_limit`).
-    command_limit : float, optional
-        The same of whatever is commanded, in its unit: a voltage, a duty. Give one of the two.
-    step_N : float, optional
-        A step of the reference that the current limit must at least hold.
-    reserve : float
-        Fraction by which Ms, Mt and the other limits are met with room to spare, so that parameters as uncertain as a
-        fit leaves them do not break them.
-    bandwidth_tolerance : float
-        Share of bandwidth_hz by which a law that is given, not tuned (`seaopt.control.assess`), may fall short of it.
 
     Raises
     ------
@@ -127,40 +56,105 @@ class ControllerSpec:
 
     """
 
-    measured: Measured = "F1"
-    bandwidth_hz: float = 30.0
-    bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
-    structure: Structure = "pid"
-    speed_loop: SpeedLaw = "P"
-    notch: Notch | None = None
-    link_feedforward: LinkFeedforward | None = None
-    prefilter: PrefilterOrder | Prefilter | None = None
-    reference_weights: ReferenceWeights = "tuned"
-    sample_rate_hz: float = 1000.0
-    compute_delay_samples: int | None = None
-    drive_delay_s: float | None = None
-    delay_samples: int | None = None
-    max_sensitivity: Level = BY_NAME["max_sensitivity"].default
-    max_complementary: Level = BY_NAME["max_complementary"].default
-    min_disk_margin: Level = BY_NAME["min_disk_margin"].default
-    max_reference_peak: Level = BY_NAME["max_reference_peak"].default
-    max_droop_db: Level = BY_NAME["max_droop_db"].default
-    max_noise_gain: Level = BY_NAME["max_noise_gain"].default
-    max_other_noise_gain: Level = BY_NAME["max_other_noise_gain"].default
-    min_filter_samples: Level = BY_NAME["min_filter_samples"].default
-    min_friction_margin: Level = BY_NAME["min_friction_margin"].default
-    min_sensitivity_bandwidth_hz: Level = None
-    passive_band_hz: tuple[float, float] | None = None
-    objective: Literal["disturbance", "noise"] = "disturbance"
-    current_limit_A: float | None = None
-    command_limit: float | None = None
-    step_N: float | None = None
-    reserve: float = 0.005
-    bandwidth_tolerance: float = BANDWIDTH_TOLERANCE
+    measured: Measured = option(
+        "The output that is regulated; or a list, it first and then what else is fed back, such as the motor's speed.",
+        default="F1",
+    )
+    bandwidth_hz: float = _limit("bandwidth_hz", unit="Hz", stated=True)
+    bandwidth_range_hz: tuple[float, float] = option(
+        "Within which a bandwidth may be asked. It has no other effect.", default=(15.0, 60.0), unit="Hz"
+    )
+    structure: Structure = option(
+        "A pid_dob has a disturbance observer whose nominal plant is the design plant; a cascade closes a loop on the "
+        "motor's speed, the second of `measured`, inside the force loop; custom is a law that is given "
+        "(`seaopt.assess`), which may have more than bandwidth_hz.",
+        default="pid",
+    )
+    speed_loop: SpeedLaw = option(
+        "The law of a cascade's inner loop: a PI rejects disturbances better, and hunts with the force loop's "
+        "integral where dry friction sticks.",
+        default="P",
+    )
+    notch: Notch | None = option("A notch in series.", default=None, switch=True)
+    link_feedforward: LinkFeedforward | None = option(
+        "Adds the effort that the link's measured motion needs, from the model of the first plant whose link moves.",
+        default=None,
+        switch=True,
+    )
+    prefilter: PrefilterOrder | Prefilter | None = option(
+        "A low-pass of the reference alone, of this order, tuned with the gains; bandwidth_hz and all limits hold "
+        "with it.",
+        default=None,
+    )
+    reference_weights: ReferenceWeights = option(
+        "k_r and c, by which the reference enters: tuned with the gains; of the error, k_r = 1/P(0) + k_p and c = 1; "
+        "or the derivative of the measurement alone, c = 0, with k_r tuned.",
+        default="tuned",
+    )
+    sample_rate_hz: float = option("At which the controller runs.", default=1000.0, unit="Hz", above=0.0, most=1e6)
+    compute_delay_samples: int | None = option(
+        "Whole samples from a reading to the command being put out, besides the hold: the user's program. Left out: 0 "
+        "where the log shows a delay behind a held command, else 1.",
+        default=None,
+    )
+    drive_delay_s: float | None = option(
+        "From the command to its effect, exact in fractions of a sample, where no log tells it; that of the fit where "
+        "left out.",
+        default=None,
+        unit="s",
+    )
+    delay_samples: int | None = option(
+        "The older key: both delays together, in whole samples. Not beside the other two.", default=None
+    )
+    max_sensitivity: Level = _limit("max_sensitivity")
+    max_complementary: Level = _limit("max_complementary")
+    min_disk_margin: Level = _limit("min_disk_margin")
+    max_reference_peak: Level = _limit("max_reference_peak")
+    max_droop_db: Level = _limit("max_droop_db")
+    max_noise_gain: Level = _limit("max_noise_gain")
+    max_other_noise_gain: Level = _limit("max_other_noise_gain")
+    min_filter_samples: Level = _limit("min_filter_samples")
+    min_friction_margin: Level = _limit("min_friction_margin")
+    min_sensitivity_bandwidth_hz: Level = _limit("min_sensitivity_bandwidth_hz")
+    passive_band_hz: tuple[float, float] | None = _limit("passive_band_hz")
+    objective: Literal["disturbance", "noise"] = option(
+        "What is sought among the laws that keep the limits: the least integral over log-frequency of |S| "
+        "from 0.1 Hz to bandwidth_hz on the worst plant, or the least noise gain.",
+        default="disturbance",
+    )
+    current_limit_A: float | None = option(
+        "Largest current of the motor; it does not shape the gains. The controller says which force it leaves.",
+        default=None,
+        unit="A",
+    )
+    command_limit: float | None = option(
+        "The same of another command, in its unit: a voltage, or a duty. Give one of the two.", default=None
+    )
+    step_N: float | None = option(
+        "Size of the step that is judged, which the limit of the command must at least hold.", default=None, above=0.0
+    )
+    reserve: float = option(
+        "Share by which each limit is met with room to spare, so that parameters as uncertain as a fit leaves them do "
+        "not break it.",
+        default=0.005,
+        least=0.0,
+        below=0.5,
+    )
+    bandwidth_tolerance: float = option(
+        "Share of bandwidth_hz by which a law that is given, not tuned (`seaopt.assess`), may fall short of it.",
+        default=BANDWIDTH_TOLERANCE,
+        least=0.0,
+        below=0.5,
+    )
 
     def __post_init__(self) -> None:
         self._check_measured()
-        self._check_types()
+        check_options(self, ControlError)
+        if not self.bandwidth_hz > 0.0:
+            likely = abs(self.bandwidth_hz) or 30.0
+            raise ControlError(
+                f"bandwidth_hz = {self.bandwidth_hz:g} is not positive; give it in Hz: bandwidth_hz = {likely:g}"
+            )
         low, high = self.bandwidth_range_hz
         if not 0.0 < low < high:
             raise ControlError(
@@ -173,28 +167,11 @@ class ControllerSpec:
                 f"or give another range: bandwidth_range_hz = [{min(low, self.bandwidth_hz):g}, "
                 f"{max(high, self.bandwidth_hz):g}]"
             )
-        if self.structure not in STRUCTURES:
-            raise ControlError(
-                f'structure = "{self.structure}" is not known; {suggestion(str(self.structure), STRUCTURES)}'
-            )
-        if self.reference_weights not in REFERENCE_WEIGHTS:
-            raise ControlError(
-                f'reference_weights = "{self.reference_weights}" is not known; '
-                f"{suggestion(str(self.reference_weights), REFERENCE_WEIGHTS)}"
-            )
-        if self.speed_loop not in ("P", "PI"):
-            raise ControlError(f'speed_loop = {self.speed_loop!r} is not known; give speed_loop = "P", or "PI"')
-        if self.objective not in ("disturbance", "noise"):
-            raise ControlError(
-                f'objective = "{self.objective}" is not known; use "noise", or objective = "disturbance"'
-            )
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
             raise ControlError(
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
                 f"sample more than four times as fast: sample_rate_hz = {10.0 * self.bandwidth_hz:g}"
             )
-        if self.sample_rate_hz > FASTEST_HZ:
-            raise ControlError(f"sample_rate_hz = {self.sample_rate_hz:g} is above {FASTEST_HZ:g} Hz; give it in Hz")
         check_delays(self, MAX_DELAY_SAMPLES)
         self._check_limits()
 
@@ -212,14 +189,6 @@ class ControllerSpec:
                 f'give both: measured = ["{names[0]}", "thetad_m"]'
             )
 
-    def _check_types(self) -> None:
-        for name in ("bandwidth_hz", "sample_rate_hz", "reserve", "bandwidth_tolerance", *OPTIONAL):
-            value = getattr(self, name)
-            if value is None and name in OPTIONAL:
-                continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise ControlError(f"{name} = {value!r} is not a finite number; give one")
-
     def _check_limits(self) -> None:
         for name in LIFTABLE:
             BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
@@ -227,17 +196,7 @@ class ControllerSpec:
         self._check_prefilter()
         self._check_link_feedforward()
         self._check_band()
-        if self.step_N is not None and not self.step_N > 0.0:
-            raise ControlError(
-                f"step_N = {self.step_N:g} is not positive; give the step's size: step_N = {abs(self.step_N) or 10.0:g}"
-            )
         check_command_limits(self.current_limit_A, self.command_limit)
-        if not 0.0 <= self.reserve < 0.5:
-            raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")
-        if not 0.0 <= self.bandwidth_tolerance < 0.5:
-            raise ControlError(
-                f"bandwidth_tolerance = {self.bandwidth_tolerance:g} is not a small fraction; give 0 to 0.5"
-            )
 
     def _check_band(self) -> None:
         if self.passive_band_hz is None:
@@ -371,9 +330,7 @@ class ControllerSpec:
                 f"frf:{measured.name}: is of {measured.output} alone, and of a plant whose link moves, which "
                 "link_feedforward reads; give a model of that plant, and responses of one that holds its link"
             )
-        for what, own, other in (
-            ("output", measured.output, self.measured), ("input", measured.source, command.input)
-        ):  # fmt: skip
+        for what, own, other in (("output", measured.output, self.measured), ("input", measured.source, command.input)):
             if own != other:
                 raise ControlError(
                     f"frf:{measured.name}: is measured at the {what} {own}, and the controller's is {other}; measure "
@@ -385,9 +342,7 @@ class ControllerSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        filters = {
-            "notch": self.notch, "prefilter": self.reference_filter, "link_feedforward": self.link_feedforward
-        }  # fmt: skip
+        filters = {"notch": self.notch, "prefilter": self.reference_filter, "link_feedforward": self.link_feedforward}
         stated = {name: None if one is None else asdict(one) for name, one in filters.items()}
         if self.bandwidth_tolerance == BANDWIDTH_TOLERANCE:
             del values["bandwidth_tolerance"]  # stands in no file of a law that was tuned

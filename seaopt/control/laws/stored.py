@@ -1,15 +1,17 @@
-"""What a controller needs of its controller.json, as pydantic models, and whether its fields agree with each other."""
+"""What a controller needs of its controller.json, and whether its fields agree with each other."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
-from typing import Annotated, Any, Literal
+from dataclasses import asdict, field, replace
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict, model_validator
+from jaxtyping import Float
+from pydantic import ConfigDict
 
+from seaopt.codec import Fields, Limits, check_agrees, from_content, to_content
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec
@@ -29,16 +31,16 @@ from seaopt.control.laws.structures import (
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward, LinkPath
-from seaopt.control.loops.compensation.ripple_term import MOST_CYCLES, RippleTerm
-from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.documents import Flag, ResultTable, Whole, check_result
+from seaopt.documents import Number, ResultTable
 from seaopt.errors import ControlError, FileError
 from seaopt.plants import Plant
+from seaopt.records import record
 
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
 PREFILTER_GAINS = {PREFILTER, "prefilter_damping"}
@@ -46,298 +48,97 @@ FIGURES_AGREE = 1e-4  # a bandwidth where abs(F/F_ref) is flat is known to the r
 ROUNDINGS = 1024 * float(np.finfo(float).eps)
 TUNE_AGAIN = "tune again"
 
-Finite = Annotated[FiniteFloat, Strict()]
-Coefficients = Annotated[list[Finite], Field(min_length=1)]
 
-
-def _begin_with_one(values: list[float]) -> list[float]:
-    if values[0] != 1.0:
-        raise ValueError("should begin with 1")
-    return values
-
-
-class StoredTransferFunction(ResultTable):
-    """num(q)/den(q), ascending powers of q = z^-1."""
-
-    num: Coefficients
-    den: Coefficients
-
-    def build(self) -> TransferFunction:
-        """Return the transfer function."""
-        return TransferFunction(num=np.array(self.num), den=np.array(self.den))
-
-
-class StoredLaw(ResultTable):
+@record(eq=False)
+class StoredLaw:
     """The law: a state space from (reference, measured) to effort."""
 
-    A: list[list[Finite]]
-    B: list[list[Finite]]
-    C: list[list[Finite]]
-    D: list[list[Finite]]
+    A: Float[np.ndarray, "_ _"]  # whose shapes are checked with each other
+    B: Float[np.ndarray, "_ _"]
+    C: Float[np.ndarray, "_ _"]
+    D: Float[np.ndarray, "_ _"]
 
     def build(self, sample_time_s: float) -> Law:
         """Return the law."""
-        n, k = len(self.A), len(self.D[0]) if self.D else 0
+        n, k = len(self.A), self.D.shape[1]
         shapes = {"A": (n, n), "B": (n, k), "C": (1, n), "D": (1, max(k, 2))}
-        matrices: dict[str, np.ndarray] = {}
         for name, shape in shapes.items():
-            rows = getattr(self, name)
-            if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
+            if getattr(self, name).shape != shape and (getattr(self, name).size or math.prod(shape)):
                 raise _contradict(f"law.{name}", f"is not a matrix of {shape[0]} x {shape[1]}")
-            matrices[name] = np.array(rows, dtype=float).reshape(shape)
-        return Law(
-            a=matrices["A"], b=matrices["B"], c=matrices["C"][0], d=matrices["D"][0], sample_time_s=sample_time_s
-        )
+        b = self.B.reshape(shapes["B"])
+        return Law(a=self.A, b=b, c=self.C.reshape(n), d=self.D[0], sample_time_s=sample_time_s)
 
 
-class StoredReading(StoredTransferFunction):
-    """One of the law's two transfer functions."""
+@record(eq=False)
+class StoredObserver:
+    """A disturbance observer: the two parts of its nominal plant, and the time constant of Q; what these give."""
 
-    den: Annotated[Coefficients, AfterValidator(_begin_with_one)]
-
-
-class StoredObserver(ResultTable):
-    """A disturbance observer: the two parts of its nominal plant, and the time constant of Q."""
-
-    kept: Coefficients
-    inverse: list[StoredTransferFunction]
-    T_q: Finite
-    bandwidth_hz: Finite
-    Q: StoredTransferFunction
-    Q_over_P_n: StoredTransferFunction
+    kept: Annotated[Float[np.ndarray, " n"], Limits(min_length=1)]
+    inverse: tuple[TransferFunction, ...]
+    T_q: float
+    bandwidth_hz: float
+    Q: TransferFunction
+    Q_over_P_n: TransferFunction
 
     def build(self, sample_time_s: float) -> DisturbanceObserver:
         """Return the observer; refuse what is for reading where it is not that of T_q, kept and inverse."""
-        nominal = Nominal(kept=np.array(self.kept), inverse=tuple(part.build() for part in self.inverse))
-        observer = DisturbanceObserver(nominal=nominal, T_q=self.T_q)
-        if not abs(self.bandwidth_hz - observer.bandwidth_hz) <= AGREES * observer.bandwidth_hz:
-            raise _contradict("observer.bandwidth_hz", f"is {self.bandwidth_hz:g}, and T_q says otherwise")
-        filters = zip(("Q", "Q_over_P_n"), (self.Q, self.Q_over_P_n), observer.filters(sample_time_s), strict=True)
-        for name, stated, made in filters:
-            for end in ("num", "den"):
-                one, other = np.array(getattr(stated, end)), getattr(made, end)
-                if one.shape != other.shape or np.any(np.abs(one - other) > AGREES * np.max(np.abs(other))):
-                    raise _contradict(f"observer.{name}.{end}", "is not what T_q, kept and inverse give")
+        observer = DisturbanceObserver(nominal=Nominal(kept=self.kept, inverse=self.inverse), T_q=self.T_q)
+        made = observer.to_dict(sample_time_s)
+        check_agrees(to_content(self), made, "controller.json", remedy=TUNE_AGAIN, place="observer", rtol=AGREES)
         return observer
 
 
-class StoredNumber(ResultTable):
+@record
+class StoredNumber:
     """A gain as a drive is set."""
 
-    value: Finite
+    value: float
     unit: str
-
-
-class StoredCommand(ResultTable):
-    """What the controller sends to the motor for an effort."""
-
-    input: str
-    unit: str
-    per_effort: Annotated[Finite, Field(gt=0.0)]
-    effort_unit: str
-    largest: Annotated[Finite, Field(gt=0.0)] | None = None
-    measured_unit: str = ""
 
 
 class StoredSpec(ResultTable):
     """A specification; what is not here is checked by `ControllerSpec` itself."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
-    bandwidth_range_hz: tuple[Finite, Finite]
-    passive_band_hz: tuple[Finite, Finite] | None = None
+    bandwidth_range_hz: tuple[Number, Number]
+    passive_band_hz: tuple[Number, Number] | None = None
     measured: str | tuple[str, ...] = "F1"
     robust_to: list[str] = []
 
 
-class StoredPossible(ResultTable):
-    """The bandwidths that keep the limits."""
-
-    nearest_hz: tuple[Finite, ...]
-    largest_hz: Finite | None
-    closest_hz: Finite | None
-    missed_by: Finite | None
-    fall: Finite | None = None
-    largest_fall: Finite | None = None
-    fall_unit: str = ""
-    fall_parameters: tuple[str, ...] = ()
-
-    @model_validator(mode="after")
-    def _require_pairs(self) -> StoredPossible:
-        for pair in (("closest_hz", "missed_by"), ("fall", "largest_fall")):
-            if len({getattr(self, name) is None for name in pair}) > 1:
-                raise ValueError(f"should have both of {' and '.join(pair)}, or neither")
-        return self
-
-
-class StoredMeasured(ResultTable):
-    """What the law does on one measured response; what is not finite stands as nothing."""
-
-    name: str
-    confidence: Finite
-    points: Whole
-    band_hz: tuple[Finite, Finite]
-    bandwidth_hz: tuple[Finite | None, Finite | None]
-    stable: Flag
-    ms: Finite | None
-    ms_hz: Finite | None
-    mt: Finite | None
-    disk_margin: Finite
-    noise_gain: Finite | None
-    reference_peak: Finite | None
-    droop_db: Finite | None
-    assumed: str
-
-    def build(self) -> MeasuredFigures:
-        """Return the figures."""
-        fields: dict[str, Any] = self.model_dump()
-        sizes = ("ms", "mt", "noise_gain", "reference_peak", "droop_db")
-        missing: dict[str, Any] = {name: np.inf for name in sizes if fields[name] is None}
-        missing |= {"ms_hz": np.nan} if self.ms_hz is None else {}
-        return MeasuredFigures(**(fields | missing))
-
-
-class StoredOuterLoop(ResultTable):
-    """An outer loop of stiffness and damping."""
-
-    stiffness: Annotated[Finite, Field(ge=0.0)]
-    damping: Finite
-    velocity_filter_s: Annotated[Finite, Field(ge=0.0)]
-    direction: Finite
-    sample_time_s: Annotated[Finite, Field(gt=0.0)]
-    place_unit: Literal["m", "rad"]
-    plant: str = ""
-
-
-class StoredFrictionTerm(ResultTable):
-    """Compensation of friction."""
-
-    effort: Annotated[Finite, Field(gt=0.0)]
-    speed: Annotated[Finite, Field(gt=0.0)]
-    speed_unit: str
-    fraction: Annotated[Finite, Field(gt=0.0)]
-    source: Literal["reference", "speed"]
-    reads: str
-    velocity_per_rate: Finite
-
-    @model_validator(mode="after")
-    def _require_reading(self) -> StoredFrictionTerm:
-        if bool(self.reads) != (self.source == "speed"):
-            raise ValueError('should have reads where source is "speed", and only there')
-        return self
-
-
-class StoredGravityTerm(ResultTable):
-    """Compensation of gravity."""
-
-    coefficients: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=100)]
-    low: Finite
-    high: Finite
-    reads: Annotated[str, Field(min_length=1)]
-    unit: str
-    fraction: Annotated[Finite, Field(gt=0.0)]
-
-    @model_validator(mode="after")
-    def _require_range(self) -> StoredGravityTerm:
-        if not self.low < self.high:
-            raise ValueError("should have low below high")
-        return self
-
-
-class StoredRippleTerm(ResultTable):
-    """Compensation of torque ripple."""
-
-    cycles: Annotated[
-        tuple[Annotated[Whole, Field(ge=1, le=MOST_CYCLES)], ...], Field(min_length=1, max_length=MOST_CYCLES)
-    ]
-    cos: tuple[Finite, ...]
-    sin: tuple[Finite, ...]
-    period: Annotated[Finite, Field(gt=0.0)]
-    reads: Annotated[str, Field(min_length=1)]
-    unit: str
-    fraction: Annotated[Finite, Field(gt=0.0)]
-
-    @model_validator(mode="after")
-    def _require_series(self) -> StoredRippleTerm:
-        if not len(set(self.cycles)) == len(self.cycles) == len(self.cos) == len(self.sin):
-            raise ValueError("should have each of cycles once, and one cos and one sin for each")
-        return self
-
-
-class StoredCompensation(ResultTable):
-    """What is added to reference and effort."""
-
-    friction: StoredFrictionTerm | None = None
-    gravity: StoredGravityTerm | None = None
-    ripple: StoredRippleTerm | None = None
-
-    def build(self, sample_time_s: float) -> Compensation:
-        """Return the compensation."""
-        friction = None if self.friction is None else FrictionTerm(**self.friction.model_dump())
-        gravity = None if self.gravity is None else GravityTerm(**self.gravity.model_dump())
-        ripple = None if self.ripple is None else RippleTerm(**self.ripple.model_dump())
-        return Compensation(sample_time_s=sample_time_s, friction=friction, gravity=gravity, ripple=ripple)
-
-
-class StoredLinkPath(ResultTable):
-    """What is fed forward of the link's motion."""
-
-    measured: str
-    unit: str
-    inertia: Finite
-    damping: Finite
-    is_speed: Flag
-    fraction: Finite
-    corner_hz: Annotated[Finite, Field(gt=0.0)]
-    high_pass_hz: Annotated[Finite, Field(ge=0.0)]
-
-
-class StoredGate(ResultTable):
-    """A plausibility gate."""
-
-    range_N: tuple[Finite, Finite]
-    max_step_N: Finite
-    max_held: Whole
-    ramp_A_per_s: Finite
-
-    def build(self) -> PlausibilityGate:
-        """Return the gate."""
-        try:
-            return PlausibilityGate(**self.model_dump())
-        except ControlError as error:
-            raise _contradict("guards.gate", f"is none: {error}") from error
-
-
-class StoredGuards(ResultTable):
+@record
+class StoredGuards:
     """What stands between the law and the world."""
 
-    gate: StoredGate | None = None
+    gate: PlausibilityGate | None = None
 
 
-class StoredController(ResultTable):
+@record(eq=False)
+class StoredController:
     """A controller.json."""
 
     structure: str
-    gains: dict[str, Finite]
-    sample_time_s: Finite
-    compute_delay_samples: Annotated[Whole, Field(ge=0)]
-    drive_delay_s: Annotated[Finite, Field(ge=0.0)]
-    delay_samples: Finite
+    gains: dict[str, float]
+    sample_time_s: float
+    compute_delay_samples: Annotated[int, Limits(ge=0)]
+    drive_delay_s: Annotated[float, Limits(ge=0.0)]
+    delay_samples: float
     law: StoredLaw
-    measured: list[str] | None = None
-    reference: StoredReading
-    measurement: StoredReading | list[StoredReading]
-    command: StoredCommand
+    measured: tuple[str, ...] | None = None
+    reference: TransferFunction
+    measurement: TransferFunction | tuple[TransferFunction, ...]
+    command: Command
     spec: StoredSpec
-    feasible: Flag
-    active_constraints: list[str]
-    blocked_by: list[str] = []
-    possible: StoredPossible | None = None
+    feasible: bool
+    active_constraints: tuple[str, ...]
+    blocked_by: tuple[str, ...] = ()
+    possible: PossibleBandwidths | None = None
     observer: StoredObserver | None = None
-    engineering: dict[str, StoredNumber] = {}
-    measured_responses: list[StoredMeasured] = []
-    impedance: StoredOuterLoop | None = None
-    compensation: StoredCompensation | None = None
-    link_feedforward: StoredLinkPath | None = None
+    engineering: dict[str, StoredNumber] = field(default_factory=dict[str, StoredNumber])
+    measured_responses: tuple[MeasuredFigures, ...] = ()
+    impedance: OuterLoop | None = None
+    compensation: Annotated[Mapping[str, Any], Fields(of=Compensation)] | None = None
+    link_feedforward: LinkPath | None = None
     guards: StoredGuards = StoredGuards()
 
 
@@ -350,11 +151,9 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         A field is missing or malformed, or two contradict each other: the gains must give the coefficients.
 
     """
-    table = check_result(StoredController, content, "controller.json", remedy=TUNE_AGAIN)
+    table = from_content(StoredController, content, "controller.json", remedy=TUNE_AGAIN)
     spec, robust_to = _build_spec(table.spec)
-    for name, expected in (
-        ("structure", spec.structure), ("compute_delay_samples", spec.loop_delay_samples)
-    ):  # fmt: skip
+    for name, expected in (("structure", spec.structure), ("compute_delay_samples", spec.loop_delay_samples)):
         if getattr(table, name) != expected:
             raise _contradict(name, f"is {getattr(table, name)!r} and spec.{name} {expected!r}")
     both = table.compute_delay_samples + table.drive_delay_s / table.sample_time_s
@@ -364,12 +163,12 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         stated = f"is {table.sample_time_s:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}"
         raise _contradict("sample_time_s", stated)
     law = table.law.build(spec.sample_time_s)
-    link = None if table.link_feedforward is None else LinkPath(**table.link_feedforward.model_dump())
+    link = table.link_feedforward
     if (link is None) != (spec.link_feedforward is None):
         raise _contradict("link_feedforward", "is not that of spec.link_feedforward")
     reads = _check_measured(table, spec, law, link)
     observer = None if table.observer is None else table.observer.build(spec.sample_time_s)
-    outer = None if table.impedance is None else OuterLoop(**table.impedance.model_dump())
+    outer = table.impedance
     if outer is not None and not abs(outer.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
         raise _contradict("impedance.sample_time_s", f"is {outer.sample_time_s:g}, and the law has another")
     _check_gains(table.gains, observer, spec, law, reads, link)
@@ -378,19 +177,36 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         if not abs(stated.value - expected) <= AGREES * abs(expected):
             raise _contradict(f"engineering.{name}", f"is {stated.value:g}, and the gain makes {expected:g}")
     _check_reading(table, law)
+    command, terms = table.command, table.compensation
+    if (command.input, command.unit) == ("duty", "-") and command.largest is not None and command.largest > 1.0:
+        raise _contradict("command.largest", f"is {command.largest:g}, and a duty ends at 1")
+    if (command.input, command.unit) == (
+        "duty",
+        "-",
+    ) and command.largest is None:  # as written before there were ranges
+        command = replace(command, largest=1.0)
     return {
         "law": law,
-        "structure": spec.structure, "gains": table.gains, "sample_time_s": table.sample_time_s,
-        "compute_delay_samples": table.compute_delay_samples, "drive_delay_s": table.drive_delay_s,
-        "command": _build_command(table.command), "spec": spec,
-        "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
-        "observer": observer, "link": link, "reads": reads, "blocked_by": tuple(table.blocked_by),
-        "measured": tuple(one.build() for one in table.measured_responses),
+        "structure": spec.structure,
+        "gains": table.gains,
+        "sample_time_s": table.sample_time_s,
+        "compute_delay_samples": table.compute_delay_samples,
+        "drive_delay_s": table.drive_delay_s,
+        "command": command,
+        "spec": spec,
+        "met": table.feasible,
+        "robust_to": robust_to,
+        "active_constraints": table.active_constraints,
+        "observer": observer,
+        "link": link,
+        "reads": reads,
+        "blocked_by": table.blocked_by,
+        "measured": table.measured_responses,
         "outer": outer,
-        "compensation": None if table.compensation is None else table.compensation.build(spec.sample_time_s),
-        "gate": None if table.guards.gate is None else table.guards.gate.build(),
-        "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
-    }  # fmt: skip
+        "compensation": terms and Compensation(sample_time_s=spec.sample_time_s, **terms),
+        "gate": table.guards.gate,
+        "possible": table.possible,
+    }
 
 
 def check_link(link: LinkPath, spec: ControllerSpec, plant: Plant) -> None:
@@ -415,28 +231,16 @@ def check_link(link: LinkPath, spec: ControllerSpec, plant: Plant) -> None:
         raise _contradict("link_feedforward.unit", f'is "{link.unit}", and {link.measured} is in {unit}')
 
 
-def _check_measured(
-    table: StoredController, spec: ControllerSpec, law: Law, link: LinkPath | None
-) -> tuple[str, ...]:  # fmt: skip
+def _check_measured(table: StoredController, spec: ControllerSpec, law: Law, link: LinkPath | None) -> tuple[str, ...]:
     """Return the outputs that the law reads, where they are not those of the specification; refuse another number."""
     names = list_names(spec.measured)
-    reads = names if table.measured is None else tuple(table.measured)
+    reads = names if table.measured is None else table.measured
     further = () if link is None else (link.measured,)
     if len(reads) != len(names) + len(further) or reads[0] != names[0] or reads[len(names) :] != further:
         raise _contradict("measured", f"is {list(reads)}, and spec.measured {list(names)}")
     if law.d.size != 1 + len(reads):
         raise _contradict("law", f"has {law.d.size} inputs, and reference and measured are {1 + len(reads)}")
     return () if reads == names else reads
-
-
-def _build_command(stored: StoredCommand) -> Command:
-    """Return the command; a duty ends at 1 also where the file is older than ranges, and has none."""
-    command = Command(**stored.model_dump())
-    if (command.input, command.unit) != ("duty", "-"):
-        return command
-    if command.largest is not None and command.largest > 1.0:
-        raise _contradict("command.largest", f"is {command.largest:g}, and a duty ends at 1")
-    return command if "largest" in stored.model_fields_set else replace(command, largest=1.0)
 
 
 def _build_spec(stored: StoredSpec) -> tuple[ControllerSpec, tuple[str, ...]]:
@@ -517,15 +321,16 @@ def _check_reading(table: StoredController, law: Law) -> None:
     """Refuse transfer functions that are not the law multiplied out."""
     f = COMPARED / law.sample_time_s
     q = np.exp(-2j * np.pi * COMPARED)
-    measurements = table.measurement if isinstance(table.measurement, list) else [table.measurement]
+    measurements = table.measurement if isinstance(table.measurement, tuple) else (table.measurement,)
     if len(measurements) != law.d.size - 1:
         raise _contradict("measurement", f"has {len(measurements)} entries, and the law reads {law.d.size - 1} signals")
-    read = [("reference", table.reference.build(), law.reference_response(f))]
+    read = [("reference", table.reference, law.reference_response(f))]
     read += [
-        ("measurement", one.build(), response)
-        for one, response in zip(measurements, law.feedback_responses(f), strict=True)
+        ("measurement", one, response) for one, response in zip(measurements, law.feedback_responses(f), strict=True)
     ]
     for name, tf, expected in read:
+        if tf.den[0] != 1.0:
+            raise _contradict(f"{name}.den", "should begin with 1")
         num, den = (np.polynomial.polynomial.polyval(q, p) for p in (tf.num, tf.den))
         # C den = num, to the rounding of either polynomial's coefficients.
         rounding = ROUNDINGS * (np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(expected))

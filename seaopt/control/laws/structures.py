@@ -82,6 +82,7 @@ from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.options import option
 from seaopt.records import record
 
 Structure = Literal["pd", "pid", "pid_dob", "cascade", "custom"]
@@ -107,22 +108,13 @@ HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal l
 
 @record
 class Notch:
-    """A notch; what is None is tuned.
+    """A notch; what is left out is tuned."""
 
-    Parameters
-    ----------
-    frequency_hz : float, optional
-        Its centre.
-    width : float, optional
-        Damping ratio of its poles: it is 2 width frequency_hz wide.
-    depth : float, optional
-        Gain at its centre, above 0 to 1.
-
-    """
-
-    frequency_hz: float | None = None
-    width: float | None = None
-    depth: float | None = None
+    frequency_hz: float | None = option("Its centre; tuned where left out.", default=None, unit="Hz")
+    width: float | None = option(
+        "Damping ratio of its poles: it is 2 width frequency_hz wide; tuned where left out.", default=None
+    )
+    depth: float | None = option("Gain at its centre, up to 1; tuned where left out.", default=None)
 
     def biquad(self, sample_time_s: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Return numerator and denominator, denominator not normalised; every field must have a value."""
@@ -137,22 +129,11 @@ class Notch:
 
 @record
 class Prefilter:
-    """A low-pass in series with the reference; what is None is tuned.
+    """A low-pass in series with the reference; what is left out is tuned."""
 
-    Parameters
-    ----------
-    order : {"first_order", "second_order"}
-        Its order.
-    corner_hz : float, optional
-        Where its asymptotes meet.
-    damping : float, optional
-        Damping ratio, of one of second order.
-
-    """
-
-    order: PrefilterOrder = "first_order"
-    corner_hz: float | None = None
-    damping: float | None = None
+    order: PrefilterOrder = option("Without or with a damping.", default="first_order", stated=True)
+    corner_hz: float | None = option("Where its asymptotes meet; tuned where left out.", default=None, unit="Hz")
+    damping: float | None = option("Damping ratio of one of second order; tuned where left out.", default=None)
 
     @property
     def is_second_order(self) -> bool:
@@ -176,18 +157,10 @@ class Prefilter:
 
 @record(eq=False)
 class Nominal:
-    """The nominal plant of a disturbance observer in its two parts: Q = Q_0 kept, Q/P_n = Q_0 inverse.
+    """The nominal plant of a disturbance observer in its two parts: Q = Q_0 kept, Q/P_n = Q_0 inverse."""
 
-    Parameters
-    ----------
-    kept : array
-        q^(1+d) B_u(q)/B_u(1), coefficients in ascending powers of q.
-    inverse : tuple of TransferFunction
-        A(q)/(B_s(q) B_u(1)) as a product of factors of second order at most: multiplied out it would lose digits.
-
-    """
-
-    kept: Float[np.ndarray, " n"]
+    kept: Float[np.ndarray, " n"]  # q^(1+d) B_u(q)/B_u(1), coefficients in ascending powers of q
+    # A(q)/(B_s(q) B_u(1)) as a product of factors of second order at most: multiplied out it would lose digits
     inverse: tuple[TransferFunction, ...]
 
     @classmethod
@@ -288,16 +261,9 @@ class DisturbanceObserver:
 
 @record
 class SpeedLoop:
-    """What the speed loop of a cascade reads: the motor's speed, or its encoder.
+    """What the speed loop of a cascade reads: the motor's speed, or its encoder."""
 
-    Parameters
-    ----------
-    differenced : bool
-        It is an encoder's position, and the law takes the difference over one sample.
-
-    """
-
-    differenced: bool
+    differenced: bool  # it is an encoder's position, and the law takes the difference over one sample
 
     def sense(self, q: Complex[np.ndarray, " m"], sample_time_s: float) -> Complex[np.ndarray, " m"]:
         """Return the speed per what is read, at q = exp(-j omega T_s)."""
@@ -306,25 +272,12 @@ class SpeedLoop:
 
 @record
 class InnerLoop:
-    """The speed loop of a cascade.
+    """The speed loop of a cascade."""
 
-    Parameters
-    ----------
-    k_v : float
-        Effort per motor speed, N s/m or N m s/rad.
-    T_v : float
-        Seconds: its integral time; infinite for none.
-    k_ff : float
-        Effort per reference besides, 1/P(0).
-    speed : SpeedLoop
-        What it reads.
-
-    """
-
-    k_v: float
-    T_v: float
-    k_ff: float
-    speed: SpeedLoop
+    k_v: float  # effort per motor speed, N s/m or N m s/rad
+    T_v: float  # seconds: its integral time; infinite for none
+    k_ff: float  # effort per reference besides, 1/P(0)
+    speed: SpeedLoop  # what it reads
 
     @property
     def integrates(self) -> bool:
@@ -412,9 +365,12 @@ class Gains:
 
     @classmethod
     def from_names(
-        cls, numbers: Mapping[str, float], observer: DisturbanceObserver | None = None, speed: SpeedLoop | None = None,
+        cls,
+        numbers: Mapping[str, float],
+        observer: DisturbanceObserver | None = None,
+        speed: SpeedLoop | None = None,
         link: LinkPath | None = None,
-    ) -> Gains:  # fmt: skip
+    ) -> Gains:
         """Return the gains of `by_name`; observer, what a speed loop reads and link are given."""
         notch = inner = prefilter = None
         if PREFILTER in numbers:
@@ -422,15 +378,17 @@ class Gains:
             order = PREFILTER_ORDERS[damping is not None]
             prefilter = Prefilter(order=order, corner_hz=numbers[PREFILTER], damping=damping)
         if speed is not None:
-            inner = InnerLoop(
-                k_v=numbers["k_v"], k_ff=numbers["k_ff"], T_v=numbers.get("T_v", math.inf), speed=speed
-            )  # fmt: skip
+            inner = InnerLoop(k_v=numbers["k_v"], k_ff=numbers["k_ff"], T_v=numbers.get("T_v", math.inf), speed=speed)
         if "notch_depth" in numbers:
             notch = Notch(**{field.name: numbers[f"notch_{field.name}"] for field in fields(Notch)})
         return cls(
-            **{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch, inner=inner,
-            prefilter=prefilter, link=link,
-        )  # fmt: skip
+            **{name: numbers[name] for name in LAW_GAINS},
+            observer=observer,
+            notch=notch,
+            inner=inner,
+            prefilter=prefilter,
+            link=link,
+        )
 
     def makes(self, law: Law, structure: Structure) -> bool:
         """Tell whether these gains make a law: its responses, to a millionth or to rounding, and its integrators."""
@@ -495,26 +453,19 @@ class LawTerms(NamedTuple):
 
 
 def evaluate_terms(
-    q: Any, ts: Any, T_f: Any, observer: tuple[Any, Any, Any] | None = None,
-    notch: tuple[Any, Any, Any] | None = None, speed_rate: Any = 0.0, prefilter: tuple[Any, Any | None] | None = None,
-) -> LawTerms:  # fmt: skip
+    q: Any,
+    ts: Any,
+    T_f: Any,
+    observer: tuple[Any, Any, Any] | None = None,
+    notch: tuple[Any, Any, Any] | None = None,
+    speed_rate: Any = 0.0,
+    prefilter: tuple[Any, Any | None] | None = None,
+) -> LawTerms:
     """Return the terms of a law at q, for numbers that may be arrays or symbols.
 
-    Parameters
-    ----------
-    q : complex
-        exp(-j omega T_s).
-    ts, T_f
-        Seconds.
-    observer : (T_q, kept, inverse), optional
-        The time constant, and the two parts of the nominal plant at q.
-    notch : (w, width, depth), optional
-        w = tan(pi f T_s) of its frequency.
-    speed_rate
-        1/T_v of a speed loop, rad/s; 0 where it does not integrate.
-    prefilter : (w, damping), optional
-        The same w of its corner; the damping is None in one of first order.
-
+    `observer`: the time constant, and the two parts of the nominal plant at q. `notch`: w = tan(pi f T_s) of its
+    frequency. `speed_rate`: 1/T_v of a speed loop, rad/s; 0 where it does not integrate. `prefilter`: the same w of its
+    corner; the damping is None in one of first order.
     """
     series: Any = 1.0
     more: Any = 0.0

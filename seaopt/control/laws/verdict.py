@@ -12,6 +12,7 @@ from seaopt.control.laws.limits import OTHER_NOISE, Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
+from seaopt.errors import ControlError
 from seaopt.formatting import format_count, join_words
 from seaopt.records import record
 
@@ -99,6 +100,11 @@ class PossibleBandwidths:
     fall_unit: str = ""
     fall_parameters: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        for pair in (("closest_hz", "missed_by"), ("fall", "largest_fall")):
+            if len({getattr(self, name) is None for name in pair}) > 1:
+                raise ControlError(f"has one of {' and '.join(pair)}; give both, or neither")
+
     def __str__(self) -> str:
         if self.fall is None:
             return self._format_bandwidths()
@@ -112,8 +118,8 @@ class PossibleBandwidths:
         if self.largest_hz is None and self.closest_hz is None:
             return "no stable law was found at other bandwidths"
         if self.largest_hz is None:
-            least = f"{self.closest_hz:.4g} Hz misses least, by {self.missed_by:.1%}"
-            return f"no other is known that keeps them; of those {least}"
+            closest = f"the closest is {self.closest_hz:.4g} Hz, which exceeds one by {self.missed_by:.1%}"
+            return f"no bandwidth that meets all limits was found; {closest}"
         nearest = " and ".join(f"{f:.4g} Hz" for f in self.nearest_hz)
         most = "" if self.largest_hz in self.nearest_hz else f", {self.largest_hz:.4g} Hz at most"
         return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"

@@ -75,32 +75,17 @@ EVERY = slice(None)
 
 @record
 class FrictionMargin:
-    """How much steeper than they are all friction curves may be for the test of stability to hold.
+    """How much steeper than they are all friction curves may be for the test of stability to hold."""
 
-    Parameters
-    ----------
-    factor : float
-        Of the curves' own steepest slopes, 1 and more where the test holds for the curves as they are; infinite where
-        it does even for a jump (ideal Coulomb friction), zero where it does for nothing.
-    slopes : tuple of float
-        The slopes up to which it holds, N s/m (N m s/rad).
-    frequency_hz : float
-        Where the test fails first with steeper curves.
-    multiplier : str
-        With which it holds.
-    angles : int
-        At how many angles it was looked at, those about the worst of them included; between them nothing is enclosed.
-    linearised : bool
-        A link turns, for which the plant is linearised at rest.
-
-    """
-
+    # of the curves' own steepest slopes, 1 and more where the test holds for the curves as they are; infinite where it
+    # does even for a jump (ideal Coulomb friction), zero where it does for nothing
     factor: float
-    slopes: tuple[float, ...]
-    frequency_hz: float
-    multiplier: str
+    slopes: tuple[float, ...]  # the slopes up to which it holds, N s/m (N m s/rad)
+    frequency_hz: float  # where the test fails first with steeper curves
+    multiplier: str  # with which it holds
+    # at how many angles it was looked at, those about the worst of them included; between them nothing is enclosed
     angles: int = 0
-    linearised: bool = False
+    linearised: bool = False  # a link turns, for which the plant is linearised at rest
 
     @property
     def shown(self) -> bool:
@@ -133,15 +118,9 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
     is zero, and its `multiplier` says why. Sums over aliases are truncated with a bound on the rest; rounding is not
     enclosed, nor is what lies between the angles looked at.
 
-    Parameters
-    ----------
-    loop : FrictionLoop
-        The loop with its friction taken out.
-    first : str, optional
-        The name of a multiplier that is tried first, and alone where it shows stability for the curves as they are.
-    least : float
-        A smaller factor is not looked for, which is quicker: the margin is then zero.
-
+    `loop`: the loop with its friction taken out. `first`: the name of a multiplier that is tried first, and alone where
+    it shows stability for the curves as they are. `least`: a smaller factor is not looked for, which is quicker: the
+    margin is then zero.
     """
     none = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
     obstacle = loop.obstacle
@@ -163,10 +142,13 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
         worst = int(np.argmin(test(inverse * (1.0 - 0.01), EVERY)))
         factor = np.inf if inverse == 0.0 else 1.0 / inverse
         best = FrictionMargin(
-            factor=float(factor), slopes=tuple(float(slope) for slope in factor * loop.slopes),
-            frequency_hz=float(theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
-            angles=count, linearised=loop.linearised,
-        )  # fmt: skip
+            factor=float(factor),
+            slopes=tuple(float(slope) for slope in factor * loop.slopes),
+            frequency_hz=float(theta[worst] / (2 * np.pi * loop.plant.sample_time_s)),
+            multiplier=name,
+            angles=count,
+            linearised=loop.linearised,
+        )
         if name == first and best.shown:
             break
     return best
@@ -221,11 +203,14 @@ def find_responses(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) 
     if feedback:
         read = np.einsum("ym,mkpy->mkp", loop.feedback(theta), read)
     return LoopResponses(
-        theta=theta, s=1j * (theta[:, None] + 2 * np.pi * orders) / period, mobility=by_friction[..., :ports, :],
-        command=-response.by_motor[..., :ports], sensed=np.conj(read),
+        theta=theta,
+        s=1j * (theta[:, None] + 2 * np.pi * orders) / period,
+        mobility=by_friction[..., :ports, :],
+        command=-response.by_motor[..., :ports],
+        sensed=np.conj(read),
         tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
         order=ALIASES + theta / (2 * np.pi),
-    )  # fmt: skip
+    )
 
 
 def _weigh(at: LoopResponses, multiplier: Multiplier) -> Test:
@@ -260,12 +245,12 @@ def _form_terms_of_one(at: LoopResponses, weight: Complex[np.ndarray, "m k"]) ->
     """Return `_form_terms` where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
     mobility, slope = np.real(weight * at.mobility[..., 0, 0]), np.real(weight)
     command, sensed = weight * at.command[..., 0], at.sensed[..., 0]
-    own, other, both = _square(command), _square(sensed), np.conj(sensed) * command
+    commanded, sensing, crossed = _square(command), _square(sensed), np.conj(sensed) * command
 
     def form(inverse: float, angles: Places) -> Terms:
         real = mobility[angles] + inverse * slope[angles]
         share = 1.0 / np.where(real > 0.0, real, 1.0)
-        return np.min(real, axis=-1) > 0.0, own[angles] * share, other[angles] * share, both[angles] * share
+        return np.min(real, axis=-1) > 0.0, commanded[angles] * share, sensing[angles] * share, crossed[angles] * share
 
     return form
 
@@ -275,9 +260,12 @@ def _square(values: Complex[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
 
 
 def _compare(
-    at: LoopResponses, angles: Places, alpha: Float[np.ndarray, "a n"], beta: Float[np.ndarray, "a n"],
+    at: LoopResponses,
+    angles: Places,
+    alpha: Float[np.ndarray, "a n"],
+    beta: Float[np.ndarray, "a n"],
     gamma: Complex[np.ndarray, "a n"],
-) -> Angles:  # fmt: skip
+) -> Angles:
     """Return |2 + gamma|^2 - alpha beta of the terms at the aliases, scaled, with what is beyond them against it.
 
     The terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
@@ -376,34 +364,18 @@ class FeedbackLimit:
     :math:`\beta = K^* B K`, and :math:`|2 + \gamma|^2 > \alpha\beta` reads
 
     .. math:: |1 + (P + \tfrac12 \gamma_1)^T C| > \tfrac12 \sqrt{\alpha\, C^* B C} .
-
-    Parameters
-    ----------
-    plants : array, shape (y, m)
-        :math:`P + \gamma_1/2`, with the loop's delay.
-    weights : array, shape (y, y, m)
-        A root of :math:`\alpha B/4`, with what is beyond the aliases; `NO_FEEDBACK` where no feedback does.
-
     """
 
-    plants: Complex[np.ndarray, "y m"]
+    plants: Complex[np.ndarray, "y m"]  # :math:`P + \gamma_1/2`, with the loop's delay
+    # a root of :math:`\alpha B/4`, with what is beyond the aliases; `NO_FEEDBACK` where no feedback does
     weights: Complex[np.ndarray, "y y m"]
 
 
 def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: float) -> FeedbackLimit:
     """Return what is asked of C so that a multiplier shows stability for curves `factor` times as steep as they are.
 
-    Parameters
-    ----------
-    loop : FrictionLoop
-        The loop with its friction taken out; its own law does not matter.
-    theta : array, shape (m,)
-        Angles.
-    multiplier : str
-        As named in a `FrictionMargin`.
-    factor : float
-        Of the curves' own steepest slopes.
-
+    `loop`: the loop with its friction taken out; its own law does not matter. `theta`: shape (m,). `factor`: of the
+    curves' own steepest slopes.
     """
     at = find_responses(loop, theta, feedback=False)
     through = loop.plant.responses(theta / (2 * np.pi * loop.plant.sample_time_s))

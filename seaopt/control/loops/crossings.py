@@ -31,9 +31,10 @@ def find_crossings(
 
 
 def add_minima(
-    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: Float[np.ndarray, " m"],
+    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]],
+    f: Float[np.ndarray, " m"],
     shallow: float = np.inf,
-) -> Float[np.ndarray, " k"]:  # fmt: skip
+) -> Float[np.ndarray, " k"]:
     """Return f with every local minimum of the curve on that grid, refined by thirds, ascending.
 
     Who looks for crossings of zero can leave out minima that do not reach it: on the grid they are above zero by more

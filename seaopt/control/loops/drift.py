@@ -50,17 +50,9 @@ class _Drift:
 def leave_out_drift(plant: Plant, measured: str | tuple[str, ...]) -> Plant:
     """Return the plant without the motion that neither it nor a fed-back output depends on; often the plant itself.
 
-    Parameters
-    ----------
-    plant : Plant
-        Friction that remembers where it bent holds a link: such a plant is returned as it is.
-    measured : str or tuple of str
-        The output that is fed back, or all that are.
-
-    Returns
-    -------
-    Plant
-        In the coordinates relative to what drifts; outputs that tell where that is are left out.
+    `plant`: friction that remembers where it bent holds a link: such a plant is returned as it is. `measured`: the
+    output that is fed back, or all that are. Returned: in the coordinates relative to what drifts; outputs that tell
+    where that is are left out.
 
     Examples
     --------
@@ -78,8 +70,8 @@ def leave_out_drift(plant: Plant, measured: str | tuple[str, ...]) -> Plant:
     drift = _find_drift(plant)
     if drift is None:
         return plant
-    rest = _take_out(plant, drift)
-    return leave_out_drift(rest, measured) if names <= rest.outputs.keys() else plant
+    remaining = _take_out(plant, drift)
+    return leave_out_drift(remaining, measured) if names <= remaining.outputs.keys() else plant
 
 
 def _look(plant: Plant) -> list[tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "_ n"], Any]]:
@@ -116,26 +108,26 @@ def _find_drift(plant: Plant) -> _Drift | None:
     direction = turned[-1] / size
     touched = np.flatnonzero(np.abs(direction * size) > ROUNDING)
     along = int(touched[-1])
-    others = [int(i) for i in touched[:-1]]
-    moved = _solve_ratios(plant, first, along, others)
+    coupled = [int(i) for i in touched[:-1]]
+    moved = _solve_ratios(plant, first, along, coupled)
     names = list(plant.states)
-    drift = _Drift(along=names[along], others={names[i]: one for i, one in zip(others, moved, strict=True)})
+    drift = _Drift(along=names[along], others={names[i]: ratio for i, ratio in zip(coupled, moved, strict=True)})
     return drift if _is_drift(plant, drift, places) else None
 
 
-def _solve_ratios(plant: Plant, a: Float[np.ndarray, "n n"], along: int, others: Sequence[int]) -> list[Any]:
+def _solve_ratios(plant: Plant, a: Float[np.ndarray, "n n"], along: int, coupled: Sequence[int]) -> list[Any]:
     """Return how far the others move with one, solved for in symbols: from as many equations as there are others."""
-    if not others:
+    if not coupled:
         return []
     # The rows that tell the others best: a triangle with pivots picks them.
     from scipy.linalg import qr  # deferred: scipy is slow to load
 
-    pivots: Any = qr(a[:, others].T, mode="r", pivoting=True)[-1]
-    rows = np.sort(pivots[: len(others)])
+    pivots: Any = qr(a[:, coupled].T, mode="r", pivoting=True)[-1]
+    rows = np.sort(pivots[: len(coupled)])
     slopes = ca.substitute(ca.jacobian(plant.dynamics, plant.x), plant.t, 0.0)
     slopes = ca.substitute(slopes, ca.vertcat(plant.x, plant.u), ca.SX.zeros(plant.x.numel() + plant.u.numel()))
     picked = slopes[rows.tolist(), :]
-    return ca.vertsplit(ca.simplify(-ca.solve(picked[:, list(others)], picked[:, along])))
+    return ca.vertsplit(ca.simplify(-ca.solve(picked[:, list(coupled)], picked[:, along])))
 
 
 def _is_drift(plant: Plant, drift: _Drift, places: Sequence[tuple[Any, Any, Any]]) -> bool:
@@ -168,12 +160,13 @@ def _take_out(plant: Plant, drift: _Drift) -> Plant:
     def settle(expression: Any) -> Any:
         return ca.substitute(ca.SX(expression), zero, 0.0)
 
-    def relative(one: Friction) -> Friction:
-        velocity, loads = one.velocity, one.loads
+    def relative(friction: Friction) -> Friction:
+        velocity, loads = friction.velocity, friction.loads
         return replace(
-            one, velocity=lambda x, p: settle(velocity(fill(x), p)),
+            friction,
+            velocity=lambda x, p: settle(velocity(fill(x), p)),
             loads=None if loads is None else lambda x, u, p: settle(loads(fill(x), u, p)),
-        )  # fmt: skip
+        )
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
         rates = {name: settle(rate) for name, rate in plant.f(t, fill(x), u, p).items()}
@@ -187,11 +180,19 @@ def _take_out(plant: Plant, drift: _Drift) -> Plant:
         return {name: settle(value) for name, value in plant.h(t, fill(x), u, p).items() if name not in told}
 
     return replace(
-        plant, f=f, h=h, ports=(), energy=None, spring=None, sensing=None, mode=None, derived=None,
+        plant,
+        f=f,
+        h=h,
+        ports=(),
+        energy=None,
+        spring=None,
+        sensing=None,
+        mode=None,
+        derived=None,
         states={name: unit for name, unit in plant.states.items() if name != drift.along},
         outputs={name: unit for name, unit in plant.outputs.items() if name not in told},
-        friction={name: relative(one) for name, one in plant.friction.items()},
-    )  # fmt: skip
+        friction={name: relative(friction) for name, friction in plant.friction.items()},
+    )
 
 
 def _find_telling(plant: Plant, drift: _Drift) -> set[str]:
@@ -201,5 +202,5 @@ def _find_telling(plant: Plant, drift: _Drift) -> set[str]:
     for _, c, p in _look(plant):
         v = np.array(direction(p)).ravel()
         seen = np.abs(c @ v) > ROUNDING * (np.abs(c) @ np.abs(v)) + 1e-300
-        told |= {name for name, one in zip(plant.outputs, seen, strict=True) if one}
+        told |= {name for name, depends in zip(plant.outputs, seen, strict=True) if depends}
     return told

@@ -40,50 +40,23 @@ FUNDAMENTAL = np.zeros(1, dtype=int)  # the order of the angle itself
 
 @record(eq=False)
 class FrictionLoop:
-    r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = c x.
+    r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = c x."""
 
-    Parameters
-    ----------
-    a, motor : arrays, shapes (n, n) and (n,)
-        The continuous plant without friction, and the effect of the motor effort u.
-    friction : array, shape (n, p)
-        The effect of each friction effort in the direction of its velocity.
-    velocity, measured : arrays, shapes (p, n) and (n,)
-        The velocities that friction acts on, and the regulated output.
-    through : array, shape (p,)
-        The effect of each friction effort on that output itself.
-    slopes : array, shape (p,)
-        The steepest slope of each friction curve, N s/m (N m s/rad).
-    plant : DigitalPlant
-        The same plant, sampled, from u to y, with its delay.
-    law : Law
-        Its C_y closes the loop.
-    delay_s : float
-        Of the motor effort, besides the whole samples of `plant`.
-    linear : bool
-        Besides its friction the plant is linear, once links that turn are linearised at rest.
-    linearised : bool
-        Some link is.
-    remembers : bool
-        Some friction has bristles, and is no curve of its velocity.
-    others : (measured, through), optional
-        Of further outputs that the law reads, shapes (k, n) and (k, p).
-
-    """
-
-    a: Float[np.ndarray, "n n"]
+    a: Float[np.ndarray, "n n"]  # a, motor: the continuous plant without friction, and the effect of the motor effort u
     motor: Float[np.ndarray, " n"]
-    friction: Float[np.ndarray, "n p"]
+    friction: Float[np.ndarray, "n p"]  # the effect of each friction effort in the direction of its velocity
+    # velocity, measured: the velocities that friction acts on, and the regulated output
     velocity: Float[np.ndarray, "p n"]
     measured: Float[np.ndarray, " n"]
-    through: Float[np.ndarray, " p"]
-    slopes: Float[np.ndarray, " p"]
-    plant: DigitalPlant
-    law: Law
-    delay_s: float = 0.0
-    linear: bool = True
-    linearised: bool = False
-    remembers: bool = False
+    through: Float[np.ndarray, " p"]  # the effect of each friction effort on that output itself
+    slopes: Float[np.ndarray, " p"]  # the steepest slope of each friction curve, N s/m (N m s/rad)
+    plant: DigitalPlant  # the same plant, sampled, from u to y, with its delay
+    law: Law  # its C_y closes the loop
+    delay_s: float = 0.0  # of the motor effort, besides the whole samples of `plant`
+    linear: bool = True  # besides its friction the plant is linear, once links that turn are linearised at rest
+    linearised: bool = False  # some link is
+    remembers: bool = False  # some friction has bristles, and is no curve of its velocity
+    # of further outputs that the law reads, shapes (k, n) and (k, p)
     others: tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k p"]] | None = None
 
     @property
@@ -114,15 +87,8 @@ class FrictionLoop:
     ) -> FrictionResponse:
         """Return what friction efforts and motor commands do to some rows of the states, the loop open.
 
-        Parameters
-        ----------
-        theta : array, shape (m,)
-            Angles, 2 pi times frequency over sample rate.
-        orders : array, shape (k,)
-            Which aliases: that of order k is theta + 2 pi k.
-        seen : array, shape (y, n)
-            The rows.
-
+        `theta`: angles, 2 pi times frequency over sample rate. `orders`: which aliases: that of order k is theta + 2 pi
+        k.
         """
         period = self.plant.sample_time_s
         s = 1j * (theta[:, None] + 2 * np.pi * orders) / period
@@ -142,19 +108,10 @@ class FrictionLoop:
 
 @record(eq=False)
 class FrictionResponse:
-    """Rows of the states at m angles and k aliases.
+    """Rows of the states at m angles and k aliases."""
 
-    Parameters
-    ----------
-    by_friction : array, shape (m, k, y, p)
-        Per unit of each friction effort, as it pushes.
-    by_motor : array, shape (m, k, y)
-        Per unit of the sampled motor command at the fundamental, delayed and held.
-
-    """
-
-    by_friction: Complex[np.ndarray, "m k y p"]
-    by_motor: Complex[np.ndarray, "m k y"]
+    by_friction: Complex[np.ndarray, "m k y p"]  # per unit of each friction effort, as it pushes
+    by_motor: Complex[np.ndarray, "m k y"]  # per unit of the sampled motor command at the fundamental, delayed and held
 
 
 def transfer(
@@ -186,32 +143,16 @@ def make_friction_loops(
 ) -> list[FrictionLoop | None]:
     """Return, per set of parameters, the sliding loop with what friction has above its flattest slope taken out.
 
-    Parameters
-    ----------
-    plant : Plant
-        With its friction.
-    sets : sequence of ParameterSet
-        All with the same conditions among them.
-    measured : str or tuple of str
-        The output that is fed back, or several, the regulated one first.
-    per_effort : float
-        The command that the law's effort becomes, per unit.
-    delay_samples : int
-        Whole samples from measurement to output, besides the hold.
-    law : Law
-        Its sample time is the loop's.
-
-    Returns
-    -------
-    list of FrictionLoop or None
-        None where there is no friction.
-
+    `sets`: all with the same conditions among them. `measured`: the output that is fed back, or several, the regulated
+    one first. `per_effort`: the command that the law's effort becomes, per unit. `delay_samples`: whole samples from
+    measurement to output, besides the hold. `law`: its sample time is the loop's. Returned: None where there is no
+    friction.
     """
     plant = leave_out_drift(freeze_heat(plant), measured)
     values = [plant.complete(params) for params in sets]
     spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
-    held = [np.array(find_bristle_stiffness(plant, each)) for each in values]
-    if not np.any(spans) and not np.any(held):
+    bristles = [np.array(find_bristle_stiffness(plant, each)) for each in values]
+    if not np.any(spans) and not np.any(bristles):
         return [None] * len(sets)
     sliding = friction_states(plant)[SLIDING]
     names = (measured,) if isinstance(measured, str) else measured
@@ -219,17 +160,31 @@ def make_friction_loops(
     blocks, delays = linearise_sets(sliding, values, names, per_effort)
     sampled = sample_linear(blocks, delays, law.sample_time_s, delay_samples)
     loops: list[FrictionLoop | None] = []
-    for k, (each, span, stiffness) in enumerate(zip(values, spans, held, strict=True)):
+    for k, (each, span, stiffness) in enumerate(zip(values, spans, bristles, strict=True)):
         x, u = find_rest(plant, each)
         on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, each.vector))
         linear, linearised = _check_linear(sliding, x, each.vector)
         remembers = bool(np.any(stiffness))
-        loops.append(None if not np.any(span) and not remembers else FrictionLoop(
-            a=blocks[0][k], motor=blocks[1][k], measured=blocks[2][k][0], friction=on_states, velocity=velocity,
-            through=on_outputs[rows[0]], slopes=span, plant=sampled[k],
-            law=law, delay_s=float(delays[k]), linear=linear, linearised=linearised, remembers=remembers,
-            others=(blocks[2][k][1:], on_outputs[rows[1:]]),
-        ))  # fmt: skip
+        loops.append(
+            None
+            if not np.any(span) and not remembers
+            else FrictionLoop(
+                a=blocks[0][k],
+                motor=blocks[1][k],
+                measured=blocks[2][k][0],
+                friction=on_states,
+                velocity=velocity,
+                through=on_outputs[rows[0]],
+                slopes=span,
+                plant=sampled[k],
+                law=law,
+                delay_s=float(delays[k]),
+                linear=linear,
+                linearised=linearised,
+                remembers=remembers,
+                others=(blocks[2][k][1:], on_outputs[rows[1:]]),
+            )
+        )
     return loops
 
 
@@ -249,7 +204,7 @@ def _check_linear(plant: Plant, rest: Float[np.ndarray, " n"], values: Float[np.
         return True, False
     slopes = ca.substitute(slopes, plant.p, ca.DM(values))
     kept = [column for column in range(slopes.shape[1]) if column not in turning]
-    held = ca.vertcat(*(float(rest[i]) if i in turning else plant.x[i] for i in range(len(plant.states))))
-    others = ca.substitute(slopes[:, kept], plant.x, held)
-    linear = not ca.depends_on(ca.vec(others), variables)
+    turned = ca.vertcat(*(float(rest[i]) if i in turning else plant.x[i] for i in range(len(plant.states))))
+    remaining = ca.substitute(slopes[:, kept], plant.x, turned)
+    linear = not ca.depends_on(ca.vec(remaining), variables)
     return linear, linear and bool(ca.depends_on(ca.vec(slopes), variables))

@@ -141,11 +141,11 @@ class Law:
         Balanced, controllability and observability Gramians are equal and diagonal, which keeps rounding noise low, so
         that single precision can hold the states (`seaopt.control.loops.minimal`).
         """
-        m, rest = self.integrators, self.rest
-        if not rest[2].size or np.max(np.abs(np.linalg.eigvals(rest[0]))) >= 1.0:
+        m, block = self.integrators, self.rest
+        if not block[2].size or np.max(np.abs(np.linalg.eigvals(block[0]))) >= 1.0:
             return self
         try:
-            balanced = balance(*rest, float(np.max(np.abs(self.d))))
+            balanced = balance(*block, float(np.max(np.abs(self.d))))
         except np.linalg.LinAlgError:  # so close to the unit circle that rounding makes a Gramian infinite
             return self
         return Law(**build_chain(self.b[:m], *balanced), d=self.d, sample_time_s=self.sample_time_s)
@@ -175,9 +175,15 @@ class Law:
 
         measured = [f"measured{i}" if self.d.size > 2 else "measured" for i in range(1, self.d.size)]
         return control.StateSpace(
-            self.a, self.b, self.c[None], self.d[None], self.sample_time_s,
-            inputs=["reference", *measured], outputs=["effort"], name="law",
-        )  # fmt: skip
+            self.a,
+            self.b,
+            self.c[None],
+            self.d[None],
+            self.sample_time_s,
+            inputs=["reference", *measured],
+            outputs=["effort"],
+            name="law",
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return A, B, C and D as matrices, for JSON."""
@@ -185,9 +191,13 @@ class Law:
 
     @classmethod
     def from_state_space(
-        cls, a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"],
-        d: Float[np.ndarray, " k"], sample_time_s: float,
-    ) -> Law:  # fmt: skip
+        cls,
+        a: Float[np.ndarray, "n n"],
+        b: Float[np.ndarray, "n k"],
+        c: Float[np.ndarray, " n"],
+        d: Float[np.ndarray, " k"],
+        sample_time_s: float,
+    ) -> Law:
         """Return the balanced law of a state space in any coordinates, with what integrates set apart.
 
         Poles nearer to 1 than 1e-6 are integrators, two at most, where the response from 1e-4 of the sample rate on
@@ -223,7 +233,7 @@ class Law:
             reference, *measurements = fractions
             with suppress(ControlError):
                 return cls.from_transfer_functions(
-                    reference, [replace(one, num=-one.num) for one in measurements], sample_time_s
+                    reference, [replace(path, num=-path.num) for path in measurements], sample_time_s
                 )
         return _set_apart(as_given)
 
@@ -265,8 +275,8 @@ class Law:
             )
         if isinstance(system, control.TransferFunction):
             parts = [_in_delay(system.num[0][i], system.den[0][i]) for i in range(system.ninputs)]
-            first, *others = parts if len(parts) > 1 else (parts[0], replace(parts[0], num=-parts[0].num))
-            return cls.from_transfer_functions(first, [replace(one, num=-one.num) for one in others], float(ts))
+            first, *paths = parts if len(parts) > 1 else (parts[0], replace(parts[0], num=-parts[0].num))
+            return cls.from_transfer_functions(first, [replace(path, num=-path.num) for path in paths], float(ts))
         b, d = np.asarray(system.B), np.asarray(system.D)[0]
         if system.ninputs == 1:
             b, d = np.hstack([b, -b]), np.concatenate([d, -d])
@@ -302,9 +312,11 @@ class Law:
 
     @classmethod
     def from_transfer_functions(
-        cls, reference: TransferFunction, measurement: TransferFunction | Sequence[TransferFunction],
+        cls,
+        reference: TransferFunction,
+        measurement: TransferFunction | Sequence[TransferFunction],
         sample_time_s: float,
-    ) -> Law:  # fmt: skip
+    ) -> Law:
         """Return the balanced law u = C_r r - C_y y of transfer functions, one C_y for each measured signal.
 
         Raises
@@ -322,8 +334,8 @@ class Law:
         """
         measurements = [measurement] if isinstance(measurement, TransferFunction) else list(measurement)
         given = {"reference": reference} | {
-            f"measurement {number}" if len(measurements) > 1 else "measurement": one
-            for number, one in enumerate(measurements, start=1)
+            f"measurement {number}" if len(measurements) > 1 else "measurement": path
+            for number, path in enumerate(measurements, start=1)
         }
         parts = [split(name, tf) for name, tf in given.items()]
         m = max(part.chain.size for part in parts)
@@ -384,7 +396,7 @@ def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -
 def _is_same(law: Law, given: Law, share: float = RESPONSE_TOLERANCE) -> bool:
     """Tell whether two laws have the same responses from `LOWEST` on, but for a share of them."""
     per_sample = np.geomspace(LOWEST, 0.49, 25)
-    found, wanted = (one.responses(per_sample / law.sample_time_s) for one in (law, given))
+    found, wanted = (side.responses(per_sample / law.sample_time_s) for side in (law, given))
     size = np.abs(wanted)
     above = np.maximum.accumulate(size[:, ::-1], axis=1)[:, ::-1]
     allowed = share * size + ROUNDED * above + TINY
@@ -447,9 +459,12 @@ def _power(polynomial: Float[np.ndarray, " n"], exponent: int) -> Float[np.ndarr
 def make_static_law(gain: float, sample_time_s: float, measured: int = 1) -> Law:
     """Return the law that feeds back a gain of the error and nothing else, of so many signals."""
     return Law(
-        a=np.zeros((0, 0)), b=np.zeros((0, 1 + measured)), c=np.zeros(0),
-        d=np.array([gain, -gain] + [0.0] * (measured - 1)), sample_time_s=sample_time_s,
-    )  # fmt: skip
+        a=np.zeros((0, 0)),
+        b=np.zeros((0, 1 + measured)),
+        c=np.zeros(0),
+        d=np.array([gain, -gain] + [0.0] * (measured - 1)),
+        sample_time_s=sample_time_s,
+    )
 
 
 def count_filter_samples(law: Law) -> float:

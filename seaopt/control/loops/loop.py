@@ -163,9 +163,15 @@ class Loop:
             inputs = ["disturbance", "reference", *(f"noise{number}" for number in range(1, measured + 1))]
             outputs = ["command", "effort", "measured1"]
         return control.StateSpace(
-            system.a, system.b, system.c, system.d, self.plant.sample_time_s, inputs=inputs, outputs=outputs,
+            system.a,
+            system.b,
+            system.c,
+            system.d,
+            self.plant.sample_time_s,
+            inputs=inputs,
+            outputs=outputs,
             name="loop",
-        )  # fmt: skip
+        )
 
     def eigenvalues(self) -> Complex[np.ndarray, " n"]:
         """Return the closed loop's eigenvalues."""
@@ -232,15 +238,28 @@ class Loop:
         radius = float(np.max(np.abs(system.poles), initial=0.0))
         if not radius < STABLE:
             return LoopFigures(
-                stable=False, spectral_radius=radius, bandwidth_hz=None, tracking_band_hz=None, crossover_hz=None,
-                sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
-                droop_db=np.inf, return_hz=None,
-                gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0, disk_margin=0.0, noise_gain=np.inf,
+                stable=False,
+                spectral_radius=radius,
+                bandwidth_hz=None,
+                tracking_band_hz=None,
+                crossover_hz=None,
+                sensitivity_bandwidth_hz=0.0,
+                ms=np.inf,
+                mt=np.inf,
+                ms_hz=np.nan,
+                reference_peak=np.inf,
+                droop_db=np.inf,
+                return_hz=None,
+                gain_margin_db=0.0,
+                phase_margin_deg=0.0,
+                delay_margin_s=0.0,
+                disk_margin=0.0,
+                noise_gain=np.inf,
                 other_noise_gains=(np.inf,) * (self.law.d.size - 2),
-            )  # fmt: skip
+            )
         extremes = find_extremes(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
-        (ms, mt, skew, noise, reference, *others), ms_at = extremes.peaks, extremes.at[0]
+        (ms, mt, skew, noise, reference, *further), ms_at = extremes.peaks, extremes.at[0]
         crossovers, slow, below = extremes.crossovers, extremes.sensitivity_edges, extremes.bandwidth_edges
         least = find_least(system, TRACKING, DROOP_BAND * (float(below[0]) if below.size else np.pi))
         quiet = abs(extremes.ends[0, 0]) < HALF_POWER
@@ -263,7 +282,7 @@ class Loop:
             delay_margin_s=_least(extremes.delays * self.plant.sample_time_s),
             disk_margin=2.0 / float(skew),
             noise_gain=float(noise),
-            other_noise_gains=tuple(map(float, others)),
+            other_noise_gains=tuple(map(float, further)),
         )
 
     def _find_return(self, system: ClosedLoop, bandwidth_hz: float, static: float) -> float | None:

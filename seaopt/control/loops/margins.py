@@ -110,9 +110,16 @@ def margins(loop: Loop) -> Margins:
     system = loop.system()
     if not np.max(np.abs(system.poles), initial=0.0) < STABLE:
         return Margins(
-            gain_up_db=0.0, gain_down_db=0.0, phase_deg=0.0, phase_hz=None, delay_s=0.0, delay_hz=None,
-            gain_crossings=(), phase_crossings=(), disks={},
-        )  # fmt: skip
+            gain_up_db=0.0,
+            gain_down_db=0.0,
+            phase_deg=0.0,
+            phase_hz=None,
+            delay_s=0.0,
+            delay_hz=None,
+            gain_crossings=(),
+            phase_crossings=(),
+            disks={},
+        )
     extremes = find_extremes(system)
     hz = 1.0 / (2 * np.pi * loop.plant.sample_time_s)
     gains, lag, delays = extremes.gains_db, extremes.lags_deg, extremes.delays * loop.plant.sample_time_s
@@ -141,9 +148,13 @@ def disk(skew: float, angle: float, s: complex, hz: float) -> DiskMargin:
     ends = [_factor(skew, -alpha), _factor(skew, alpha)]
     low, high = max(0.0, ends[0].real), ends[1].real if ends[1].real > 1.0 else np.inf
     return DiskMargin(
-        skew=skew, alpha=alpha, frequency_hz=angle * hz, perturbation=_factor(skew, delta), gain_range=(low, high),
+        skew=skew,
+        alpha=alpha,
+        frequency_hz=angle * hz,
+        perturbation=_factor(skew, delta),
+        gain_range=(low, high),
         phase_deg=_phase(ends[0].real, ends[1].real),
-    )  # fmt: skip
+    )
 
 
 def _factor(skew: float, delta: complex) -> complex:

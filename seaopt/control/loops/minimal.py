@@ -51,11 +51,7 @@ class SplitLaw:
 def split(name: str, tf: TransferFunction) -> SplitLaw:
     """Take a transfer function apart as the module's docstring does, m as small as the numerator lets it be.
 
-    Raises
-    ------
-    ControlError
-        A coefficient is not finite, den[0] is not 1, or slow poles make a root at 1 of rounding.
-
+    Raises ControlError: a coefficient is not finite, den[0] is not 1, or slow poles make a root at 1 of rounding.
     """
     num, den, m = tf.num.astype(float), np.trim_zeros(tf.den.astype(float), "b"), 0
     if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
@@ -71,12 +67,12 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     for power, value in zip(range(m, 0, -1), series, strict=False):
         chain[: power + 1] += value * np.array([math.comb(power, i) for i in range(power + 1)])
     removed = np.convolve(_flip(series[:m]), den) if m else np.zeros(1)
-    rest = np.zeros(max(num.size, removed.size, m + 1))
-    rest[: num.size] = num
-    rest[: removed.size] -= removed
+    numerator = np.zeros(max(num.size, removed.size, m + 1))
+    numerator[: num.size] = num
+    numerator[: removed.size] -= removed
     for _ in range(m):
-        rest = np.cumsum(rest)[:-1]
-    return SplitLaw(chain=chain[1:], rest=rest, den=den)
+        numerator = np.cumsum(numerator)[:-1]
+    return SplitLaw(chain=chain[1:], rest=numerator, den=den)
 
 
 def refuse_slow_poles(name: str) -> ControlError:
@@ -139,9 +135,11 @@ def realise_rest(
 
 
 def build_chain(
-    chain: Float[np.ndarray, "m k"], a: Float[np.ndarray, "l l"], b: Float[np.ndarray, "l k"],
+    chain: Float[np.ndarray, "m k"],
+    a: Float[np.ndarray, "l l"],
+    b: Float[np.ndarray, "l k"],
     c: Float[np.ndarray, " l"],
-) -> dict[str, Float[np.ndarray, "..."]]:  # fmt: skip
+) -> dict[str, Float[np.ndarray, "..."]]:
     """Return a, b and c of a chain of m accumulators, g_j in row j of `chain`, beside a state space."""
     m, n = len(chain), len(chain) + c.size
     whole = np.zeros((n, n))
@@ -190,18 +188,18 @@ def split_integrators(
         triangle, basis, first = parts
         if first != m:
             continue
-        one, rest = triangle[:m, :m], triangle[m:, m:]
-        link = np.asarray(solve_sylvester(one, -rest, -triangle[:m, m:])) if rest.size else np.zeros((m, 0))
-        known = COEFFICIENTS * np.linalg.norm(scaled) * np.hypot(1.0, np.linalg.norm(link))
-        if abs(np.mean(offsets[:m])) + known > NEAR_ONE:
+        near, far = triangle[:m, :m], triangle[m:, m:]
+        link = np.asarray(solve_sylvester(near, -far, -triangle[:m, m:])) if far.size else np.zeros((m, 0))
+        rounding = COEFFICIENTS * np.linalg.norm(scaled) * np.hypot(1.0, np.linalg.norm(link))
+        if abs(np.mean(offsets[:m])) + rounding > NEAR_ONE:
             continue
         into, out = basis.T @ b_scaled, c_scaled @ basis
         drive, read = into[:m] - link @ into[m:], out[:m]
         chain, power = np.zeros((m, b.shape[1])), np.eye(m)
         for j in range(m):
             chain[j] = read @ power @ drive
-            power = power @ (one - np.eye(m))
-        yield chain, rest, into[m:], out[m:] + read @ link
+            power = power @ (near - np.eye(m))
+        yield chain, far, into[m:], out[m:] + read @ link
 
 
 def read_companion(
@@ -268,11 +266,7 @@ def balance(
 
     What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the largest Hankel singular value, is rounding.
 
-    Raises
-    ------
-    LinAlgError
-        A pole is so close to the unit circle that a Gramian is not finite.
-
+    Raises LinAlgError: a pole is so close to the unit circle that a Gramian is not finite.
     """
     a, turn = (np.asarray(part) for part in schur(a))  # powers of a triangle keep its poles, of a companion form not
     b, c = turn.T @ b, c @ turn

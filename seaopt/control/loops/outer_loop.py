@@ -10,10 +10,14 @@ x is the link's position as sampled, m or rad, and D(q) its filtered backward di
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.errors import ControlError, require_number
+from seaopt.codec import Limits
+from seaopt.errors import ControlError
+from seaopt.options import check_options, option
 from seaopt.records import record
 from seaopt.units import mechanics_of
 
@@ -21,15 +25,6 @@ from seaopt.units import mechanics_of
 @record
 class Impedance:
     """A stiffness and a damping to be rendered at the link.
-
-    Parameters
-    ----------
-    stiffness : float
-        K_v, N/m or N m/rad; zero or more.
-    damping : float
-        D_v, N s/m or N m s/rad; below zero it takes damping away.
-    velocity_filter_s : float, optional
-        T_v, seconds, of the speed that is computed from the position; one sample if left out.
 
     Raises
     ------
@@ -43,19 +38,17 @@ class Impedance:
 
     """
 
-    stiffness: float
-    damping: float
-    velocity_filter_s: float | None = None
+    stiffness: float = option("K_v, N/m or N m/rad.", least=0.0)
+    damping: float = option("D_v, N s/m or N m s/rad; below zero it takes damping away.")
+    velocity_filter_s: float | None = option(
+        "Time constant T_v of the speed that is computed from the position; one sample where left out.",
+        default=None,
+        unit="s",
+        least=0.0,
+    )
 
     def __post_init__(self) -> None:
-        filter_s = 0.0 if self.velocity_filter_s is None else self.velocity_filter_s
-        given = {"stiffness": self.stiffness, "damping": self.damping, "velocity_filter_s": filter_s}
-        for name, number in given.items():
-            value = require_number(number, name, ControlError)
-            if not np.isfinite(value):
-                raise ControlError(f"{name} = {value:g} is not finite; give a number")
-            if name != "damping" and value < 0.0:
-                raise ControlError(f"{name} = {value:g} is negative; give zero or more")
+        check_options(self, ControlError)
 
     def filter_for(self, sample_time_s: float) -> float:
         """Return T_v at a sample time."""
@@ -92,20 +85,18 @@ class OuterLoop:
 
     """
 
-    stiffness: float
+    stiffness: Annotated[float, Limits(ge=0.0)]
     damping: float
-    velocity_filter_s: float
+    velocity_filter_s: Annotated[float, Limits(ge=0.0)]
     direction: float
-    sample_time_s: float
-    place_unit: str
+    sample_time_s: Annotated[float, Limits(gt=0.0)]
+    place_unit: Annotated[str, Limits(pattern="^(m|rad)$")]
     plant: str = ""
 
     @property
     def impedance(self) -> Impedance:
         """What it renders."""
-        return Impedance(
-            stiffness=self.stiffness, damping=self.damping, velocity_filter_s=self.velocity_filter_s
-        )  # fmt: skip
+        return Impedance(stiffness=self.stiffness, damping=self.damping, velocity_filter_s=self.velocity_filter_s)
 
     def describe(self) -> str:
         """Return what it renders, in words."""
@@ -141,8 +132,8 @@ class OuterLoop:
 
         """
         speed = state + self.rate * position
-        asked = self.direction * (self.stiffness * (reference - position) - self.damping * speed)
-        return asked, self.pole * speed - self.rate * position
+        reference_effort = self.direction * (self.stiffness * (reference - position) - self.damping * speed)
+        return reference_effort, self.pole * speed - self.rate * position
 
     def difference(self, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return D at points of the z plane."""

@@ -29,35 +29,21 @@ SMALLEST_FACTOR = 1e-9
 
 @record(eq=False)
 class Extremes:
-    """Peaks, crossings and ends of a closed loop; angles in radians a sample, ascending.
+    """Peaks, crossings and ends of a closed loop; angles in radians a sample, ascending."""
 
-    Parameters
-    ----------
-    peaks, at
-        Largest values of S, T, S - T, C_y S and F/F_ref, of further measured signals C_y S, and the angles where.
-    ends
-        The curves at 0 and pi, shape (c, 2).
-    static : float
-        abs(F/F_ref) at 0; zero where a zero of the plant leaves nothing but rounding.
-    crossovers, crossover_phases
-        Where abs(L) = 1, and the phase of -L there (rad).
-    gain_factors
-        Every positive factor on L that puts it through -1.
-    gain_angles
-        Where these factors do.
-    sensitivity_edges, bandwidth_edges, band_edges
-        Where abs(S) is -3 dB, abs(F/F_ref) -3 dB of its static value, and within 3 dB of 1 or not.
-
-    """
-
+    # peaks, at: largest values of S, T, S - T, C_y S and F/F_ref, of further measured signals C_y S, and the angles
+    # where
     peaks: Float[np.ndarray, " c"]
     at: Float[np.ndarray, " c"]
-    ends: Complex[np.ndarray, "c 2"]
-    static: float
+    ends: Complex[np.ndarray, "c 2"]  # the curves at 0 and pi, shape (c, 2)
+    static: float  # abs(F/F_ref) at 0; zero where a zero of the plant leaves nothing but rounding
+    # crossovers, crossover_phases: where abs(L) = 1, and the phase of -L there (rad)
     crossovers: Float[np.ndarray, " k"]
     crossover_phases: Float[np.ndarray, " k"]
-    gain_factors: Float[np.ndarray, " l"]
-    gain_angles: Float[np.ndarray, " l"]
+    gain_factors: Float[np.ndarray, " l"]  # every positive factor on L that puts it through -1
+    gain_angles: Float[np.ndarray, " l"]  # where these factors do
+    # sensitivity_edges, bandwidth_edges, band_edges: where abs(S) is -3 dB, abs(F/F_ref) -3 dB of its static value, and
+    # within 3 dB of 1 or not
     sensitivity_edges: Float[np.ndarray, " m"]
     bandwidth_edges: Float[np.ndarray, " n"]
     band_edges: Float[np.ndarray, " o"]
@@ -81,11 +67,7 @@ class Extremes:
 def find_extremes(system: ClosedLoop) -> Extremes:
     """Return the peaks and crossings of a stable closed loop.
 
-    Raises
-    ------
-    ControlError
-        A peak cannot be proved.
-
+    Raises ControlError: a peak cannot be proved.
     """
     peaks, at = _find_candidates(system)
     ends = system.curves(np.array([0.0, np.pi]))
@@ -98,8 +80,8 @@ def find_extremes(system: ClosedLoop) -> Extremes:
     pencils = [system.equal(), system.real(), *(system.modulus(k, level) for k, level in levels)]
     edges = find_arcs([*pencils, *proofs])
     peaks, at = _prove(system, peaks, at, present, edges[len(pencils) :])
-    own = system.sensitivity(at[:3])
-    peaks[:3] = np.abs([own[0], 1.0 - own[1], 2.0 * own[2] - 1.0])
+    at_peaks = system.sensitivity(at[:3])
+    peaks[:3] = np.abs([at_peaks[0], 1.0 - at_peaks[1], 2.0 * at_peaks[2] - 1.0])
 
     def function(theta: Float[np.ndarray, " m"], which: Indices) -> Float[np.ndarray, " m"]:
         values = system.curves(theta)
@@ -111,11 +93,18 @@ def find_extremes(system: ClosedLoop) -> Extremes:
     turns = np.concatenate([[0.0], crossings[1], [np.pi]])
     factors, angles = _gain_factors(system, turns)
     return Extremes(
-        peaks=peaks, at=at, ends=ends, static=static,
-        crossovers=crossings[0], crossover_phases=_phases(system, crossings[0]),
-        gain_factors=factors, gain_angles=angles, sensitivity_edges=crossings[2],
-        bandwidth_edges=crossings[5] if static else np.empty(0), band_edges=np.sort(np.concatenate(crossings[3:5])),
-    )  # fmt: skip
+        peaks=peaks,
+        at=at,
+        ends=ends,
+        static=static,
+        crossovers=crossings[0],
+        crossover_phases=_phases(system, crossings[0]),
+        gain_factors=factors,
+        gain_angles=angles,
+        sensitivity_edges=crossings[2],
+        bandwidth_edges=crossings[5] if static else np.empty(0),
+        band_edges=np.sort(np.concatenate(crossings[3:5])),
+    )
 
 
 def find_least(system: ClosedLoop, curve: int, until: float) -> float:
@@ -204,9 +193,14 @@ def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " c"], Float
 
 
 def _climb(
-    system: ClosedLoop, peaks: Float[np.ndarray, " c"], at: Float[np.ndarray, " c"], curve: Indices,
-    low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"], wanted: Bool[np.ndarray, " m"] | None = None,
-) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:  # fmt: skip
+    system: ClosedLoop,
+    peaks: Float[np.ndarray, " c"],
+    at: Float[np.ndarray, " c"],
+    curve: Indices,
+    low: Float[np.ndarray, " m"],
+    high: Float[np.ndarray, " m"],
+    wanted: Bool[np.ndarray, " m"] | None = None,
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in.
 
     Maxima that are not `wanted` are followed for as long as others are.
@@ -222,40 +216,39 @@ def _climb(
     value = np.abs(system.curves(top)[curve, every])
     peaks, at = peaks.copy(), at.copy()
     for k in range(peaks.size):
-        own = np.flatnonzero(curve == k)
-        if own.size and value[own].max() > peaks[k]:
-            best = own[np.argmax(value[own])]
+        on_curve = np.flatnonzero(curve == k)
+        if on_curve.size and value[on_curve].max() > peaks[k]:
+            best = on_curve[np.argmax(value[on_curve])]
             peaks[k], at[k] = value[best], top[best]
     return peaks, at
 
 
 def _prove(
-    system: ClosedLoop, peaks: Float[np.ndarray, " c"], at: Float[np.ndarray, " c"], curves: Int[np.ndarray, " k"],
+    system: ClosedLoop,
+    peaks: Float[np.ndarray, " c"],
+    at: Float[np.ndarray, " c"],
+    curves: Int[np.ndarray, " k"],
     edges: list[Float[np.ndarray, " _"]],
-) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return the peaks, raised until no arc of the level set just above them holds a larger value.
 
-    Raises
-    ------
-    ControlError
-        That does not come to an end.
-
+    Raises ControlError: that does not come to an end.
     """
     for _ in range(MAX_PROOF_ROUNDS):
-        own = np.repeat(curves, [row.size - 1 for row in edges])
+        curve = np.repeat(curves, [row.size - 1 for row in edges])
         low, high = np.concatenate([row[:-1] for row in edges]), np.concatenate([row[1:] for row in edges])
         middle = 0.5 * (low + high)
-        values = np.abs(system.curves(middle)[own, np.arange(own.size)])
-        above = values > peaks[own] * (1.0 + PROOF)
+        values = np.abs(system.curves(middle)[curve, np.arange(curve.size)])
+        above = values > peaks[curve] * (1.0 + PROOF)
         if not np.any(above):
             return peaks, at
-        own, low, high = own[above], low[above], high[above]
-        for k, value, theta in zip(own, values[above], middle[above], strict=True):
+        curve, low, high = curve[above], low[above], high[above]
+        for k, value, theta in zip(curve, values[above], middle[above], strict=True):
             if value > peaks[k]:
                 peaks[k], at[k] = value, theta
-        rising = (system.differentiate(low, own)[1] > 0.0) & (system.differentiate(high, own)[1] < 0.0)
-        peaks, at = _climb(system, peaks, at, own[rising], low[rising], high[rising])
-        curves = np.unique(own)
+        rising = (system.differentiate(low, curve)[1] > 0.0) & (system.differentiate(high, curve)[1] < 0.0)
+        peaks, at = _climb(system, peaks, at, curve[rising], low[rising], high[rising])
+        curves = np.unique(curve)
         edges = find_arcs([system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, curves)])
     raise ControlError(
         f"the peaks of this loop are still rising after {MAX_PROOF_ROUNDS} rounds, so that they cannot be stated; look "

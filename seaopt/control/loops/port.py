@@ -54,37 +54,18 @@ class PortResponse:
 
 @record(eq=False)
 class PortModel:
-    """A linearised plant whose port is moved, its other links held.
+    """A linearised plant whose port is moved, its other links held."""
 
-    Parameters
-    ----------
-    a, motor, force
-        x' = a x + motor F_m + force F_e, shapes (n, n), (n,), (n,).
-    feedback : array, shape (n + 2,)
-        The fed-back force of x, F_m and F_e.
-    speed, place : int
-        Which states are the port's speed and its position.
-    mass : float
-        The inertia on the port (kg or kg m^2), which is taken off again.
-    delay_s : float
-        Of the motor, besides the controller's.
-    place_unit : str
-        Of the port's motion: m or rad.
-    others : array, shape (k, n + 2), optional
-        Further signals that the law reads, as `feedback`.
-
-    """
-
-    a: Float[np.ndarray, "n n"]
+    a: Float[np.ndarray, "n n"]  # a, motor, force: x' = a x + motor F_m + force F_e, shapes (n, n), (n,), (n,)
     motor: Float[np.ndarray, " n"]
     force: Float[np.ndarray, " n"]
-    feedback: Float[np.ndarray, " n+2"]
-    speed: int
+    feedback: Float[np.ndarray, " n+2"]  # the fed-back force of x, F_m and F_e
+    speed: int  # speed, place: which states are the port's speed and its position
     place: int
-    mass: float
-    delay_s: float = 0.0
-    place_unit: str = LINEAR.place
-    others: Float[np.ndarray, "k m"] | None = None
+    mass: float  # the inertia on the port (kg or kg m^2), which is taken off again
+    delay_s: float = 0.0  # of the motor, besides the controller's
+    place_unit: str = LINEAR.place  # of the port's motion: m or rad
+    others: Float[np.ndarray, "k m"] | None = None  # further signals that the law reads, as `feedback`
 
     @property
     def read(self) -> Float[np.ndarray, "y m"]:
@@ -152,11 +133,7 @@ def probe_of(plant: Plant) -> Plant:
 
     It is without heat, as all that looks at linear loops.
 
-    Raises
-    ------
-    ControlError
-        The plant states no port, or its port states no probe.
-
+    Raises ControlError: the plant states no port, or its port states no probe.
     """
     if plant.port is None:
         raise ControlError(
@@ -174,11 +151,7 @@ def probe_of(plant: Plant) -> Plant:
 def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: float) -> PortModel:
     """Return a plant's port, driven by the command for an effort.
 
-    Raises
-    ------
-    ControlError
-        The plant has no such port or output.
-
+    Raises ControlError: the plant has no such port or output.
     """
     probe = probe_of(plant)
     values = probe.complete(params)
@@ -214,11 +187,7 @@ class BarePort:
 def bare_port(probe: Plant) -> BarePort:
     """Return the names of a probe's port.
 
-    Raises
-    ------
-    ControlError
-        The probe does not state them.
-
+    Raises ControlError: the probe does not state them.
     """
     port = probe.port
     if port is None or not (port.effort and port.coordinate and port.rate) or len(port.payload) != 1:
@@ -239,18 +208,11 @@ class PassivityCondition:
     r"""Re Z >= 0 as a condition on the feedback C, one row per signal: Re[unit (1 + forces C) conj(1 + loops C)] >= 0.
 
     :math:`Z/|G_{22}|` is that over :math:`|1 + \text{loops}\,C|^2`.
-
-    Parameters
-    ----------
-    unit : array, shape (m,)
-        :math:`G_{22}/|G_{22}|`.
-    loops, forces : arrays, shape (y, m)
-        :math:`G_{11}` and :math:`\Delta/G_{22}` with delay and hold, of every signal; `forces` is zero where what is
-        measured tells the force at the port, and the condition is then affine in C.
-
     """
 
-    unit: Response
+    unit: Response  # shape (m,); :math:`G_{22}/|G_{22}|`
+    # loops, forces: :math:`G_{11}` and :math:`\Delta/G_{22}` with delay and hold, of every signal; `forces` is zero
+    # where what is measured tells the force at the port, and the condition is then affine in C
     loops: Complex[np.ndarray, "y m"]
     forces: Complex[np.ndarray, "y m"]
 
@@ -258,7 +220,7 @@ class PassivityCondition:
 def weigh_passivity(port: PortModel, sample_time_s: float, delay_samples: int, f: Frequencies) -> PassivityCondition:
     """Return what passivity asks of the feedback at frequencies."""
     response, late = port.response(f), hold_response(f, sample_time_s, delay_samples)
-    loops, own, delta = response.motor_to_read, response.motion_to_port, response.determinant
-    size = np.abs(loops * own) + np.abs(response.motion_to_read * response.motor_to_port)
+    loops, moved, delta = response.motor_to_read, response.motion_to_port, response.determinant
+    size = np.abs(loops * moved) + np.abs(response.motion_to_read * response.motor_to_port)
     delta = np.where(np.abs(delta) > NOT_AFFINE * size, delta, 0.0)
-    return PassivityCondition(unit=own / np.abs(own), loops=loops * late, forces=delta * late / own)
+    return PassivityCondition(unit=moved / np.abs(moved), loops=loops * late, forces=delta * late / moved)

@@ -78,44 +78,30 @@ def list_curves(measured: int) -> Curves:
         noises, regulated = [*range(2, 2 + measured)], 2
     more = len(noises) - 1
     return Curves(
-        outputs=np.array([0, 0, 0, 1, regulated] + [1] * more), inputs=np.array([0, 0, 0, noises[0], 1, *noises[1:]]),
+        outputs=np.array([0, 0, 0, 1, regulated] + [1] * more),
+        inputs=np.array([0, 0, 0, noises[0], 1, *noises[1:]]),
         factors=np.array([1.0, -1.0, 2.0, -1.0, 1.0] + [-1.0] * more),
         offsets=np.array([0.0, 1.0, -1.0, 0.0, 0.0] + [0.0] * more),
-    )  # fmt: skip
+    )
 
 
 @record(eq=False)
 class ClosedLoop:
-    """A closed loop from (noise, reference) to (measured force, motor force), balanced; or of `list_curves`.
+    """A closed loop from (noise, reference) to (measured force, motor force), balanced; or of `list_curves`."""
 
-    Parameters
-    ----------
-    a, b, c, d
-        Shapes (n, n), (n, i), (o, n) and (o, i).
-    triangle, right, left
-        The complex Schur form of `a`, and `b` and `c` in its basis.
-    opened
-        The poles of plant and law, which are the zeros of S.
-    blocks
-        The matrices of plant and law whose eigenvalues those are, but for the law's integrators.
-    table
-        Its curves.
-    through
-        Their direct terms.
-
-    """
-
-    a: Float[np.ndarray, "n n"]
+    a: Float[np.ndarray, "n n"]  # a, b, c, d: shapes (n, n), (n, i), (o, n) and (o, i)
     b: Float[np.ndarray, "n i"]
     c: Float[np.ndarray, "o n"]
     d: Float[np.ndarray, "o i"]
+    # triangle, right, left: the complex Schur form of `a`, and `b` and `c` in its basis
     triangle: Complex[np.ndarray, "n n"]
     right: Complex[np.ndarray, "n i"]
     left: Complex[np.ndarray, "o n"]
-    opened: Complex[np.ndarray, " n"]
+    opened: Complex[np.ndarray, " n"]  # the poles of plant and law, which are the zeros of S
+    # the matrices of plant and law whose eigenvalues those are, but for the law's integrators
     blocks: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
-    table: Curves
-    through: Float[np.ndarray, " k"]
+    table: Curves  # its curves
+    through: Float[np.ndarray, " k"]  # their direct terms
 
     @property
     def poles(self) -> Complex[np.ndarray, " n"]:
@@ -137,8 +123,8 @@ class ClosedLoop:
         The first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
         7.2.2).
         """
-        plant, rest = (_resolution(block) for block in self.blocks)
-        return np.concatenate([plant, np.zeros(self.opened.size - plant.size - rest.size), rest])
+        plant, law = (_resolution(block) for block in self.blocks)
+        return np.concatenate([plant, np.zeros(self.opened.size - plant.size - law.size), law])
 
     def differentiate(
         self, theta: Float[np.ndarray, " m"], which: Indices | None = None
@@ -167,8 +153,8 @@ class ClosedLoop:
         x = np.zeros((n, inputs, count), dtype=complex)
         flat = x.reshape(n, inputs * count)
         for i in range(n - 1, -1, -1):
-            known = self.triangle[i, i + 1 :] @ flat[i + 1 :]
-            x[i] = (rhs[i] + known.reshape(inputs, -1)) / distance[i]
+            above = self.triangle[i, i + 1 :] @ flat[i + 1 :]
+            x[i] = (rhs[i] + above.reshape(inputs, -1)) / distance[i]
         return x
 
     def _combine(
@@ -202,9 +188,11 @@ class ClosedLoop:
         return self._pencil(self.b[:, 0], (none, c), (c, -1.0, 0.0))
 
     def _pencil(
-        self, b: Float[np.ndarray, " n"], costate: tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]],
+        self,
+        b: Float[np.ndarray, " n"],
+        costate: tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]],
         last: tuple[Float[np.ndarray, " n"], float, float],
-    ) -> Pencil:  # fmt: skip
+    ) -> Pencil:
         n = b.size
         m, k = np.zeros((2 * n + 1, 2 * n + 1)), np.zeros((2 * n + 1, 2 * n + 1))
         m[:n, :n], m[:n, -1] = self.a, b
@@ -251,9 +239,18 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
     if not np.max(np.abs(whole)) < LARGEST_ENTRY:
         gone = np.diag(opened)
         return ClosedLoop(
-            a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, law.rest[0]),
-            table=table, through=through,
-        )  # fmt: skip
+            a=a,
+            b=b,
+            c=c,
+            d=d,
+            triangle=gone,
+            right=b + 0j,
+            left=c + 0j,
+            opened=opened,
+            blocks=(ap, law.rest[0]),
+            table=table,
+            through=through,
+        )
     with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
         scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
         scale = scale[: n + m] / np.prod(scale[n + m :]) ** (1.0 / side)
@@ -263,9 +260,18 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
     triangle, basis = (np.asarray(matrix) for matrix in schur(a, output="complex")[:2])
     opened = np.concatenate([np.linalg.eigvals(ap), law.poles]).astype(complex)
     return ClosedLoop(
-        a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened,
-        blocks=(ap, law.rest[0]), table=table, through=through,
-    )  # fmt: skip
+        a=a,
+        b=b,
+        c=c,
+        d=d,
+        triangle=triangle,
+        right=basis.conj().T @ b,
+        left=c @ basis,
+        opened=opened,
+        blocks=(ap, law.rest[0]),
+        table=table,
+        through=through,
+    )
 
 
 def _resolution(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
@@ -332,9 +338,14 @@ def find_sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]
 
 
 def find_zeros(
-    function: Indexed, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"], at_low: Float[np.ndarray, " m"],
-    at_high: Float[np.ndarray, " m"], tolerance: float, wanted: Bool[np.ndarray, " m"] | None = None,
-) -> Float[np.ndarray, " m"]:  # fmt: skip
+    function: Indexed,
+    low: Float[np.ndarray, " m"],
+    high: Float[np.ndarray, " m"],
+    at_low: Float[np.ndarray, " m"],
+    at_high: Float[np.ndarray, " m"],
+    tolerance: float,
+    wanted: Bool[np.ndarray, " m"] | None = None,
+) -> Float[np.ndarray, " m"]:
     """Return a zero in every bracket (Chandrupatla, Advances in Engineering Software 28, 1997).
 
     `function(x, i)` is evaluated at x for the brackets number i only. A bracket is done when it, or the function
@@ -362,9 +373,14 @@ def find_zeros(
 
 
 def _fraction(
-    a: Float[np.ndarray, " m"], b: Float[np.ndarray, " m"], c: Float[np.ndarray, " m"], fa: Float[np.ndarray, " m"],
-    fb: Float[np.ndarray, " m"], fc: Float[np.ndarray, " m"], tolerance: float,
-) -> Float[np.ndarray, " m"]:  # fmt: skip
+    a: Float[np.ndarray, " m"],
+    b: Float[np.ndarray, " m"],
+    c: Float[np.ndarray, " m"],
+    fa: Float[np.ndarray, " m"],
+    fb: Float[np.ndarray, " m"],
+    fc: Float[np.ndarray, " m"],
+    tolerance: float,
+) -> Float[np.ndarray, " m"]:
     """Return where to look next from b to a: by inverse quadratic interpolation where that is safe, else the middle."""
     with np.errstate(divide="ignore", invalid="ignore"):
         xi, phi = (b - a) / (c - a), (fb - fa) / (fc - fa)

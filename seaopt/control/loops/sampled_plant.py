@@ -38,14 +38,16 @@ from seaopt.units import factor
 # Of one measured output c is a vector and d a number; of several they have a row each.
 StateSpace = tuple[
     Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, "... n"], float | Float[np.ndarray, " y"]
-]  # fmt: skip
+]
 LinearPlants = tuple[
     Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k ... n"], Float[np.ndarray, "k ..."]
-]  # fmt: skip
+]
 SampledPlants = tuple[
-    Inexact[np.ndarray, "k m m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, "k ... m"],
+    Inexact[np.ndarray, "k m m"],
+    Inexact[np.ndarray, "k m"],
+    Inexact[np.ndarray, "k ... m"],
     Inexact[np.ndarray, "k ..."],
-]  # fmt: skip
+]
 Measured = str | tuple[str, ...]  # one output by its name, or several, the regulated one first
 
 DELAY = "delay_s"
@@ -162,14 +164,10 @@ def linearise_sets(
 ) -> tuple[LinearPlants, Float[np.ndarray, " k"]]:
     """Return what `linearise` does at k sets of parameters with the same conditions among them, and their delays (s).
 
-    Raises
-    ------
-    ControlError
-        The plant has no such output, or cannot rest where it is to be linearised.
-
+    Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised.
     """
     places = [read_conditions(plant, values) for values in sets]
-    at = {name: np.array([place[name] for place in places]) for name in places[0]}
+    at = {name: np.array([conditions_there[name] for conditions_there in places]) for name in places[0]}
     linear = linearise(plant, np.column_stack([values.vector for values in sets]), at, measured, gain)
     return linear, np.zeros(len(sets)) + find_delay(plant, at)
 
@@ -186,11 +184,17 @@ def sample_linear(
     static = [_compute_static_gain(a, b, regulated(c), float(regulated(d))) for a, b, c, d in zip(*plants, strict=True)]
     return [
         DigitalPlant(
-            a=a, b=b, c=regulated(c), d=float(regulated(d)), sample_time_s=sample_time_s, delay_samples=delay_samples,
-            static_gain=gain, others=(c[1:], d[1:]) if several and len(c) > 1 else None,
+            a=a,
+            b=b,
+            c=regulated(c),
+            d=float(regulated(d)),
+            sample_time_s=sample_time_s,
+            delay_samples=delay_samples,
+            static_gain=gain,
+            others=(c[1:], d[1:]) if several and len(c) > 1 else None,
         )
         for a, b, c, d, gain in zip(*hold(*plants, sample_time_s, delay_s), static, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float:
@@ -198,11 +202,7 @@ def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float
 
     Bristles slide, which at rest carry a part of the input.
 
-    Raises
-    ------
-    ControlError
-        The plant has no such output, or cannot rest where it is to be linearised.
-
+    Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised.
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items()}
     a, b, c, d = linearise(_let_slide(plant), params.vector[:, None], at, output, 1.0)
@@ -212,12 +212,12 @@ def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float
 def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
     """Return what a plant's `ParameterSet` may hold besides its parameters."""
     described = {DELAY: "delay besides the controller's and the drive's", DRIVE_DELAY: "from a command to its effect"}
-    known = {
+    conditions = {
         name: Parameter(name=name, value=0.0, unit="s", min=0.0, description=text) for name, text in described.items()
     }
     for plant in plants:
-        known |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
-    return known
+        conditions |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
+    return conditions
 
 
 def find_delay(plant: Plant, at: Mapping[str, Any]) -> Any:
@@ -237,8 +237,8 @@ def find_delay(plant: Plant, at: Mapping[str, Any]) -> Any:
 def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:
     """Return a delay as whole samples and the rest in seconds."""
     whole = math.floor(delay_s / sample_time_s + 1e-9)
-    rest = delay_s - whole * sample_time_s
-    return whole, rest if rest > 1e-9 * sample_time_s else 0.0
+    remainder = delay_s - whole * sample_time_s
+    return whole, remainder if remainder > 1e-9 * sample_time_s else 0.0
 
 
 def add_drive_delay(params: ParameterSet, drive_delay_s: float) -> ParameterSet:
@@ -251,7 +251,11 @@ def add_drive_delay(params: ParameterSet, drive_delay_s: float) -> ParameterSet:
 def drop_drive_delay(params: ParameterSet) -> ParameterSet:
     """Return parameters without a drive's delay, where samples count it already."""
     given = _list_given(params)
-    return ParameterSet(one for name, one in given.items() if name != DRIVE_DELAY) if DRIVE_DELAY in given else params
+    return (
+        ParameterSet(parameter for name, parameter in given.items() if name != DRIVE_DELAY)
+        if DRIVE_DELAY in given
+        else params
+    )
 
 
 def _list_given(params: ParameterSet) -> ParameterSet:
@@ -262,10 +266,7 @@ def _list_given(params: ParameterSet) -> ParameterSet:
 def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
     """Return the conditions that parameters hold, in SI units, by name.
 
-    Raises
-    ------
-    ControlError
-        One is not finite, a delay is negative, or a unit is of another dimension.
+    Raises ControlError: one is not finite, a delay is negative, or a unit is of another dimension.
 
     Examples
     --------
@@ -290,9 +291,12 @@ def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
 
 
 def linearise(
-    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]], measured: Measured,
+    plant: Plant,
+    p: Float[np.ndarray, "np k"],
+    at: Mapping[str, Float[np.ndarray, " k"]],
+    measured: Measured,
     gain: float,
-) -> LinearPlants:  # fmt: skip
+) -> LinearPlants:
     """Return (a, b, c, d) from motor force to a measured output of k plants, one column of parameters each.
 
     Of several outputs c and d have a row for each.
@@ -320,17 +324,10 @@ def list_names(measured: Measured) -> tuple[str, ...]:
 def find_signals(plant: Plant, measured: Measured) -> tuple[str, ...]:
     """Return the outputs that a law reads for what is measured: of a motor's speed that is no output, its position.
 
-    Parameters
-    ----------
-    plant : Plant
-        The design plant, whose `sensing` states which position has which speed.
-    measured : str or tuple of str
-        The regulated output, and what else is measured.
+    `plant`: the design plant, whose `sensing` states which position has which speed. `measured`: the regulated output,
+    and what else is measured.
 
-    Raises
-    ------
-    ControlError
-        The plant has no such output, and no encoder for it.
+    Raises ControlError: the plant has no such output, and no encoder for it.
 
     Examples
     --------
@@ -356,11 +353,7 @@ def _find_signal(plant: Plant, name: str) -> str:
 def find_rows(plant: Plant, measured: Measured) -> Any:
     """Return which of a plant's outputs are measured: a number, or a list of several.
 
-    Raises
-    ------
-    ControlError
-        The plant has no such output.
-
+    Raises ControlError: the plant has no such output.
     """
     names = list(plant.outputs)
     for name in (measured,) if isinstance(measured, str) else measured:
@@ -374,10 +367,7 @@ def find_rows(plant: Plant, measured: Measured) -> Any:
 def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
     """Return states and inputs at rest where the conditions among `params` are; zeros without any.
 
-    Raises
-    ------
-    ControlError
-        The plant cannot rest there.
+    Raises ControlError: the plant cannot rest there.
 
     Examples
     --------
@@ -398,12 +388,12 @@ def find_rests(
     plant: Plant, params: CompletedParameters, places: Mapping[str, Float[np.ndarray, " k"]], count: int
 ) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
     """Return what `find_rest` does at `count` places, a column each: of a coordinate by name, before the conditions."""
-    known = {name: value for name, value in read_conditions(plant, params).items() if name not in DELAYS}
-    at = {name: np.full(count, value) for name, value in known.items()} | dict(places)
+    fixed_conditions = {name: value for name, value in read_conditions(plant, params).items() if name not in DELAYS}
+    at = {name: np.full(count, value) for name, value in fixed_conditions.items()} | dict(places)
     cool = freeze_heat(plant)
     x, u = _solve_rest(_let_slide(cool), np.repeat(params.vector[:, None], count, axis=1), at)
-    rest = dict(zip(cool.states, x, strict=True))  # a winding is cold there, though a current flows
-    return np.array([rest.get(name, np.zeros(count)) for name in plant.states]), u
+    resting = dict(zip(cool.states, x, strict=True))  # a winding is cold there, though a current flows
+    return np.array([resting.get(name, np.zeros(count)) for name in plant.states]), u
 
 
 def _let_slide(plant: Plant) -> Plant:
@@ -440,14 +430,19 @@ def _solve_rest(
         if np.all(left <= 1e-12):
             return x, u
         slowest = int(np.argmax(left))
-    place = ", ".join(f"{names[i]} = {at[names[i]][slowest]:g}" for i in fixed)
-    raise ControlError(f"plant {plant.name} cannot rest at {place}, so it cannot be linearised there; give another")
+    where = ", ".join(f"{names[i]} = {at[names[i]][slowest]:g}" for i in fixed)
+    raise ControlError(f"plant {plant.name} cannot rest at {where}, so it cannot be linearised there; give another")
 
 
 def differentiate_linearisation(
-    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]],
-    dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: Measured, gain: float,
-) -> tuple[LinearPlants, LinearPlants]:  # fmt: skip
+    plant: Plant,
+    p: Float[np.ndarray, "np k"],
+    at: Mapping[str, Float[np.ndarray, " k"]],
+    dp: Float[np.ndarray, "np k"],
+    dat: Mapping[str, Float[np.ndarray, " k"]],
+    measured: Measured,
+    gain: float,
+) -> tuple[LinearPlants, LinearPlants]:
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
     plant = leave_out_drift(freeze_heat(plant), measured)
     sliding = _let_slide(plant)
@@ -529,9 +524,13 @@ def _turn_function(plant: Plant) -> Any:
 
 
 def hold(
-    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], c: Inexact[np.ndarray, "k ... n"],
-    d: Inexact[np.ndarray, "k ..."], sample_time_s: float, delay_s: Inexact[np.ndarray, " k"],
-) -> SampledPlants:  # fmt: skip
+    a: Inexact[np.ndarray, "k n n"],
+    b: Inexact[np.ndarray, "k n"],
+    c: Inexact[np.ndarray, "k ... n"],
+    d: Inexact[np.ndarray, "k ..."],
+    sample_time_s: float,
+    delay_s: Inexact[np.ndarray, " k"],
+) -> SampledPlants:
     """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's.
 
     Imaginary parts come through as derivatives do: with 1e-20 of a
@@ -541,9 +540,9 @@ def hold(
     if not np.any(delay_s):
         return whole_period, gamma, c, d
     whole = np.floor(np.real(delay_s) / sample_time_s + 1e-9).astype(int)
-    rest = delay_s - whole * sample_time_s
-    rest = rest - np.minimum(np.real(rest), 0.0)
-    newer = _exponential(a, b, sample_time_s - rest)[1]
+    remainder = delay_s - whole * sample_time_s
+    remainder = remainder - np.minimum(np.real(remainder), 0.0)
+    newer = _exponential(a, b, sample_time_s - remainder)[1]
     count, n, chain = a.shape[0], a.shape[1], int(whole.max()) + 1
     rows = np.arange(count)
     drive = np.zeros((count, n, chain + 1), dtype=newer.dtype)  # column i: the command i samples ago
@@ -551,7 +550,7 @@ def hold(
     drive[rows, :, whole] = newer
     drive[rows, :, whole + 1] += gamma - newer
     # The output is read before the command changes.
-    through[rows, ..., np.where(np.real(rest) > 0.0, whole + 1, whole)] = d
+    through[rows, ..., np.where(np.real(remainder) > 0.0, whole + 1, whole)] = d
     big = np.zeros((count, n + chain, n + chain), dtype=drive.dtype)
     late = np.zeros((count, n + chain), dtype=drive.dtype)
     big[:, :n, :n], big[:, :n, n:] = whole_period, drive[:, :, 1:]
@@ -576,10 +575,10 @@ def _exponential(
     # Each its own: squared as often as the stiffest of them needs, the others would lose their digits.
     squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, 1e-300) / REACH))).astype(int)
     block *= np.ldexp(1.0, -squarings)[:, None, None]
-    one = np.eye(n + 1)
-    out = one + block / DEGREE
+    identity = np.eye(n + 1)
+    out = identity + block / DEGREE
     for k in range(DEGREE - 1, 0, -1):
-        out = one + block @ out / k
+        out = identity + block @ out / k
     for done in range(int(squarings.max(initial=0))):
         live = squarings > done
         out[live] = out[live] @ out[live]

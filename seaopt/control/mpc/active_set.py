@@ -85,60 +85,56 @@ class _Bounds:
         Q, tall = np.linalg.qr(normals.T, mode="complete")
         R = tall[:k]
         w = np.linalg.solve(R.T, ends - normals @ self.start)
-        return _Held(
-            rows=rows, signs=signs, point=self.start + Q[:, :k] @ w, dual=np.linalg.solve(R, w), Q=Q, R=R
-        )  # fmt: skip
+        return _Held(rows=rows, signs=signs, point=self.start + Q[:, :k] @ w, dual=np.linalg.solve(R, w), Q=Q, R=R)
 
-    def let_go(self, held: _Held, j: int) -> _Held:
+    def let_go(self, state: _Held, j: int) -> _Held:
         """Return what holds without the j-th of the held rows."""
-        return self.hold(held.rows[:j] + held.rows[j + 1 :], held.signs[:j] + held.signs[j + 1 :])
+        return self.hold(state.rows[:j] + state.rows[j + 1 :], state.signs[:j] + state.signs[j + 1 :])
 
-    def find_broken(self, held: _Held) -> tuple[int, int, float]:
+    def find_broken(self, state: _Held) -> tuple[int, int, float]:
         """Return the row that is broken most, its side, and by how much."""
-        values = self.normals @ held.point
+        values = self.normals @ state.point
         broken = np.maximum(values - self.high, self.low - values)
-        broken[list(held.rows)] = 0.0
+        broken[list(state.rows)] = 0.0
         row = int(np.argmax(broken))
         return row, 1 if values[row] > self.high[row] else -1, float(broken[row])
 
-    def take_in(self, held: _Held, row: int, sign: int, broken: float, most: int) -> tuple[_Held, Ending, int]:
+    def take_in(self, state: _Held, row: int, sign: int, broken: float, most: int) -> tuple[_Held, Ending, int]:
         """Return what holds with a broken row, once the rows that are in its way are let go; in `most` changes."""
-        dual = held.dual
+        dual = state.dual
         for used in range(1, most + 1):
-            k = len(held.rows)
-            d = held.Q.T @ (-sign * self.normals[row])
-            share, rest = np.linalg.solve(held.R, d[:k]), float(d[k:] @ d[k:])
+            k = len(state.rows)
+            d = state.Q.T @ (-sign * self.normals[row])
+            share, remaining = np.linalg.solve(state.R, d[:k]), float(d[k:] @ d[k:])
             ratios = np.where(share > 0.0, dual / np.where(share > 0.0, share, 1.0), np.inf)
-            partial, full = float(np.min(ratios, initial=np.inf)), broken / rest if rest > DEPENDENT else np.inf
+            partial, full = (
+                float(np.min(ratios, initial=np.inf)),
+                broken / remaining if remaining > DEPENDENT else np.inf,
+            )
             step = min(partial, full)
             if step == np.inf:
-                return held, INFEASIBLE, used
+                return state, INFEASIBLE, used
             if full <= partial:
-                return self.hold((*held.rows, row), (*held.signs, sign)), SOLVED, used
+                return self.hold((*state.rows, row), (*state.signs, sign)), SOLVED, used
             j = int(np.argmin(ratios))
-            dual, broken = np.delete(dual - step * share, j), broken - (step * rest if full < np.inf else 0.0)
-            held = self.let_go(held, j)
-        return held, UNFINISHED, most
+            dual, broken = np.delete(dual - step * share, j), broken - (step * remaining if full < np.inf else 0.0)
+            state = self.let_go(state, j)
+        return state, UNFINISHED, most
 
 
 def find_nearest(
-    start: Float[np.ndarray, " n"], normals: Float[np.ndarray, "m n"], low: Float[np.ndarray, " m"],
-    high: Float[np.ndarray, " m"], sides: Int[np.ndarray, " m"], max_iterations: int,
-) -> Nearest:  # fmt: skip
+    start: Float[np.ndarray, " n"],
+    normals: Float[np.ndarray, "m n"],
+    low: Float[np.ndarray, " m"],
+    high: Float[np.ndarray, " m"],
+    sides: Int[np.ndarray, " m"],
+    max_iterations: int,
+) -> Nearest:
     """Return the point nearest to `start` within bounds.
 
-    Parameters
-    ----------
-    start : array, shape (n,)
-        The other point.
-    normals : array, shape (m, n)
-        Rows of length 1.
-    low, high : arrays, shape (m,)
-        Their bounds, low <= high: of a row that is held at one end the other is not looked at.
-    sides : array of int, shape (m,)
-        Where rows are held to begin with, as `Nearest.sides`; the held ones are linearly independent.
-    max_iterations : int
-        Changes of the held rows at most, besides the rows that are let go at the start.
+    `low`, `high`: their bounds, low <= high: of a row that is held at one end the other is not looked at. `sides`:
+    where rows are held to begin with, as `Nearest.sides`; the held ones are linearly independent. `max_iterations`:
+    changes of the held rows at most, besides the rows that are let go at the start.
 
     Examples
     --------
@@ -150,17 +146,17 @@ def find_nearest(
     """
     bounds = _Bounds(start=start, normals=normals, low=low, high=high)
     at = np.flatnonzero(sides)
-    held = bounds.hold(tuple(at.tolist()), tuple(sides[at].tolist()))
-    while np.min(held.dual, initial=0.0) < 0.0:
-        held = bounds.let_go(held, int(np.argmin(held.dual)))
+    state = bounds.hold(tuple(at.tolist()), tuple(sides[at].tolist()))
+    while np.min(state.dual, initial=0.0) < 0.0:
+        state = bounds.let_go(state, int(np.argmin(state.dual)))
     status: Ending = SOLVED
     iterations, tolerance = 0, TOLERANCE * (1.0 + float(np.max(np.abs(normals @ start))))
     while status == SOLVED:
-        row, sign, broken = bounds.find_broken(held)
+        row, sign, broken = bounds.find_broken(state)
         if not broken > tolerance:
             break
-        held, status, used = bounds.take_in(held, row, sign, broken, max_iterations - iterations)
+        state, status, used = bounds.take_in(state, row, sign, broken, max_iterations - iterations)
         iterations += used
     ended = np.zeros_like(sides)
-    ended[list(held.rows)] = held.signs
-    return Nearest(point=held.point, sides=ended, status=status, iterations=iterations)
+    ended[list(state.rows)] = state.signs
+    return Nearest(point=state.point, sides=ended, status=status, iterations=iterations)

@@ -167,9 +167,12 @@ class Estimator:
         """The plant at rest at zero, with no delayed input."""
         n, nu = self.B.shape
         return EstimatorState(
-            predicted=np.zeros(n), corrected=np.zeros(n), applied=np.zeros(nu),
-            past=np.zeros((self.delay_samples + 1, nu)), innovation=np.full(len(self.outputs), np.nan),
-        )  # fmt: skip
+            predicted=np.zeros(n),
+            corrected=np.zeros(n),
+            applied=np.zeros(nu),
+            past=np.zeros((self.delay_samples + 1, nu)),
+            innovation=np.full(len(self.outputs), np.nan),
+        )
 
     def list_acting(self, past: Float[np.ndarray, "m nu"]) -> Float[np.ndarray, " nu"]:
         """Return the input in force as a sample is read, of those before it and its own."""
@@ -192,9 +195,12 @@ class Estimator:
         applied = self.list_acting(line)
         corrected, innovation = self.correct(state, y, applied)
         return EstimatorState(
-            predicted=self.advance(corrected, line[0], line[1]), corrected=corrected, applied=applied, past=line[1:],
+            predicted=self.advance(corrected, line[0], line[1]),
+            corrected=corrected,
+            applied=applied,
+            past=line[1:],
             innovation=innovation,
-        )  # fmt: skip
+        )
 
     def values(self, state: EstimatorState) -> dict[str, float]:
         """Return the estimates of the last sample by name, in `units`."""
@@ -335,17 +341,35 @@ def estimator(
     keep = np.eye(len(A)) - gain @ C
     names, units, G, H = _list_estimates(plant, values, (a, b, c, d), disturbances)
     return Estimator(
-        plant=plant, outputs=chosen, sample_time_s=sample_time_s, delay_samples=delay_samples + waits,
-        noise=noise, A=A, B=B, C=C, D=D, late=total - B, gain=gain,
-        covariance=keep @ P @ keep.T + gain @ R @ gain.T, innovation_covariance=S,
-        offset=np.array([noise.offset.get(name, 0.0) for name in chosen]), names=names, units=units, G=G, H=H,
-    )  # fmt: skip
+        plant=plant,
+        outputs=chosen,
+        sample_time_s=sample_time_s,
+        delay_samples=delay_samples + waits,
+        noise=noise,
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        late=total - B,
+        gain=gain,
+        covariance=keep @ P @ keep.T + gain @ R @ gain.T,
+        innovation_covariance=S,
+        offset=np.array([noise.offset.get(name, 0.0) for name in chosen]),
+        names=names,
+        units=units,
+        G=G,
+        H=H,
+    )
 
 
 def _check(
-    plant: Plant, params: CompletedParameters, noise: NoiseModel, outputs: tuple[str, ...], sample_time_s: float,
+    plant: Plant,
+    params: CompletedParameters,
+    noise: NoiseModel,
+    outputs: tuple[str, ...],
+    sample_time_s: float,
     delay: int,
-) -> None:  # fmt: skip
+) -> None:
     for name in outputs:
         if name not in plant.outputs:
             raise ControlError(f'output "{name}" is not one of {plant.name}; {suggestion(name, plant.outputs)}')
@@ -368,9 +392,13 @@ def _check(
 
 
 def _solve_riccati(
-    plant: Plant, outputs: tuple[str, ...], A: Float[np.ndarray, "n n"], C: Float[np.ndarray, "ny n"],
-    Q: Float[np.ndarray, "n n"], R: Float[np.ndarray, "ny ny"],
-) -> Float[np.ndarray, "n n"]:  # fmt: skip
+    plant: Plant,
+    outputs: tuple[str, ...],
+    A: Float[np.ndarray, "n n"],
+    C: Float[np.ndarray, "ny n"],
+    Q: Float[np.ndarray, "n n"],
+    R: Float[np.ndarray, "ny ny"],
+) -> Float[np.ndarray, "n n"]:
     """Return the covariance of the prediction in steady state."""
     from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
 
@@ -421,9 +449,11 @@ def _augment(
 
 
 def _list_estimates(
-    plant: Plant, params: CompletedParameters, matrices: tuple[Any, Any, Any, Any],
+    plant: Plant,
+    params: CompletedParameters,
+    matrices: tuple[Any, Any, Any, Any],
     disturbances: list[tuple[int, float, float]],
-) -> tuple[tuple[str, ...], tuple[str, ...], Float[np.ndarray, "nz n"], Float[np.ndarray, "nz nu"]]:  # fmt: skip
+) -> tuple[tuple[str, ...], tuple[str, ...], Float[np.ndarray, "nz n"], Float[np.ndarray, "nz nu"]]:
     """Return names, units, G and H of everything that is estimated."""
     a, b, c, d = matrices
     nx, nu = b.shape

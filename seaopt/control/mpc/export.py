@@ -6,50 +6,40 @@ from collections.abc import Mapping
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import Limits, to_content
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
 from seaopt.control.mpc.quadratic_program import PENALTY, WIDE, factor_program, stack_hessian
 from seaopt.errors import FileError
-from seaopt.files import write_text
+from seaopt.files import plain, write_text
 from seaopt.records import record
 
+CName = Annotated[str, Limits(pattern=r"^[A-Za-z_]+$")]
+CText = Annotated[str, Limits(pattern=r'^[^"\\\r\n]*$')]  # stands between quotation marks in C
 SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "arithmetic.h", "example.c")
 
 
 @record(eq=False)
 class MPCCode:
-    """All numbers of a controller's C code; `collect_code` takes them from one.
+    """All numbers of a controller's C code; `collect_code` takes them from one."""
 
-    Parameters
-    ----------
-    sizes, numbers, arrays, units : mapping of name to value
-        Of ``force_mpc_data.h``.
-    hessian, rows : arrays, shapes (nv, nv) and (r, nv)
-        Of the program.
-
-    """
-
-    sizes: Mapping[str, int]
-    numbers: Mapping[str, float]
-    arrays: Mapping[str, Float[np.ndarray, "..."]]
-    units: Mapping[str, str]
-    hessian: Float[np.ndarray, "nv nv"]
+    sizes: Mapping[CName, int]  # sizes, numbers, units, arrays: of ``force_mpc_data.h``
+    numbers: Mapping[CName, float]
+    units: Mapping[CName, CText]
+    arrays: Mapping[CName, Float[np.ndarray, "..."]]
+    hessian: Float[np.ndarray, "nv nv"]  # hessian, rows: of the program
     rows: Float[np.ndarray, "r nv"]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as they stand in controller.json."""
-        return {
-            "sizes": dict(self.sizes), "numbers": dict(self.numbers), "units": dict(self.units),
-            "arrays": {name: value.tolist() for name, value in self.arrays.items()},
-            "hessian": self.hessian.tolist(), "rows": self.rows.tolist(),
-        }  # fmt: skip
+        return plain(to_content(self))
 
 
 def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = False) -> Path:
@@ -117,10 +107,13 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "DELAYS": mpc.delays,
     }
     code = MPCCode(
-        sizes=sizes, numbers={name: value for name, value in numbers.items() if np.isfinite(value)}, units=units,
-        arrays={name: value for name, value in arrays.items() if value.size}, hessian=stack_hessian(prediction),
+        sizes=sizes,
+        numbers={name: value for name, value in numbers.items() if np.isfinite(value)},
+        units=units,
+        arrays={name: value for name, value in arrays.items() if value.size},
+        hessian=stack_hessian(prediction),
         rows=prediction.rows,
-    )  # fmt: skip
+    )
     return set_gate(code, mpc.gate, spec.sample_time_s)
 
 
@@ -145,9 +138,15 @@ def _format_data(code: MPCCode, single_precision: bool) -> str:
     lines += [f"static const force_mpc_real mpc_{name} = {_format_number(value)};" for name, value in numbers.items()]
     lines += [_format_array(name, value) for name, value in arrays.items()]
     return "\n".join(
-        ["/* Sizes and numbers of one controller. */", "#ifndef FORCE_MPC_DATA_H", "#define FORCE_MPC_DATA_H",
-         *lines, "#endif", ""]
-    )  # fmt: skip
+        [
+            "/* Sizes and numbers of one controller. */",
+            "#ifndef FORCE_MPC_DATA_H",
+            "#define FORCE_MPC_DATA_H",
+            *lines,
+            "#endif",
+            "",
+        ]
+    )
 
 
 def _format_number(value: float) -> str:

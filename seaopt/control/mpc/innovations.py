@@ -79,9 +79,7 @@ def estimate_noise(
             sensor_std={name: sensors[name] * float(s) for name, s in zip(outputs, scale[1:], strict=True)},
             input_noise={drive: float(scale[0])},
         )
-        return estimator(
-            plant, params, trial, outputs=outputs, sample_time_s=log.period, delay_samples=delay_samples
-        )  # fmt: skip
+        return estimator(plant, params, trial, outputs=outputs, sample_time_s=log.period, delay_samples=delay_samples)
 
     def cost(logs: Float[np.ndarray, " q"]) -> float:
         kalman = filter_of(logs)

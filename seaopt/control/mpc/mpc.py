@@ -36,7 +36,7 @@ from seaopt.control.laws.delay import LoopDelays, settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.spec import describe_lifted
-from seaopt.control.laws.verdict import Verdict, explain_broken, join_labels, judge_all, list_broken, shorten_blocked
+from seaopt.control.laws.verdict import Verdict, explain_broken, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
@@ -67,14 +67,13 @@ from seaopt.control.mpc.step import MPCState, MPCStep
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
-from seaopt.formatting import format_number, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import find_range, name_input, require_plant
-from seaopt.records import Result, record
+from seaopt.records import Result, Worded, record
 from seaopt.units import mechanics_of, name_command, show_command, unit_after
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
@@ -82,8 +81,8 @@ LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that i
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
 
 
-@record(eq=False)
-class ForceMPC(LoopDelays, Result):
+@record(eq=False, repr=False)
+class ForceMPC(LoopDelays, Result, Worded):
     """A force controller within limits; `force_mpc` makes one.
 
     Parameters
@@ -124,11 +123,6 @@ class ForceMPC(LoopDelays, Result):
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
-    @property
-    def met(self) -> bool:
-        """Whether every limit is met, as measured."""
-        return self.feasible
-
     def __reduce__(self) -> tuple[Any, ...]:
         return _design, (*self.design, self.spec, self.gate, self.warnings)  # what it remembers does not pickle
 
@@ -138,7 +132,7 @@ class ForceMPC(LoopDelays, Result):
         """Around the design plant while no limit is active, in newtons of motor force; with friction sliding, stuck."""
         plant, values = self.design
         states = split_friction({"design plant": plant}, values)
-        return {name: self.close(one, values) for name, one in states.items()}
+        return {name: self.close(model, values) for name, model in states.items()}
 
     @property
     @memo
@@ -162,7 +156,7 @@ class ForceMPC(LoopDelays, Result):
 
         It is the first on the way down from the one asked, in steps of a sixth, moved up by bisection to a hundredth.
         """
-        return None if self.feasible else _find_possible(self)
+        return None if self.met else _find_possible(self)
 
     @property
     @memo
@@ -216,7 +210,7 @@ class ForceMPC(LoopDelays, Result):
         return self.measured_loops[0].figures
 
     @property
-    def feasible(self) -> bool:
+    def met(self) -> bool:
         """Whether every limit is met, as measured."""
         return all(verdict.met for verdict in self.verdicts)
 
@@ -228,24 +222,23 @@ class ForceMPC(LoopDelays, Result):
     @property
     def explanation(self) -> str:
         """One line: the limits that block, and the bandwidth that is possible; empty where every limit is met."""
-        if self.feasible:
+        if self.met:
             return ""
         design, loop = self.measured_loops[0], next(iter(self.loops.values()))
         blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, design, loop))
         remedy = (
-            f"{self.possible_hz:.4g} Hz is possible" if self.possible_hz is not None
+            f"{self.possible_hz:.4g} Hz is possible"
+            if self.possible_hz is not None
             else "no lower bandwidth is known that keeps them; shorten the delay, sample faster, give the plan more "
             "moves, or raise a limit"
-        )  # fmt: skip
+        )
         return f"{self.spec.bandwidth_hz:g} Hz is blocked by {blocked}; {remedy}"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
         proof = () if self.friction is None else (f"{self.friction}, while no limit is active",)
-        limit = limit_notes(
-            self.actuation, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None
-        )  # fmt: skip
+        limit = limit_notes(self.actuation, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
         return (*describe_lifted(self.spec), *self.warnings, *limit, *proof)
 
     @property
@@ -253,13 +246,14 @@ class ForceMPC(LoopDelays, Result):
         """At rest at zero."""
         n, m = self.prediction.knots.size, len(self.prediction.rows)
         return MPCState(
-            kalman=self.kalman.start, current_A=0.0, plan=np.zeros(n), sides=np.zeros(m, dtype=int),
+            kalman=self.kalman.start,
+            current_A=0.0,
+            plan=np.zeros(n),
+            sides=np.zeros(m, dtype=int),
             age=self.spec.samples,
-        )  # fmt: skip
+        )
 
-    def step(
-        self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float
-    ) -> MPCStep:  # fmt: skip
+    def step(self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float) -> MPCStep:
         """Return the current for a reference and a measured force; one that is not finite is predicted.
 
         Parameters
@@ -305,16 +299,20 @@ class ForceMPC(LoopDelays, Result):
         current = self.admissible(float(planned[0]), last)
         kalman = self._advance(state.kalman, corrected, innovation, current)
         return MPCStep(
-            current_A=current, solved=not status, status=status or solution.status, target_N=float(targets[-1]),
+            current_A=current,
+            solved=not status,
+            status=status or solution.status,
+            target_N=float(targets[-1]),
             slack=0.0 if status else SLACK_UNIT * float(np.max(theta[shifted.size :], initial=0.0)),
             state=MPCState(kalman=kalman, current_A=current, plan=planned, sides=sides, age=age, gate=seen),
-            force_N=float(self.kalman.C[0] @ corrected), iterations=solution.iterations,
+            force_N=float(self.kalman.C[0] @ corrected),
+            iterations=solution.iterations,
             step_time_s=time.perf_counter() - began,
-        )  # fmt: skip
+        )
 
     def command(
         self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float
-    ) -> tuple[float, MPCState]:  # fmt: skip
+    ) -> tuple[float, MPCState]:
         """Return the current and the next state alone, as `close_loop` takes them."""
         result = self.step(state, reference_N, measurement_N)
         return result.current_A, result.state
@@ -339,7 +337,7 @@ class ForceMPC(LoopDelays, Result):
             The force's targets from the first sample that a command reaches, as far as they are known.
 
         """
-        prediction, limit, one = self.prediction, self.command_limit, np.ones(self.prediction.knots.size)
+        prediction, limit, ones = self.prediction, self.command_limit, np.ones(self.prediction.knots.size)
         slopes = np.zeros(len(prediction.M))
         if slopes.size:
             slopes[0] = (last_A - u_s) / self.spec.slew_per_sample_A
@@ -348,8 +346,8 @@ class ForceMPC(LoopDelays, Result):
         gradient = prediction.F @ np.append(xi, last_A - u_s) + prediction.R @ delta
         under, over = prediction.outputs.limits(np.append(xi, last_A - u_s), u_s + drift, WIDE)
         q = np.concatenate([gradient, np.full(len(prediction.outputs.names), PENALTY)])
-        low = np.concatenate([(-1.0 - u_s / limit) * one, slopes - 1.0, under])
-        high = np.concatenate([(1.0 - u_s / limit) * one, slopes + 1.0, over])
+        low = np.concatenate([(-1.0 - u_s / limit) * ones, slopes - 1.0, under])
+        high = np.concatenate([(1.0 - u_s / limit) * ones, slopes + 1.0, over])
         return q, low, high
 
     def _read_references(self, given: float | Float[np.ndarray, " r"]) -> Float[np.ndarray, " p"]:
@@ -375,9 +373,7 @@ class ForceMPC(LoopDelays, Result):
             ahead = self.kalman.advance(ahead, older, newer)
         return corrected, innovation, ahead
 
-    def _targets(
-        self, drift: float, references: Float[np.ndarray, " p"]
-    ) -> tuple[float, Float[np.ndarray, " r"]]:  # fmt: skip
+    def _targets(self, drift: float, references: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " r"]]:
         """Return the current at rest for the last reference, and the nearest forces to all that the limits can hold."""
         ends = self.prediction.outputs.admissible_rest(drift, self.command_limit)
         currents = np.clip(references / self.static_gain - drift, *ends)
@@ -396,16 +392,22 @@ class ForceMPC(LoopDelays, Result):
         return f"{UNFINISHED}, {broken}" if broken and solution.status == UNFINISHED else broken
 
     def _advance(
-        self, kalman: EstimatorState, corrected: Float[np.ndarray, " n"], innovation: Float[np.ndarray, " 1"],
+        self,
+        kalman: EstimatorState,
+        corrected: Float[np.ndarray, " n"],
+        innovation: Float[np.ndarray, " 1"],
         current: float,
-    ) -> EstimatorState:  # fmt: skip
+    ) -> EstimatorState:
         u = np.zeros(self.kalman.B.shape[1])
         u[0] = current
         line = np.vstack([kalman.past, u])
         return EstimatorState(
-            predicted=self.kalman.advance(corrected, line[0], line[1]), corrected=corrected,
-            applied=self.kalman.list_acting(line), past=line[1:], innovation=innovation,
-        )  # fmt: skip
+            predicted=self.kalman.advance(corrected, line[0], line[1]),
+            corrected=corrected,
+            applied=self.kalman.list_acting(line),
+            past=line[1:],
+            innovation=innovation,
+        )
 
     def unlimited(self) -> Law:
         """Return what the controller is as long as no limit is active: from reference and measurement to current."""
@@ -428,9 +430,12 @@ class ForceMPC(LoopDelays, Result):
 
         size = n + past
         whole = np.column_stack(
-            [*[respond(e, 0.0, 0.0) for e in np.eye(size)], respond(np.zeros(size), 1.0, 0.0),
-             respond(np.zeros(size), 0.0, 1.0)]
-        )  # fmt: skip
+            [
+                *[respond(e, 0.0, 0.0) for e in np.eye(size)],
+                respond(np.zeros(size), 1.0, 0.0),
+                respond(np.zeros(size), 0.0, 1.0),
+            ]
+        )
         a, c = whole[:size, :size], whole[size, :size]
         return Law(a=a, b=whole[:size, size:], c=c, d=whole[size, size:], sample_time_s=self.spec.sample_time_s)
 
@@ -460,33 +465,6 @@ class ForceMPC(LoopDelays, Result):
         """Return the limits of the command and its rate, as text."""
         slew, rate = self.spec.current_slew_A_per_s, f"{unit_after(self.actuation.unit) or ' 1'}/s"
         return self.actuation.show(self.command_limit) + ("" if slew is None else f", {slew:g}{rate}")
-
-    def describe_figures(self) -> list[str]:
-        """Return a line of margins for each loop of the design plant: with friction sliding and stuck."""
-        lines: list[str] = []
-        for loop in self.measured_loops:
-            a = loop.figures
-            bandwidth = format_number(a.bandwidth_hz, missing="none")
-            lines.append(f"{loop.name}: bandwidth {bandwidth} Hz, {a.describe_peaks()}; {a.describe_margins()}")
-        return lines
-
-    def __repr__(self) -> str:
-        s = self.spec
-        unit = self.design[0].outputs[s.measured]
-        verdict = "every limit met" if self.feasible else f"NOT FEASIBLE: {join_labels(self.broken)}"
-        lines = [
-            f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, {self.delays}: {verdict}",
-            f"  within {self.describe_limits()}, which hold {self.static_gain * self.command_limit:.4g} {unit}",
-            f"  bandwidth {format_number(self.achieved.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}) "
-            f"while no limit of the {self.actuation.word} is active; horizon {1e3 * s.horizon_s:g} ms, "
-            f"{self.prediction.knots.size} moves",
-            *(f"  {line}" for line in self.describe_figures()),
-            *([] if self.feasible else [f"  {self.explanation}"]),
-            *(f"  note: {note}" for note in self.notes),
-        ]
-        return "\n".join(lines)
-
-    _repr_html_ = html_text
 
 
 def force_mpc(
@@ -546,48 +524,63 @@ def _find_possible(mpc: ForceMPC) -> float | None:
         except ControlError:  # slower than any weight makes it
             return False
 
-    asked = mpc.spec.bandwidth_hz
-    return find_end(keeps, list_steps(asked, asked / LOWEST_SHARE), asked)
+    bandwidth_hz = mpc.spec.bandwidth_hz
+    return find_end(keeps, list_steps(bandwidth_hz, bandwidth_hz / LOWEST_SHARE), bandwidth_hz)
 
 
 def _design(
-    plant: Plant, values: ParameterSet, spec: MPCSpec, gate: PlausibilityGate | None = None,
+    plant: Plant,
+    values: ParameterSet,
+    spec: MPCSpec,
+    gate: PlausibilityGate | None = None,
     warnings: tuple[str, ...] = (),
-) -> ForceMPC:  # fmt: skip
+) -> ForceMPC:
     """Return the controller of a specification whose delay is settled; friction slides in its model."""
     design = (plant, values)
     plant = freeze_heat(take_sliding(plant, values))
-    completed = plant.complete(ParameterSet(one for name, one in values.items() if name not in DELAYS))
+    completed = plant.complete(ParameterSet(parameter for name, parameter in values.items() if name not in DELAYS))
     digital = sample(plant, completed, spec.measured, 1.0, spec.sample_time_s, 0)
     limit = limit_command(spec, plant, completed)
     gain = _static_gain(plant, digital, spec, limit)
     noise = spec.noise or NoiseModel(
-        sensor_std={spec.measured: SENSOR * abs(gain)}, input_noise={_drive(plant): 1.0},
+        sensor_std={spec.measured: SENSOR * abs(gain)},
+        input_noise={_drive(plant): 1.0},
         input_drift={_drive(plant): 3.0},
-    )  # fmt: skip
+    )
     if not noise.input_drift.get(_drive(plant), 0.0) > 0.0 or len(noise.input_drift) > 1:
         raise ControlError(
             f"noise: input_drift must be of {_drive(plant)} alone and above zero, for it takes the force's offset away"
         )
     kalman = estimator(
-        plant, values, noise, outputs=(spec.measured,), sample_time_s=spec.sample_time_s,
+        plant,
+        values,
+        noise,
+        outputs=(spec.measured,),
+        sample_time_s=spec.sample_time_s,
         delay_samples=spec.loop_delay_samples,
-    )  # fmt: skip
+    )
     a, c, nx = digital.a, digital.c, digital.b.size
     b, late = kalman.B[:nx, 0], kalman.late[:nx, 0]
     weighted = c + spec.lag_s * _rate(plant, completed, spec.measured)
     regulator = tune_regulator(a, b, late, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
     knots = spread_knots(spec.samples, spec.moves)
     outputs = bound_outputs(spec.bounds, kalman, a, b, late, interpolate_knots(knots), limit)
-    known = max(spec.preview_samples - kalman.delay_samples, 0)
-    prediction = condense(a, b, late, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A, known, outputs)
+    preview = max(spec.preview_samples - kalman.delay_samples, 0)
+    prediction = condense(a, b, late, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A, preview, outputs)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
-        spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
-        rest=np.linalg.solve(np.eye(nx) - a, digital.b), shift=shift,
+        spec=spec,
+        design=design,
+        kalman=kalman,
+        regulator=regulator,
+        prediction=prediction,
+        static_gain=gain,
+        rest=np.linalg.solve(np.eye(nx) - a, digital.b),
+        shift=shift,
         solver=factor_program(stack_hessian(prediction), prediction.rows),
-        gate=gate, warnings=warnings,
-    )  # fmt: skip
+        gate=gate,
+        warnings=warnings,
+    )
 
 
 def _rate(plant: Plant, params: CompletedParameters, measured: str) -> Float[np.ndarray, " nx"]:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field
 
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
+from seaopt.options import option
 from seaopt.plants import Plant
 from seaopt.records import record
 
@@ -24,18 +24,6 @@ from seaopt.records import record
 class NoiseModel:
     """Standard deviations by name of output and input.
 
-    Parameters
-    ----------
-    sensor_std : mapping of output to float
-        White sensor noise, in the output's unit.
-    input_noise : mapping of input to float
-        Standard deviation of the mean over one second of a white noise on the input: A s^(1/2) for a current. Over
-        one sample of T seconds it is this over the root of T.
-    input_drift : mapping of input to float
-        Standard deviation of the change over one second of a random walk on the input: A s^(-1/2).
-    offset : mapping of output to float
-        Known offset of the sensor, subtracted before anything else.
-
     Raises
     ------
     ControlError
@@ -43,10 +31,21 @@ class NoiseModel:
 
     """
 
-    sensor_std: Mapping[str, float]
-    input_noise: Mapping[str, float] = field(default_factory=dict[str, float])
-    input_drift: Mapping[str, float] = field(default_factory=dict[str, float])
-    offset: Mapping[str, float] = field(default_factory=dict[str, float])
+    sensor_std: Mapping[str, float] = option("White noise of the measured output, in its unit.", least=0.0)
+    input_noise: Mapping[str, float] = option(
+        "White noise of the command: standard deviation of its mean over a second, A s^(1/2) for a current. Over one "
+        "sample of T seconds it is this over the root of T.",
+        default_factory=dict[str, float],
+        least=0.0,
+    )
+    input_drift: Mapping[str, float] = option(
+        "Random walk of the command: standard deviation of its change over a second, A s^(-1/2); above zero.",
+        default_factory=dict[str, float],
+        least=0.0,
+    )
+    offset: Mapping[str, float] = option(
+        "Known offset of the sensor, subtracted before anything else.", default_factory=dict[str, float]
+    )
 
     def __post_init__(self) -> None:
         for what in ("sensor_std", "input_noise", "input_drift", "offset"):
@@ -64,9 +63,13 @@ class NoiseModel:
 
     @classmethod
     def from_fit(
-        cls, fit: Fit, *, experiment: str = "", input_noise: Mapping[str, float] | None = None,
+        cls,
+        fit: Fit,
+        *,
+        experiment: str = "",
+        input_noise: Mapping[str, float] | None = None,
         input_drift: Mapping[str, float] | None = None,
-    ) -> NoiseModel:  # fmt: skip
+    ) -> NoiseModel:
         """Return the sensors of one of a fit's experiments: residuals' sigma and offsets; the inputs' noise is given.
 
         Where something besides the input moves the plant the residuals contain that too: `estimate_noise` separates
@@ -92,16 +95,19 @@ class NoiseModel:
             raise ControlError(f'the fit has no experiment "{name}"; {suggestion(name, fit.outputs)}')
         return cls(
             sensor_std={output: scores.rms_residual for output, scores in fit.outputs[name].items()},
-            input_noise=dict(input_noise or {}), input_drift=dict(input_drift or {}),
+            input_noise=dict(input_noise or {}),
+            input_drift=dict(input_drift or {}),
             offset=dict(fit.nuisance[name].offset),
-        )  # fmt: skip
+        )
 
     def check(self, plant: Plant, outputs: tuple[str, ...]) -> None:
         """Refuse names that the plant lacks, and a measured output without a sensor."""
         for what, names in (
-            ("sensor_std", plant.outputs), ("offset", plant.outputs),
-            ("input_noise", plant.inputs), ("input_drift", plant.inputs),
-        ):  # fmt: skip
+            ("sensor_std", plant.outputs),
+            ("offset", plant.outputs),
+            ("input_noise", plant.inputs),
+            ("input_drift", plant.inputs),
+        ):
             for name in getattr(self, what):
                 if name not in names:
                     raise ControlError(f'noise: {what} names "{name}"; {suggestion(name, names)}')

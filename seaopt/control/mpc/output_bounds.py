@@ -34,29 +34,15 @@ SLACK_UNIT = 0.1  # of a slack, in half widths: the solver's tolerance grows wit
 
 @record(eq=False)
 class OutputBounds:
-    """Bounded signals over the horizon, each in units of half the width of its bounds.
+    """Bounded signals over the horizon, each in units of half the width of its bounds."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        Outputs and states of the plant.
-    middle, half : arrays, shape (k,)
-        Centre and half width of the bounds, in the signals' units.
-    static : array, shape (k,)
-        Value at rest per unit of command, over `half`.
-    free : array, shape (k m, nx + 1)
-        From the state's distance to its target, and the last command's, to the signal at m samples, signal by signal.
-    forced : array, shape (k m, n)
-        The same of the knots, in units of the limit of the command.
-
-    """
-
-    names: tuple[str, ...]
-    middle: Float[np.ndarray, " k"]
+    names: tuple[str, ...]  # outputs and states of the plant
+    middle: Float[np.ndarray, " k"]  # middle, half: centre and half width of the bounds, in the signals' units
     half: Float[np.ndarray, " k"]
-    static: Float[np.ndarray, " k"]
+    static: Float[np.ndarray, " k"]  # value at rest per unit of command, over `half`
+    # from the state's distance to its target, and the last command's, to the signal at m samples, signal by signal
     free: Float[np.ndarray, "km nx1"]
-    forced: Float[np.ndarray, "km n"]
+    forced: Float[np.ndarray, "km n"]  # the same of the knots, in units of the limit of the command
 
     @property
     def samples(self) -> int:
@@ -79,15 +65,8 @@ class OutputBounds:
     ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
         """Return lower and upper ends of these rows.
 
-        Parameters
-        ----------
-        start : array, shape (nx + 1,)
-            The state's distance from its target, and the last command's.
-        rest : float
-            The command that reaches the plant at rest, with its disturbance.
-        wide : float
-            What stands for no limit.
-
+        `start`: the state's distance from its target, and the last command's. `rest`: the command that reaches the
+        plant at rest, with its disturbance.
         """
         k = len(self.names)
         base = np.repeat(self.static * rest - self.middle / self.half, self.samples) + self.free @ start
@@ -111,9 +90,13 @@ class OutputBounds:
 
 
 def go_on(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
-    free: Float[np.ndarray, "nx nx1"], forced: Float[np.ndarray, "nx samples"], j: int,
-) -> tuple[Float[np.ndarray, "nx nx1"], Float[np.ndarray, "nx samples"]]:  # fmt: skip
+    a: Float[np.ndarray, "nx nx"],
+    b: Float[np.ndarray, " nx"],
+    late: Float[np.ndarray, " nx"],
+    free: Float[np.ndarray, "nx nx1"],
+    forced: Float[np.ndarray, "nx samples"],
+    j: int,
+) -> tuple[Float[np.ndarray, "nx nx1"], Float[np.ndarray, "nx samples"]]:
     """Return the state at sample j + 1, as shares of the start (state, last command) and of the commands, from j's."""
     free, forced = a @ free, a @ forced
     forced[:, j] += b
@@ -135,31 +118,18 @@ def bound_outputs(
 ) -> OutputBounds:
     """Return the rows of bounds by name.
 
-    Parameters
-    ----------
-    bounds : mapping of name to (low, high)
-        Of outputs and states of the plant, deflection and rate of its spring, in their units.
-    kalman : Estimator
-        Whose estimates they are.
-    a, b, late
-        The sampled plant, and what the command before adds.
-    W : array, shape (samples, n)
-        From the knots to the command at each sample of the horizon.
-    limit : float
-        Of the command, the unit of the knots.
+    `bounds`: of outputs and states of the plant, deflection and rate of its spring, in their units. `a`, `b`, `late`:
+    the sampled plant, and what the command before adds. `W`: from the knots to the command at each sample of the
+    horizon. `limit`: of the command, the unit of the knots.
 
-    Raises
-    ------
-    ControlError
-        A name is not one of the estimates.
-
+    Raises ControlError: a name is not one of the estimates.
     """
     nx, N = b.size, len(W)
-    known = [name for name, row in zip(kalman.names, kalman.G, strict=True) if np.any(row[:nx])]
+    available = [name for name, row in zip(kalman.names, kalman.G, strict=True) if np.any(row[:nx])]
     for name in bounds:
-        if name not in known:
+        if name not in available:
             raise ControlError(
-                f'bounds of "{name}": not an output or state of {kalman.plant.name}; {suggestion(name, known)}'
+                f'bounds of "{name}": not an output or state of {kalman.plant.name}; {suggestion(name, available)}'
             )
     rows = [kalman.names.index(name) for name in bounds]
     C, D = kalman.G[rows][:, :nx], kalman.H[rows, 0]
@@ -179,8 +149,10 @@ def bound_outputs(
             forces.append(limit * np.where(direct, now, C @ forced) @ W)
     scale = half[:, None, None]
     return OutputBounds(
-        names=tuple(bounds), middle=ends.mean(axis=1), half=half,
+        names=tuple(bounds),
+        middle=ends.mean(axis=1),
+        half=half,
         static=(C @ np.linalg.solve(np.eye(nx) - a, b + late) + D) / half,
         free=(np.stack(frees, axis=1) / scale).reshape(-1, nx + 1),
         forced=(np.stack(forces, axis=1) / scale).reshape(-1, W.shape[1]),
-    )  # fmt: skip
+    )

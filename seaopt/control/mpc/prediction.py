@@ -41,21 +41,10 @@ BELOW = 1000  # frequencies of the three decades below the bandwidth at which th
 
 @record(eq=False)
 class Regulator:
-    """The unlimited optimum: increments of current are -(K_x xi + K_u mu), the cost to go is quadratic in Pi.
+    """The unlimited optimum: increments of current are -(K_x xi + K_u mu), the cost to go is quadratic in Pi."""
 
-    Parameters
-    ----------
-    rho : float
-        Weight of the current's increments, 1/A^2.
-    K_x : array, shape (nx,)
-        A per unit of each state.
-    K_u : float
-    Pi : array, shape (nx + 1, nx + 1)
-
-    """
-
-    rho: float
-    K_x: Float[np.ndarray, " nx"]
+    rho: float  # weight of the current's increments, 1/A^2
+    K_x: Float[np.ndarray, " nx"]  # A per unit of each state
     K_u: float
     Pi: Float[np.ndarray, "n n"]
 
@@ -66,36 +55,28 @@ class HorizonProgram:
 
     Minimise theta' H theta / 2 + (F s + R delta)' theta, s = [xi_0, mu_-1], with rows theta and M theta within bounds,
     and those of `outputs`, whose slacks are variables too.
-
-    Parameters
-    ----------
-    knots : array of int, shape (n,)
-        Samples at which the current is free.
-    H : array, shape (n, n)
-    F : array, shape (n, nx + 1)
-    M : array, shape (n, n) or (0, n)
-        Slopes between knots over the slew limit, if there is one; the first row is the step from the last current.
-    R : array, shape (n, p)
-        Of the differences to the last reference known, at as many samples as can be known ahead.
-    outputs : OutputBounds
-    rows : array, shape (r, nv)
-        The matrix of all rows, over knots and slacks: knots, slopes, and those of `outputs`.
-
     """
 
-    knots: Int[np.ndarray, " n"]
+    knots: Int[np.ndarray, " n"]  # samples at which the current is free
     H: Float[np.ndarray, "n n"]
     F: Float[np.ndarray, "n s"]
+    # slopes between knots over the slew limit, if there is one; the first row is the step from the last current
     M: Float[np.ndarray, "m n"]
+    # of the differences to the last reference known, at as many samples as can be known ahead
     R: Float[np.ndarray, "n p"]
     outputs: OutputBounds
+    # the matrix of all rows, over knots and slacks: knots, slopes, and those of `outputs`
     rows: Float[np.ndarray, "r nv"]
 
 
 def solve_regulator(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
-    w: Float[np.ndarray, " nx"], gain: float, rho: float,
-) -> Regulator:  # fmt: skip
+    a: Float[np.ndarray, "nx nx"],
+    b: Float[np.ndarray, " nx"],
+    late: Float[np.ndarray, " nx"],
+    w: Float[np.ndarray, " nx"],
+    gain: float,
+    rho: float,
+) -> Regulator:
     """Return the linear-quadratic regulator of w xi over `gain` and current increments."""
     from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
 
@@ -114,14 +95,20 @@ def solve_regulator(
 
 
 def tune_regulator(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
-    c: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
-) -> Regulator:  # fmt: skip
+    a: Float[np.ndarray, "nx nx"],
+    b: Float[np.ndarray, " nx"],
+    late: Float[np.ndarray, " nx"],
+    c: Float[np.ndarray, " nx"],
+    w: Float[np.ndarray, " nx"],
+    gain: float,
+    bandwidth_hz: float,
+    sample_time_s: float,
+) -> Regulator:
     """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by a search for rho."""
     from scipy.optimize import brentq  # deferred: scipy is slow to load
 
     nx = b.size
-    rest = np.linalg.solve(np.eye(nx) - a, b + late) / gain  # x_s per newton
+    resting = np.linalg.solve(np.eye(nx) - a, b + late) / gain  # x_s per newton
     A = np.block([[a, (b + late)[:, None]], [np.zeros((1, nx)), np.eye(1)]])
     B, row = np.append(b, 1.0), np.append(c, 0.0)
     below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
@@ -129,7 +116,7 @@ def tune_regulator(
     def tracking(candidate: Regulator, f: Float[np.ndarray, " m"] = below[-1:]) -> Float[np.ndarray, " m"]:
         """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
         z = np.exp(2j * np.pi * f * sample_time_s)[:, None, None]
-        drive = (B * (candidate.K_x @ rest + candidate.K_u / gain)).astype(complex)[:, None]
+        drive = (B * (candidate.K_x @ resting + candidate.K_u / gain)).astype(complex)[:, None]
         closed = A - np.outer(B, np.append(candidate.K_x, candidate.K_u))
         return np.abs(np.linalg.solve(z * np.eye(nx + 1) - closed, drive)[:, :, 0] @ row)
 
@@ -156,10 +143,18 @@ def tune_regulator(
 
 
 def condense(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], late: Float[np.ndarray, " nx"],
-    w: Float[np.ndarray, " nx"], gain: float, regulator: Regulator, knots: Int[np.ndarray, " n"], limit: float,
-    slew_per_sample: float, known: int, outputs: OutputBounds,
-) -> HorizonProgram:  # fmt: skip
+    a: Float[np.ndarray, "nx nx"],
+    b: Float[np.ndarray, " nx"],
+    late: Float[np.ndarray, " nx"],
+    w: Float[np.ndarray, " nx"],
+    gain: float,
+    regulator: Regulator,
+    knots: Int[np.ndarray, " n"],
+    limit: float,
+    slew_per_sample: float,
+    known: int,
+    outputs: OutputBounds,
+) -> HorizonProgram:
     """Return the quadratic program of a horizon.
 
     `limit` and `slew_per_sample` are in A, the latter infinite if there is none; references are known at `known`
@@ -191,6 +186,11 @@ def condense(
     limits = np.vstack([np.eye(knots.size), M])
     slackless = np.zeros((len(limits), len(outputs.names)))
     return HorizonProgram(
-        knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=M, R=R * scale, outputs=outputs,
+        knots=knots,
+        H=0.5 * (H + H.T) * scale,
+        F=F * scale,
+        M=M,
+        R=R * scale,
+        outputs=outputs,
         rows=np.vstack([np.hstack([limits, slackless]), outputs.rows()]),
-    )  # fmt: skip
+    )

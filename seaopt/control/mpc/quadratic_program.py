@@ -39,27 +39,20 @@ class Solution:
 
 @record(eq=False)
 class QuadraticProgram:
-    """A program's matrices; `factor_program` makes one.
-
-    Parameters
-    ----------
-    inverse : array, shape (n, n)
-        Of L.
-    normals : array, shape (m, n)
-        The rows of y, of length 1.
-    scale : array, shape (m,)
-        One over the lengths that they had: of their bounds too.
-
-    """
+    """A program's matrices; `factor_program` makes one."""
 
     inverse: Float[np.ndarray, "n n"]
-    normals: Float[np.ndarray, "m n"]
-    scale: Float[np.ndarray, " m"]
+    normals: Float[np.ndarray, "m n"]  # the rows of y, of length 1
+    scale: Float[np.ndarray, " m"]  # one over the lengths that they had: of their bounds too
 
     def solve(
-        self, q: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
-        sides: Int[np.ndarray, " m"], max_iterations: int,
-    ) -> Solution:  # fmt: skip
+        self,
+        q: Float[np.ndarray, " n"],
+        low: Float[np.ndarray, " m"],
+        high: Float[np.ndarray, " m"],
+        sides: Int[np.ndarray, " m"],
+        max_iterations: int,
+    ) -> Solution:
         """Return the solution for a gradient and bounds, from rows that are held to begin with."""
         nearest = find_nearest(
             -self.inverse @ q, self.normals, low * self.scale, high * self.scale, sides, max_iterations

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import replace
 from types import NoneType
+from typing import Any
 
 import numpy as np
 
 from seaopt.control.laws.delay import check_delays, count_loop_samples
 from seaopt.control.laws.limits import BY_NAME, Limit
-from seaopt.control.laws.spec import Level
+from seaopt.control.laws.spec import ControllerSpec, Level
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, require_type
+from seaopt.options import check_options, list_options, option
 from seaopt.records import record
 
 NO_SLEW_LIMIT = 1e12  # A/s, far above which the plan's rows for it vanish in rounding
@@ -33,56 +35,18 @@ MPC_LIMITS = (  # of the table of limits, those of a loop without gains
     ),
 )  # fmt: skip
 
+CONTROLLER_OPTIONS = {one.name: one for one in list_options(ControllerSpec)}
+
+
+def _shared(name: str) -> Any:
+    """Return an option that a plan has in common with gains."""
+    one = CONTROLLER_OPTIONS[name]
+    return option(one.option.text, default=one.default, unit=one.option.unit)
+
 
 @record(keywords=True)
 class MPCSpec:
     """Limits of the plan, and bandwidth and margins while none of them is active.
-
-    Parameters
-    ----------
-    current_limit_A, command_limit : float
-        The command, a current or whatever the plant's first input is, stays within plus and minus this. Give one.
-    current_slew_A_per_s : float, optional
-        Largest rate of change of the command, in its unit over s; None: no limit.
-    measured : str
-        The output that is fed back, F1 as a rule.
-    bandwidth_hz : float
-        Frequency at which abs(F/F_ref) is 3 dB below its static value as long as no limit is active, on the design
-        plant; it sets the weight of the current's increments, and is a limit: a plan of few moves over a long
-        horizon may miss it by more than 2 %.
-    sample_rate_hz : float
-        Of the controller.
-    compute_delay_samples : int, optional
-        Whole samples from a reading to the command being put out, besides the hold; 1 if left out.
-    drive_delay_s : float, optional
-        Seconds from the command to its effect; left out, where `force_mpc` is given a fit, that of its experiments on
-        the design plant.
-    delay_samples : int, optional
-        The older key: the whole loop in samples, the drive's delay among them. Not beside the other two.
-    decay : float
-        Time constant with which the force error should die out, times 2 pi bandwidth_hz, from 0 to below 1: the
-        larger, the less overshoot and the more noise in the current.
-    horizon_s : float
-        How far it plans.
-    moves : int
-        Number of free currents in the plan, with straight lines between.
-    largest_force_N : float, optional
-        A force that the current limit must be able to hold; a limit too low for it is refused.
-    bounds : mapping of name to (low, high)
-        Of outputs and states of the plant, deflection and rate of its spring (`spring_deflection`, `spring_rate`), in
-        their units. They are soft: a plan breaks them where none keeps them, and then as little as it can.
-    preview_samples : int
-        How many references beyond the present one the controller may be given; the horizon and the delay at most.
-    max_iterations : int
-        Of the solver in one step, each of which takes in or lets go a limit of the plan. Where they do not suffice, its
-        plan is used if it keeps the limits; otherwise the last plan goes on.
-    noise : NoiseModel, optional
-        Of the Kalman filter, with a drift of the current. If left out, one that makes the filter quick: its sensor
-        noise is 1/120 of the static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).
-    max_sensitivity, max_complementary, min_disk_margin : float, optional
-        Limits of the loop, as in `ControllerSpec`: left out, each has its default; False lifts one.
-    max_reference_peak, max_droop_db, max_noise_gain, min_sensitivity_bandwidth_hz : float, optional
-        Likewise.
 
     Raises
     ------
@@ -91,54 +55,84 @@ class MPCSpec:
 
     """
 
-    current_limit_A: float | None = None
-    command_limit: float | None = None
-    current_slew_A_per_s: float | None = None
-    measured: str = "F1"
-    bandwidth_hz: float = 30.0
-    sample_rate_hz: float = 1000.0
-    compute_delay_samples: int | None = None
-    drive_delay_s: float | None = None
-    delay_samples: int | None = None
-    decay: float = 0.8
-    horizon_s: float = 0.05
-    moves: int = 12
-    largest_force_N: float | None = None
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
-    preview_samples: int = 0
-    max_iterations: int = 100
-    noise: NoiseModel | None = None
-    max_sensitivity: Level = BY_NAME["max_sensitivity"].default
-    max_complementary: Level = BY_NAME["max_complementary"].default
-    min_disk_margin: Level = BY_NAME["min_disk_margin"].default
-    max_reference_peak: Level = BY_NAME["max_reference_peak"].default
-    max_droop_db: Level = BY_NAME["max_droop_db"].default
-    max_noise_gain: Level = BY_NAME["max_noise_gain"].default
-    min_sensitivity_bandwidth_hz: Level = None
+    current_limit_A: float | None = option(
+        "The command, a current, stays within plus and minus this.", default=None, unit="A", above=0.0
+    )
+    command_limit: float | None = option("The same of another command, in its unit. Give one.", default=None, above=0.0)
+    current_slew_A_per_s: float | None = option(
+        "Largest rate of the command, in its unit per second; no limit where left out.",
+        default=None,
+        above=0.0,
+        most=NO_SLEW_LIMIT,
+    )
+    measured: str = option("The output that is fed back.", default="F1")
+    bandwidth_hz: float = option(
+        "Frequency at which |F/F_ref| is 3 dB below its static value while no limit is active, on the design plant; it "
+        "sets the weight of the command's increments, and is a limit: a plan of few moves over a long horizon may miss "
+        "it by more than 2 %.",
+        default=30.0,
+        unit="Hz",
+        above=0.0,
+    )
+    sample_rate_hz: float = option("At which the controller runs.", default=1000.0, unit="Hz", above=0.0)
+    compute_delay_samples: int | None = _shared("compute_delay_samples")
+    drive_delay_s: float | None = _shared("drive_delay_s")
+    delay_samples: int | None = _shared("delay_samples")
+    decay: float = option(
+        "Time constant with which the force error dies out, times 2 pi bandwidth_hz; the larger, the less overshoot "
+        "and the more noise in the command.",
+        default=0.8,
+        least=0.0,
+        below=1.0,
+    )
+    horizon_s: float = option("How far it plans.", default=0.05, unit="s", above=0.0)
+    moves: int = option(
+        "Free commands in a plan, with straight lines between.", default=12, least=2, most=MAX_HORIZON_SAMPLES
+    )
+    largest_force_N: float | None = option(
+        "A force that the limit of the command must be able to hold; a limit too low for it is refused.",
+        default=None,
+        above=0.0,
+    )
+    bounds: Mapping[str, tuple[float, float]] = option(
+        "Within [low, high] stay these outputs and states of the plant, deflection and rate of its spring "
+        "(`spring_deflection`, `spring_rate`), in their units. The bounds are soft: a plan breaks them where none "
+        "keeps them, and then as little as it can.",
+        default_factory=dict[str, tuple[float, float]],
+    )
+    preview_samples: int = option(
+        "References beyond the present one that the law may be given; the horizon and the delay at most.",
+        default=0,
+        least=0,
+        most=MAX_HORIZON_SAMPLES,
+    )
+    max_iterations: int = option(
+        "Iterations of the solver in one step, each of which takes in or lets go a limit of the plan. Where they "
+        "do not suffice, its plan is used if it keeps the limits; otherwise the last plan goes on.",
+        default=100,
+        least=1,
+        most=MAX_MPC_ITERATIONS,
+    )
+    noise: NoiseModel | None = option(
+        "What the Kalman filter counts on. Left out, one that makes the filter quick: its sensor noise is 1/120 of the "
+        "static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).",
+        default=None,
+    )
+    max_sensitivity: Level = _shared("max_sensitivity")
+    max_complementary: Level = _shared("max_complementary")
+    min_disk_margin: Level = _shared("min_disk_margin")
+    max_reference_peak: Level = _shared("max_reference_peak")
+    max_droop_db: Level = _shared("max_droop_db")
+    max_noise_gain: Level = _shared("max_noise_gain")
+    min_sensitivity_bandwidth_hz: Level = _shared("min_sensitivity_bandwidth_hz")
 
     def __post_init__(self) -> None:
         if (self.current_limit_A is None) == (self.command_limit is None):
             raise ControlError(
                 f"current_limit_A = {self.current_limit_A}, command_limit = {self.command_limit}: give one of the two"
             )
-        for name in ("bandwidth_hz", "sample_rate_hz", "horizon_s"):
-            self._positive(name)
-        for name in ("current_limit_A", "command_limit", "current_slew_A_per_s", "largest_force_N"):
-            if getattr(self, name) is not None:
-                self._positive(name)
-        if self.current_slew_A_per_s is not None and self.current_slew_A_per_s > NO_SLEW_LIMIT:
-            raise ControlError(f"current_slew_A_per_s = {self.current_slew_A_per_s:g} limits nothing; leave it out")
+        check_options(self, ControlError)
         require_type(self.noise, (NoiseModel, NoneType), "noise", "give a NoiseModel", ControlError)
-        if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
-            raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
-        ranges = {
-            "moves": (2, MAX_HORIZON_SAMPLES), "max_iterations": (1, MAX_MPC_ITERATIONS),
-            "preview_samples": (0, MAX_HORIZON_SAMPLES),
-        }  # fmt: skip
-        for name, (least, most) in ranges.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-                raise ControlError(f"{name} = {value!r} is not a whole number from {least} to {most}")
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
             raise ControlError(
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
@@ -155,11 +149,6 @@ class MPCSpec:
         for limit in MPC_LIMITS:
             if limit.has_field:
                 limit.check(getattr(self, limit.name), self.bandwidth_hz)
-
-    def _positive(self, name: str) -> None:
-        value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
-            raise ControlError(f"{name} = {value!r} is not a number above zero; give one")
 
     def _check_bounds(self) -> None:
         if not isinstance(self.bounds, Mapping):

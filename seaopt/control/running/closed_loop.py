@@ -41,8 +41,9 @@ from seaopt.errors import SimulationError, StepSizeError, require_seed, suggesti
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
+from seaopt.plants.equations.declaration import ENERGY
 from seaopt.plants.friction import SLIDING, friction_states
-from seaopt.plants.plant import ENERGY, Matrices, name_input
+from seaopt.plants.plant import Matrices, name_input
 from seaopt.records import record
 from seaopt.units import name_command, unit_after
 
@@ -57,56 +58,41 @@ RESTS = 1e-10  # of the largest state: a state below it is at rest but for round
 
 @record(eq=False)
 class LoopRun:
-    """What runs did, sample by sample.
+    """What runs did, sample by sample."""
 
-    Parameters
-    ----------
-    time : array, shape (n,)
-        Seconds.
-    reference : array, shape (runs, n)
-        N.
-    outputs : mapping of name to array, shape (runs, n)
-        The plant's outputs (as they are, not as measured), and "energy" (J) where the plant declares it.
-    current : array, shape (runs, n)
-        A, in force at the end of the sample.
-    states : array, shape (runs, n, nx)
-        The plant's states.
-    peaks : mapping of name to array, shape (runs,)
-        Largest magnitude of each output over all integration steps.
-    end : LoopState
-        One sample after the last.
-    error : float
-        Estimated integration error of the worst sample, over the state's largest value.
-    substeps : int
-        Integration steps per sample.
-    wall_s : float
-        Time the simulation took, with steps that were too long, but not compilation.
-
-    """
-
-    time: Float[np.ndarray, " n"]
-    reference: Rows
+    time: Float[np.ndarray, " n"]  # seconds
+    reference: Rows  # shape (runs, n); N
+    # shape (runs, n); the plant's outputs (as they are, not as measured), and "energy" (J) where the plant declares it
     outputs: Mapping[str, Rows]
-    current: Rows
-    states: Float[np.ndarray, "runs n nx"]
-    peaks: Mapping[str, Float[np.ndarray, " runs"]]
-    end: LoopState
-    error: float
-    substeps: int
-    wall_s: float
+    current: Rows  # shape (runs, n); A, in force at the end of the sample
+    states: Float[np.ndarray, "runs n nx"]  # the plant's states
+    peaks: Mapping[str, Float[np.ndarray, " runs"]]  # largest magnitude of each output over all integration steps
+    end: LoopState  # one sample after the last
+    error: float  # estimated integration error of the worst sample, over the state's largest value
+    substeps: int  # integration steps per sample
+    wall_s: float  # time the simulation took, with steps that were too long, but not compilation
     command: tuple[str, str] = ("I", "A")
 
     def __repr__(self) -> str:
         return describe_runs(
-            "LoopRun", f"from {self.time[0]:.4g} to {self.time[-1]:.4g} s", self.current, self.peaks, self.error,
+            "LoopRun",
+            f"from {self.time[0]:.4g} to {self.time[-1]:.4g} s",
+            self.current,
+            self.peaks,
+            self.error,
             self.command,
-        )  # fmt: skip
+        )
 
 
 def describe_runs(
-    kind: str, span: str, current: Rows, peaks: Mapping[str, Float[np.ndarray, " runs"]], error: float,
-    command: tuple[str, str], more: str = "",
-) -> str:  # fmt: skip
+    kind: str,
+    span: str,
+    current: Rows,
+    peaks: Mapping[str, Float[np.ndarray, " runs"]],
+    error: float,
+    command: tuple[str, str],
+    more: str = "",
+) -> str:
     """Describe simulated runs in one line: how many, of how many samples, and the largest magnitudes."""
     runs, samples = current.shape
     largest = ", ".join(f"{name} {np.max(value):.4g}" for name, value in peaks.items())
@@ -254,10 +240,10 @@ def _lose_alike(before: LoopArrays, after: LoopArrays, *, shortest: bool) -> Boo
     lost = np.stack([_first_lost_sample(before), _first_lost_sample(after)])
     alike = (np.abs(lost[1] - lost[0]) <= 1) & ((np.min(lost, axis=0) > 1) | shortest)
     for run in np.flatnonzero(alike):
-        one, other = (arrays.states[run, : max(int(np.min(lost[:, run])), 1)] for arrays in (before, after))
-        size = np.max(np.maximum(np.abs(one), np.abs(other)), axis=0)
+        coarse, fine = (arrays.states[run, : max(int(np.min(lost[:, run])), 1)] for arrays in (before, after))
+        size = np.max(np.maximum(np.abs(coarse), np.abs(fine)), axis=0)
         scale = np.maximum(size, RESTS * np.max(size))
-        alike[run] = bool(np.all(np.max(np.abs(other - one), axis=0) <= ALIKE * scale))
+        alike[run] = bool(np.all(np.max(np.abs(fine - coarse), axis=0) <= ALIKE * scale))
     return alike
 
 
@@ -295,8 +281,8 @@ def _noise(
     std = np.array([[find_std(values, name) for name in loop.signals] for values in params])
     noise = np.zeros((len(params), n, len(loop.signals)))
     places = np.reshape(standing, (-1, 1)) if np.ndim(standing) < 2 else standing
-    for name, place in zip(loop.standing, np.broadcast_to(places, (len(params), len(loop.standing))).T, strict=True):
-        noise[:, :, loop.signals.index(name)] = place[:, None]
+    for name, position in zip(loop.standing, np.broadcast_to(places, (len(params), len(loop.standing))).T, strict=True):
+        noise[:, :, loop.signals.index(name)] = position[:, None]
     if not np.any(std):
         return noise
     rng = np.random.default_rng(require_seed(seed, SimulationError))

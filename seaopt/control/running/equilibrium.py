@@ -29,25 +29,16 @@ Runs = Float[np.ndarray, " runs"]
 
 @record(eq=False)
 class Equilibrium:
-    """Where runs rest.
+    """Where runs rest."""
 
-    Parameters
-    ----------
-    state : LoopState
-        Of plant, law and waiting commands.
-    reference, force, current_A, energy_J : arrays, shape (runs,)
-        F_ref and the measured output (N); the current; what the plant stores, zero where it declares no energy.
-    unit : str
-        Of reference and force: N, or N m of a torque.
-
-    """
-
-    state: LoopState
+    state: LoopState  # of plant, law and waiting commands
+    # reference, force, current_A, energy_J: shape (runs,); F_ref and the measured output (N); the current; what the
+    # plant stores, zero where it declares no energy
     reference: Runs
     force: Runs
     current_A: Runs
     energy_J: Runs
-    unit: str = LINEAR.unit
+    unit: str = LINEAR.unit  # of reference and force: N, or N m of a torque
     command: tuple[str, str] = ("I", "A")
 
     def __repr__(self) -> str:
@@ -60,17 +51,10 @@ class Equilibrium:
 def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equilibrium:
     """Return where a loop rests at the conditions among each run's parameters; at zero without any.
 
-    Parameters
-    ----------
-    loop : SampledLoop
-        Plant and law; the current's limit is not looked at.
-    params : sequence of CompletedParameters
-        One per run, given with a state of the plant (phi) where it is to rest elsewhere.
+    `loop`: plant and law; the current's limit is not looked at. `params`: one per run, given with a state of the plant
+    (phi) where it is to rest elsewhere.
 
-    Raises
-    ------
-    ControlError
-        The plant cannot rest there, or no reference makes the law command what it takes.
+    Raises ControlError: the plant cannot rest there, or no reference makes the law command what it takes.
 
     Examples
     --------
@@ -110,9 +94,14 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
     unit = plant.outputs[loop.regulated]
     return Equilibrium(
-        state=state, reference=reference, force=force, current_A=current, energy_J=energy, unit=unit,
+        state=state,
+        reference=reference,
+        force=force,
+        current_A=current,
+        energy_J=energy,
+        unit=unit,
         command=name_input(plant),
-    )  # fmt: skip
+    )
 
 
 def _law_at_rest(
@@ -125,16 +114,16 @@ def _law_at_rest(
         -np.dot(law.b_measurement, read), current_A / law.per_effort + float(np.dot(law.d_measurement, read))
     )
     try:
-        rest = np.linalg.solve(left, right)
+        solution = np.linalg.solve(left, right)
     except np.linalg.LinAlgError:
-        rest = np.full(n + 1, np.nan)
-    if not np.all(np.isfinite(rest)):
+        solution = np.full(n + 1, np.nan)
+    if not np.all(np.isfinite(solution)):
         raise ControlError(
             f"no reference makes the law command the {show_command(current_A, *name_input(plant))} that rest takes at "
             f"{float(np.ravel(read)[0]):.4g} {plant.outputs[measured]}; its "
             "reference path is blocked at 0 Hz"
         )
-    return rest[:-1], float(rest[-1])
+    return solution[:-1], float(solution[-1])
 
 
 @memo

@@ -176,7 +176,7 @@ def close_loop(
         raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, values.vector
     output, integrator = _Call(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
-    others = [0.0] * (len(plant.inputs) - 1)
+    idle = [0.0] * (len(plant.inputs) - 1)
     reading = _place_sensor(sensors or Sensors(), plant, values, measured)
     noise = reading.noise_std * np.random.default_rng(require_seed(seed, ControlError)).normal(size=n)
     if not current_step_A >= 0.0:
@@ -196,7 +196,7 @@ def close_loop(
     force, current, law_time_s, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
 
     def inputs(k: int, sample: int) -> list[float]:
-        return [(current[sample] if sample >= 0 else start_command) + disturbance[k], *others]
+        return [(current[sample] if sample >= 0 else start_command) + disturbance[k], *idle]
 
     for k in range(n):
         older = k - newer - (rest_s > 0.0)
@@ -212,10 +212,17 @@ def close_loop(
             x = integrator.advance(time_s[k], x, inputs(k, older), p, rest_s)
         x = integrator.advance(time_s[k] + rest_s, x, inputs(k, k - newer), p, sample_time_s - rest_s)
     return ForceRun(
-        time=time_s, reference=reference, force=force, current=current, law_time_s=law_time_s, state=states,
-        error=integrator.error, substeps=2 * integrator.substeps, unit=plant.outputs[measured],
+        time=time_s,
+        reference=reference,
+        force=force,
+        current=current,
+        law_time_s=law_time_s,
+        state=states,
+        error=integrator.error,
+        substeps=2 * integrator.substeps,
+        unit=plant.outputs[measured],
         command=name_input(plant),
-    )  # fmt: skip
+    )
 
 
 def _convert_command(command: float, step_A: float, most_A: float) -> float:
@@ -249,10 +256,12 @@ def _place_sensor(sensors: Sensors, plant: Plant, values: CompletedParameters, m
     names, erring = list(plant.outputs), sensors.erring & plant.outputs.keys()
     weights = evaluate_weights(plant, values, measured)
     return _Reading(
-        sensors=sensors, name=measured, row=names.index(measured),
+        sensors=sensors,
+        name=measured,
+        row=names.index(measured),
         noise_std=sensors.combine_errors(plant, values, measured)[0],
         encoders=tuple((name, names.index(name), weights[name]) for name in weights if name in erring),
-    )  # fmt: skip
+    )
 
 
 def _check(plant: Plant, params: CompletedParameters, measured: str, delay_samples: int) -> float:
@@ -339,10 +348,10 @@ class _Call:
         self.buffer, self.run = function.buffer()  # `run` alone does not keep the memory that it works in
         self.given = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
         self.found = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
-        for place, arrays in ((self.buffer.set_arg, self.given), (self.buffer.set_res, self.found)):
+        for set_pointer, arrays in ((self.buffer.set_arg, self.given), (self.buffer.set_res, self.found)):
             for i, numbers in enumerate(arrays):
                 if numbers.size:  # nothing has no address
-                    place(i, numbers.data)
+                    set_pointer(i, numbers.data)
 
     def __call__(self, *arguments: Any) -> list[Float[np.ndarray, " n"]]:
         for numbers, argument in zip(self.given, arguments, strict=True):

@@ -114,13 +114,17 @@ class _Structure:
 def _structure_of(loop: SampledLoop) -> _Structure:
     sensors, names = loop.sensors, loop.signals
     return _Structure(
-        measured=names, fed_back=loop.law.measured, law_states=loop.law.c.size, waiting=loop.waiting,
+        measured=names,
+        fed_back=loop.law.measured,
+        law_states=loop.law.c.size,
+        waiting=loop.waiting,
         rounds_current=bool(loop.current_step_A),
         devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
-        limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
+        limits_current=math.isfinite(loop.law.current_limit_A),
+        sticks=loop.sticks,
         compensation=CompensationShape() if loop.law.compensation is None else loop.law.compensation.shape,
-    )  # fmt: skip
+    )
 
 
 def _sample_function(plant: Plant, structure: _Structure) -> Any:
@@ -168,8 +172,8 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
         if structure.limits_current:
             current = ca.fmin(ca.fmax(current, -most), most)
     moved = ca.vertcat(after, *memory, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
-    known = ca.vertcat(current, behind)
-    u, late = ca.vertcat(ca.dot(first, known), e), ca.dot(second, known)
+    commands = ca.vertcat(current, behind)
+    u, late = ca.vertcat(ca.dot(first, commands), e), ca.dot(second, commands)
     arguments = [plant.t, plant.x, z, e, r, w, plant.p, c, lag]
     return ca.Function("seaopt_sample", arguments, [ca.densify(moved), u, late, observe(plant.t, plant.x, u, plant.p)])
 
@@ -245,10 +249,15 @@ def _allocate(loop: SampledLoop, job: Job) -> LoopArrays:
     nx, ny = len(loop.plant.states), len(channel_names(loop.plant))
     require_memory(runs * n * (nx + ny + 1), f"{runs} runs of {n} samples", SimulationError)
     return LoopArrays(
-        x=np.array(job.start.x, dtype=float, order="C"), z=np.array(job.start.z, dtype=float, order="C"),
-        peak=np.zeros((runs, ny)), error=np.zeros((runs, nx)), size=np.zeros((runs, nx)),
-        y=np.zeros((runs, n, ny)), applied=np.zeros((runs, n)), states=np.zeros((runs, n, nx)),
-    )  # fmt: skip
+        x=np.array(job.start.x, dtype=float, order="C"),
+        z=np.array(job.start.z, dtype=float, order="C"),
+        peak=np.zeros((runs, ny)),
+        error=np.zeros((runs, nx)),
+        size=np.zeros((runs, nx)),
+        y=np.zeros((runs, n, ny)),
+        applied=np.zeros((runs, n)),
+        states=np.zeros((runs, n, nx)),
+    )
 
 
 _POINTERS = ("p", "c", "lag", "r", "w", "e", "x", "z", "peak", "error", "size", "y", "applied", "states")
@@ -316,17 +325,13 @@ def _run_interpreted(loop: SampledLoop, job: Job, substeps: int, c: Float[np.nda
 
 
 @memo
-def _chain(
-    plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, chunk: int, split: bool
-) -> Any:  # fmt: skip
+def _chain(plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, chunk: int, split: bool) -> Any:
     """Return `_period_function` of `chunk` samples in a row."""
     period = _period_function(plant, structure, sample_time_s, substeps, split)
     return (period.expand() if substeps <= MAX_EXPANDED_STEPS else period).mapaccum(chunk)
 
 
-def _period_function(
-    plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, split: bool
-) -> Any:  # fmt: skip
+def _period_function(plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, split: bool) -> Any:
     """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s) -> (the same a sample later, y, current, x)."""
     sample, advance, _ = _kernel(plant, structure)
     sizes = [len(plant.states), structure.kept + structure.waiting, len(channel_names(plant))]

@@ -20,14 +20,8 @@ from seaopt.control.loops.outer_loop import OuterLoop
 def enclose_law(law: RunnableLaw, outer: OuterLoop, place: int | None = None) -> RunnableLaw:
     """Return the law of x_0, of what a force law measures and of the link's position, that both loops make.
 
-    Parameters
-    ----------
-    law : RunnableLaw
-        Of one measured signal or several.
-    outer : OuterLoop
-        Before it, at the same rate.
-    place : int, optional
-        Which of the measured signals is the link's position; it is one more, the last, where none of them is.
+    `law`: of one measured signal or several. `place`: which of the measured signals is the link's position; it is one
+    more, the last, where none of them is.
 
     Examples
     --------
@@ -57,22 +51,23 @@ def enclose_law(law: RunnableLaw, outer: OuterLoop, place: int | None = None) ->
     if added is not None and added.gravity is not None:  # of the force law's reference: here it moves x_0
         added = replace(added, gravity=added.gravity.scaled(1.0 / by_reference))
     return replace(
-        law, a=a, b_measurement=measured, c=np.append(law.c, law.d_reference * by_speed),
-        b_reference=np.append(law.b_reference * by_reference, 0.0), d_reference=law.d_reference * by_reference,
-        d_measurement=direct, anti_windup=np.append(law.anti_windup, 0.0), compensation=added,
-    )  # fmt: skip
+        law,
+        a=a,
+        b_measurement=measured,
+        c=np.append(law.c, law.d_reference * by_speed),
+        b_reference=np.append(law.b_reference * by_reference, 0.0),
+        d_reference=law.d_reference * by_reference,
+        d_measurement=direct,
+        anti_windup=np.append(law.anti_windup, 0.0),
+        compensation=added,
+    )
 
 
 def enclose_controller(controller: Controller, position: str) -> tuple[RunnableLaw, tuple[str, ...]]:
     """Return the law of a controller with its outer loop, and the outputs that it reads.
 
-    Parameters
-    ----------
-    controller : Controller
-        With an outer loop; its law may read the link's position itself.
-    position : str
-        The output that is the link's position.
-
+    `controller`: with an outer loop; its law may read the link's position itself. `position`: the output that is the
+    link's position.
     """
     assert controller.outer is not None
     signals = controller.signals

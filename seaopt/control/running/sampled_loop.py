@@ -16,8 +16,8 @@ from seaopt.control.loops.sampled_plant import Measured, find_delay, read_condit
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.equations.declaration import ENERGY
 from seaopt.plants.friction import can_stick
-from seaopt.plants.plant import ENERGY
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
 from seaopt.units import show_command
@@ -169,14 +169,7 @@ def channel_names(plant: Plant) -> tuple[str, ...]:
 
 @record(eq=False)
 class LoopState:
-    """Where runs stand: states of the plant, and of the law with the commands that still wait.
-
-    Parameters
-    ----------
-    x : array, shape (runs, nx)
-    z : array, shape (runs, law_states + waiting)
-
-    """
+    """Where runs stand: states of the plant, and of the law with the commands that still wait."""
 
     x: Float[np.ndarray, "runs nx"]
     z: Float[np.ndarray, "runs nz"]

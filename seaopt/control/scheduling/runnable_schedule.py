@@ -131,16 +131,23 @@ class RunnableSchedule:
             raise ControlError(f"command = {command:g} is above the limit of {limit}; lower it")
         known = is_number(place)
         at_rest = ScheduleState(
-            reference=reference, measurement=measurement, place=place if known else self.fallback, command=command,
+            reference=reference,
+            measurement=measurement,
+            place=place if known else self.fallback,
+            command=command,
             misplaced=0 if known else 1,
-        )  # fmt: skip
+        )
         if not self.table.integrates:
             return at_rest
         effort = command / self.per_effort - self._find_effort(at_rest, reference, measurement, at_rest.place)[0]
         return ScheduleState(
-            effort=effort, reference=reference, measurement=measurement, place=at_rest.place, command=command,
+            effort=effort,
+            reference=reference,
+            measurement=measurement,
+            place=at_rest.place,
+            command=command,
             misplaced=at_rest.misplaced,
-        )  # fmt: skip
+        )
 
     def _find_effort(
         self, state: ScheduleState, reference: float, measurement: float, place: float
@@ -173,46 +180,46 @@ class RunnableSchedule:
                 effort=state.effort + 2.0 * half + pull,
                 reference=state.reference + turn * (reference - state.reference),
                 measurement=state.measurement + turn * (measurement - state.measurement),
-                place=at, command=min(max(applied * self.per_effort, -self.limit), self.limit), misplaced=misplaced,
-            )  # fmt: skip
+                place=at,
+                command=min(max(applied * self.per_effort, -self.limit), self.limit),
+                misplaced=misplaced,
+            )
         if not all((is_number(reference), is_number(measurement), *map(math.isfinite, (effort, following.effort)))):
             return state.command, ScheduleState(
-                effort=state.effort, reference=state.reference, measurement=state.measurement, place=at,
-                command=state.command, held=state.held + 1, misplaced=misplaced,
-            )  # fmt: skip
+                effort=state.effort,
+                reference=state.reference,
+                measurement=state.measurement,
+                place=at,
+                command=state.command,
+                held=state.held + 1,
+                misplaced=misplaced,
+            )
         return following.command, following
 
 
 def make_runnable(
-    table: GainTable, *, per_effort: float = 1.0, limit: float | None = None, fallback: float | None = None,
-    tracking_time_s: float | None = None, command: tuple[str, str] = ("I", "A"),
-) -> RunnableSchedule:  # fmt: skip
+    table: GainTable,
+    *,
+    per_effort: float = 1.0,
+    limit: float | None = None,
+    fallback: float | None = None,
+    tracking_time_s: float | None = None,
+    command: tuple[str, str] = ("I", "A"),
+) -> RunnableSchedule:
     """Return a table of gains ready to run.
 
-    Parameters
-    ----------
-    table : GainTable
-        The gains.
-    per_effort : float
-        The command for one unit of effort.
-    limit : float, optional
-        Of the command, in its unit; None: no limit.
-    fallback : float, optional
-        The scheduling variable that counts until there was a finite one; the first point if left out.
-    tracking_time_s : float, optional
-        Of the anti-windup, at every point; that of `seaopt.control.laws.realisation` at each if left out.
-    command : (str, str)
-        Name and unit of the input that is commanded.
+    `per_effort`: the command for one unit of effort. `limit`: of the command, in its unit; None: no limit. `fallback`:
+    the scheduling variable that counts until there was a finite one; the first point if left out. `tracking_time_s`: of
+    the anti-windup, at every point; that of `seaopt.control.laws.realisation` at each if left out. `command`: name and
+    unit of the input that is commanded.
 
-    Raises
-    ------
-    ControlError
-        A number is out of range.
+    Raises ControlError: a number is out of range.
 
     Examples
     --------
     >>> import numpy as np
-    >>> rows = {"k_p": [1.0, 3.0], "k_i": [8.0, 4.0], "k_d": [0.0, 0.0], "T_f": [1e-3] * 2, "k_r": [2.0, 4.0], "c": [1.0] * 2}
+    >>> rows = {"k_p": [1.0, 3.0], "k_i": [8.0, 4.0], "k_d": [0.0, 0.0],
+    ...         "T_f": [1e-3] * 2, "k_r": [2.0, 4.0], "c": [1.0] * 2}
     >>> table = GainTable(
     ...     over="phi", unit="rad", points=np.array([0.0, 1.0]), gains={k: np.array(v) for k, v in rows.items()},
     ...     structure="pid", sample_time_s=1e-3,
@@ -222,14 +229,17 @@ def make_runnable(
     >>> round(command, 6)
     3.003
 
-    """  # noqa: E501
+    """
     each = [
         realise(
-            table.law(float(point)), per_effort=per_effort, current_limit_A=limit, tracking_time_s=tracking_time_s,
+            table.law(float(point)),
+            per_effort=per_effort,
+            current_limit_A=limit,
+            tracking_time_s=tracking_time_s,
             command=command,
         )
         for point in table.points
-    ]  # fmt: skip
+    ]
     return RunnableSchedule(
         table=table,
         anti_windup=np.array([law.anti_windup[0] if law.integrators else 0.0 for law in each]),

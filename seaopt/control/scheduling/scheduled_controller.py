@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control.laws.command import Command, name_gain_units
+from seaopt.codec import OrInfinite, to_content
+from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, Gains
@@ -20,11 +21,10 @@ from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
 from seaopt.control.tuning.tuner import describe_law, make_task
 from seaopt.errors import ControlError, suggestion
-from seaopt.formatting import format_count, format_number, html_text, join_words
+from seaopt.formatting import format_count, join_words
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.records import Result, record
-from seaopt.units import unit_after
+from seaopt.records import Result, Worded, record
 
 SCHEDULE_SCHEMA = "seaopt/schedule/2"
 PARTS = 4  # of every stretch between two points, at whose ends the limits are judged
@@ -36,33 +36,18 @@ Plants = Mapping[str, tuple[Plant, ParameterSet]]
 
 @record(eq=False)
 class PlaceFigures:
-    """What the law does while the variable stands at a value between the points.
+    """What the law does while the variable stands at a value between the points."""
 
-    Parameters
-    ----------
-    value : float
-        Of the variable.
-    bandwidth_hz : float or None
-        Of the design plant.
-    asked_hz : float
-        The bandwidth asked there, interpolated.
-    ms, mt : float
-        The worst of all plants.
-    broken : tuple of str
-        The limits that are broken.
-
-    """
-
-    value: float
-    bandwidth_hz: float | None
-    asked_hz: float
-    ms: float
-    mt: float
-    broken: tuple[str, ...]
+    value: float  # of the variable
+    bandwidth_hz: float | None  # of the design plant
+    asked_hz: float  # the bandwidth asked there, interpolated
+    ms: OrInfinite  # ms, mt: the worst of all plants
+    mt: OrInfinite
+    broken: tuple[str, ...]  # the limits that are broken
 
 
 @record(eq=False, repr=False)
-class ScheduledController(Result):
+class ScheduledController(Result, Worded):
     """A controller per point of one scheduling variable, with its gains interpolated between them.
 
     Parameters
@@ -89,11 +74,6 @@ class ScheduledController(Result):
     others: Plants
     fallback: float
     between: tuple[PlaceFigures, ...] = ()
-
-    @property
-    def met(self) -> bool:
-        """Whether every limit is met at the points, and where it was looked between them."""
-        return self.feasible
 
     @property
     def table(self) -> GainTable:
@@ -123,15 +103,15 @@ class ScheduledController(Result):
         return tuple(one.spec.bandwidth_hz for one in self.controllers)
 
     @property
-    def feasible(self) -> bool:
+    def met(self) -> bool:
         """Whether every limit is met at the points, and where it was looked between them."""
-        return all(one.feasible for one in self.controllers) and not any(place.broken for place in self.between)
+        return all(one.met for one in self.controllers) and not any(place.broken for place in self.between)
 
     @property
     def broken(self) -> tuple[str, ...]:
         """The limits that are broken, each once with where: at the points, and between them."""
         found = [
-            *((point, () if one.feasible else one.active_constraints) for point, one in self._pairs),
+            *((point, () if one.met else one.active_constraints) for point, one in self._pairs),
             *((one.value, one.broken) for one in self.between),
         ]
         places: dict[str, list[float]] = {}
@@ -151,7 +131,7 @@ class ScheduledController(Result):
     @property
     def remedy(self) -> str:
         """What to change where a limit is broken; empty where none is."""
-        infeasible = [(point, one) for point, one in self._pairs if not one.feasible]
+        infeasible = [(point, one) for point, one in self._pairs if not one.met]
         if infeasible:
             point, one = infeasible[0]
             return f"at {self.over} = {point:g}: {one.explanation}"
@@ -228,18 +208,25 @@ class ScheduledController(Result):
     def _judge_place(self, value: float) -> PlaceFigures:
         """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
         frozen, asked = self.at(value), self.asked_hz(value)
-        worst = [frozen.achieved, *(
-            frozen.close(plant, place_variable(plant, params, self.over, value)).figures()
-            for plant, params in self.others.values()
-        )]  # fmt: skip
+        worst = [
+            frozen.achieved,
+            *(
+                frozen.close(plant, place_variable(plant, params, self.over, value)).figures()
+                for plant, params in self.others.values()
+            ),
+        ]
         band = frozen.achieved.bandwidth_hz
-        broken = () if frozen.feasible else frozen.active_constraints
+        broken = () if frozen.met else frozen.active_constraints
         if band is None or band < LEAST_BANDWIDTH * asked:
             broken = (*broken, f"{LEAST_BANDWIDTH:g} of bandwidth_hz")
         return PlaceFigures(
-            value=value, bandwidth_hz=band, asked_hz=asked, ms=max(one.ms for one in worst),
-            mt=max(one.mt for one in worst), broken=broken,
-        )  # fmt: skip
+            value=value,
+            bandwidth_hz=band,
+            asked_hz=asked,
+            ms=max(one.ms for one in worst),
+            mt=max(one.mt for one in worst),
+            broken=broken,
+        )
 
     def runnable(self, *, limit: float | None = None, tracking_time_s: float | None = None) -> RunnableSchedule:
         """Return the law ready to run.
@@ -253,11 +240,13 @@ class ScheduledController(Result):
 
         """
         return make_runnable(
-            self.table, per_effort=self.command.per_effort,
+            self.table,
+            per_effort=self.command.per_effort,
             limit=self.controllers[0].command_limit if limit is None else self.command.limit(limit),
-            fallback=self.fallback, tracking_time_s=tracking_time_s,
+            fallback=self.fallback,
+            tracking_time_s=tracking_time_s,
             command=(self.command.input, self.command.unit),
-        )  # fmt: skip
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of schedule.json (schema seaopt/schedule/2)."""
@@ -268,20 +257,14 @@ class ScheduledController(Result):
             "points": list(self.points),
             "fallback": self.fallback,
             "met": self.met,
-            "feasible": self.feasible,
+            "feasible": self.met,
             "broken": list(self.broken),
             "notes": list(self.notes),
             "gains": {name: row.tolist() for name, row in self.table.gains.items()},
             "anti_windup": self.runnable().anti_windup.tolist(),
-            "between": [
-                {
-                    "value": one.value, "bandwidth_hz": one.bandwidth_hz, "asked_hz": one.asked_hz,
-                    "ms": one.ms, "mt": one.mt, "broken": list(one.broken),
-                }
-                for one in self.between
-            ],
+            "between": to_content(self.between),
             "controllers": [one.to_dict() for one in self.controllers],
-        }  # fmt: skip
+        }
 
     @classmethod
     def from_dict(
@@ -303,66 +286,20 @@ class ScheduledController(Result):
             for point, one in zip(stored.points, content["controllers"], strict=True)
         )
         return cls(
-            over=stored.over, unit=stored.unit, points=tuple(stored.points), controllers=controllers,
-            others=others or {}, fallback=stored.fallback,
-        ).with_places()  # fmt: skip
-
-    def list_rows(self) -> list[tuple[str, ...]]:
-        """Return the points as text: value, gains, bandwidth, Ms, Mt, and whether the limits are met."""
-        return [
-            (
-                f"{point:g}", *(f"{one.gains[name]:.4g}" for name in LAW_GAINS),
-                format_number(one.achieved.bandwidth_hz, missing="none"), f"{one.achieved.ms:.3f}",
-                f"{one.achieved.mt:.3f}", "met" if one.feasible else "not met",
-            )
-            for point, one in self._pairs
-        ]  # fmt: skip
-
-    @property
-    def row_heads(self) -> tuple[str, ...]:
-        """What stands above the columns of `list_rows`."""
-        units = name_gain_units(self.command)
-        gains = [f"{name}{unit_after(units[name]) if name in units else ''}" for name in LAW_GAINS]
-        return (f"{self.over}{unit_after(self.unit)}", *gains, "bandwidth Hz", "Ms", "Mt", "limits")
-
-    def describe_between(self) -> str:
-        """Return one line on what was found between the points."""
-        bands = [one.bandwidth_hz or 0.0 for one in self.between]
-        if not bands:
-            return "nothing was looked at between the points"
-        return (
-            f"between the points, at {format_count(len(bands), 'value')}: bandwidth {min(bands):.4g} to "
-            f"{max(bands):.4g} Hz, Ms up to {max(one.ms for one in self.between):.3f}, Mt up to "
-            f"{max(one.mt for one in self.between):.3f}"
-        )
-
-    def __repr__(self) -> str:
-        spec, verdict = self.spec, "every limit met" if self.feasible else "NOT FEASIBLE"
-        rows = [self.row_heads, *self.list_rows()]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        return "\n".join(
-            [
-                f"ScheduledController {spec.structure} on {spec.measured} over {self.over}, "
-                f"{format_count(len(self.points), 'point')}, at {spec.sample_rate_hz:g} Hz: {verdict}",
-                *("  " + "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows),
-                f"  {self.describe_between()}",
-                *(f"  not met: {text}" for text in self.broken),
-                *([f"  {self.remedy}"] if self.remedy else []),
-                *(f"  note: {note}" for note in self.notes),
-            ]
-        )
-
-    _repr_html_ = html_text
+            over=stored.over,
+            unit=stored.unit,
+            points=tuple(stored.points),
+            controllers=controllers,
+            others=others or {},
+            fallback=stored.fallback,
+        ).with_places()
 
 
 def make_table(over: str, unit: str, points: Sequence[float], controllers: Sequence[Controller]) -> GainTable:
     """Return the gains of controllers at points.
 
-    Raises
-    ------
-    ControlError
-        Their gains cannot be interpolated, they run at different rates, or command an effort differently.
-
+    Raises ControlError: their gains cannot be interpolated, they run at different rates, or command an effort
+    differently.
     """
     first = controllers[0]
     for point, one in zip(points, controllers, strict=True):
@@ -380,10 +317,13 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
                 f"than that at {points[0]:g}; a schedule has one of each"
             )
     return GainTable(
-        over=over, unit=unit, points=np.array(points, dtype=float),
+        over=over,
+        unit=unit,
+        points=np.array(points, dtype=float),
         gains={name: np.array([one.gains[name] for one in controllers]) for name in LAW_GAINS},
-        structure=first.spec.structure, sample_time_s=first.sample_time_s,
-    )  # fmt: skip
+        structure=first.spec.structure,
+        sample_time_s=first.sample_time_s,
+    )
 
 
 def freeze(
@@ -437,14 +377,7 @@ def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) 
 
 
 def find_unit(over: str, plants: Mapping[str, Plant]) -> str:
-    """Return the unit of a scheduling variable, a state or a parameter of some plant.
-
-    Raises
-    ------
-    ControlError
-        No plant has it.
-
-    """
+    """Return the unit of a scheduling variable, a state or a parameter of some plant."""
     for plant in plants.values():
         if over in plant.parameters:
             return plant.parameter_unit(over)

@@ -1,4 +1,4 @@
-"""What a schedule.json holds, as a pydantic model, and whether its fields agree with each other."""
+"""What a schedule.json holds, and whether its fields agree with each other."""
 
 from __future__ import annotations
 
@@ -6,53 +6,45 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
-from seaopt.control.laws.stored import TUNE_AGAIN, Finite, StoredController
+from seaopt.codec import Key, Limits, from_content
+from seaopt.control.laws.stored import TUNE_AGAIN, StoredController
 from seaopt.control.laws.structures import AGREES, LAW_GAINS
 from seaopt.control.scheduling.gain_table import check_points
-from seaopt.documents import Flag, ResultTable, check_result
+from seaopt.control.scheduling.scheduled_controller import PlaceFigures
 from seaopt.errors import ControlError, FileError
+from seaopt.records import record
 
 
-class StoredPlace(ResultTable):
-    """What the law does at a value between the points."""
-
-    value: Finite
-    bandwidth_hz: Finite | None
-    asked_hz: Finite
-    ms: Finite | None
-    mt: Finite | None
-    broken: list[str]
-
-
-class StoredSchedule(ResultTable):
+@record(eq=False)
+class StoredSchedule:
     """A schedule.json."""
 
-    document: Annotated[Literal["seaopt/schedule/2"], Field(alias="schema")]
+    json_keys = (
+        *(Key(field="document", name="schema"), "over", "unit", "points", "fallback", "feasible", "broken", "notes"),
+        *("gains", "anti_windup", "between", "controllers"),
+    )
+
+    document: Literal["seaopt/schedule/2"]
     over: str
     unit: str
-    points: Annotated[list[Finite], Field(min_length=2)]
-    fallback: Finite
-    feasible: Flag
-    broken: list[str]
-    notes: list[str] = []
-    gains: dict[str, list[Finite]]
-    anti_windup: list[Finite]
-    between: list[StoredPlace] = []
-    controllers: list[StoredController]
+    points: Annotated[tuple[float, ...], Limits(min_length=2)]
+    fallback: float
+    feasible: bool
+    broken: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    gains: dict[str, tuple[float, ...]]
+    anti_windup: tuple[float, ...]
+    between: tuple[PlaceFigures, ...] = ()
+    controllers: tuple[StoredController, ...]
 
 
 def read_schedule(content: Mapping[str, Any]) -> StoredSchedule:
     """Return the fields of a schedule.json.
 
-    Raises
-    ------
-    FileError
-        A field is missing or malformed, or the gains are not those of the controllers.
-
+    Raises FileError: a field is missing or malformed, or the gains are not those of the controllers.
     """
-    table = check_result(StoredSchedule, content, "schedule.json", remedy=TUNE_AGAIN)
+    table = from_content(StoredSchedule, content, "schedule.json", remedy=TUNE_AGAIN)
     try:
         check_points(table.over, np.array(table.points))
     except ControlError as error:

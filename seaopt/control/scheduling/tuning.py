@@ -135,9 +135,13 @@ def tune_schedule(
             controllers.append(make_controller(task, x, loops, (plant, here)))
     make_table(over, unit, places.tolist(), controllers)  # refuses gains that cannot be interpolated
     schedule = ScheduledController(
-        over=over, unit=unit, points=tuple(places.tolist()), controllers=tuple(controllers), others=others,
+        over=over,
+        unit=unit,
+        points=tuple(places.tolist()),
+        controllers=tuple(controllers),
+        others=others,
         fallback=float(places[0]),
-    ).with_places()  # fmt: skip
+    ).with_places()
     progress(f"{places.size} points over {over}", 1.0)
     return replace(schedule, fallback=_choose_fallback(schedule))
 
@@ -188,10 +192,12 @@ def _choose_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
     """Return the numbers of every point with their loops, of the better of the chains from either end."""
     forward, backward = divide(progress, 1.0, 1.0)
     chains = [_tune_chain(tasks, forward), _tune_chain(tasks[::-1], backward)[::-1]]
-    values = np.array([
-        [task.rank(task.grid(place_frequencies(task)), x)[1] for task, (x, _) in zip(tasks, chain, strict=True)]
-        for chain in chains
-    ])  # fmt: skip
+    values = np.array(
+        [
+            [task.rank(task.grid(place_frequencies(task)), x)[1] for task, (x, _) in zip(tasks, chain, strict=True)]
+            for chain in chains
+        ]
+    )
     losses = np.max(values / np.min(values, axis=0), axis=1)
     broken = [
         sum(_breaks_limits(task, loops) for task, (_, loops) in zip(tasks, chain, strict=True)) for chain in chains

@@ -322,25 +322,34 @@ def _solve_step(
 
 
 def solve_qp(
-    quadratic: Float[np.ndarray, "n n"], linear: Float[np.ndarray, " n"], matrix: Float[np.ndarray, "m n"],
-    lower: Float[np.ndarray, " m"], upper: Float[np.ndarray, " m"],
-) -> Float[np.ndarray, " n"] | None:  # fmt: skip
+    quadratic: Float[np.ndarray, "n n"],
+    linear: Float[np.ndarray, " n"],
+    matrix: Float[np.ndarray, "m n"],
+    lower: Float[np.ndarray, " m"],
+    upper: Float[np.ndarray, " m"],
+) -> Float[np.ndarray, " n"] | None:
     """Minimise x'Qx/2 + c'x with lower <= A x <= upper by OSQP; None where it refuses, or its status is no solution."""
     import osqp
 
     solver = osqp.OSQP(algebra="builtin")  # else it looks for others at every program
     try:
         solver.setup(
-            P=_make_sparse(np.triu(quadratic)), q=linear, A=_make_sparse(matrix), l=lower, u=upper, verbose=False,
-            eps_abs=1e-5, eps_rel=1e-5, max_iter=500, check_termination=10,
-        )  # fmt: skip
+            P=_make_sparse(np.triu(quadratic)),
+            q=linear,
+            A=_make_sparse(matrix),
+            l=lower,
+            u=upper,
+            verbose=False,
+            eps_abs=1e-5,
+            eps_rel=1e-5,
+            max_iter=500,
+            check_termination=10,
+        )
     except osqp.OSQPException:  # ends that have crossed by a rounding, or numbers that are not finite
         return None
     result = solver.solve(raise_error=False)
     status: Any = osqp.SolverStatus
-    usable = result.info.status_val in (
-        status.OSQP_SOLVED, status.OSQP_SOLVED_INACCURATE, status.OSQP_MAX_ITER_REACHED
-    )  # fmt: skip
+    usable = result.info.status_val in (status.OSQP_SOLVED, status.OSQP_SOLVED_INACCURATE, status.OSQP_MAX_ITER_REACHED)
     x = np.asarray(result.x, dtype=float)
     return x if usable and np.all(np.isfinite(x)) else None
 

@@ -88,9 +88,7 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
     low, high = LEAST_SHARE * spec.sample_rate_hz, wanted
     while high / low > 1.01:
         middle = float(np.sqrt(low * high))
-        low, high = (
-            (middle, high) if sensitivity_possible(middle, ms, spec.sample_time_s, late) else (low, middle)
-        )  # fmt: skip
+        low, high = (middle, high) if sensitivity_possible(middle, ms, spec.sample_time_s, late) else (low, middle)
     asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with a delay of {late - 1} whole samples"
     raise ControlError(
         f"{asked} at {spec.sample_rate_hz:g} Hz: no controller keeps |S| below -3 dB up to {wanted:.4g} Hz with "

@@ -92,13 +92,22 @@ class Grid:
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
         return Grid(
-            f=self.f[index], q=self.q[index], p=self.p[:, index], discs=self.discs[:, index],
-            fixed=self.fixed[:, index], speed=self.speed[:, index], rows=self.rows,
-            kept=self.kept[index], inverse=self.inverse[index], port=self.port.at(index), force=self.force.at(index),
-            unit=self.unit[index], friction=self.friction.at((..., index)),
+            f=self.f[index],
+            q=self.q[index],
+            p=self.p[:, index],
+            discs=self.discs[:, index],
+            fixed=self.fixed[:, index],
+            speed=self.speed[:, index],
+            rows=self.rows,
+            kept=self.kept[index],
+            inverse=self.inverse[index],
+            port=self.port.at(index),
+            force=self.force.at(index),
+            unit=self.unit[index],
+            friction=self.friction.at((..., index)),
             friction_size=self.friction_size.at((..., index)),
             levels={name: level[index] for name, level in self.levels.items()},
-        )  # fmt: skip
+        )
 
 
 @record(eq=False)
@@ -115,9 +124,14 @@ class LawResponse:
 
 
 def use_disc(
-    curve: LimitCurve, level: Float[np.ndarray, "..."], p: Complex[np.ndarray, "..."], discs: Float[np.ndarray, "..."],
-    c_y: Complex[np.ndarray, "..."], c_r: Complex[np.ndarray, "..."], rest: Complex[np.ndarray, "..."],
-) -> Float[np.ndarray, "..."]:  # fmt: skip
+    curve: LimitCurve,
+    level: Float[np.ndarray, "..."],
+    p: Complex[np.ndarray, "..."],
+    discs: Float[np.ndarray, "..."],
+    c_y: Complex[np.ndarray, "..."],
+    c_r: Complex[np.ndarray, "..."],
+    rest: Complex[np.ndarray, "..."],
+) -> Float[np.ndarray, "..."]:
     """Return the usage of a limit by the worst of the responses in discs."""
     least, most = bound_disc(curve.of, p, discs, c_y, c_r, rest)
     return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level

@@ -61,7 +61,8 @@ QUADRATURE_CHUNK = 64  # quadrature points come in multiples of this
 SLACK_PRICE = 1e3
 LEAST_SPEED_GAIN = 1e-2  # of the inverse of the speed per command at the bandwidth: k_v that makes a difference
 HOPELESS = 1.05  # worst usage beyond which solutions that bring next to nothing are not repeated
-STALLED, MOST_STALLED = 0.99, 2  # of the usage before: that is next to nothing; how often it may be
+CLEARLY = 1.01  # and beyond which they are not that bring neither more nor less
+STALLED, MOST_STALLED = 0.9, 2  # of what was missed before: that is next to nothing; how often it may be
 UNUSED = 1e-6  # of a limit: outside its band, or not imposed
 SMOOTHING = 1e-12  # keeps magnitudes differentiable at zero
 
@@ -145,7 +146,7 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5, *, keepin
             break
         again = _add_missed(task, grid, trial, chosen)
         trial_rank = task.rank(grid, trial)
-        stalled = stalled + 1 if rank[0] > HOPELESS and trial_rank[0] > STALLED * rank[0] else 0
+        stalled = stalled + 1 if _has_stalled(rank[0], trial_rank[0]) else 0
         if trial_rank < rank and task.is_stable(trial):
             again = again or _reached_end(trial, x, factor)
             x, rank, factor = trial, trial_rank, min(factor**2, LARGEST_FACTOR)
@@ -154,6 +155,12 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5, *, keepin
         if not again or stalled == MOST_STALLED:
             break
     return x
+
+
+def _has_stalled(usage: float, trial: float) -> bool:
+    """Tell whether a solution brought next to nothing, where limits are missed clearly."""
+    left = (trial - 1.0) / max(usage - 1.0, 1e-9)
+    return usage > CLEARLY and left > STALLED and (usage > HOPELESS or left < 1.0 / STALLED)
 
 
 def _reached_end(trial: LawNumbers, x: LawNumbers, factor: float) -> bool:
@@ -200,18 +207,38 @@ class _Points(NamedTuple):
 
 @lru_cache(maxsize=32)
 def _build_program(
-    quadrature: int, kinds: tuple[str, ...], observer: bool, notch: bool, noise: bool, discs: bool, paths: bool,
-    gains: int, inside: bool, prefilter: str, signals: int,
-) -> tuple[Any, list[str]]:  # fmt: skip
+    quadrature: int,
+    kinds: tuple[str, ...],
+    observer: bool,
+    notch: bool,
+    noise: bool,
+    discs: bool,
+    paths: bool,
+    gains: int,
+    inside: bool,
+    prefilter: str,
+    signals: int,
+) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
     passive, tops = PASSIVE in kinds, POINTS_PER_LIMIT * ((PASSIVE in kinds) + signals * (FRICTION in kinds))
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
     complex_data = ("p", "q", "kept", "inverse", *(("fixed", "speed", "sense") if paths else ()))
-    shapes = {f"{name}_{part}": total for name in complex_data for part in ("re", "im")} | {
-        "weight": quadrature, "ln_level": n, "at": 2 * len(complex_data), "ts": 1, "kff": 1, "scale": 14,
-        "linear": LINEAR_LIMITS * gains, "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
-    } | {f"top_{name}_{part}": tops for name in ("fixed", "y", "v") for part in ("re", "im")}  # fmt: skip
+    shapes = (
+        {f"{name}_{part}": total for name in complex_data for part in ("re", "im")}
+        | {
+            "weight": quadrature,
+            "ln_level": n,
+            "at": 2 * len(complex_data),
+            "ts": 1,
+            "kff": 1,
+            "scale": 14,
+            "linear": LINEAR_LIMITS * gains,
+            "unit": 2 * POINTS_PER_LIMIT * passive,
+            "discs": n * discs,
+        }
+        | {f"top_{name}_{part}": tops for name in ("fixed", "y", "v") for part in ("re", "im")}
+    )
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
     v, t, slack = ca.MX.sym("v", 14), ca.MX.sym("t"), ca.MX.sym("slack")
     x = v * data["scale"]
@@ -220,10 +247,14 @@ def _build_program(
         """Return plants and law at some points."""
         at = {name: _Complex(part[f"{name}_re"], part[f"{name}_im"]) for name in complex_data}
         series, integral, rate, more, ahead, low_pass = evaluate_terms(
-            at["q"], data["ts"], x[T_F], (x[T_Q], at["kept"], at["inverse"]) if observer else None,
-            (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH]) if notch else None, x[SPEED_RATE] if inside else 0.0,
+            at["q"],
+            data["ts"],
+            x[T_F],
+            (x[T_Q], at["kept"], at["inverse"]) if observer else None,
+            (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH]) if notch else None,
+            x[SPEED_RATE] if inside else 0.0,
             (x[PREFILTER_W], x[DAMPING] if prefilter == "second_order" else None) if prefilter else None,
-        )  # fmt: skip
+        )
         both = integral * x[K_I] + x[K_P]
         c_y = (both + rate * x[K_D] + more) * series
         c_r = ((both - x[W_R] + rate * (x[K_D] - x[W_C])) * series + _Complex.of(ahead) * data["kff"]) * low_pass
@@ -368,7 +399,7 @@ def _solve(
     least_v = LEAST_SPEED_GAIN / (float(np.abs(grid.speed[0, at])) or 1.0)
     scale = np.maximum(
         sizes, [0.1, 0.1, 1e-4, 0.1, 1e-4, least_v, 0.1 * spec.sample_time_s, 1e-4, 1.0, 1e-3, 1e-2, 1e-2, 1e-3, 1e-2]
-    )  # fmt: skip
+    )
     (linear, least, largest), gains = task.linear_limits(start), task.gains_tuned
     rows = np.max(np.abs(linear * scale[gains]), axis=1)  # each in units of its largest term
     near, far = (
@@ -390,10 +421,18 @@ def _solve(
         *_stack(tops),
     ]  # fmt: skip
     solver, _ = _build_program(
-        weights.size, (*kinds, *([PASSIVE] * passive), *([FRICTION] * friction)), task.nominal is not None,
-        spec.notch is not None, noise, radii.size > 0, paths, gains.stop, bool(start[SPEED_RATE] > 0.0),
-        "" if spec.reference_filter is None else spec.reference_filter.order, grid.friction_size.y.shape[1],
-    )  # fmt: skip
+        weights.size,
+        (*kinds, *([PASSIVE] * passive), *([FRICTION] * friction)),
+        task.nominal is not None,
+        spec.notch is not None,
+        noise,
+        radii.size > 0,
+        paths,
+        gains.stop,
+        bool(start[SPEED_RATE] > 0.0),
+        "" if spec.reference_filter is None else spec.reference_filter.order,
+        grid.friction_size.y.shape[1],
+    )
     used = max(float(np.max(curve)) for curve in task.usage(grid, law).values())
     value = task.objective(grid, law)
     x0 = np.concatenate([start / scale, [np.log(value) if noise else value, max(0.0, np.log(used)) + 0.01]])
@@ -402,10 +441,14 @@ def _solve(
     lower[0] = 0.0
     lower[1 : 1 + least.size], upper[1 : 1 + least.size] = least / rows, largest / rows
     answer = solve_ipopt(
-        solver, x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,
+        solver,
+        x0=x0,
+        p=np.concatenate([np.asarray(part, dtype=float) for part in data]),
+        lbg=lower,
+        ubg=upper,
         lbx=[*(near / scale), -np.inf, 0.0],
         ubx=[*(far / scale), np.inf, np.inf],
-    )  # fmt: skip
+    )
     x = np.array(answer["x"]).ravel()[: start.size] * scale
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 

@@ -320,12 +320,17 @@ class Task:
             T_v = 1.0 / float(x[SPEED_RATE]) if x[SPEED_RATE] > 0.0 else np.inf
             inner = InnerLoop(k_v=float(x[K_V]), T_v=T_v, k_ff=self.k_ff, speed=self.speed_loop)
         return Gains(
-            k_p=k_p, k_i=float(x[K_I]), k_d=k_d, T_f=float(x[T_F]),
+            k_p=k_p,
+            k_i=float(x[K_I]),
+            k_d=k_d,
+            T_f=float(x[T_F]),
             k_r=k_p - float(x[W_R]) + (self.k_ff if inner is None else 0.0),
-            c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole), notch=notch, inner=inner,
+            c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole),
+            notch=notch,
+            inner=inner,
             prefilter=low_pass,
             observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[T_Q])),
-        )  # fmt: skip
+        )
 
     def law_of(self, x: LawNumbers) -> Law:
         """Return the law of a vector, not balanced."""
@@ -370,11 +375,22 @@ class Task:
         for k, one in enumerate(aimed):
             plants[k], weights[k] = self._limit_feedback(one, f)
         return Grid(
-            f=f, q=q, p=p, discs=discs, fixed=fixed, speed=speed, rows=rows, kept=kept, inverse=inverse,
-            port=self._feed(loops, 1.0, f), force=self._feed(forces, 1.0, f), unit=unit,
-            friction=self._feed(plants, 1.0, f), friction_size=self._feed(weights, 0.0, f),
+            f=f,
+            q=q,
+            p=p,
+            discs=discs,
+            fixed=fixed,
+            speed=speed,
+            rows=rows,
+            kept=kept,
+            inverse=inverse,
+            port=self._feed(loops, 1.0, f),
+            force=self._feed(forces, 1.0, f),
+            unit=unit,
+            friction=self._feed(plants, 1.0, f),
+            friction_size=self._feed(weights, 0.0, f),
             levels={name: self.level(name, f) for name in self.curve_names},
-        )  # fmt: skip
+        )
 
     def _feed(self, signals: Complex[np.ndarray, "... y m"], start: float, f: Float[np.ndarray, " m"]) -> Path:
         """Return a number and a weighted sum over the signals fed back, of one row per signal."""
@@ -457,9 +473,7 @@ class Task:
         everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | self.friction_usage(grid, law)
         return everywhere | {name: np.array(curves) for name, curves in rows.items()}
 
-    def curves(
-        self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse
-    ) -> dict[str, np.ndarray]:  # fmt: skip
+    def curves(self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse) -> dict[str, np.ndarray]:
         """Return the usage of the imposed ones of some limits on a grid's plants, in discs around them the worst."""
         p, rest, discs = grid.p[plants], law.rest[plants], grid.discs[plants]
         open_loop = rest - 1.0 + p * law.c_y
@@ -516,9 +530,11 @@ class Task:
         """Return the task with one multiplier per plant with friction: that named, or the one that shows most of x."""
         if not self.asks_margin:
             return self
-        names = [multiplier] * len(self.frictions) if multiplier else [
-            margin.multiplier if margin.factor else SIMPLEST for margin in self.find_margins(self.law_of(x))
-        ]  # fmt: skip
+        names = (
+            [multiplier] * len(self.frictions)
+            if multiplier
+            else [margin.multiplier if margin.factor else SIMPLEST for margin in self.find_margins(self.law_of(x))]
+        )
         aimed = (replace(one, multiplier=name) for one, name in zip(self.frictions, names, strict=True))
         return replace(self, frictions=tuple(aimed))
 
@@ -545,11 +561,15 @@ class Task:
             slopes = {one.plant: margin.least_slope for one, margin in margins}
         return [
             MeasuredLoop(
-                name=name, figures=self._figures(i, law), port=None if i else port,
-                filter_samples=filter_samples, integral_rad_s=integral_rad_s, friction_slope=slopes.get(i, np.inf),
+                name=name,
+                figures=self._figures(i, law),
+                port=None if i else port,
+                filter_samples=filter_samples,
+                integral_rad_s=integral_rad_s,
+                friction_slope=slopes.get(i, np.inf),
             )
             for i, name in enumerate(self.names)
-        ]  # fmt: skip
+        ]
 
     def _figures(self, row: int, law: Law) -> LoopFigures:
         loop = close_plant(self.plants[row], law)

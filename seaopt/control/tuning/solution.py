@@ -30,14 +30,15 @@ from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.grid import Grid
-from seaopt.control.tuning.interior_point import HOPELESS, refine
+from seaopt.control.tuning.interior_point import CLEARLY, HOPELESS, refine
 from seaopt.control.tuning.optimisation_problem import FRICTION, K_I, W_R, LawNumbers, Task
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, count_off, divide, ignore
 
 STARTS_TRIED = 3  # two more where an observer, a notch, a prefilter or a speed loop makes more valleys
 STARTS_REFINED = 2  # one more with an observer, a prefilter or a speed loop, all with a notch
-FAR_OFF = 1.3  # worst usage of the best of two refined starts beyond which no other is refined; an evolution follows
+FAR_OFF = 1.15  # of `far_off`; an evolution follows
+AGREED, AGREEMENT = 1.01, 0.05  # usage of the limits themselves beyond which two starts tell; and how alike they miss
 ROUNDS, LONG_ROUNDS = 5, 9  # of the interior point; integrals of a cascade move far
 QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
@@ -45,6 +46,7 @@ NARROW = 1.01  # of a limit: what a law misses by less, it may miss between the 
 TIGHTENINGS = 3
 NO_LEVEL_ABOVE = 10.0  # a frequency further off counts no more: |F/F_ref| along -3 dB falls below it anywhere
 LOWER_FRACTIONS = 4  # of a link's feedforward, by a fifth each
+CLOSER = 0.5  # of what is missed with all of it and without any: a fraction between that misses more is not solved
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: of a law without any, less is not looked for
 SCAN, IMPROVEMENT, REFINEMENT, RECHECK = 1.0, 1.0, 3.0, 0.5  # of the time of a solution
@@ -52,7 +54,9 @@ ONCE, RAISING = 1.0, 4.0  # of that of one with a friction margin: each of four 
 Solution = tuple[LawNumbers, list[MeasuredLoop]]  # with the loop of every plant
 
 
-def solve(task: Task, warm: Sequence[LawNumbers] = (), progress: Progress = ignore) -> Solution:
+def solve(
+    task: Task, warm: Sequence[LawNumbers] = (), progress: Progress = ignore, *, far_off: float = FAR_OFF
+) -> Solution:
     """Find the best numbers, and return them with every plant's loop.
 
     Parameters
@@ -63,10 +67,12 @@ def solve(task: Task, warm: Sequence[LawNumbers] = (), progress: Progress = igno
         Numbers to start from besides those of the scan, which then tries one less.
     progress : callable, optional
         Called as starts are refined.
+    far_off : float
+        Worst usage of the best of two refined starts beyond which no other is refined.
 
     """
     once, raising = divide(progress, ONCE, (3.0 * ONCE + RAISING) * task.asks_margin)
-    x, loops = _solve_once(task, warm, once)
+    x, loops = _solve_once(task, warm, once, far_off)
     return _meet_friction_margin(task, x, loops, raising) if task.asks_margin else (x, loops)
 
 
@@ -76,19 +82,21 @@ def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], 
     The multiplier that shows most of a law is made a limit, and the best law with that looked for, as another may then
     show more. Where none has the margin, it is the law with the largest that keeps all other limits.
     """
-    best = (x, loops)
+    broken, best = list_broken_limits(task.spec, loops, task.design_states), (x, loops)
+    if not broken:
+        return best
     *parts, raising = divide(progress, ONCE, ONCE, ONCE, RAISING)
-    for multiplier in ("", "", SIMPLEST):
-        broken = list_broken_limits(task.spec, best[1], task.design_states)
-        if not broken:
-            return best
-        tried = _solve_once(task.aim_multipliers(best[0], multiplier), (best[0],), parts.pop(0))
-        missed = list_broken_limits(task.spec, tried[1], task.design_states)
-        if not missed or broken - {FRICTION}:  # what cannot be kept without a margin cannot be kept with it
+    if broken - {FRICTION}:  # what cannot be kept without a margin cannot be kept with it
+        return _solve_from(task.aim_multipliers(x), x, parts[0])
+    other = x
+    for multiplier, part in zip(("", "", SIMPLEST), parts, strict=True):
+        tried = _solve_once(task.aim_multipliers(best[0], multiplier), (best[0],), part)
+        missed, other = list_broken_limits(task.spec, tried[1], task.design_states), tried[0]
+        if not missed:
             return tried
         if missed == {FRICTION} and _least_slope(tried[1]) > _least_slope(best[1]):
             best = tried
-    return _raise_friction_margin(task, *best, tried[0], raising)
+    return _raise_friction_margin(task, *best, other, raising)
 
 
 def _raise_friction_margin(
@@ -130,12 +138,19 @@ def _least_slope(loops: Sequence[MeasuredLoop]) -> float:
     return min(loop.friction_slope for loop in loops)
 
 
-def _solve_once(task: Task, warm: Sequence[LawNumbers], progress: Progress) -> Solution:
+def _solve_once(task: Task, warm: Sequence[LawNumbers], progress: Progress, far_off: float = FAR_OFF) -> Solution:
     """Find the best numbers with the multipliers that are aimed at, if any."""
     finding, checking = divide(progress, SCAN + IMPROVEMENT + REFINEMENT, RECHECK)
     grid = task.grid(place_frequencies(task))
-    x = find_best(replace(task, settles=False), grid, warm, finding)
+    x = find_best(replace(task, settles=False), grid, warm, finding, far_off)
     return _finish(task, grid, x, checking)
+
+
+def _solve_from(task: Task, x: LawNumbers, progress: Progress = ignore, *, keeping: bool = False) -> Solution:
+    """Find the best numbers near given ones; `keeping` is of `refine`."""
+    grid = task.grid(place_frequencies(task))
+    x = refine(task, grid, improve(task, grid, x)[1], _count_rounds(task), keeping=keeping)
+    return _finish(task, grid, x, progress)
 
 
 def search(task: Task, x: LawNumbers, loops: list[MeasuredLoop], *, again: bool = True) -> Solution:
@@ -171,8 +186,7 @@ def retry(
     for start in map(task.tidy, starts):
         if not task.is_stable(start):
             continue
-        tried = refine(task, grid, improve(task, grid, start)[1], _count_rounds(task), keeping=keeping)
-        tried = _finish(task, grid, tried, ignore)
+        tried = _solve_from(task, start, keeping=keeping)
         missed = list_broken_limits(task.spec, tried[1], task.design_states)
         if not missed - {FRICTION}:
             return _meet_friction_margin(task, *tried, ignore) if missed else tried
@@ -242,8 +256,10 @@ def recheck(task: Task, grid: Grid, x: LawNumbers, rounds: int = ROUNDS) -> LawN
     return x
 
 
-def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress: Progress = ignore) -> LawNumbers:
-    """Find the best numbers on a grid."""
+def find_best(
+    task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress: Progress = ignore, far_off: float = FAR_OFF
+) -> LawNumbers:
+    """Find the best numbers on a grid; `far_off` is of `solve`."""
     scanning, improving, refining = divide(progress, SCAN, IMPROVEMENT, REFINEMENT)
     scanning("scanning gains", 0.0)
     parts = (task.nominal, task.spec.notch, task.spec.reference_filter, task.speed_loop)
@@ -256,13 +272,21 @@ def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress:
     for _, x in ranked:
         if len(chosen) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
-    rank, best = (math.inf, math.inf), chosen[0]
-    for number, start in enumerate(count_off(chosen, "refining start", refining), start=1):
+    refined: list[tuple[tuple[float, float], LawNumbers]] = []
+    best = chosen[0]
+    for start in count_off(chosen, "refining start", refining):
         x = refine(task, grid, start, _count_rounds(task))
-        rank, best = min((rank, best), (task.rank(grid, x), x), key=lambda pair: pair[0])
-        if number == STARTS_REFINED and rank[0] > FAR_OFF:
+        refined.append((task.rank(grid, x), x))
+        (least, _), best = min(refined, key=lambda pair: pair[0])
+        if len(refined) == STARTS_REFINED and (least > far_off or _agree(task, *(rank[0] for rank, _ in refined))):
             return best
     return best if task.speed_loop is None else _quicken_integral(task, grid, best)
+
+
+def _agree(task: Task, *usages: float) -> bool:
+    """Tell whether laws from different starts miss the limits themselves, and by the same: the least there is."""
+    least, most = min(usages) * (1.0 - task.spec.reserve), max(usages) * (1.0 - task.spec.reserve)
+    return least > AGREED and most - least < AGREEMENT * (least - 1.0)
 
 
 def _count_rounds(task: Task) -> int:
@@ -306,8 +330,8 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
 
     It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is that
     which shows most of a friction margin that alone is missed, else zero, as nothing shows then which one misses least.
-    Where limits are missed clearly with all of it and without any, what lies between is solved only where a law near
-    one of these two comes close to keeping them.
+    Where limits are missed clearly with all of it, little is looked for without any; and what lies between is solved
+    only where a law near the better of these two comes close to keeping them.
     """
     asked, link = task.spec.link_feedforward, task.link
     broken = list_broken_limits(task.spec, loops, task.design_states)
@@ -316,13 +340,12 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
     shares = (*(0.8 ** (power + 1) for power in range(LOWER_FRACTIONS)), 0.0)
     *lower, none = (feed_link(task, replace(link, fraction=round(share * link.fraction, 3))) for share in shares)
     missing, without = [(task, x, loops)] if broken == {FRICTION} else [], None
-    if _measure_miss(task, x) > HOPELESS:
-        without = solve(none)
-        least = min(_measure_miss(task, x), _measure_miss(none, without[0]))
-        if least > FAR_OFF:
-            lower = []
-        elif least > HOPELESS:
-            lower = [one for one in lower if min(_follow(one, start) for start in (x, without[0])) <= HOPELESS]
+    miss = _measure_miss(task, x)
+    if miss > CLEARLY:
+        without = solve(none, (x,), far_off=CLEARLY)
+        least, start = min((miss, x), (_measure_miss(none, without[0]), without[0]), key=lambda pair: pair[0])
+        close = float(np.clip(1.0 + CLOSER * (least - 1.0), CLEARLY, HOPELESS))
+        lower = [] if least > FAR_OFF else [one for one in lower if _follow(one, start) <= close]
     found = (task, x, loops)
     for one in (*lower, none):
         found = (one, *(without if one is none and without else solve(one)))

@@ -145,9 +145,13 @@ def thin_grid(task: Task, grid: Grid, plants: Sequence[int] = range(SCANNED_PLAN
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
     return replace(
-        coarse, p=coarse.p[some], discs=coarse.discs[some], fixed=coarse.fixed[some], speed=coarse.speed[some],
+        coarse,
+        p=coarse.p[some],
+        discs=coarse.discs[some],
+        fixed=coarse.fixed[some],
+        speed=coarse.speed[some],
         rows=tuple(coarse.rows[k] for k in some),
-    )  # fmt: skip
+    )
 
 
 def _list_shapes(task: Task, grid: Grid) -> Iterator[Shape]:
@@ -165,8 +169,9 @@ def _list_shapes(task: Task, grid: Grid) -> Iterator[Shape]:
     every.sort(key=lambda shape: sum(number > 0 for number, _ in shape[2:]) > 1)  # one part at a time comes first
     alone = sum(sum(number > 0 for number, _ in shape[2:]) <= 1 for shape in every)
     for t_f, t_q, (_, (k_v, speed_rate)), (_, notch), (_, prefilter) in (
-        *_thin_out(every[:alone], MOST_SHAPES), *_thin_out(every[alone:], MOST_SHAPES // 3)
-    ):  # fmt: skip
+        *_thin_out(every[:alone], MOST_SHAPES),
+        *_thin_out(every[alone:], MOST_SHAPES // 3),
+    ):
         shape = np.clip((k_v, t_f, t_q, 0.0, *notch, *prefilter), low[K_V:], high[K_V:])
         shape[SPEED_RATE - K_V] = speed_rate
         yield (*shape,)

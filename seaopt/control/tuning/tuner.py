@@ -174,9 +174,12 @@ def tune(
 
 
 def _describe_request(
-    plant: Plant | MeasuredResponse, params: Fit | ParameterSet, spec: ControllerSpec, robust_to: RobustTo,
+    plant: Plant | MeasuredResponse,
+    params: Fit | ParameterSet,
+    spec: ControllerSpec,
+    robust_to: RobustTo,
     draws: Sequence[Mapping[str, float]],
-) -> str:  # fmt: skip
+) -> str:
     """Return what it takes to repeat a call."""
     values = params.parameters if isinstance(params, Fit) else params
     others = {name: one[0].name if isinstance(one, tuple) else one.name for name, one in robust_to.items()}
@@ -188,9 +191,13 @@ def _describe_request(
 
 
 def _tune(
-    plant: Plant | MeasuredResponse, params: Fit | ParameterSet, spec: ControllerSpec, robust_to: RobustTo,
-    draws: Sequence[Mapping[str, float]], progress: Progress,
-) -> Controller:  # fmt: skip
+    plant: Plant | MeasuredResponse,
+    params: Fit | ParameterSet,
+    spec: ControllerSpec,
+    robust_to: RobustTo,
+    draws: Sequence[Mapping[str, float]],
+    progress: Progress,
+) -> Controller:
     model = name_design(plant)
     if spec.structure == CUSTOM:
         raise ControlError('structure = "custom" is of a law that is given, which nothing tunes; use seaopt.assess')
@@ -263,16 +270,22 @@ def _find_possible(
     steepest, largest, law = eased
     friction, fall = steepest.find_fall()
     possible = replace(
-        possible, fall=fall, largest_fall=largest * fall, fall_unit=friction.slope_unit,
+        possible,
+        fall=fall,
+        largest_fall=largest * fall,
+        fall_unit=friction.slope_unit,
         fall_parameters=list_fall_parameters(steepest.model, friction),
-    )  # fmt: skip
+    )
     return possible, [*near, law]
 
 
 def make_task(
-    plant: Plant | MeasuredResponse, params: ParameterSet, spec: ControllerSpec, robust_to: RobustTo,
+    plant: Plant | MeasuredResponse,
+    params: ParameterSet,
+    spec: ControllerSpec,
+    robust_to: RobustTo,
     draws: Sequence[Mapping[str, float]] = (),
-) -> Task:  # fmt: skip
+) -> Task:
     """Return what is to be tuned.
 
     Raises
@@ -327,10 +340,12 @@ def make_task(
     pairs = [*models.items(), *_draw_plants(models, draws)]
     plants = (
         *first.values(),
-        *(sample(model, values, signals, gain, spec.sample_time_s, spec.loop_delay_samples)
-          for _, (model, values) in pairs),
+        *(
+            sample(model, values, signals, gain, spec.sample_time_s, spec.loop_delay_samples)
+            for _, (model, values) in pairs
+        ),
         *seen.values(),
-    )  # fmt: skip
+    )
     static = plants[0].static_gain
     if not np.isfinite(static) or abs(static) < 1e-6:
         raise ControlError(
@@ -349,12 +364,20 @@ def make_task(
         further = (*further, link.feedback(spec.sample_time_s))
     frictions = _find_friction(
         spec, signals, [pair for _, pair in pairs], plants[len(first) :], whole, gain, len(first)
-    )  # fmt: skip
+    )
     return Task(
-        spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
-        design_states=design_states, signals=signals, frictions=frictions,
-        further=further, link=link,
-    )  # fmt: skip
+        spec=spec,
+        plants=plants,
+        names=names,
+        k_ff=1.0 / static,
+        nominal=nominal,
+        port=port,
+        design_states=design_states,
+        signals=signals,
+        frictions=frictions,
+        further=further,
+        link=link,
+    )
 
 
 def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
@@ -396,9 +419,7 @@ def _find_link(
         )
     for model, values in named.values():
         if name_link_signal(asked, model) is not None:
-            return model_link_path(
-                asked, model, values, spec.regulated, per_effort, spec.bandwidth_hz
-            )  # fmt: skip
+            return model_link_path(asked, model, values, spec.regulated, per_effort, spec.bandwidth_hz)
     missing = "link motion" if asked.measured is None else f'output "{asked.measured}" that is its link\'s motion'
     raise ControlError(
         f"link_feedforward: none of {', '.join(named)} has a {missing}; name a plant whose link moves in robust_to, "
@@ -443,9 +464,14 @@ def _check_measured_design(spec: ControllerSpec) -> None:
 
 
 def _find_friction(
-    spec: ControllerSpec, signals: tuple[str, ...], pairs: Sequence[tuple[Plant, CompletedParameters]],
-    plants: Sequence[DigitalPlant | MeasuredPlant], whole: Mapping[Plant, Plant], gain: float, before: int,
-) -> tuple[PlantWithFriction, ...]:  # fmt: skip
+    spec: ControllerSpec,
+    signals: tuple[str, ...],
+    pairs: Sequence[tuple[Plant, CompletedParameters]],
+    plants: Sequence[DigitalPlant | MeasuredPlant],
+    whole: Mapping[Plant, Plant],
+    gain: float,
+    before: int,
+) -> tuple[PlantWithFriction, ...]:
     """Return the plants of which a friction margin is asked, and those that grow as they slide.
 
     Of those that slide, `whole` is the one with friction; in the task, `before` plants precede these.
@@ -482,9 +508,8 @@ def _draw_plants(
         for name, (model, nominal) in models.items():
             own = {**conditions((model,)), **nominal}
             used = {
-                key: require_number(value, f"draws: {key}", ControlError)
-                for key, value in values.items() if key in own
-            }  # fmt: skip
+                key: require_number(value, f"draws: {key}", ControlError) for key, value in values.items() if key in own
+            }
             if not used:
                 continue
             label = format_values(used, missing="") if len(used) < 3 else f"draw {number}"
@@ -503,16 +528,26 @@ def make_controller(
     """Return the controller of tuned numbers."""
     gains = task.gains(x)
     return describe_law(
-        task, task.law_of(x).balanced(), loops, design, gains=gains.by_name(), observer=gains.observer,
+        task,
+        task.law_of(x).balanced(),
+        loops,
+        design,
+        gains=gains.by_name(),
+        observer=gains.observer,
         possible=possible,
-    )  # fmt: skip
+    )
 
 
 def describe_law(
-    task: Task, law: Law, loops: Sequence[MeasuredLoop], design: tuple[Plant | MeasuredResponse, ParameterSet], *,
-    gains: Mapping[str, float], observer: DisturbanceObserver | None = None,
+    task: Task,
+    law: Law,
+    loops: Sequence[MeasuredLoop],
+    design: tuple[Plant | MeasuredResponse, ParameterSet],
+    *,
+    gains: Mapping[str, float],
+    observer: DisturbanceObserver | None = None,
     possible: PossibleBandwidths | None = None,
-) -> Controller:  # fmt: skip
+) -> Controller:
     """Return the controller of a law whose loops are measured."""
     spec, (plant, params) = task.spec, design
     if not isinstance(plant, MeasuredResponse) and task.link is not None:
@@ -529,7 +564,7 @@ def describe_law(
         command=command_of(name_design(plant), params, spec.regulated),
         spec=spec,
         achieved=loops[0].figures,
-        feasible=not broken,
+        met=not broken,
         active_constraints=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[task.design_states :],
         design=None if isinstance(plant, MeasuredResponse) else (plant, params),

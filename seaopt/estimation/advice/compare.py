@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import to_content
 from seaopt.errors import EstimationError
 from seaopt.estimation.advice.forecasts import (
     Percent,
@@ -53,33 +54,16 @@ LOWEST_LINES = 4  # lines of the spectrum that the lowest octave has at least
 
 @record(eq=False)
 class Ranked:
-    """One fit in a ranking.
+    """One fit in a ranking."""
 
-    Parameters
-    ----------
-    name : str
-        Its label.
-    aic, bic : float
-        With every sample counted.
-    effective_bic : float
-        With the effective number of samples, up to a constant that all fits share.
-    unknowns : int
-        Sigmas included.
-    free_run : mapping of experiment to mapping of output to Percent
-        Fit of the simulation, over the samples used and those held out.
-    held_out_ratio : float or None
-        Held-out residual over that of the first in the ranking, geometric mean over outputs; None if nothing is held
-        out.
-
-    """
-
-    name: str
-    aic: float
+    name: str  # its label
+    aic: float  # aic, bic: with every sample counted
     bic: float
-    effective_bic: float
-    unknowns: int
-    free_run: Mapping[str, Mapping[str, Percent]]
+    effective_bic: float  # with the effective number of samples, up to a constant that all fits share
+    unknowns: int  # sigmas included
+    # Held-out residual over that of the first in the ranking, geometric mean over outputs; None if nothing is held out
     held_out_ratio: float | None
+    free_run: Mapping[str, Mapping[str, Percent]]  # fit of the simulation, over the samples used and those held out
 
 
 @record(eq=False)
@@ -139,25 +123,24 @@ class Ranking:
     def to_dict(self) -> dict[str, Any]:
         """Return the content as numbers, lists and text."""
         return {
-            "preferred": self.preferred, "evidence": self.evidence, "samples": self.samples,
-            "effective_samples": self.effective_samples, "sentences": list(self.sentences),
-            "ranking": [
-                {
-                    "name": row.name, "aic": row.aic, "bic": row.bic, "effective_bic": row.effective_bic,
-                    "unknowns": row.unknowns, "held_out_ratio": row.held_out_ratio,
-                    "free_run": {
-                        name: {output: {"used": p.used, "held_out": p.held_out} for output, p in outputs.items()}
-                        for name, outputs in row.free_run.items()
-                    },
-                }
-                for row in self.rows
-            ],
+            "preferred": self.preferred,
+            "evidence": self.evidence,
+            "samples": self.samples,
+            "effective_samples": self.effective_samples,
+            "sentences": list(self.sentences),
+            "ranking": to_content(self.rows),
             "bands": [
-                {"experiment": band.experiment, "output": band.output, "low_hz": band.low_hz, "high_hz": band.high_hz,
-                 "unit": f"({band.unit})^2", "power": dict(band.power)}
+                {
+                    "experiment": band.experiment,
+                    "output": band.output,
+                    "low_hz": band.low_hz,
+                    "high_hz": band.high_hz,
+                    "unit": f"({band.unit})^2",
+                    "power": dict(band.power),
+                }
                 for band in self.bands
             ],
-        }  # fmt: skip
+        }
 
     def __repr__(self) -> str:
         rows = format_table((self._cells(row) for row in self.rows), _HEAD, "<>>>>")
@@ -225,18 +208,23 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
     free = {name: simulate_freely(minimum, residuals[name]) for name, minimum in minima.items()}
     shared = next(iter(problems.values()))
     effective = {
-        output.label: min(_count_effective(output, own) for own in residuals.values()) for output in shared.outputs
+        output.label: min(_count_effective(output, residual) for residual in residuals.values())
+        for output in shared.outputs
     }
     bic = {name: _compute_bic(fit, problems[name], residuals[name], effective) for name, fit in named.items()}
     order = sorted(named, key=lambda name: bic[name])
     rows = tuple(
         Ranked(
-            name=name, aic=named[name].aic, bic=named[name].bic, effective_bic=bic[name],
-            unknowns=named[name].all_unknowns, free_run=_compute_percents(problems[name], free[name]),
+            name=name,
+            aic=named[name].aic,
+            bic=named[name].bic,
+            effective_bic=bic[name],
+            unknowns=named[name].all_unknowns,
+            free_run=_compute_percents(problems[name], free[name]),
             held_out_ratio=_compare_held_out(shared, free[name], free[order[0]]),
         )
         for name in order
-    )  # fmt: skip
+    )
     octaves = [
         _compute_octaves(places, {name: residuals[name] for name in order})
         for places in zip(*(problems[name].outputs for name in order), strict=True)
@@ -244,10 +232,15 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
     bands = tuple(octave for row in octaves for octave in row)
     evidence = _weigh_evidence(rows)
     return Ranking(
-        rows=rows, preferred=None if evidence == "undecided" else order[0], evidence=evidence,
-        samples=named[order[0]].samples, effective_samples=float(sum(effective.values())), bands=bands,
-        sentences=_explain(rows, evidence, bands, named), fits={name: named[name] for name in order},
-    )  # fmt: skip
+        rows=rows,
+        preferred=None if evidence == "undecided" else order[0],
+        evidence=evidence,
+        samples=named[order[0]].samples,
+        effective_samples=float(sum(effective.values())),
+        bands=bands,
+        sentences=_explain(rows, evidence, bands, named),
+        fits={name: named[name] for name in order},
+    )
 
 
 def _name_apart(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
@@ -272,9 +265,9 @@ def _name_apart(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
 
 def _check(problems: dict[str, FitProblem]) -> None:
     """Refuse fits to data that are not the same: their likelihoods are not of the same thing."""
-    (first, one), *others = problems.items()
-    for name, other in others:
-        what = _find_difference(one, other)
+    (first, reference), *further = problems.items()
+    for name, other in further:
+        what = _find_difference(reference, other)
         if what:
             raise EstimationError(
                 f'compare: "{name}" and "{first}" differ in {what}, and likelihoods of other data cannot be compared; '
@@ -282,18 +275,18 @@ def _check(problems: dict[str, FitProblem]) -> None:
             )
 
 
-def _find_difference(one: FitProblem, other: FitProblem) -> str:
+def _find_difference(first: FitProblem, other: FitProblem) -> str:
     """Return what differs in the data of two problems; empty if nothing does."""
-    names, others = [e.name for e in one.experiments], [e.name for e in other.experiments]
-    if names != others:
-        return f"their experiments ({', '.join(names)}; {', '.join(others)})"
-    if one.band_hz != other.band_hz:
-        return f"band_hz ({one.band_hz}; {other.band_hz})"
-    if one.loss != other.loss:
-        return f"their loss ({one.loss}; {other.loss})"
-    if one.holdout != other.holdout:
-        return f"holdout ({one.holdout:g}; {other.holdout:g})"
-    for a, b in zip((e.data for e in one.experiments), (e.data for e in other.experiments), strict=True):
+    names, other_names = [e.name for e in first.experiments], [e.name for e in other.experiments]
+    if names != other_names:
+        return f"their experiments ({', '.join(names)}; {', '.join(other_names)})"
+    if first.band_hz != other.band_hz:
+        return f"band_hz ({first.band_hz}; {other.band_hz})"
+    if first.loss != other.loss:
+        return f"their loss ({first.loss}; {other.loss})"
+    if first.holdout != other.holdout:
+        return f"holdout ({first.holdout:g}; {other.holdout:g})"
+    for a, b in zip((e.data for e in first.experiments), (e.data for e in other.experiments), strict=True):
         if a.outputs != b.outputs:
             return f"the outputs of {a.name} ({', '.join(a.outputs)}; {', '.join(b.outputs)})"
         channels = [*a.outputs, *(u for u in a.plant.inputs if u in a.log.signals and u in b.plant.inputs)]
@@ -334,13 +327,13 @@ def _compute_percents(problem: FitProblem, residuals: ResidualsByExperiment) -> 
     }
 
 
-def _compare_held_out(problem: FitProblem, one: ResidualsByExperiment, best: ResidualsByExperiment) -> float | None:
+def _compare_held_out(problem: FitProblem, other: ResidualsByExperiment, best: ResidualsByExperiment) -> float | None:
     """Return the ratio of held-out residuals to the best fit's, geometric mean over outputs."""
     logs: list[float] = []
     for output in problem.outputs:
         _, held_out = split_samples(output)
         if np.any(held_out):
-            raw = [residuals[output.experiment.name].raw_of(output.name) for residuals in (one, best)]
+            raw = [residuals[output.experiment.name].raw_of(output.name) for residuals in (other, best)]
             signals = [filter_to_band(output.experiment, rows)[held_out] for rows in raw]
             rms = [max(float(np.sqrt(np.mean(signal**2))), 1e-300) for signal in signals]
             logs.append(float(np.log(rms[0] / rms[1])))
@@ -354,8 +347,8 @@ def _compute_octaves(places: Sequence[FitOutput], residuals: Mapping[str, Residu
     """
     output, period = places[0], places[0].experiment.period
     signals = {
-        name: np.concatenate(own[place.experiment.name].weighted_of(place.name)) * place.sigma
-        for place, (name, own) in zip(places, residuals.items(), strict=True)
+        name: np.concatenate(residual[fitted.experiment.name].weighted_of(fitted.name)) * fitted.sigma
+        for fitted, (name, residual) in zip(places, residuals.items(), strict=True)
     }
     counts = {name: max(int(np.count_nonzero(r)), 1) for name, r in signals.items()}
     lowest = LOWEST_LINES / (max(counts.values()) * period)
@@ -369,13 +362,17 @@ def _compute_octaves(places: Sequence[FitOutput], residuals: Mapping[str, Residu
         power = {
             name: float(np.sum(density[(f > low if low else f >= 0.0) & (f <= high)]))
             for name, (f, density) in spectra.items()
-        }  # fmt: skip
+        }
         rows.append(
             OctavePower(
-                experiment=output.experiment.name, output=output.name, unit=output.unit, low_hz=low, high_hz=high,
+                experiment=output.experiment.name,
+                output=output.name,
+                unit=output.unit,
+                low_hz=low,
+                high_hz=high,
                 power=power,
             )
-        )  # fmt: skip
+        )
     return rows[::-1]
 
 

@@ -50,27 +50,14 @@ LITTLE = 0.01  # share of what is known
 
 @record(eq=False)
 class OutputDiagnostics:
-    """The residual of one output of one experiment.
+    """The residual of one output of one experiment."""
 
-    Parameters
-    ----------
-    whiteness_p : float
-        Ljung-Box p-value of the weighted residual.
-    autocorrelation : array, shape (lags + 1,)
-        Of the weighted residual.
-    autocorrelation_bound : float
-        99 % bound at one lag, for a white residual.
-    inputs : mapping of input to CrossCorrelation
-        Inputs that move.
-    free_run, one_step : Percent
-        Fit of the simulation, and of the prediction one sample ahead; the latter is NaN where no filter is found.
-
-    """
-
-    whiteness_p: float
-    autocorrelation: Float[np.ndarray, " lags1"]
-    autocorrelation_bound: float
-    inputs: Mapping[str, CrossCorrelation]
+    whiteness_p: float  # Ljung-Box p-value of the weighted residual
+    autocorrelation: Float[np.ndarray, " lags1"]  # of the weighted residual
+    autocorrelation_bound: float  # 99 % bound at one lag, for a white residual
+    inputs: Mapping[str, CrossCorrelation]  # inputs that move
+    # free_run, one_step: fit of the simulation, and of the prediction one sample ahead; the latter is NaN where no
+    # filter is found
     free_run: Percent
     one_step: Percent
 
@@ -121,25 +108,29 @@ class Diagnostics:
         """Return the content as numbers, lists and text."""
         return {
             "outputs": {
-                name: {output: _output_dict(one) for output, one in row.items()} for name, row in self.outputs.items()
+                name: {output: _output_dict(figures) for output, figures in row.items()}
+                for name, row in self.outputs.items()
             },
             "leverage": {
                 name: {"parameters": dict(source.parameters), "whole": source.whole}
                 for name, source in self.leverage.items()
             },
-            "at_bound": list(self.at_bound), "held": {name: asdict(test) for name, test in self.held.items()},
-            "aic": self.aic, "bic": self.bic, "sentences": list(self.sentences),
-        }  # fmt: skip
+            "at_bound": list(self.at_bound),
+            "held": {name: asdict(test) for name, test in self.held.items()},
+            "aic": self.aic,
+            "bic": self.bic,
+            "sentences": list(self.sentences),
+        }
 
     def __repr__(self) -> str:
         lines = ["Diagnostics: " + ("no problem found" if self.ok else f"{len(self.sentences)} to look at")]
         lines += [f"  - {sentence}" for sentence in self.sentences]
         for name, row in self.outputs.items():
-            for output, one in row.items():
-                lines.append(f"  {name}.{output}: whiteness p {one.whiteness_p:.2g}; {_percents(one)}")
+            for output, figures in row.items():
+                lines.append(f"  {name}.{output}: whiteness p {figures.whiteness_p:.2g}; {_percents(figures)}")
                 lines += [
                     f"    against {u}: {cross.worst:.2g} of the 99 % bound, at lag {cross.worst_lag}"
-                    for u, cross in one.inputs.items()
+                    for u, cross in figures.inputs.items()
                 ]
         lines += [
             f"  {name} = {test.value:.6g}{unit_after(test.unit)} held fixed: chi-square {test.chi2:.3g}, one step with "
@@ -157,26 +148,30 @@ class Diagnostics:
         return html_text(self) + self.plot.to_html()
 
 
-def _output_dict(one: OutputDiagnostics) -> dict[str, Any]:
+def _output_dict(figures: OutputDiagnostics) -> dict[str, Any]:
     return {
-        "whiteness_p": one.whiteness_p,
-        "autocorrelation": one.autocorrelation,
-        "autocorrelation_bound": one.autocorrelation_bound,
+        "whiteness_p": figures.whiteness_p,
+        "autocorrelation": figures.autocorrelation,
+        "autocorrelation_bound": figures.autocorrelation_bound,
         "inputs": {
             name: {
-                "lags": cross.lags, "values": cross.values, "bound": cross.bound, "p": cross.p,
-                "worst_lag": cross.worst_lag, "outside": cross.outside,
+                "lags": cross.lags,
+                "values": cross.values,
+                "bound": cross.bound,
+                "p": cross.p,
+                "worst_lag": cross.worst_lag,
+                "outside": cross.outside,
             }
-            for name, cross in one.inputs.items()
+            for name, cross in figures.inputs.items()
         },
-        "free_run": {"used": one.free_run.used, "held_out": one.free_run.held_out},
-        "one_step": {"used": one.one_step.used, "held_out": one.one_step.held_out},
-    }  # fmt: skip
+        "free_run": {"used": figures.free_run.used, "held_out": figures.free_run.held_out},
+        "one_step": {"used": figures.one_step.used, "held_out": figures.one_step.held_out},
+    }
 
 
-def _percents(one: OutputDiagnostics) -> str:
+def _percents(figures: OutputDiagnostics) -> str:
     parts: list[str] = []
-    for what, percent in (("simulated", one.free_run), ("one sample ahead", one.one_step)):
+    for what, percent in (("simulated", figures.free_run), ("one sample ahead", figures.one_step)):
         held_out = "" if percent.held_out is None else f" (held out {percent.held_out:.2f} %)"
         parts.append(f"{what} {percent.used:.2f} %{held_out}")
     return ", ".join(parts)
@@ -231,18 +226,28 @@ def diagnose(fit: Fit) -> Diagnostics:
         outputs[output.experiment.name][output.name] = _diagnose_output(output, residuals, free, ahead, whiteness_p)
     leverage, at_bound = measure_leverage(minimum), problem.unknowns.find_at_bound(minimum.z)
     sentences = [] if fit.status == "converged" else [f"the fit is {fit.status.replace('_', ' ')}: {fit.message}"]
-    sentences += [f"{one.where}: {one.text}" if one.where else one.text for one in fit.findings]
+    sentences += [f"{finding.where}: {finding.text}" if finding.where else finding.text for finding in fit.findings]
     sentences += [*_advise_on_outputs(fit, outputs, residuals), *_advise_on_leverage(leverage)]
     return Diagnostics(
-        outputs=outputs, leverage=leverage, at_bound=at_bound, held=run_score_tests(minimum, fit), aic=fit.aic,
-        bic=fit.bic, findings=fit.findings, sentences=tuple(sentences), residuals=residuals,
-    )  # fmt: skip
+        outputs=outputs,
+        leverage=leverage,
+        at_bound=at_bound,
+        held=run_score_tests(minimum, fit),
+        aic=fit.aic,
+        bic=fit.bic,
+        findings=fit.findings,
+        sentences=tuple(sentences),
+        residuals=residuals,
+    )
 
 
 def _diagnose_output(
-    output: FitOutput, residuals: ResidualsByExperiment, free: ResidualsByExperiment,
-    ahead: ResidualsByExperiment | None, whiteness_p: float,
-) -> OutputDiagnostics:  # fmt: skip
+    output: FitOutput,
+    residuals: ResidualsByExperiment,
+    free: ResidualsByExperiment,
+    ahead: ResidualsByExperiment | None,
+    whiteness_p: float,
+) -> OutputDiagnostics:
     residual = np.concatenate(residuals[output.experiment.name].weighted_of(output.name))
     count = int(np.count_nonzero(residual))
     return OutputDiagnostics(
@@ -273,7 +278,7 @@ def _advise_on_outputs(
     """Return what the residuals show besides the fit's findings."""
     problem, sentences = fit.require_minimum("diagnose").problem, list[str]()
     # What a cause or the inputs would explain is not noise, whatever a filter predicts of it.
-    explained = any(one.kind in ("cause", "explained") for one in fit.findings)
+    explained = any(finding.kind in ("cause", "explained") for finding in fit.findings)
     for output in problem.outputs:
         row = outputs[output.experiment.name][output.name]
         about_inputs = _advise_on_inputs(output, row, residuals, explained=explained)
@@ -299,10 +304,10 @@ def _advise_on_inputs(
         late = f" = {1e3 * lag * output.experiment.period:.3g} ms" if lag else ""
         residual = np.concatenate(residuals[output.experiment.name].weighted_of(output.name))
         frequency = _find_centre_hz(residual, output.experiment.period)
-        rest = "what no cause above explains is a missing pole" if explained else "a missing pole"
+        remaining = "what no cause above explains is a missing pole" if explained else "a missing pole"
         sentences.append(
             f"{output.label}: the residual follows {name}, most around lag {lag}{late} {size}, half of its power is "
-            f"below {frequency:.3g} Hz: {rest}; compare() it with a plant that has one more part"
+            f"below {frequency:.3g} Hz: {remaining}; compare() it with a plant that has one more part"
         )
     return sentences
 

@@ -217,9 +217,16 @@ def design_experiment(
     """
     limits = _keep_range(limits, plant, params, input_name)
     bench = make_bench(
-        plant, params, sigma, duration_s=limits.duration_s, rate_hz=limits.rate_hz, offset=offset,
-        initial_state=initial_state, input_name=input_name, watched=_limited_signals(plant, limits),
-    )  # fmt: skip
+        plant,
+        params,
+        sigma,
+        duration_s=limits.duration_s,
+        rate_hz=limits.rate_hz,
+        offset=offset,
+        initial_state=initial_state,
+        input_name=input_name,
+        watched=_limited_signals(plant, limits),
+    )
     measure = make_measure(bench, criterion)
     search = ExcitationSearch(bench=bench, limits=limits, measure=measure)
     band = _band(None if signal is None else signal.band_hz, limits)
@@ -272,9 +279,15 @@ def expected_covariance(
 
     """
     bench = make_bench(
-        plant, params, sigma, duration_s=duration_s, rate_hz=rate_hz, offset=offset, initial_state=initial_state,
+        plant,
+        params,
+        sigma,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        offset=offset,
+        initial_state=initial_state,
         input_name=input_name,
-    )  # fmt: skip
+    )
     u = bench.samples(excitation, seed)
     return Covariance(names=bench.model.free, matrix=bench.refine_steps(u).run(u).covariance)
 
@@ -288,12 +301,12 @@ def _keep_range(limits: Limits, plant: Plant, params: ParameterSet, input_name: 
 
 
 def _limited_signals(plant: Plant, limits: Limits) -> tuple[str, ...]:
-    known = (*plant.outputs, *plant.states)
+    signals = (*plant.outputs, *plant.states)
     for name in limits.peaks:
-        if name not in known:
+        if name not in signals:
             raise EstimationError(
                 f'limits: peaks names "{name}", which is not an output or state of {plant.name}; '
-                f"{suggestion(name, known)}"
+                f"{suggestion(name, signals)}"
             )
     return tuple(limits.peaks)
 
@@ -322,6 +335,12 @@ def _design(search: ExcitationSearch, candidate: Candidate, criterion: str) -> D
             )
     figures = (replace(bench.params[name], std=covariance.std(name)) for name in names)
     return Design(
-        excitation=final.excitation, criterion=criterion, parameters=bench.params.with_parameters(*figures),
-        covariance=covariance, rms=final.trial.rms, peaks=final.trial.peaks, limits=search.limits, bench=bench,
-    )  # fmt: skip
+        excitation=final.excitation,
+        criterion=criterion,
+        parameters=bench.params.with_parameters(*figures),
+        covariance=covariance,
+        rms=final.trial.rms,
+        peaks=final.trial.peaks,
+        limits=search.limits,
+        bench=bench,
+    )

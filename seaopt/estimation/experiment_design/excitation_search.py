@@ -131,11 +131,7 @@ class Measure:
 def make_measure(bench: Bench, criterion: str) -> Measure:
     """Return the criterion of a name: "A", "D" or a free parameter's.
 
-    Raises
-    ------
-    EstimationError
-        The name is unknown, or a relative variance is asked of a parameter that is zero.
-
+    Raises EstimationError: the name is unknown, or a relative variance is asked of a parameter that is zero.
     """
     names = bench.model.free
     if criterion == "D":
@@ -186,11 +182,7 @@ class ExcitationSearch:
     def scale_to_limits(self, excitation: Excitation) -> Candidate:
         """Scale the excitation to be as large as the limits allow.
 
-        Raises
-        ------
-        EstimationError
-            No size was found within them.
-
+        Raises EstimationError: no size was found within them.
         """
         u = self.bench.samples(excitation)
         low, high, factor = 0.0, np.inf, 1.0
@@ -219,11 +211,7 @@ class ExcitationSearch:
 def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: Multisines) -> Candidate:
     """Return the best multisine within the limits.
 
-    Raises
-    ------
-    EstimationError
-        Nothing in the band distinguishes the free parameters, or a setting is out of range.
-
+    Raises EstimationError: nothing in the band distinguishes the free parameters, or a setting is out of range.
     """
     bench = search.bench
     if chosen.lines < 1 or not 0.0 <= chosen.spread < 1.0:
@@ -234,9 +222,15 @@ def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: 
     multiples = choose_harmonics(bench.n, rate, band, chosen.lines)
     signals = [-1, *(bench.place(name) for name in search.limits.peaks)]
     lines = make_spectrum(
-        bench.model, bench.theta, bench.clock, multiples, n=bench.n, sigma=bench.sigma, channel=bench.channel,
+        bench.model,
+        bench.theta,
+        bench.clock,
+        multiples,
+        n=bench.n,
+        sigma=bench.sigma,
+        channel=bench.channel,
         signals=signals,
-    )  # fmt: skip
+    )
     if bench.model.linear:
         return _solve_convex(search, lines, chosen.spread)
     return _refine(search, _best_start(search, lines, chosen.spread))

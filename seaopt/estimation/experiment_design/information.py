@@ -26,66 +26,30 @@ from seaopt.simulation import Clock, Model, Pass, Point, Segment, make_model, ru
 
 @record(eq=False)
 class Trial:
-    """What a simulated log identifies and what it takes.
+    """What a simulated log identifies and what it takes."""
 
-    Parameters
-    ----------
-    covariance : array, shape (p, p)
-        Expected of the free parameters; infinite where they cannot be identified.
-    rms : float
-        Of the input.
-    peaks : mapping of signal to float
-        Largest magnitude of the input and of each watched signal.
-
-    """
-
-    covariance: Float[np.ndarray, "p p"]
-    rms: float
-    peaks: Mapping[str, float]
+    covariance: Float[np.ndarray, "p p"]  # expected of the free parameters; infinite where they cannot be identified
+    rms: float  # of the input
+    peaks: Mapping[str, float]  # largest magnitude of the input and of each watched signal
 
 
 @record(eq=False)
 class Bench:
-    """A plant with its guess and sensors, to be tried with one excitation after another.
+    """A plant with its guess and sensors, to be tried with one excitation after another."""
 
-    Parameters
-    ----------
-    plant, params
-        The actuator and every parameter of it.
-    model : Model
-        The plant in its free parameters; the measured outputs come first.
-    theta, prior : array, shape (p,)
-        Free parameters, and what is known of them beforehand: 1/std^2.
-    sigma : array, shape (nm,)
-        Noise of the measured outputs.
-    input_name : str
-        The input that is excited.
-    watched : tuple of str
-        Outputs and states whose peaks are wanted.
-    clock : Clock
-        Period and hold.
-    n : int
-        Samples.
-    offset, initial : bool
-        Whether those are estimated too.
-    substeps : int
-        Integration steps per sample.
-
-    """
-
-    plant: Plant
+    plant: Plant  # plant, params: the actuator and every parameter of it
     params: ParameterSet
-    model: Model
-    theta: Float[np.ndarray, " p"]
+    model: Model  # the plant in its free parameters; the measured outputs come first
+    theta: Float[np.ndarray, " p"]  # theta, prior: free parameters, and what is known of them beforehand: 1/std^2
     prior: Float[np.ndarray, " p"]
-    sigma: Float[np.ndarray, " nm"]
-    input_name: str
-    watched: tuple[str, ...]
-    clock: Clock
-    n: int
-    offset: bool
+    sigma: Float[np.ndarray, " nm"]  # noise of the measured outputs
+    input_name: str  # the input that is excited
+    watched: tuple[str, ...]  # outputs and states whose peaks are wanted
+    clock: Clock  # period and hold
+    n: int  # samples
+    offset: bool  # offset, initial: whether those are estimated too
     initial: bool
-    substeps: int = 1
+    substeps: int = 1  # integration steps per sample
 
     @property
     def channel(self) -> int:
@@ -117,11 +81,7 @@ class Bench:
     def refine_steps(self, u: Float[np.ndarray, " n"]) -> Bench:
         """Return the bench with integration steps that are fine enough for `u`.
 
-        Raises
-        ------
-        EstimationError
-            No step is.
-
+        Raises EstimationError: no step is.
         """
         substeps = self.substeps
         while not self.model.linear:
@@ -146,10 +106,14 @@ class Bench:
         # A residual is needed to be counted: nothing measured is all zeros.
         segment = Segment(u=inputs, y=(still,) * self.model.ny)
         point = Point(
-            theta=self.theta, offset=np.zeros(self.model.ny), gain=np.ones(self.model.ny),
-            drift=np.zeros((self.model.ny, 0)), clock=self.clock, substeps=substeps,
-        )  # fmt: skip
-        return run_passes(self.model, segment, point, np.zeros((1, self.model.nx)), outputs=True, states=True)
+            theta=self.theta,
+            offset=np.zeros(self.model.ny),
+            gain=np.ones(self.model.ny),
+            drift=np.zeros((self.model.ny, 0)),
+            clock=self.clock,
+            substeps=substeps,
+        )
+        return run_passes(self.model, segment, point, np.zeros(self.model.nx), outputs=True, states=True)
 
     def _covariance(self, result: Pass) -> Float[np.ndarray, "p p"]:
         p, nx, m = self.theta.size, self.model.nx, self.sigma.size
@@ -157,11 +121,11 @@ class Bench:
         total = np.zeros((size, size))
         for o, sigma in enumerate(self.sigma):
             rows = [*range(1, 1 + p), *(range(1 + p, 1 + p + nx) if self.initial else ())]
-            place = list(range(len(rows)))
+            columns = list(range(len(rows)))
             if self.offset:
                 rows.append(1 + p + nx)
-                place.append(p + nx * self.initial + o)
-            total[np.array(place)[:, None], place] += result.gram[0, o][rows][:, rows] / sigma**2
+                columns.append(p + nx * self.initial + o)
+            total[np.array(columns)[:, None], columns] += result.gram[o][rows][:, rows] / sigma**2
         if not np.all(np.isfinite(total)):
             return np.full((p, p), np.inf)
         total[np.arange(p), np.arange(p)] += self.prior
@@ -183,11 +147,7 @@ def make_bench(
 ) -> Bench:
     """Return a bench for the free parameters of `params`; the outputs in `sigma` are measured.
 
-    Raises
-    ------
-    EstimationError
-        Nothing is free, or a name or a value is wrong.
-
+    Raises EstimationError: nothing is free, or a name or a value is wrong.
     """
     if not isinstance(sigma, Mapping) or not sigma:
         raise EstimationError(f"sigma = {sigma!r}; give a mapping of each measured output to its noise")
@@ -208,13 +168,19 @@ def make_bench(
     outputs = (*sigma, *(name for name in watched if name in plant.outputs and name not in sigma))
     stds = [complete[name].prior_std for name in free]
     return Bench(
-        plant=plant, params=complete, model=make_model(plant, complete, free, outputs),
+        plant=plant,
+        params=complete,
+        model=make_model(plant, complete, free, outputs),
         theta=np.array(complete.values_of(free)),
         prior=np.array([0.0 if std is None else std**-2.0 for std in stds]),
-        sigma=np.array([float(value) for value in sigma.values()]), input_name=excited, watched=watched,
-        clock=Clock(period=1.0 / rate_hz), n=round(duration_s * rate_hz), offset=offset,
+        sigma=np.array([float(value) for value in sigma.values()]),
+        input_name=excited,
+        watched=watched,
+        clock=Clock(period=1.0 / rate_hz),
+        n=round(duration_s * rate_hz),
+        offset=offset,
         initial=initial_state == "estimate",
-    )  # fmt: skip
+    )
 
 
 def _free_names(plant: Plant, params: ParameterSet) -> tuple[str, ...]:

@@ -36,31 +36,17 @@ SINGULAR = 1e-11  # eigenvalues of the normalised information below this part of
 
 @record(eq=False)
 class Spectrum:
-    """What one ampere squared at each of K frequencies identifies, and what it moves.
+    """What one ampere squared at each of K frequencies identifies, and what it moves."""
 
-    Parameters
-    ----------
-    harmonics : array, shape (K,)
-        Multiples of rate/n.
-    information : array, shape (K, p, p)
-        Fisher information of a unit mean square at each line.
-    gains : array, shape (m, K)
-        Responses of the limited signals.
-
-    """
-
-    harmonics: Int[np.ndarray, " K"]
-    information: Float[np.ndarray, "K p p"]
-    gains: Complex[np.ndarray, "m K"]
+    harmonics: Int[np.ndarray, " K"]  # multiples of rate/n
+    information: Float[np.ndarray, "K p p"]  # Fisher information of a unit mean square at each line
+    gains: Complex[np.ndarray, "m K"]  # responses of the limited signals
 
 
 def choose_harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Int[np.ndarray, " K"]:
     """Return at most `lines` log-spaced multiples of rate_hz/n in a band.
 
-    Raises
-    ------
-    EstimationError
-        No multiple lies in the band.
+    Raises EstimationError: no multiple lies in the band.
 
     Examples
     --------
@@ -91,21 +77,9 @@ def make_spectrum(
 ) -> Spectrum:
     """Return the spectrum of a plant, linearised at rest where it is not linear.
 
-    Parameters
-    ----------
-    model, theta, clock
-        The plant, its free parameters and the hold.
-    multiples : array, shape (K,)
-        The lines, in multiples of 1/(n period).
-    n : int
-        Samples.
-    sigma : array, shape (nm,)
-        Noise of the first nm outputs, those that are measured.
-    channel : int
-        The input that is excited.
-    signals : list of int
-        Limited signals: -1 is the input, then the outputs, then the states.
-
+    `model`, `theta`, `clock`: the plant, its free parameters and the hold; `multiples`: the lines, in multiples of
+    1/(n period); `n`: samples; `sigma`: noise of the first nm outputs, those that are measured; `channel`: the
+    input that is excited; `signals`: limited signals: -1 is the input, then the outputs, then the states.
     """
     linear = linearise(model)
     blocks = transition(linear, theta, clock)
@@ -143,25 +117,10 @@ def optimal_powers(
 ) -> Float[np.ndarray, " K"]:
     """Return the powers that minimise trace(W F^-1), or -log det F, within linear limits.
 
-    Parameters
-    ----------
-    information : array, shape (K, p, p)
-        F = sum_k P_k information[k] + prior.
-    budget : array, shape (m, K)
-        budget @ P <= 1; not negative, and no column zero.
-    weight : array, shape (p, p), or None
-        W; None for the determinant.
-    prior : array, shape (p, p), optional
-        Information from elsewhere.
+    `information`: F = sum_k P_k information[k] + prior; `budget`: budget @ P <= 1; not negative, and no column
+    zero; `weight`: W; None for the determinant; `prior`: information from elsewhere.
 
-    Returns
-    -------
-    array, shape (K,)
-
-    Raises
-    ------
-    EstimationError
-        Some direction of the parameters shows at no line.
+    Raises EstimationError: some direction of the parameters shows at no line.
 
     Examples
     --------
@@ -174,11 +133,11 @@ def optimal_powers(
     """
     k, p = information.shape[:2]
     even = np.full(k, 1.0 / np.max(np.sum(budget, axis=1)))
-    known = np.zeros((p, p)) if prior is None else prior
-    root = _inverse_root(np.einsum("k,kij->ij", even, information) + known)
+    before = np.zeros((p, p)) if prior is None else prior
+    root = _inverse_root(np.einsum("k,kij->ij", even, information) + before)
     normal = np.einsum("ai,k,kij,jb->kab", root.T, even, information, root)
     q = ca.SX.sym("q", k)
-    total = ca.reshape(ca.mtimes(ca.DM(normal.reshape(k, p * p).T), q), p, p) + ca.DM(root.T @ known @ root)
+    total = ca.reshape(ca.mtimes(ca.DM(normal.reshape(k, p * p).T), q), p, p) + ca.DM(root.T @ before @ root)
     cost = _cost(total, None if weight is None else root.T @ weight @ root, p)
     nlp = {"x": q, "f": cost, "g": ca.mtimes(ca.DM(budget * even), q)}
     options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "error_on_fail": True}
@@ -204,21 +163,17 @@ def _substitute_forward(upper: Any, right: Any, p: int) -> Any:
     """Return (R')^-1 B by forward substitution: |.|^2 is then trace(B' (R'R)^-1 B)."""
     rows: list[Any] = []
     for i in range(p):
-        rest = right[i, :]
+        row = right[i, :]
         for j in range(i):
-            rest -= upper[j, i] * rows[j]
-        rows.append(rest / upper[i, i])
+            row -= upper[j, i] * rows[j]
+        rows.append(row / upper[i, i])
     return ca.vertcat(*rows)
 
 
 def _inverse_root(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Return S with S' M S = 1.
 
-    Raises
-    ------
-    EstimationError
-        M is singular.
-
+    Raises EstimationError: M is singular.
     """
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
@@ -240,26 +195,21 @@ def low_peak_phases(
 ) -> Float[np.ndarray, " K"]:
     """Return phases that make the largest of m periodic signals over n samples small.
 
-    Parameters
-    ----------
-    lines : array, shape (m, K)
-        Signal m is Im sum_k lines[m, k] exp(i (phase_k + 2 pi places_k t/n)).
-    multiples : array, shape (K,)
-        Harmonics.
-    n : int
-        Samples.
-    start : array, shape (K,)
-        First phases.
-
+    `lines`: signal m is Im sum_k lines[m, k] exp(i (phase_k + 2 pi places_k t/n)); `multiples`: harmonics; `n`:
+    samples; `start`: first phases.
     """
     from scipy.optimize import minimize  # deferred: 0.3 s
 
     phases = start
     for order in ORDERS:
         solution = minimize(
-            lambda x, q: _log_norm(x, lines, multiples, n, q), phases, args=(order,), jac=True, method="L-BFGS-B",
+            lambda x, q: _log_norm(x, lines, multiples, n, q),
+            phases,
+            args=(order,),
+            jac=True,
+            method="L-BFGS-B",
             options={"maxiter": 40},
-        )  # fmt: skip
+        )
         phases = np.asarray(solution.x)
     return phases
 

@@ -66,23 +66,28 @@ class Candidate:
 
 
 def list_candidates(
-    fit: Fit, minimum: Minimum, residuals: ResidualsByExperiment, suspects: Mapping[str, ScoreTest],
-    alternatives: Sequence[Plant], *, poor: bool,
-) -> Iterator[Candidate]:  # fmt: skip
+    fit: Fit,
+    minimum: Minimum,
+    residuals: ResidualsByExperiment,
+    suspects: Mapping[str, ScoreTest],
+    alternatives: Sequence[Plant],
+    *,
+    poor: bool,
+) -> Iterator[Candidate]:
     """Yield the changes to try."""
     first = minimum.problem.params
-    here = first if poor else fit.parameters
-    yield from _swap_channels(fit.experiments, here, poor=poor)
+    values = first if poor else fit.parameters
+    yield from _swap_channels(fit.experiments, values, poor=poor)
     if poor:
         for plant in alternatives:  # the right one is soon found, and the wrong one takes long to refit
             yield from _change_plant(fit.experiments, first, plant)
         yield from _free_gains(fit.experiments, first)
-    yield from _read_deflections(fit.experiments, here)
-    yield from _free_delays(fit.experiments, here)
+    yield from _read_deflections(fit.experiments, values)
+    yield from _free_delays(fit.experiments, values)
     yield from _free_parameters(fit, minimum, suspects)
-    yield from _load_friction(fit.experiments, here)
-    yield from _clip_outputs(minimum.problem, residuals, here)
-    yield from _filter_outputs(fit.experiments, here)
+    yield from _load_friction(fit.experiments, values)
+    yield from _clip_outputs(minimum.problem, residuals, values)
+    yield from _filter_outputs(fit.experiments, values)
 
 
 def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTest]) -> Iterator[Candidate]:
@@ -135,9 +140,11 @@ def _read_deflections(experiments: tuple[Experiment, ...], params: ParameterSet)
 
         plant = replace(first, h=h)
         yield Candidate(
-            where=output, experiments=tuple(replace(e, plant=plant) for e in experiments), params=params,
+            where=output,
+            experiments=tuple(replace(e, plant=plant) for e in experiments),
+            params=params,
             describe=describe,
-        )  # fmt: skip
+        )
 
 
 def _adds_damping(plant: Plant, output: str, stiffness: str) -> bool:
@@ -148,8 +155,8 @@ def _adds_damping(plant: Plant, output: str, stiffness: str) -> bool:
     more = ca.Function("more", [plant.t, plant.x, plant.u, plant.p], [row])
     still = np.array([0.0 if unit.endswith("/s") else 1.0 for unit in plant.states.values()])
     ones = np.ones(len(plant.parameters))
-    rest, motion = (abs(float(more(0.0, at, 0.0, ones))) for at in (still, 1.0 + np.arange(still.size)))
-    return rest < 1e-12 < motion
+    resting, motion = (abs(float(more(0.0, at, 0.0, ones))) for at in (still, 1.0 + np.arange(still.size)))
+    return resting < 1e-12 < motion
 
 
 def _load_friction(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
@@ -194,16 +201,16 @@ def _grow_with_load(plant: Plant) -> Plant | None:
 def _say_value(parameter: Parameter, value: float, unresolved: float) -> str:
     """Return what a parameter should have been; `unresolved` is the std of a speed that smooths friction."""
     unit = unit_after(parameter.unit)
-    place = f"in place of {parameter.value:.4g}{unit}"
+    instead = f"in place of {parameter.value:.4g}{unit}"
     if value < 2.0 * unresolved:
         return (
             f"friction that jumps at rest more sharply than the logs resolve: {parameter.name} = {value:.1g}{unit} or "
-            f"less {place}; let it jump, with sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"
+            f"less {instead}; let it jump, with sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"
         )
     if value in (parameter.min, parameter.max):
         way = "smaller" if value < parameter.value else "larger"
-        return f"{parameter.name} is much {way} {place}, as far as its bounds allow; correct it, or widen its bounds"
-    return f"{parameter.name} = {value:.4g}{unit} {place}; free it, or correct it"
+        return f"{parameter.name} is much {way} {instead}, as far as its bounds allow; correct it, or widen its bounds"
+    return f"{parameter.name} = {value:.4g}{unit} {instead}; free it, or correct it"
 
 
 def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
@@ -226,18 +233,18 @@ def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
 
 def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
     """Yield a delay of the inputs, and one for each output; negative where signals can be shifted."""
-    leads = [LEAD if len(e.stretches) == 1 and len(e.log) > 4 * LEAD else 0 for e in experiments]
-    known = [e.delay_s.value if isinstance(e.delay_s, Parameter) else e.delay_s for e in experiments]
+    leads = [LEAD if len(e.log_segments) == 1 and len(e.log) > 4 * LEAD else 0 for e in experiments]
+    delays = [e.delay_s.value if isinstance(e.delay_s, Parameter) else e.delay_s for e in experiments]
     if any(isinstance(e.delay_s, Parameter) and e.delay_s.free for e in experiments):
         return
     shifted = tuple(
         free_delay(_lead(e, lead), value + lead * e.log.period)
-        for e, lead, value in zip(experiments, leads, known, strict=True)
+        for e, lead, value in zip(experiments, leads, delays, strict=True)
     )
 
     def describe_common(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         words: list[str] = []
-        for e, lead, value in zip(experiments, leads, known, strict=True):
+        for e, lead, value in zip(experiments, leads, delays, strict=True):
             late = values[f"{e.name}.delay_s"] - lead * e.log.period - value
             if abs(late) > 0.05 * e.log.period:
                 words.append(_say_late(e.name if len(experiments) > 1 else "", late, value))
@@ -246,34 +253,51 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
     names = tuple(f"{e.name}.delay_s" for e in experiments)
     kept = tuple(_cut_ends(e, lead) for e, lead in zip(experiments, leads, strict=True))
     yield Candidate(
-        where=experiments[0].name, experiments=shifted, params=params, describe=describe_common, delays=names,
-        kept=kept, frees={name: lead * e.log.period for name, e, lead in zip(names, experiments, leads, strict=True)},
-    )  # fmt: skip
+        where=experiments[0].name,
+        experiments=shifted,
+        params=params,
+        describe=describe_common,
+        delays=names,
+        kept=kept,
+        frees={name: lead * e.log.period for name, e, lead in zip(names, experiments, leads, strict=True)},
+    )
     if all(len(e.outputs) == 1 for e in experiments):
         return
     apart = tuple(
         replace(
-            e, outputs=(o,), name=f"{e.name}-{o}", sigma=_only(e.sigma, o), gain=_only(e.gain, o),
+            e,
+            outputs=(o,),
+            name=f"{e.name}-{o}",
+            sigma=_only(e.sigma, o),
+            gain=_only(e.gain, o),
             saturation=_only(e.saturation, o),
             offset=_only(e.offset, o) if isinstance(e.offset, Mapping) else e.offset,
         )
         for e in shifted
         for o in e.outputs
-    )  # fmt: skip
+    )
 
     def describe_each(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         words: list[str] = []
-        for e, lead, value in zip(experiments, leads, known, strict=True):
+        for e, lead, value in zip(experiments, leads, delays, strict=True):
             late = {o: values[f"{e.name}-{o}.delay_s"] - lead * e.log.period - value for o in e.outputs}
             if np.ptp(list(late.values())) < 0.3 * e.log.period:
                 continue
-            words += [f"{o} is {_ahead(one)}" for o, one in late.items() if abs(one) > 0.3 * e.log.period]
+            words += [
+                f"{o} is {1e3 * abs(shift):.4g} ms {'late' if shift > 0.0 else 'early'}"
+                for o, shift in late.items()
+                if abs(shift) > 0.3 * e.log.period
+            ]
         return f"{join_words(words)}: correct the channels' stamps" if words else None
 
     yield Candidate(
-        where=experiments[0].name, experiments=apart, params=params, describe=describe_each,
-        delays=tuple(f"{e.name}.delay_s" for e in apart), kept=kept,
-    )  # fmt: skip
+        where=experiments[0].name,
+        experiments=apart,
+        params=params,
+        describe=describe_each,
+        delays=tuple(f"{e.name}.delay_s" for e in apart),
+        kept=kept,
+    )
 
 
 def _say_late(where: str, late: float, value: float) -> str:
@@ -281,10 +305,6 @@ def _say_late(where: str, late: float, value: float) -> str:
     if late > 0.0:
         return f"a delay{of} of {1e3 * (value + late):.4g} ms; give delay_s, or free it"
     return f"inputs{of} that are stamped {-1e3 * late:.4g} ms late; shift their channels"
-
-
-def _ahead(late: float) -> str:
-    return f"{1e3 * abs(late):.4g} ms {'late' if late > 0.0 else 'early'}"
 
 
 def _only(values: Mapping[str, V], name: str) -> dict[str, V]:
@@ -317,9 +337,9 @@ def _cut_ends(experiment: Experiment, samples: int) -> Experiment:
         return experiment
     signals = dict(experiment.log.signals)
     for name in experiment.outputs:
-        known = signals[name].values.copy()
-        known[:samples] = known[-samples:] = np.nan
-        signals[name] = replace(signals[name], values=known)
+        values = signals[name].values.copy()
+        values[:samples] = values[-samples:] = np.nan
+        signals[name] = replace(signals[name], values=values)
     return replace(experiment, log=replace(experiment.log, signals=signals))
 
 
@@ -327,27 +347,29 @@ def _swap_channels(experiments: tuple[Experiment, ...], params: ParameterSet, *,
     """Yield the outputs swapped in pairs; inputs with outputs too where hardly anything is explained."""
     first = experiments[0]
     inputs = [name for name in first.plant.inputs if name in first.log.signals] if poor else []
-    for one, other in combinations([*inputs, *first.outputs], 2):
-        if one in inputs and other in inputs:
+    for channel, other in combinations([*inputs, *first.outputs], 2):
+        if channel in inputs and other in inputs:
             continue
-        swapped = tuple(_swap(e, one, other) for e in experiments if {one, other} <= set(e.log.signals))
+        swapped = tuple(_swap(e, channel, other) for e in experiments if {channel, other} <= set(e.log.signals))
         if len(swapped) < len(experiments):
             continue
 
         def describe(
-            values: Mapping[str, float], stds: Mapping[str, float], one: str = one, other: str = other
+            values: Mapping[str, float], stds: Mapping[str, float], channel: str = channel, other: str = other
         ) -> str | None:
-            return f"the columns of {one} and {other} are swapped"
+            return f"the columns of {channel} and {other} are swapped"
 
-        yield Candidate(where=f"{one}, {other}", experiments=swapped, params=params, describe=describe, certain=True)
+        yield Candidate(
+            where=f"{channel}, {other}", experiments=swapped, params=params, describe=describe, certain=True
+        )
 
 
-def _swap(experiment: Experiment, one: str, other: str) -> Experiment:
+def _swap(experiment: Experiment, channel: str, other: str) -> Experiment:
     """Return the experiment with the values of two channels swapped."""
     signals = dict(experiment.log.signals)
-    signals[one] = replace(signals[one], values=experiment.log[other])
-    signals[other] = replace(signals[other], values=experiment.log[one])
-    sigma = {name: value for name, value in experiment.sigma.items() if name not in (one, other)}
+    signals[channel] = replace(signals[channel], values=experiment.log[other])
+    signals[other] = replace(signals[other], values=experiment.log[channel])
+    sigma = {name: value for name, value in experiment.sigma.items() if name not in (channel, other)}
     return replace(experiment, log=replace(experiment.log, signals=signals), sigma=sigma)
 
 
@@ -419,9 +441,9 @@ def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -
     groups = [tuple(read), *((name,) for name in read if len(read) > 1)] if read else []
     for group in groups:
         plant = wrapped(first.plant, ("load_cell",), outputs=group)
-        known = plant.complete(params)["load_cell_hz"]
+        default = plant.complete(params)["load_cell_hz"]
         # The faster a pole, the more integration steps it takes: its range ends soon after what is said of it.
-        pole = replace(known, value=0.3 * nyquist, free=True, max=2.0 * FASTEST_POLE * nyquist)
+        pole = replace(default, value=0.3 * nyquist, free=True, max=2.0 * FASTEST_POLE * nyquist)
 
         def describe(
             values: Mapping[str, float], stds: Mapping[str, float], group: tuple[str, ...] = group
@@ -471,11 +493,6 @@ def _say_gain(gain: float) -> str | None:
     return f"reads {gain:.3g} times what it should" if likely else None
 
 
-def _share_parameter(name: str, one: Plant, other: Plant) -> bool:
-    """Tell whether both plants have a parameter, in the same unit."""
-    return name in other.parameters and one.parameter_unit(name) == other.parameter_unit(name)
-
-
 def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, plant: Plant) -> Iterator[Candidate]:
     """Yield another plant in place of the experiments' own."""
     if any(e.plant.name == plant.name for e in experiments):
@@ -491,18 +508,26 @@ def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, pla
         return
     changed = tuple(
         replace(
-            e, plant=plant, initial_state=e.initial_state if isinstance(e.initial_state, str) else "estimate",
-            parameters={n: v for n, v in e.parameters.items() if _share_parameter(n, e.plant, plant)},
+            e,
+            plant=plant,
+            initial_state=e.initial_state if isinstance(e.initial_state, str) else "estimate",
+            parameters={
+                name: value
+                for name, value in e.parameters.items()
+                if name in plant.parameters and plant.parameter_unit(name) == e.plant.parameter_unit(name)
+            },
         )
         for e in experiments
-    )  # fmt: skip
-    own = [own for e in changed for own in e.list_own().values()]
+    )
+    local = [local for e in changed for local in e.list_own().values()]
     values = plant.complete(changed[0].apply_own(params.fix())).values()
 
     def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         return f"the log is of the plant {plant.name}, not {experiments[0].plant.name}"
 
     yield Candidate(
-        where=experiments[0].name, experiments=changed, params=ParameterSet([*values, *own]).free(*free),
+        where=experiments[0].name,
+        experiments=changed,
+        params=ParameterSet([*values, *local]).free(*free),
         describe=describe,
-    )  # fmt: skip
+    )

@@ -35,58 +35,32 @@ FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free de
 
 @record(eq=False)
 class Cause:
-    """Another explanation of the logs.
+    """Another explanation of the logs."""
 
-    Parameters
-    ----------
-    text, where : str
-        What it is, and of what.
-    gain : float
-        Logarithm of its likelihood over the fit's.
-    material : bool
-        Whether it takes half of a residual's power away, or moves an estimate beyond what the fit says.
-    solved : bool
-        Whether it leaves hardly anything of the residual of any output.
-    consequence : str
-        What it does to the residuals and the estimates.
-    preferred : mapping of name to (value, std)
-        What the refit gives the parameter or the delays that it frees.
-    unknowns : int
-        How many its refit had.
-
-    """
-
-    text: str
+    text: str  # text, where: what it is, and of what
     where: str
-    gain: float
-    solved: bool
-    material: bool
-    consequence: str
-    preferred: Mapping[str, tuple[float, float]]
-    unknowns: int
+    gain: float  # logarithm of its likelihood over the fit's
+    solved: bool  # whether it leaves hardly anything of the residual of any output
+    material: bool  # whether it takes half of a residual's power away, or moves an estimate beyond what the fit says
+    consequence: str  # what it does to the residuals and the estimates
+    preferred: Mapping[str, tuple[float, float]]  # what the refit gives the parameter or the delays that it frees
+    unknowns: int  # how many its refit had
 
 
 def find_causes(
-    fit: Fit, residuals: ResidualsByExperiment, suspects: Mapping[str, ScoreTest], alternatives: Sequence[Plant], *,
-    poor: bool, progress: Progress = ignore,
-) -> list[Cause]:  # fmt: skip
+    fit: Fit,
+    residuals: ResidualsByExperiment,
+    suspects: Mapping[str, ScoreTest],
+    alternatives: Sequence[Plant],
+    *,
+    poor: bool,
+    progress: Progress = ignore,
+) -> list[Cause]:
     """Return what explains the logs better than the fit, the best first.
 
-    Parameters
-    ----------
-    fit : Fit
-        With its minimum.
-    residuals : mapping
-        Of the fit.
-    suspects : mapping of name to ScoreTest
-        What was fixed and is at odds with the logs.
-    alternatives : sequence of Plant
-        Other plants that may have been on the bench.
-    poor : bool
-        Whether the fit explains so little that its estimates are no start: what searches does so from its own.
-    progress : callable, optional
-        Called before each that is tried.
-
+    `fit`: with its minimum; `residuals`: of the fit; `suspects`: what was fixed and is at odds with the logs;
+    `alternatives`: other plants that may have been on the bench; `poor`: whether the fit explains so little that
+    its estimates are no start: what searches does so from its own; `progress`: called before each that is tried.
     """
     minimum = fit.require_minimum("find_causes")
     whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
@@ -109,12 +83,14 @@ def find_causes(
     return sorted(causes, key=lambda c: (c.gain < best - ENOUGH, c.unknowns if c.gain >= best - ENOUGH else 0, -c.gain))
 
 
-def _measure_powers(here: Evaluation, problem: FitProblem) -> Float[np.ndarray, "outputs 2"]:
+def _measure_powers(evaluation: Evaluation, problem: FitProblem) -> Float[np.ndarray, "outputs 2"]:
     """Return, output by output, the residual's mean square over the measured one's, and how many samples count."""
     rows = [
         (squares / max(count, 1.0) / max(spread**2, 1e-300), count)
         for e in problem.experiments
-        for squares, count, spread in zip(here.power[e.name].squares, here.power[e.name].counts, e.spread, strict=True)
+        for squares, count, spread in zip(
+            evaluation.power[e.name].squares, evaluation.power[e.name].counts, e.spread, strict=True
+        )
     ]
     return np.maximum(np.array(rows, dtype=float), 1e-24)
 
@@ -130,25 +106,29 @@ def _measure_kept(fit: Fit, minimum: Minimum, kept: Sequence[Experiment]) -> Flo
 def _measure_colour(fit: Fit) -> float:
     """Return how many times more than for white residuals the estimates vary: at least once."""
     coloured, white = np.diag(fit.covariance.matrix), np.diag(fit.white_covariance.matrix)
-    known = np.isfinite(coloured) & np.isfinite(white) & (white > 0.0)
-    return float(max(1.0, np.max(coloured[known] / white[known], initial=1.0)))
+    finite = np.isfinite(coloured) & np.isfinite(white) & (white > 0.0)
+    return float(max(1.0, np.max(coloured[finite] / white[finite], initial=1.0)))
 
 
 def _refit(minimum: Minimum, candidate: Candidate) -> Solved | None:
     """Return the minimum with the change: from the fit's, or from where its method finds a start."""
     old = minimum.problem
     problem = pose_problem(
-        candidate.experiments, candidate.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout,
+        candidate.experiments,
+        candidate.params,
+        loss=old.loss,
+        band_hz=old.band_hz,
+        holdout=old.holdout,
         noise=old.predicts,
-    )  # fmt: skip
+    )
     names, z = problem.unknowns.names, problem.unknowns.start.copy()
     if old.predicts:
         solved = replace(minimum.method, max_iterations=ROUGH_ITERATIONS, search=False).solve(problem, None)
         return solved if np.isfinite(solved.solution.evaluation.cost) else None
-    known = dict(zip(old.unknowns.names, minimum.z.tolist(), strict=True))
+    fitted = dict(zip(old.unknowns.names, minimum.z.tolist(), strict=True))
     for i, name in enumerate(names):
         if i >= problem.unknowns.shared:  # parameters start from the candidate's own
-            z[i] = known.get(name, z[i])
+            z[i] = fitted.get(name, z[i])
     problem = problem.with_each(substeps=max(e.substeps for e in old.experiments))
     if candidate.gains:
         z = _compare_gains(problem, z, candidate.gains)
@@ -205,9 +185,10 @@ def _weigh(
     moved = [
         (abs(values[name] - old.value) / max(abs(old.value), 1e-300), name)
         for name, old in fit.parameters.items()
-        if name in fit.covariance.names and name in values
+        if name in fit.covariance.names
+        and name in values
         and abs(values[name] - old.value) > max(MOVED_STDS * (old.std or 0.0), MOVED_SHARE * abs(old.value))
-    ]  # fmt: skip
+    ]
     effects = [f"takes {100.0 * (1.0 - left):.3g} % of a residual's power away"] if left < 1.0 - 1e-3 else []
     if moved:
         name = max(moved)[1]

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from seaopt.estimation.problem.correlation import load_transforms
+from seaopt import welch
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.records import record
@@ -29,7 +29,6 @@ STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
 SHORTEST = 32  # samples of a stretch
 FEWEST, MOST = 6, 256  # stretches that are averaged
 TOGETHER = 16384  # samples of as many stretches as are transformed at once: they stay in the cache
-INDEPENDENT = 0.947  # averages per overlapping stretch (Welch 1967, Hann)
 OUTLIER = 4.0  # robust standard deviations beyond which a residual tells nothing of its spectrum
 OCTAVES = 24  # below the Nyquist frequency, at most
 SILENT = 1e-9  # of an input's largest line
@@ -38,28 +37,13 @@ ALIKE = 1e-10  # of the power of inputs that differ by less there is nothing lef
 
 @record(eq=False)
 class CoherentShare:
-    """What the inputs account for, of one output and of its residual.
+    """What the inputs account for, of one output and of its residual."""
 
-    Parameters
-    ----------
-    output : float
-        Share of the output's energy that they account for.
-    residual : float
-        The same of the residual.
-    p : float
-        Probability that a residual that follows no input has so coherent an octave (Bonferroni's bound).
-    band_hz : (low, high)
-        The octave whose residual is the least likely to be chance.
-    power : float
-        Power of the residual that the inputs account for, over the output's that they account for.
-
-    """
-
-    output: float
-    residual: float
-    p: float
-    band_hz: tuple[float, float]
-    power: float
+    output: float  # share of the output's energy that they account for
+    residual: float  # the same of the residual
+    p: float  # probability that a residual that follows no input has so coherent an octave (Bonferroni's bound)
+    band_hz: tuple[float, float]  # the octave whose residual is the least likely to be chance
+    power: float  # power of the residual that the inputs account for, over the output's that they account for
 
 
 def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals) -> dict[str, CoherentShare]:
@@ -74,16 +58,21 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
     # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
     longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
     lengths = sorted({2 * (prev_fast_len(samples // 2, real=True) or 0) for samples in longest})
-    spectra = [one for length in lengths if (one := _make_spectra(inputs, outputs, length, experiment)) is not None]
+    spectra = [
+        spectrum for length in lengths if (spectrum := _make_spectra(inputs, outputs, length, experiment)) is not None
+    ]
     for o, name in enumerate(experiment.data.outputs):
-        rows = [one.compare(o, len(lengths)) for one in spectra]
+        rows = [spectrum.compare(o, len(lengths)) for spectrum in spectra]
         if not rows or not experiment.spread[o] > 0.0:
             continue
         best = min(rows, key=lambda row: row.p)
         shares[name] = CoherentShare(
-            output=max(row.output for row in rows), residual=max(row.residual for row in rows), p=best.p,
-            band_hz=best.band_hz, power=max(row.power for row in rows),
-        )  # fmt: skip
+            output=max(row.output for row in rows),
+            residual=max(row.residual for row in rows),
+            p=best.p,
+            band_hz=best.band_hz,
+            power=max(row.power for row in rows),
+        )
     return shares
 
 
@@ -175,8 +164,8 @@ class _Spectra:
         variance = float(polygamma(1, k - m) - polygamma(1, k))
         octave = np.floor(np.log2(f[-1] / f)).astype(int)
         best, band, count = 1.0, (float(f[0]), float(f[-1])), 0
-        for one in np.unique(octave)[:OCTAVES]:
-            rows = octave == one
+        for number in np.unique(octave)[:OCTAVES]:
+            rows = octave == number
             count += 1
             # Neighbouring lines of a Hann window share two thirds of their amplitude: two lines tell as much as one.
             n = max(0.5 * np.count_nonzero(rows), 1.0)
@@ -188,19 +177,18 @@ class _Spectra:
 
 
 def _make_spectra(
-    inputs: Sequence[Float[np.ndarray, "_ m"]], outputs: Sequence[Float[np.ndarray, "_ s"]], length: int,
+    inputs: Sequence[Float[np.ndarray, "_ m"]],
+    outputs: Sequence[Float[np.ndarray, "_ s"]],
+    length: int,
     experiment: FitExperiment,
-) -> _Spectra | None:  # fmt: skip
+) -> _Spectra | None:
     """Return the spectra over stretches of one length; None where there are too few of them.
 
     Stretches are summed as they come, short ones several at a time: the memory is small, however long the logs are.
     """
-    starts = [
-        (i, row) for i, rows in enumerate(inputs) for row in range(0, len(rows) - length + 1, max(length // 2, 1))
-    ]
-    if len(starts) > MOST:
-        starts = [starts[i] for i in np.linspace(0, len(starts) - 1, MOST).astype(int)]
-    averages, m = INDEPENDENT * len(starts), inputs[0].shape[1]
+    every = [(i, row) for i, rows in enumerate(inputs) for row in welch.list_starts([slice(0, len(rows))], length)]
+    starts = welch.thin(every, MOST)
+    averages, m = welch.INDEPENDENT * len(starts), inputs[0].shape[1]
     if len(starts) < FEWEST or averages < 2.0 * m + 1.0:
         return None
     frequency = np.fft.rfftfreq(length, experiment.period)
@@ -209,30 +197,23 @@ def _make_spectra(
     lines = frequency[kept].size
     if lines < 3:
         return None
-    window = np.hanning(length + 1)[:length]
+    window = welch.hann(length)
     s = outputs[0].shape[1]
     of_inputs, across = np.zeros((m, m, lines), dtype=complex), np.zeros((m, s, lines), dtype=complex)
     power = np.zeros((s, lines))
     together = max(TOGETHER // length, 1)
     for first in range(0, len(starts), together):
         cuts = starts[first : first + together]
-        u, y = (_transform([rows[i][a : a + length] for i, a in cuts], window)[..., kept] for rows in (inputs, outputs))
+        u, y = (
+            welch.transform(np.stack([rows[i][a : a + length].T for i, a in cuts]), window)[..., kept]
+            for rows in (inputs, outputs)
+        )
         conjugate = np.conj(u)[:, :, None]
         of_inputs += np.sum(conjugate * u[:, None], axis=0)
         across += np.sum(conjugate * y[:, None], axis=0)
-        power += np.sum(np.real(y) ** 2 + np.imag(y) ** 2, axis=0)
+        power += np.sum(welch.square(y), axis=0)
     coherent = _project(np.moveaxis(of_inputs, 2, 0), np.moveaxis(across, 2, 0))
     return _Spectra(frequency_hz=frequency[kept], power=power.T, coherent=coherent, averages=averages, inputs=m)
-
-
-def _transform(
-    cuts: Sequence[Float[np.ndarray, "n s"]], window: Float[np.ndarray, " n"]
-) -> Complex[np.ndarray, "c s f"]:  # fmt: skip
-    """Return the spectra of stretches without their means."""
-    signals = np.stack([cut.T for cut in cuts])
-    signals -= np.mean(signals, axis=-1, keepdims=True)
-    signals *= window
-    return np.asarray(load_transforms()[2](signals))
 
 
 def _project(of_inputs: Complex[np.ndarray, "f m m"], across: Complex[np.ndarray, "f m s"]) -> Float[np.ndarray, "f s"]:

@@ -22,7 +22,6 @@ from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
-from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.findings import FitFinding, OutputFit, order_findings
@@ -58,15 +57,8 @@ FAR = 3.0  # times beyond a plausible range
 def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ignore) -> Fit:
     """Return the fit with what its outputs explain, and what is wrong with it.
 
-    Parameters
-    ----------
-    fit : Fit
-        With its minimum.
-    alternatives : sequence of Plant
-        Other plants that may have been on the bench, tried where this one does not explain the logs.
-    progress : callable, optional
-        As in `seaopt.fit`.
-
+    `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
+    not explain the logs.
     """
     minimum = fit.require_minimum("judge")
     testing, trying = divide(progress, TESTS, CAUSES)
@@ -90,7 +82,7 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ign
     suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
     wrong = (
         bool(suspects)
-        or any(one > FAR_ABOVE for row in excess.values() for one in row.values())  # noise of a colour is so, too
+        or any(ratio > FAR_ABOVE for row in excess.values() for ratio in row.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
         or fit.status != "converged"
     )
@@ -116,7 +108,7 @@ def _measure_excess(problem: FitProblem, residuals: ResidualsByExperiment) -> di
 def _conclude(fit: Fit, findings: Sequence[FitFinding]) -> Fit:
     """Return the fit with its findings, errors first; one that explains too little did not converge."""
     ordered = order_findings(findings)
-    unexplained = [one for one in ordered if one.kind == "explained" and one.severity == "error"]
+    unexplained = [finding for finding in ordered if finding.kind == "explained" and finding.severity == "error"]
     if fit.status == "converged" and unexplained:
         message = f"{unexplained[0].where}: {unexplained[0].text} ({fit.message})"
         return replace(fit, status="stalled", message=message, findings=ordered)
@@ -128,18 +120,18 @@ def _state_shares(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]]) -
     stated: dict[str, dict[str, OutputFit]] = {}
     for name, row in fit.outputs.items():
         stated[name] = {}
-        for output, one in row.items():
-            explained = _explained(one)
+        for output, fitted in row.items():
+            explained = _explained(fitted)
             share = shares[name].get(output)
             explainable = None if share is None or explained is None else _explainable(share, explained)
-            stated[name][output] = replace(one, explained=explained, explainable=explainable)
+            stated[name][output] = replace(fitted, explained=explained, explainable=explainable)
     return stated
 
 
 def _explainable(share: CoherentShare, explained: float) -> float:
     """Return the share that the inputs account for, what they account for of the residual included."""
-    rest = share.residual if share.p < CHANCE else 0.0
-    return max(share.output, explained + (1.0 - explained) * max(rest, 0.0))
+    follows = share.residual if share.p < CHANCE else 0.0
+    return max(share.output, explained + (1.0 - explained) * max(follows, 0.0))
 
 
 def _score_held_out_shots(fit: Fit, outputs: dict[str, dict[str, OutputFit]]) -> dict[str, dict[str, OutputFit]]:
@@ -156,10 +148,10 @@ def _score_held_out_shots(fit: Fit, outputs: dict[str, dict[str, OutputFit]]) ->
     return outputs
 
 
-def _explained(one: OutputFit) -> float | None:
+def _explained(output: OutputFit) -> float | None:
     """Return the share of an output's energy that its free run explains; None where that runs away, as a plant may."""
-    percents = (one.band_fit_percent, one.fit_percent)
-    if one.fit_percent < RUNS_AWAY:
+    percents = (output.band_fit_percent, output.fit_percent)
+    if output.fit_percent < RUNS_AWAY:
         return None
     percent = next((value for value in percents if value is not None and math.isfinite(value)), 0.0)
     return max(1.0 - (1.0 - percent / 100.0) ** 2, 0.0)
@@ -174,24 +166,24 @@ def _find_unexplained(
     what neighbouring samples differ by; the rest may be what a nonlinearity leaves.
     """
     for name, row in fit.outputs.items():
-        for output, one in row.items():
+        for output, fitted in row.items():
             where = f"{name}.{output}"
             share = shares[name].get(output)
             percents = [
-                one.fit_percent,
-                *(p for p in (one.band_fit_percent, one.one_step_fit_percent) if p is not None),
+                fitted.fit_percent,
+                *(p for p in (fitted.band_fit_percent, fitted.one_step_fit_percent) if p is not None),
             ]
-            if one.explained is not None and max(percents) < WORSE:
+            if fitted.explained is not None and max(percents) < WORSE:
                 text = "the model explains it worse than a constant: look for jumps, such as a counter that wraps"
                 yield FitFinding(severity="error", kind="explained", where=where, text=text)
                 continue
-            if one.explained is None or one.explainable is None or share is None:
+            if fitted.explained is None or fitted.explainable is None or share is None:
                 continue
-            ratio = one.explained / max(one.explainable, 1e-300)
-            if ratio < MOST and one.explainable > LITTLE:
+            ratio = fitted.explained / max(fitted.explainable, 1e-300)
+            if ratio < MOST and fitted.explainable > LITTLE:
                 text = (
-                    f"the model explains {100 * one.explained:.3g} % of its energy, and the inputs account for "
-                    f"{100 * one.explainable:.3g} %"
+                    f"the model explains {100 * fitted.explained:.3g} % of its energy, and the inputs account for "
+                    f"{100 * fitted.explainable:.3g} %"
                 )
                 yield FitFinding(
                     severity="error" if ratio < HALF else "warning", kind="explained", where=where, text=text
@@ -212,21 +204,22 @@ def _find_unexplained(
 def _find_held_out(outputs: Mapping[str, Mapping[str, OutputFit]]) -> Iterator[FitFinding]:
     """Yield outputs that are explained far less where they were held out."""
     for name, row in outputs.items():
-        for output, one in row.items():
-            if one.holdout_fit_percent is None or not math.isfinite(one.holdout_fit_percent):
+        for output, fitted in row.items():
+            if fitted.holdout_fit_percent is None or not math.isfinite(fitted.holdout_fit_percent):
                 continue
-            held_out = max(1.0 - (1.0 - one.holdout_fit_percent / 100.0) ** 2, 0.0)
-            used = max(1.0 - (1.0 - one.fit_percent / 100.0) ** 2, 0.0)
+            held_out = max(1.0 - (1.0 - fitted.holdout_fit_percent / 100.0) ** 2, 0.0)
+            used = max(1.0 - (1.0 - fitted.fit_percent / 100.0) ** 2, 0.0)
             worse = (1.0 - held_out) / max(1.0 - used, 1e-300)
             if worse < WORSE_HELD_OUT**2 or held_out > 0.99 * used:
                 continue
             yield FitFinding(
-                severity="error" if held_out < HELD_OUT * used else "warning", kind="held_out",
+                severity="error" if held_out < HELD_OUT * used else "warning",
+                kind="held_out",
                 where=f"{name}.{output}",
                 text=f"{100 * used:.4g} % is explained of the samples used and {100 * held_out:.4g} % of those held "
                 "out: the plant changed, is excited elsewhere, or the fit follows what does not repeat; log longer, or "
                 "fix parameters",
-            )  # fmt: skip
+            )
 
 
 def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
@@ -235,14 +228,14 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
     touching = unknowns.find_at_bound(z)
     if not touching:
         return
-    here = minimum.problem.evaluate(z)
+    evaluation = minimum.problem.evaluate(z)
     for name in touching:
         i = unknowns.names.index(name)
-        curvature = float(here.hessian[i, i])
+        curvature = float(evaluation.hessian[i, i])
         inward = 1.0 if z[i] - unknowns.low[i] <= unknowns.high[i] - z[i] else -1.0
-        push = inward * float(here.gradient[i]) / math.sqrt(max(curvature, 1e-300))
-        own = fit.parameters.get(name)
-        away = own is not None and not own.at_bound
+        push = inward * float(evaluation.gradient[i]) / math.sqrt(max(curvature, 1e-300))
+        parameter = fit.parameters.get(name)
+        away = parameter is not None and not parameter.at_bound
         bad = push > PUSH or away
         if away:
             remedy = "which is as far as a fit searches: the logs do not hold it; fix it, or give it a bound or a prior"
@@ -251,28 +244,32 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
         else:
             remedy = "widen the bound, or fix it there and say why"
         yield FitFinding(
-            severity="error" if bad else "note", kind="bound", where=name,
+            severity="error" if bad else "note",
+            kind="bound",
+            where=name,
             text=f"{z[i]:.4g} lies on its bound{',' if away else ';'} {remedy}",
-        )  # fmt: skip
+        )
 
 
 def _find_implausible(fit: Fit) -> Iterator[FitFinding]:
     """Yield free parameters of built-in plants that lie outside what such actuators have."""
     plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
     for name in fit.covariance.names:
-        known = next((plant.parameters[name] for plant in plants if name in plant.parameters), None)
-        if not isinstance(known, Parameter) or known.plausible is None:
+        declared = next((plant.parameters[name] for plant in plants if name in plant.parameters), None)
+        if not isinstance(declared, Parameter) or declared.plausible is None:
             continue
-        (low, high), parameter = known.plausible, fit.parameters[name]
+        (low, high), parameter = declared.plausible, fit.parameters[name]
         value = parameter.value
         if low <= value <= high or not parameter.identified:
             continue
         far = value > FAR * high or value * FAR < low
         yield FitFinding(
-            severity="error" if far else "warning", kind="range", where=name,
+            severity="error" if far else "warning",
+            kind="range",
+            where=name,
             text=f"{name} = {value:.4g}{unit_after(parameter.unit)}; actuators of this kind have {low:g} to {high:g}: "
             "check the units of inputs and outputs, such as mA read as A, and the fixed parameters",
-        )  # fmt: skip
+        )
 
 
 def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:
@@ -288,29 +285,36 @@ def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:
         best = min(fitted, key=lambda name: fitted[name].std["delay_s"])
         value, std = fitted[best].delay_s, fitted[best].std["delay_s"]
         for experiment in fit.experiments:
-            own = fitted.get(experiment.name)
-            if own is None or own is fitted[best]:
+            estimated = fitted.get(experiment.name)
+            if estimated is None or estimated is fitted[best]:
                 continue
-            apart, own_std = abs(own.delay_s - value), own.std["delay_s"]
+            apart, own_std = abs(estimated.delay_s - value), estimated.std["delay_s"]
             if apart > max(APART_STDS * math.hypot(own_std, std), APART * experiment.log.period):
                 yield FitFinding(
-                    severity="warning", kind="delay", where=f"{experiment.name}.delay_s",
-                    text=f"a delay of {1e3 * own.delay_s:.4g} ± {1e3 * own_std:.2g} ms contradicts that of {best}, "
-                    f"{1e3 * value:.4g} ± {1e3 * std:.2g} ms: a delay makes up for what the model lacks in one of "
-                    "them, or they were recorded apart; look at both, or give delay_s",
-                )  # fmt: skip
+                    severity="warning",
+                    kind="delay",
+                    where=f"{experiment.name}.delay_s",
+                    text=f"a delay of {1e3 * estimated.delay_s:.4g} ± {1e3 * own_std:.2g} ms contradicts that of "
+                    f"{best}, {1e3 * value:.4g} ± {1e3 * std:.2g} ms: a delay makes up for what the model lacks in one "
+                    "of them, or they were recorded apart; look at both, or give delay_s",
+                )
 
 
 def _find_few_samples(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
     """Yield that there are too few samples for the unknowns, so that neither values nor intervals can be trusted."""
-    power = minimum.problem.map(lambda experiment: _count(experiment))
-    samples, unknowns = sum(power), minimum.z.size
-    longest = max(power, default=0)
+    counts = [
+        int(max(np.sum([segment.count_weighted() for segment in experiment.segments], axis=0)))
+        for experiment in minimum.problem.experiments
+    ]
+    samples, unknowns = sum(counts), minimum.z.size
+    longest = max(counts, default=0)
     if longest < FEWEST_SAMPLES or samples < SAMPLES_PER_UNKNOWN * unknowns:
         yield FitFinding(
-            severity="error", kind="samples", where="",
+            severity="error",
+            kind="samples",
+            where="",
             text=f"{samples} samples are too few for {unknowns} unknowns: nothing tests the model; log longer",
-        )  # fmt: skip
+        )
 
 
 def _find_noiseless(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
@@ -318,18 +322,16 @@ def _find_noiseless(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
     for output in minimum.problem.outputs:
         experiment, name = output.experiment, output.name
         spread = float(experiment.spread[experiment.data.outputs.index(name)])
-        one = fit.outputs[experiment.name][name]
-        if name not in experiment.data.sigma and 0.0 <= one.rms_residual < NOISELESS * spread:
+        fitted = fit.outputs[experiment.name][name]
+        if name not in experiment.data.sigma and 0.0 <= fitted.rms_residual < NOISELESS * spread:
             yield FitFinding(
-                severity="note", kind="noise", where=f"{experiment.name}.{name}",
-                text=f"its residual of {one.rms_residual:.2g}{unit_after(one.unit)} is rounding, less than the noise "
-                "of any sensor, as of simulated data: the stds say nothing; give the noise that it "
+                severity="note",
+                kind="noise",
+                where=f"{experiment.name}.{name}",
+                text=f"its residual of {fitted.rms_residual:.2g}{unit_after(fitted.unit)} is rounding, less than the "
+                "noise of any sensor, as of simulated data: the stds say nothing; give the noise that it "
                 "would have: sigma = ...",
-            )  # fmt: skip
-
-
-def _count(experiment: FitExperiment) -> int:
-    return int(max(np.sum([segment.count_weighted() for segment in experiment.segments], axis=0)))
+            )
 
 
 def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
@@ -338,13 +340,13 @@ def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
     if fit.status == "not_identifiable":
         return {}
     plain, bending = find_candidates(problem, fit)
-    known = {
+    delays = {
         e.name: free_delay(e.data, e.slots.delay.value)
         for e in problem.experiments
         if e.slots.delay.index is None and not depends_on_time(e.model)
     }
-    tests = run_score_tests(minimum, fit, plain, known)
-    white = all(one.whiteness_p > CHANCE for row in fit.outputs.values() for one in row.values())
+    tests = run_score_tests(minimum, fit, plain, delays)
+    white = all(output.whiteness_p > CHANCE for row in fit.outputs.values() for output in row.values())
     for name in () if white else bending:
         tests |= run_score_tests(minimum, fit, (name,))
     return tests
@@ -355,10 +357,12 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
     if not causes:
         for name in [name for name, test in suspects.items() if test.p < CHANCE][:1]:
             yield FitFinding(
-                severity="warning", kind="fixed", where=name,
+                severity="warning",
+                kind="fixed",
+                where=name,
                 text=f"{name} = {suspects[name].value:.4g} is fixed, and the logs are against it (chi-square "
                 f"{suspects[name].chi2:.3g} on one degree of freedom), but no other value alone explains them",
-            )  # fmt: skip
+            )
         return
     best = causes[0]
     rivals = [cause for cause in causes if cause.gain > RIVAL_SHARE * best.gain][:3]
@@ -368,7 +372,9 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
         each = "; or ".join(f"{cause.text}{cause.consequence}" for cause in rivals)
         text = f"{len(rivals)} likely causes explain as much, and the logs do not tell which: {each}"
     yield FitFinding(
-        severity="error" if any(cause.material for cause in rivals) else "warning", kind="cause",
-        where=", ".join(dict.fromkeys(cause.where for cause in rivals)), text=text,
+        severity="error" if any(cause.material for cause in rivals) else "warning",
+        kind="cause",
+        where=", ".join(dict.fromkeys(cause.where for cause in rivals)),
+        text=text,
         preferred={name: value for cause in rivals for name, value in cause.preferred.items()},
-    )  # fmt: skip
+    )

@@ -37,29 +37,15 @@ REDUNDANT = 1e-7  # of what a parameter does to the outputs: less of it left, an
 
 @record
 class ScoreTest:
-    """The score test of one parameter that was fixed.
+    """The score test of one parameter that was fixed."""
 
-    Parameters
-    ----------
-    value, unit : float and str
-        At which it was fixed.
-    chi2 : float
-        With one degree of freedom where the value is right, allowing for coloured residuals.
-    p : float
-        Probability that chance exceeds it in some parameter of those tested (Bonferroni's bound).
-    preferred : float
-        Where one Gauss-Newton step with it free would put it: near the value of a refit, where that is near.
-    fall : float
-        By how much that step would lower the cost.
-
-    """
-
-    value: float
+    value: float  # value, unit: at which it was fixed
     unit: str
-    chi2: float
-    p: float
+    chi2: float  # with one degree of freedom where the value is right, allowing for coloured residuals
+    p: float  # probability that chance exceeds it in some parameter of those tested (Bonferroni's bound)
+    # where one Gauss-Newton step with it free would put it: near the value of a refit, where that is near
     preferred: float
-    fall: float
+    fall: float  # by how much that step would lower the cost
 
 
 def run_score_tests(
@@ -70,31 +56,26 @@ def run_score_tests(
     A parameter that would make a linear plant nonlinear, such as friction fixed at zero, is not tested unless it is
     named: the other plant is stepped and not discretised.
 
-    Parameters
-    ----------
-    minimum, fit : Minimum and Fit
-        Where, and of what.
-    names : tuple of str, optional
-        The parameters to test; those that leave linear plants linear, if left out.
-    data : mapping of name to Experiment, optional
-        Experiments with a free delay, which is then tested too, under the name EXPERIMENT.delay_s.
-
+    `minimum`, `fit`: where, and of what; `names`: the parameters to test; those that leave linear plants linear, if
+    left out; `data`: experiments with a free delay, which is then tested too, under the name EXPERIMENT.delay_s.
     """
     names, data = find_candidates(minimum.problem, fit)[0] if names is None else names, data or {}
     if not names and not data:
         return {}
     trial, z = minimum.problem.rebuild(free_more(fit, names), minimum.z, data)
-    here = trial.evaluate(z)
-    if not np.isfinite(here.cost):
+    evaluation = trial.evaluate(z)
+    if not np.isfinite(evaluation.cost):
         return {}
     units = {name: fit.parameters[name].unit for name in names} | {f"{name}.delay_s": "s" for name in data}
     places = np.array([trial.unknowns.names.index(name) for name in units])
-    score, information, variance = _compute_scores(trial, here, places)
-    chosen = np.flatnonzero((information > REDUNDANT * np.diag(here.hessian)[places]) & (variance > 0.0))
+    score, information, variance = _compute_scores(trial, evaluation, places)
+    chosen = np.flatnonzero((information > REDUNDANT * np.diag(evaluation.hessian)[places]) & (variance > 0.0))
     order = sorted(chosen, key=lambda i: score[i] ** 2 / information[i], reverse=True)
     rows = list(units.items())
     return {
-        rows[i][0]: _test(float(here.z[places[i]]), rows[i][1], score[i], information[i], variance[i], chosen.size)
+        rows[i][0]: _test(
+            float(evaluation.z[places[i]]), rows[i][1], score[i], information[i], variance[i], chosen.size
+        )
         for i in order
     }
 
@@ -104,10 +85,13 @@ def _test(value: float, unit: str, score: float, information: float, variance: f
 
     chi2 = float(score**2 / variance)
     return ScoreTest(
-        value=value, unit=unit, chi2=chi2,
-        p=min(count * float(erfc(np.sqrt(0.5 * chi2))), 1.0), preferred=float(value - score / information),
+        value=value,
+        unit=unit,
+        chi2=chi2,
+        p=min(count * float(erfc(np.sqrt(0.5 * chi2))), 1.0),
+        preferred=float(value - score / information),
         fall=0.5 * float(score**2 / information),
-    )  # fmt: skip
+    )
 
 
 def find_candidates(problem: FitProblem, fit: Fit) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -136,20 +120,20 @@ def free_more(fit: Fit, names: tuple[str, ...]) -> ParameterSet:
 
 
 def _compute_scores(
-    trial: FitProblem, here: Evaluation, places: Int[np.ndarray, " c"]
+    trial: FitProblem, evaluation: Evaluation, places: Int[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return scores, their information, and their variances with the residuals as coloured as they are."""
-    unknowns, z = trial.unknowns, here.z
-    apart = find_blocked(here, unknowns.low, unknowns.high)  # a bound takes the place of a zero gradient
+    unknowns, z = trial.unknowns, evaluation.z
+    apart = find_blocked(evaluation, unknowns.low, unknowns.high)  # a bound takes the place of a zero gradient
     apart[places] = True
-    rest = np.flatnonzero(~apart)
-    hessian = here.hessian
+    kept = np.flatnonzero(~apart)
+    hessian = evaluation.hessian
     if not trial.loss.quadratic:
         hessian = compute_bread(trial, z) + np.diag(unknowns.precision)
-    across = solve_seen(hessian[rest][:, rest], hessian[rest][:, places], 1e-12)
-    score = here.gradient[places] - across.T @ here.gradient[rest]
-    information = np.diag(hessian)[places] - np.sum(hessian[rest][:, places] * across, axis=0)
+    across = solve_seen(hessian[kept][:, kept], hessian[kept][:, places], 1e-12)
+    score = evaluation.gradient[places] - across.T @ evaluation.gradient[kept]
+    information = np.diag(hessian)[places] - np.sum(hessian[kept][:, places] * across, axis=0)
     along = np.zeros((z.size, places.size))
-    along[rest], along[places, np.arange(places.size)] = -across, 1.0
+    along[kept], along[places, np.arange(places.size)] = -across, 1.0
     meat = compute_meat(trial, z, along, compute_statistics(trial, z))
     return score, information, np.diag(meat + (along.T * unknowns.precision) @ along)

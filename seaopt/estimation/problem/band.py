@@ -21,11 +21,7 @@ def design_filter(band_hz: tuple[float, float] | None, period: float) -> tuple[F
 
     An edge at 0 or at the Nyquist frequency needs no filter.
 
-    Raises
-    ------
-    EstimationError
-        The band is empty.
-
+    Raises EstimationError: the band is empty.
     """
     none = np.zeros((0, 5)), 0
     if band_hz is None:

@@ -26,25 +26,12 @@ QUANTILE = 2.5758293  # of the standard normal, 99 % two-sided
 
 @record(eq=False)
 class CrossCorrelation:
-    """The correlation of a residual with an input.
+    """The correlation of a residual with an input."""
 
-    Parameters
-    ----------
-    lags : array of int, shape (n,)
-        The residual is compared with the input so many samples before.
-    values : array, shape (n,)
-        Correlation, -1 to 1.
-    bound : float
-        What chance exceeds at one lag with a probability of 1 %.
-    p : float
-        Probability that chance exceeds the largest value at some lag (Bonferroni's bound).
-
-    """
-
-    lags: Float[np.ndarray, " n"]
-    values: Float[np.ndarray, " n"]
-    bound: float
-    p: float
+    lags: Float[np.ndarray, " n"]  # the residual is compared with the input so many samples before
+    values: Float[np.ndarray, " n"]  # correlation, -1 to 1
+    bound: float  # what chance exceeds at one lag with a probability of 1 %
+    p: float  # probability that chance exceeds the largest value at some lag (Bonferroni's bound)
 
     @property
     def worst_lag(self) -> int:
@@ -75,7 +62,7 @@ def choose_transform_size(samples: int, lags: int) -> int:
 
 
 class LaggedSums:
-    """Sums over t of x_a(t) x_b(t - k), k = 0..lags, of stretches of at most `longest` samples, added one by one."""
+    """Sums over t of x_a(t) x_b(t - k), k = 0..lags, of parts of at most `longest` samples, added one by one."""
 
     def __init__(self, rows: int, longest: int, lags: int) -> None:
         self.lags, self.size = lags, choose_transform_size(longest, lags)
@@ -84,7 +71,7 @@ class LaggedSums:
         self.cross = {(a, b): np.zeros(lines, dtype=complex) for a in range(rows) for b in range(a)}
 
     def add(self, x: Float[np.ndarray, "rows n"]) -> None:
-        """Add a stretch."""
+        """Add a part."""
         spectrum = np.asarray(load_transforms()[2](x, self.size))
         self.own += np.square(spectrum.view(float))
         for (a, b), total in self.cross.items():
@@ -152,9 +139,11 @@ def cross_correlation(
     deviation = float(np.sqrt(max(variance, 1e-12 * own_e[0] * own_u[0] / count)))
     worst = float(np.max(np.abs(cross))) / deviation
     return CrossCorrelation(
-        lags=span.astype(float), values=cross / size, bound=QUANTILE * deviation / size,
+        lags=span.astype(float),
+        values=cross / size,
+        bound=QUANTILE * deviation / size,
         p=min(span.size * float(erfc(worst / np.sqrt(2.0))), 1.0),
-    )  # fmt: skip
+    )
 
 
 def _products(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " m"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import field, replace
 from itertools import combinations, pairwise
 from typing import Literal
@@ -29,6 +29,13 @@ MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
 Mask = Literal["auto", "declared", "none"]
+# What a setting may be, and how to say so.
+CHOICES = {
+    "hold": (("zero", "first"), '"zero" or "first"'),
+    "gaps": (("split", "error"), '"split" or "error"'),
+    "mask": (("auto", "declared", "none"), '"auto", "declared" or "none"'),
+    "initial_state": (("estimate", "rest"), '"estimate", "rest" or a state-by-state mapping'),
+}
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
 
@@ -77,11 +84,11 @@ class Experiment:
         Parameter is estimated from this log alone, and stands among the fit's parameters as EXPERIMENT.NAME.
     differences : mapping of output to Difference
         Measured speeds that are differences of a position over samples of this log: outputs that the plant then has
-        besides its own. What the device held before a stretch's first sample is part of the initial state.
+        besides its own. What the device held before a segment's first sample is part of the initial state.
 
     Attributes
     ----------
-    stretches : tuple of slice
+    log_segments : tuple of slice
         The log's samples between gaps.
 
     Raises
@@ -110,13 +117,15 @@ class Experiment:
     shots: int = 1
     parameters: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
     differences: Mapping[str, Difference] = field(default_factory=dict[str, Difference])
-    stretches: tuple[slice, ...] = field(init=False)
+    log_segments: tuple[slice, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         for value, kind, what, remedy in (
-            (self.plant, Plant, "plant", "give a Plant"), (self.log, Log, "log", "give a Log"),
-            (self.name, str, "name", "give a text"), (self.outputs, (tuple, list), "outputs", "give names in a tuple"),
-        ):  # fmt: skip
+            (self.plant, Plant, "plant", "give a Plant"),
+            (self.log, Log, "log", "give a Log"),
+            (self.name, str, "name", "give a text"),
+            (self.outputs, (tuple, list), "outputs", "give names in a tuple"),
+        ):
             require_type(value, kind, what, remedy, EstimationError)
         if not EXPERIMENT_NAME.fullmatch(self.name):
             raise EstimationError(
@@ -145,7 +154,7 @@ class Experiment:
                 )
         self._check_units()
         self._check_parameters()
-        object.__setattr__(self, "stretches", tuple(self.log.segments))
+        object.__setattr__(self, "log_segments", tuple(self.log.segments))
         self._check_settings()
         self._mask()
         self._check_sizes()
@@ -159,12 +168,12 @@ class Experiment:
         """Return parameters with this log's own in their places; of those that a fit has estimated, their estimates."""
         if not self.parameters:
             return params
-        own: list[Parameter] = []
+        local: list[Parameter] = []
         for name, given in self.parameters.items():
             value = params.get(f"{self.name}.{name}", given)
             value = value.value if isinstance(value, Parameter) else float(value)
-            own.append(Parameter(name=name, value=value, unit=self.plant.parameter_unit(name)))
-        return params.with_parameters(*own)
+            local.append(Parameter(name=name, value=value, unit=self.plant.parameter_unit(name)))
+        return params.with_parameters(*local)
 
     def _add_differences(self) -> None:
         """Give the plant the outputs that are differences; one of theirs that it has already is there to stay."""
@@ -183,19 +192,15 @@ class Experiment:
                 plant = add_difference(plant, name, difference, self.log.period)
             position = find_state(plant, difference.of)
             if isinstance(initial, Mapping) and position in initial:  # known to be there, and taken to rest there
-                held = {f"{name}_held_{i}": initial[position] for i in range(1, difference.samples + 1)}
-                initial = {**held, **initial}
+                history = {f"{name}_held_{i}": initial[position] for i in range(1, difference.samples + 1)}
+                initial = {**history, **initial}
         object.__setattr__(self, "plant", plant)
         object.__setattr__(self, "initial_state", initial)
 
     def _check_parameters(self) -> None:
         require_type(self.parameters, Mapping, f"experiment {self.name}: parameters", "give a mapping", EstimationError)
+        self._check_names("parameters", self.parameters, self.plant.parameters, f"one of {self.plant.name}")
         for name, value in self.parameters.items():
-            if name not in self.plant.parameters:
-                raise EstimationError(
-                    f'experiment {self.name}: parameters names "{name}", which is not one of {self.plant.name}; '
-                    f"{suggestion(name, self.plant.parameters)}"
-                )
             unit = self.plant.parameter_unit(name)
             if not isinstance(value, Parameter):
                 number = require_number(value, f"experiment {self.name}: parameters: {name}", EstimationError)
@@ -207,12 +212,15 @@ class Experiment:
                     f"{unit or 'no unit'}; convert it"
                 )
 
+    def _check_names(self, what: str, names: Collection[str], known: Collection[str], kind: str) -> None:
+        for name in names:
+            if name not in known:
+                raise EstimationError(
+                    f'experiment {self.name}: {what} names "{name}", which is not {kind}; {suggestion(name, known)}'
+                )
+
     def _mask(self) -> None:
         """Make saturated samples missing in the experiment's own log."""
-        if self.mask not in ("auto", "declared", "none"):
-            raise EstimationError(
-                f'experiment {self.name}: mask = "{self.mask}" is not known; use "auto", "declared" or "none"'
-            )
         for name, ends in self.saturation.items():
             for end in ends if isinstance(ends, tuple | list) else ():
                 require_number(end, f"experiment {self.name}: saturation of {name}", EstimationError)
@@ -260,22 +268,18 @@ class Experiment:
                 if not isinstance(value, Parameter):
                     require_number(value, f"experiment {self.name}: {what} of {name}", EstimationError)
         require_type(self.offset, (bool, Mapping), f"experiment {self.name}: offset", "give a mapping", EstimationError)
-        require_type(self.initial_state, (str, Mapping), f"experiment {self.name}: initial_state",
-                     "give a mapping of state to value", EstimationError)  # fmt: skip
+        require_type(
+            self.initial_state,
+            (str, Mapping),
+            f"experiment {self.name}: initial_state",
+            "give a mapping of state to value",
+            EstimationError,
+        )
         require_type(self.drift, int, f"experiment {self.name}: drift", "give an order", EstimationError)
-        known = {
-            "sigma": self.sigma,
-            "gain": self.gain,
-            "offset": self.offset if self.offset is not True else {},
-            "saturation": self.saturation,
-        }
-        for what, values in known.items():
-            for name in values if isinstance(values, Mapping) else ():
-                if name not in self.outputs:
-                    raise EstimationError(
-                        f'experiment {self.name}: {what} names "{name}", which is not a measured output; '
-                        f"{suggestion(name, self.outputs)}"
-                    )
+        offset = self.offset if isinstance(self.offset, Mapping) else {}
+        named = {"sigma": self.sigma, "gain": self.gain, "offset": offset, "saturation": self.saturation}
+        for what, names in named.items():
+            self._check_names(what, names, self.outputs, "a measured output")
         for name, value in self.sigma.items():
             if not 0.0 < value < np.inf:
                 raise EstimationError(
@@ -286,21 +290,12 @@ class Experiment:
                 f"experiment {self.name}: drift = {self.drift!r} is not the order of a polynomial; "
                 f"give 0 (none) to {MAX_DRIFT}"
             )
-        if isinstance(self.initial_state, str):
-            if self.initial_state not in ("estimate", "rest"):
-                raise EstimationError(
-                    f'experiment {self.name}: initial_state = "{self.initial_state}" is not known; '
-                    'use "estimate", "rest" or a state-by-state mapping'
-                )
-        else:
-            for name in self.initial_state:
-                if name not in self.plant.states:
-                    raise EstimationError(
-                        f'experiment {self.name}: initial_state names "{name}", which is not a state of '
-                        f"{self.plant.name}; {suggestion(name, self.plant.states)}"
-                    )
-        if self.hold not in ("zero", "first"):
-            raise EstimationError(f'experiment {self.name}: hold = "{self.hold}" is not known; use "zero" or "first"')
+        if not isinstance(self.initial_state, str):
+            self._check_names("initial_state", self.initial_state, self.plant.states, f"a state of {self.plant.name}")
+        for what, (choices, use) in CHOICES.items():
+            value = getattr(self, what)
+            if value not in choices and not (what == "initial_state" and isinstance(value, Mapping)):
+                raise EstimationError(f'experiment {self.name}: {what} = "{value}" is not known; use {use}')
         delay = self.delay_s.value if isinstance(self.delay_s, Parameter) else self.delay_s
         if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
             raise EstimationError(f"experiment {self.name}: delay_s = {delay!r} is not a time; give seconds, 0 or more")
@@ -311,28 +306,26 @@ class Experiment:
             )
         if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
             raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
-        if self.gaps not in ("split", "error"):
-            raise EstimationError(f'experiment {self.name}: gaps = "{self.gaps}" is not known; use "split" or "error"')
-        if self.gaps == "error" and len(self.stretches) > 1:
-            count = format_count(len(self.stretches) - 1, "gap")
+        if self.gaps == "error" and len(self.log_segments) > 1:
+            count = format_count(len(self.log_segments) - 1, "gap")
             raise EstimationError(
                 f'experiment {self.name}: the log has {count} and gaps = "error"; '
                 'use gaps = "split", or slice_s to choose a stretch'
             )
 
     def __repr__(self) -> str:
-        count = format_count(len(self.stretches), "segment")
+        count = format_count(len(self.log_segments), "segment")
         return f"Experiment {self.name}: {self.plant.name}, {', '.join(self.outputs)} from {self.log.source} ({count})"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was done to the log, and which of its samples have no weight, one sentence each."""
-        log, pieces = self.log, self.stretches
+        log, segments = self.log, self.log_segments
         notes = list(log.notes)
-        if pieces != (slice(0, len(log)),):
-            alone = len(log) - sum(piece.stop - piece.start for piece in pieces)
+        if segments != (slice(0, len(log)),):
+            alone = len(log) - sum(rows.stop - rows.start for rows in segments)
             notes.append(
-                f"{format_count(len(log.gaps), 'gap')} split the log into {format_count(len(pieces), 'segment')}"
+                f"{format_count(len(log.gaps), 'gap')} split the log into {format_count(len(segments), 'segment')}"
                 + (f", {format_count(alone, 'sample')} alone between gaps left out" if alone else "")
             )
         for name in self.outputs:
@@ -361,33 +354,33 @@ class Experiment:
         ]
 
     def segments(self, holdout: float = 0.0) -> list[Segment]:
-        """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""
+        """Return the segments that are simulated; the last fraction `holdout` of the time gets no weight."""
         u = input_samples(self.plant, self.log)
         y = tuple(self.log[name] for name in self.outputs)
-        time, first, whole = self.log.time, float(self.log.time[0]), self.log.duration_s
-        used = (time <= first + (1.0 - holdout) * whole).astype(np.uint8) if holdout else None
-        step = 2.0 * self.log.period / whole
-        stretches = [whole for whole in self.stretches for _ in self._cuts(whole)[1:]]
+        time, first, duration = self.log.time, float(self.log.time[0]), self.log.duration_s
+        used = (time <= first + (1.0 - holdout) * duration).astype(np.uint8) if holdout else None
+        step = 2.0 * self.log.period / duration
+        wholes = [whole for whole in self.log_segments for _ in self._cuts(whole)[1:]]
         return [
             Segment(
-                u=tuple(channel[stretch.start : piece.stop] for channel in u),
-                y=tuple(channel[piece] for channel in y),
-                keep=() if used is None else (used[piece],) * len(y),
-                lead=piece.start - stretch.start,
-                start_s=float(time[piece.start]),
-                drift_span=(2.0 * (float(time[piece.start]) - first) / whole - 1.0, step),
+                u=tuple(channel[whole.start : rows.stop] for channel in u),
+                y=tuple(channel[rows] for channel in y),
+                keep=() if used is None else (used[rows],) * len(y),
+                lead=rows.start - whole.start,
+                start_s=float(time[rows.start]),
+                drift_span=(2.0 * (float(time[rows.start]) - first) / duration - 1.0, step),
             )
-            for piece, stretch in zip(self.pieces, stretches, strict=True)
+            for rows, whole in zip(self.segment_rows, wholes, strict=True)
         ]
 
     @property
-    def pieces(self) -> list[slice]:
-        """The stretches that are simulated, each from its own initial state."""
-        return [slice(a, b) for whole in self.stretches for a, b in pairwise(self._cuts(whole))]
+    def segment_rows(self) -> list[slice]:
+        """The samples of each segment that is simulated from an initial state of its own."""
+        return [slice(a, b) for whole in self.log_segments for a, b in pairwise(self._cuts(whole))]
 
-    def _cuts(self, stretch: slice) -> list[int]:
-        """Return the rows at which a stretch is cut into shots, its ends included."""
-        return (stretch.start + cut_into_shots(stretch.stop - stretch.start, self.shots)).tolist()
+    def _cuts(self, whole: slice) -> list[int]:
+        """Return the rows at which a segment of the log is cut into shots, its ends included."""
+        return (whole.start + cut_into_shots(whole.stop - whole.start, self.shots)).tolist()
 
     def rename(self, name: str) -> Experiment:
         """Return the experiment under another name."""
@@ -413,14 +406,11 @@ def check_shots(experiment: Experiment, longest: int, shots: int, setting: str) 
     """Refuse shots too short for the states they start from.
 
     So many samples of one output as there are states tell the state at a shot's start, where they tell it at all; with
-    no more than that, a shot would follow its log whatever the parameters are. Stretches shorter than the longest are
+    no more than that, a shot would follow its log whatever the parameters are. Segments shorter than the longest are
     cut into fewer.
 
-    Raises
-    ------
-    EstimationError
-        The longest stretch does not have a sample more than the plant has states, and at least four, for each shot.
-
+    Raises EstimationError: the longest segment does not have a sample more than the plant has states, and at least
+    four, for each shot.
     """
     states = len(experiment.plant.states)
     least = max(SHORTEST_SHOT, states + 1)

@@ -25,21 +25,12 @@ MAX_SUBSTEPS = 256
 
 @record(eq=False)
 class FitSegment:
-    """A stretch of an experiment that is simulated from a state of its own.
+    """A segment of a log, or a shot of one, that is simulated from a state of its own."""
 
-    Parameters
-    ----------
-    samples : Segment
-        The data.
-    initial : tuple of Slot
-        The state at the first sample.
-    columns, predictor_columns : tuple of arrays of int, one per output
-        Which unknown each derivative column of a pass is, -1 for none: without and with a filter's correction.
-
-    """
-
-    samples: Segment
-    initial: tuple[Slot, ...]
+    samples: Segment  # the data
+    initial: tuple[Slot, ...]  # the state at the first sample
+    # columns, predictor_columns: which unknown each derivative column of a pass is, -1 for none: without and with a
+    # filter's correction
     columns: tuple[Int[np.ndarray, " nc"], ...]
     predictor_columns: tuple[Int[np.ndarray, " nd"], ...]
 
@@ -84,58 +75,29 @@ class ResidualPower:
 
 @record(eq=False)
 class FitExperiment:
-    """One experiment of a fit.
+    """One experiment of a fit."""
 
-    Parameters
-    ----------
-    data : Experiment
-        As the user gave it.
-    segments : tuple of FitSegment
-        What is simulated.
-    model : Model
-        The plant, in its own free parameters.
-    theta : array of int, shape (np,)
-        Where those stand among the unknowns.
-    slots : Slots
-        Its other unknowns.
-    sigma : array, shape (ny,)
-        Of the filtered residual of each output.
-    spread : array, shape (ny,)
-        Standard deviation of each measured output.
-    loss : Squares, Huber or SoftL1
-        Applied to residuals in sigma.
-    band_hz : (low, high) or None
-        Residuals are filtered to this band.
-    holdout : float
-        Last fraction of the log that gets no weight.
-    substeps : int
-        Least number of integration steps per sample; see `count_steps`.
-    predictor : SteadyStateFilter or None
-        With one, the residual is the error of the prediction one sample ahead.
-
-    """
-
-    data: Experiment
-    segments: tuple[FitSegment, ...]
-    model: Model
-    theta: Int[np.ndarray, " np"]
-    slots: Slots
-    sigma: Float[np.ndarray, " ny"]
-    spread: Float[np.ndarray, " ny"]
-    loss: Loss
-    band_hz: tuple[float, float] | None = None
-    holdout: float = 0.0
-    substeps: int = 1
-    predictor: SteadyStateFilter | None = None
+    data: Experiment  # as the user gave it
+    segments: tuple[FitSegment, ...]  # what is simulated
+    model: Model  # the plant, in its own free parameters
+    theta: Int[np.ndarray, " np"]  # where those stand among the unknowns
+    slots: Slots  # its other unknowns
+    sigma: Float[np.ndarray, " ny"]  # of the filtered residual of each output
+    spread: Float[np.ndarray, " ny"]  # standard deviation of each measured output
+    loss: Loss  # applied to residuals in sigma
+    band_hz: tuple[float, float] | None = None  # residuals are filtered to this band
+    holdout: float = 0.0  # last fraction of the log that gets no weight
+    substeps: int = 1  # least number of integration steps per sample; see `count_steps`
+    predictor: SteadyStateFilter | None = None  # with one, the residual is the error of the prediction one sample ahead
 
     @property
     def name(self) -> str:
-        """Of the experiment."""
+        """The experiment's name."""
         return self.data.name
 
     @property
     def period(self) -> float:
-        """Of the samples, in s."""
+        """Time between samples, in s."""
         return self.data.log.period
 
     @property
@@ -200,8 +162,7 @@ class FitExperiment:
 
     def run(self, segment: FitSegment, z: Float[np.ndarray, " n"], **keep: Any) -> Pass:
         """Run the pass of one segment."""
-        start = segment.start(z)[None]
-        return run_passes(self.model, segment.samples, self.point(z), start, self.weights, **keep)
+        return run_passes(self.model, segment.samples, self.point(z), segment.start(z), self.weights, **keep)
 
     def run_all(self, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
         """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples."""
@@ -209,10 +170,10 @@ class FitExperiment:
         rows = 0 if self.model.linear else FIRST_SAMPLES
         return tuple(
             run_passes(
-                self.model, segment.samples, point, segment.start(z)[None], weights, outputs=rows > 0, output_rows=rows
+                self.model, segment.samples, point, segment.start(z), weights, outputs=rows > 0, output_rows=rows
             )
             for segment in self.segments
-        )  # fmt: skip
+        )
 
     def stream(
         self, segment: FitSegment, z: Float[np.ndarray, " n"], point: Point, *, columns: bool, chunk: int
@@ -230,23 +191,23 @@ class FitExperiment:
     def normal(self, passes: Sequence[Pass], n: int) -> Float[np.ndarray, "n1 n1"]:
         """Return the normal matrix of [residual, n unknowns], in sigma, of the passes of every segment."""
         total = np.zeros((1 + n,) * 2)
-        for segment, one in zip(self.segments, passes, strict=True):
+        for segment, sums in zip(self.segments, passes, strict=True):
             for o, places in enumerate(self.columns(segment)):
-                add_gram(total, one.gram[0, o] / self.sigma[o] ** 2, places)
+                add_gram(total, sums.gram[o] / self.sigma[o] ** 2, places)
         return total
 
     def cost(self, passes: Sequence[Pass]) -> float:
         """Return the loss of the passes of every segment, in sigma."""
-        return sum(float(np.sum(one.loss[0] / self.sigma**2)) for one in passes)
+        return sum(float(np.sum(sums.loss / self.sigma**2)) for sums in passes)
 
     def power(self, passes: Sequence[Pass], moved: Float[np.ndarray, " n"]) -> ResidualPower:
         """Return the power of the residuals after unknowns in which they are straight have moved."""
         squares, counts = np.zeros(len(self.sigma)), np.zeros(len(self.sigma))
-        for segment, one in zip(self.segments, passes, strict=True):
+        for segment, sums in zip(self.segments, passes, strict=True):
             for o, places in enumerate(self.columns(segment)):
                 step = np.concatenate([[1.0], np.where(places >= 0, moved[places], 0.0)])
-                squares[o] += max(float(step @ one.gram[0, o] @ step), 0.0)
-                counts[o] += one.count[0, o]
+                squares[o] += max(float(step @ sums.gram[o] @ step), 0.0)
+                counts[o] += sums.count[o]
         return ResidualPower(squares=squares, counts=counts)
 
 
@@ -265,12 +226,12 @@ class FitOutput:
 
     @property
     def unit(self) -> str:
-        """Of the output."""
+        """The output's unit."""
         return self.experiment.data.plant.outputs[self.name]
 
     @property
     def sigma(self) -> float:
-        """Of the filtered residual."""
+        """Standard deviation of the filtered residual."""
         return float(self.experiment.sigma[self.index])
 
     @property
@@ -285,17 +246,31 @@ class FitOutput:
 
 
 def make_fit_experiment(
-    data: Experiment, model: Model, slots: Slots, names: Sequence[str], *, loss: Loss,
-    band_hz: tuple[float, float] | None, holdout: float,
-) -> FitExperiment:  # fmt: skip
+    data: Experiment,
+    model: Model,
+    slots: Slots,
+    names: Sequence[str],
+    *,
+    loss: Loss,
+    band_hz: tuple[float, float] | None,
+    holdout: float,
+) -> FitExperiment:
     """Return an experiment in the unknowns of these names; a sigma that is not given is the output's spread."""
     theta = find_places(data, model, names)
     spread = [measure_spread(data.log[name]) for name in data.outputs]
     sigma = [data.sigma.get(name, size or 1.0) for name, size in zip(data.outputs, spread, strict=True)]
     return FitExperiment(
-        data=data, segments=make_segments(data, slots, theta, holdout), model=model, theta=np.array(theta, dtype=int),
-        slots=slots, sigma=np.array(sigma), spread=np.array(spread), loss=loss, band_hz=band_hz, holdout=holdout,
-    )  # fmt: skip
+        data=data,
+        segments=make_segments(data, slots, theta, holdout),
+        model=model,
+        theta=np.array(theta, dtype=int),
+        slots=slots,
+        sigma=np.array(sigma),
+        spread=np.array(spread),
+        loss=loss,
+        band_hz=band_hz,
+        holdout=holdout,
+    )
 
 
 def make_segments(data: Experiment, slots: Slots, theta: Sequence[int], holdout: float) -> tuple[FitSegment, ...]:
@@ -313,10 +288,12 @@ def make_segments(data: Experiment, slots: Slots, theta: Sequence[int], holdout:
         together = np.array([*shared, *noise, *state, *every], dtype=int)
         segments.append(
             FitSegment(
-                samples=samples, initial=initial, predictor_columns=(together,) * len(sensors),
+                samples=samples,
+                initial=initial,
+                predictor_columns=(together,) * len(sensors),
                 columns=tuple(np.array([*shared, *state, *row], dtype=int) for row in sensors),
             )
-        )  # fmt: skip
+        )
     return tuple(segments)
 
 

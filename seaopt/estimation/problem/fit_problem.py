@@ -39,7 +39,7 @@ from seaopt.estimation.problem.fit_experiment import (
     make_segments,
 )
 from seaopt.estimation.problem.losses import Loss
-from seaopt.estimation.problem.normal_equations import QuadraticModel, TrustRegionStep, solve_seen
+from seaopt.estimation.problem.normal_equations import QuadraticModel, solve_seen
 from seaopt.estimation.problem.unknowns import Unknowns, collect, find_places
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import list_smoothing
@@ -74,22 +74,12 @@ class Evaluation(QuadraticModel):
 
 @record(eq=False)
 class FitProblem:
-    """Experiments and their unknowns: what a fit minimises.
+    """Experiments and their unknowns: what a fit minimises."""
 
-    Parameters
-    ----------
-    experiments : tuple of FitExperiment
-        The data, with their models and weights; loss, band and holdout are the same in all.
-    unknowns : Unknowns
-        What may change.
-    params : ParameterSet
-        Every parameter of the plants, free or not, as the fit starts.
-
-    """
-
+    # the data, with their models and weights; loss, band and holdout are the same in all
     experiments: tuple[FitExperiment, ...]
-    unknowns: Unknowns
-    params: ParameterSet
+    unknowns: Unknowns  # what may change
+    params: ParameterSet  # every parameter of the plants, free or not, as the fit starts
 
     @property
     def outputs(self) -> tuple[FitOutput, ...]:
@@ -98,17 +88,17 @@ class FitProblem:
 
     @property
     def loss(self) -> Loss:
-        """Of all experiments."""
+        """The loss of all experiments."""
         return self.experiments[0].loss
 
     @property
     def band_hz(self) -> tuple[float, float] | None:
-        """Of all experiments."""
+        """The band of all experiments."""
         return self.experiments[0].band_hz
 
     @property
     def holdout(self) -> float:
-        """Of all experiments."""
+        """The part of each log that is held out."""
         return self.experiments[0].holdout
 
     @property
@@ -145,8 +135,8 @@ class FitProblem:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
         passes = self.map(lambda experiment: experiment.run_all(z))
         names = (experiment.name for experiment in self.experiments)
-        here = self.assemble(PassSet(z=z, by_experiment=dict(zip(names, passes, strict=True))))
-        return replace(here, cost=np.inf) if any(e.is_too_stiff(z) for e in self.experiments) else here
+        evaluation = self.assemble(PassSet(z=z, by_experiment=dict(zip(names, passes, strict=True))))
+        return replace(evaluation, cost=np.inf) if any(e.is_too_stiff(z) for e in self.experiments) else evaluation
 
     def find_smoothing(self) -> list[int]:
         """Return the unknowns that are speeds over which some plant's friction is smoothed through zero."""
@@ -166,10 +156,6 @@ class FitProblem:
         unknowns = self.unknowns
         pairs = enumerate(zip(unknowns.names, unknowns.prior_std, strict=True))
         return [i for i, (name, std) in pairs if i >= unknowns.shared and ".initial" in name and np.isfinite(std)]
-
-    def take_step(self, step: TrustRegionStep[Evaluation]) -> Evaluation:
-        """Return the evaluation at the end of a step."""
-        return self.evaluate(step.end)
 
     @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which callers check
     def assemble(self, passes: PassSet, to: Float[np.ndarray, " n"] | None = None) -> Evaluation:
@@ -201,13 +187,18 @@ class FitProblem:
             gradient = np.where(linear, 0.0, gradient + hessian @ best)
             moved += best
         return Evaluation(
-            z=z + moved, cost=cost if finite else np.inf, gradient=gradient, hessian=hessian, linear=linear,
-            power={e.name: e.power(passes.by_experiment[e.name], moved) for e in self.experiments}, passes=passes,
-        )  # fmt: skip
+            z=z + moved,
+            cost=cost if finite else np.inf,
+            gradient=gradient,
+            hessian=hessian,
+            linear=linear,
+            power={e.name: e.power(passes.by_experiment[e.name], moved) for e in self.experiments},
+            passes=passes,
+        )
 
-    def follow(self, here: Evaluation, z: Float[np.ndarray, " n"]) -> Evaluation:
+    def follow(self, evaluation: Evaluation, z: Float[np.ndarray, " n"]) -> Evaluation:
         """Return what an evaluation says of a `z` nearby, as far as residuals are straight to there."""
-        return self.assemble(here.passes, z)
+        return self.assemble(evaluation.passes, z)
 
     @property
     def straight(self) -> bool:
@@ -224,31 +215,22 @@ class FitProblem:
     ) -> tuple[FitProblem, Float[np.ndarray, " m"]]:
         """Return the problem with other parameters free, and `z` in its unknowns; new ones are at their start.
 
-        Parameters
-        ----------
-        params : ParameterSet
-            Whose free ones are the unknowns.
-        z : array
-            Unknowns of this problem.
-        data : mapping of name to Experiment, optional
-            Experiments that take the place of those of the same name.
-
+        `params`: whose free ones are the unknowns; `z`: unknowns of this problem; `data`: experiments that take the
+        place of those of the same name.
         """
         experiments = tuple((data or {}).get(e.name, e.data) for e in self.experiments)
         unknowns, modelled = collect(experiments, params, noise=self.predicts, band_hz=self.band_hz)
         start, values = unknowns.start.copy(), unknowns.start.copy()
         for name, first, value in zip(self.unknowns.names, self.unknowns.start, z, strict=True):
             if name in unknowns.names:
-                place = unknowns.names.index(name)
-                start[place], values[place] = first, value
+                index = unknowns.names.index(name)
+                start[index], values[index] = first, value
         rebuilt: list[FitExperiment] = []
         for old, new, (model, slots) in zip(self.experiments, experiments, modelled, strict=True):
             theta = np.array(find_places(new, model, unknowns.names), dtype=int)
             segments = make_segments(new, slots, theta.tolist(), old.holdout)
             rebuilt.append(replace(old, data=new, segments=segments, model=model, theta=theta, slots=slots))
-        return FitProblem(
-            experiments=tuple(rebuilt), unknowns=replace(unknowns, start=start), params=params
-        ), values  # fmt: skip
+        return FitProblem(experiments=tuple(rebuilt), unknowns=replace(unknowns, start=start), params=params), values
 
 
 def pose_problem(

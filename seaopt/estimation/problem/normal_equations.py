@@ -14,7 +14,7 @@ which costs in proportion to the number of blocks; an eigendecomposition of all 
 
 from __future__ import annotations
 
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -43,26 +43,8 @@ class QuadraticModel:
         """Return the squared distance to the minimum over the free unknowns, in standard deviations."""
         return measure_decrement(self.hessian[free][:, free], self.gradient[free], 1e-12)
 
-    def predict_fall(self, step: Float[np.ndarray, " n"]) -> float:
-        """Return by how much a step lowers the cost."""
-        return -float(self.gradient @ step + 0.5 * step @ self.hessian @ step)
 
-
-M = TypeVar("M", bound=QuadraticModel)
-
-
-@record(eq=False)
-class TrustRegionStep(Generic[M]):
-    """A step from the minimum's model at `start` to `end`; `damping` is its lambda, 0 where the region is no limit."""
-
-    start: M
-    end: Float[np.ndarray, " n"]
-    damping: float
-
-    @property
-    def moved(self) -> Float[np.ndarray, " n"]:
-        """How far the unknowns move."""
-        return self.end - self.start.z
+M = TypeVar("M", bound=QuadraticModel, covariant=True)
 
 
 def add_gram(
@@ -70,15 +52,9 @@ def add_gram(
 ) -> None:
     """Add a Gram matrix of [residual, derivatives] to the normal matrix of [residual, unknowns], in place.
 
-    Parameters
-    ----------
-    normal : array, shape (..., 1 + n, 1 + n)
-        Row 0 is the gradient, behind the residual's own square.
-    gram : array, shape (..., 1 + nd, 1 + nd)
-        Of one output of a pass, in sigma.
-    places : array of int, shape (nd,)
-        The unknown of each derivative, -1 where that is known.
-
+    `normal`: shape (..., 1 + n, 1 + n), row 0 the gradient behind the residual's square; `gram`: shape
+    (..., 1 + nd, 1 + nd), of one output of a pass, in sigma; `places`: the unknown of each derivative, -1 where that
+    is known.
     """
     used = np.flatnonzero(places >= 0)
     to, of = np.concatenate([[0], 1 + places[used]]), np.concatenate([[0], 1 + used])
@@ -181,12 +157,12 @@ def find_arrow(matrix: Float[np.ndarray, "n n"]) -> ArrowShape | None:
     meet = matrix != 0.0
     counts = np.count_nonzero(meet, axis=1)
     shaft = counts > 2.0 * np.median(counts)
-    rest = np.flatnonzero(~shaft)
-    _, labels = connected_components(csr_array(meet[rest][:, rest]), directed=False)
+    outside = np.flatnonzero(~shaft)
+    _, labels = connected_components(csr_array(meet[outside][:, outside]), directed=False)
     sizes = np.bincount(labels)
     if np.max(sizes) > LARGEST_BLOCK or np.count_nonzero(shaft) > len(matrix) // 2:
         return None
-    rows = rest[np.argsort(labels, kind="stable")]
+    rows = outside[np.argsort(labels, kind="stable")]
     ends = np.cumsum(sizes)
     blocks = tuple(
         np.array([rows[end - size : end] for end in ends[sizes == size]]) for size in np.unique(sizes).tolist()

@@ -17,19 +17,10 @@ from seaopt.simulation import Point
 
 @record(eq=False)
 class SegmentResiduals:
-    """The residuals of one segment.
+    """The residuals of one segment."""
 
-    Parameters
-    ----------
-    weighted : array, shape (n, ny)
-        Filtered residuals in sigma; zero where a sample does not count.
-    raw : array, shape (n, ny)
-        Model minus measured, neither filtered nor weighted; NaN where missing.
-
-    """
-
-    weighted: Float[np.ndarray, "n ny"]
-    raw: Float[np.ndarray, "n ny"]
+    weighted: Float[np.ndarray, "n ny"]  # filtered residuals in sigma; zero where a sample does not count
+    raw: Float[np.ndarray, "n ny"]  # model minus measured, neither filtered nor weighted; NaN where missing
 
 
 @record(eq=False)
@@ -103,19 +94,18 @@ def _stream_residuals(
     filtered, sigma = bool(len(weights.sections)), experiment.sigma[:, None]
     for rows, part in experiment.stream(segment, z, point, chunk=chunk, columns=filtered):
         assert part.outputs is not None
-        raw = np.multiply(part.outputs.T, point.gain[:, None], order="C")
-        raw += point.offset[:, None]
+        raw = point.read(part.outputs.T, samples, rows)
         for o, channel in enumerate(samples.y):
             raw[o] -= channel[rows]
-        if point.drift_terms:
-            raw += point.drift @ samples.drift_basis(rows, point.drift_terms).T
         residual = raw if part.columns is None else part.columns[:, :, 0].T
         every = not samples.keep and rows.start >= weights.settle and bool(np.all(np.isfinite(np.sum(raw, axis=1))))
         yield _Chunk(
-            rows=rows, raw=raw, weighted=residual / sigma,
+            rows=rows,
+            raw=raw,
+            weighted=residual / sigma,
             used=None if every else segment.mark_counted(weights.settle, rows).T,
             in_band=None if part.columns is None else _model_in_band(part.columns, point).T - residual,
-        )  # fmt: skip
+        )
 
 
 def _model_in_band(columns: Float[np.ndarray, "m ny nc"], point: Point) -> Float[np.ndarray, "m ny"]:
@@ -147,29 +137,17 @@ class MisfitSums:
 
 @record(eq=False)
 class ResidualStatistics:
-    """What an experiment's residuals come to, in the memory of a chunk.
+    """What an experiment's residuals come to, in the memory of a chunk."""
 
-    Parameters
-    ----------
-    outputs : tuple of str
-        In the order of the arrays.
-    correlation : array, shape (lags + 1, ny, ny)
-        Sums of r_a(t) r_b(t - k), r what the loss makes of the weighted residuals.
-    mean, count : array, shape (ny,)
-        Of r, over the samples that count.
-    used, held_out : mapping of output to MisfitSums
-        Over the samples that count, those in which the filter settles included, and over those held out.
-    in_band : mapping of output to MisfitSums
-        The same in the fit's band, of the samples that count, each segment's mean taken out; empty without a band.
-
-    """
-
-    outputs: tuple[str, ...]
+    outputs: tuple[str, ...]  # in the order of the arrays
+    # sums of r_a(t) r_b(t - k), r what the loss makes of the weighted residuals
     correlation: Float[np.ndarray, "lags1 ny ny"]
-    mean: Float[np.ndarray, " ny"]
+    mean: Float[np.ndarray, " ny"]  # mean, count: of r, over the samples that count
     count: Float[np.ndarray, " ny"]
+    # used, held_out: over the samples that count, those in which the filter settles included, and over those held out
     used: Mapping[str, MisfitSums]
     held_out: Mapping[str, MisfitSums]
+    # the same in the fit's band, of the samples that count, each segment's mean taken out; empty without a band
     in_band: Mapping[str, MisfitSums]
 
     def count_of(self, output: str) -> float:
@@ -208,9 +186,8 @@ class _Sums:
         self.total, self.count = np.zeros(ny), np.zeros(ny)
 
     def add(
-        self, slopes: Float[np.ndarray, "ny m"], used: Bool[np.ndarray, "ny m"] | None,
-        tail: Float[np.ndarray, "ny t"],
-    ) -> Float[np.ndarray, "ny next"]:  # fmt: skip
+        self, slopes: Float[np.ndarray, "ny m"], used: Bool[np.ndarray, "ny m"] | None, tail: Float[np.ndarray, "ny t"]
+    ) -> Float[np.ndarray, "ny next"]:
         """Add what the loss makes of a chunk of a segment, and return the tail that the next one takes."""
         with_tail = np.concatenate([tail, slopes], axis=1)
         self.whole.add(with_tail)
@@ -240,16 +217,23 @@ def _compute_statistics(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -
         {name: _make_sums(*row) for name, row in zip(names, rows, strict=True)} for rows in misfits.tolist()
     )
     return ResidualStatistics(
-        outputs=names, correlation=sums.whole.sums() - sums.twice.sums(),
-        mean=sums.total / np.maximum(sums.count, 1.0), count=sums.count, used=used, held_out=held_out,
+        outputs=names,
+        correlation=sums.whole.sums() - sums.twice.sums(),
+        mean=sums.total / np.maximum(sums.count, 1.0),
+        count=sums.count,
+        used=used,
+        held_out=held_out,
         in_band=in_band[0] if in_band else {},
-    )  # fmt: skip
+    )
 
 
 def _add_misfits(
-    added: Float[np.ndarray, "parts ny 5"], experiment: FitExperiment, segment: FitSegment, chunk: _Chunk,
+    added: Float[np.ndarray, "parts ny 5"],
+    experiment: FitExperiment,
+    segment: FitSegment,
+    chunk: _Chunk,
     origins: list[float],
-) -> None:  # fmt: skip
+) -> None:
     """Add a chunk's sums to those of the samples used, of those held out, and of those used in the band."""
     kept = None if chunk.used is None else segment.mark_counted(0, chunk.rows).T
     for o, channel in enumerate(segment.samples.y):

@@ -32,28 +32,13 @@ NEIGHBOUR = 1e-6  # relative step of the differences
 
 @record(eq=False)
 class SteadyStateFilter:
-    """What the gain of one experiment's filter follows from, besides parameters and noise.
+    """What the gain of one experiment's filter follows from, besides parameters and noise."""
 
-    Parameters
-    ----------
-    size : array, shape (nx,)
-        Size of each state; its process noise over one sample is exp(noise) times that.
-    sensors : array, shape (ny,)
-        Standard deviation of the measurement noise, in output units.
-    places : array, shape (m, nx + nu)
-        States and inputs over which a nonlinear plant is linearised.
-    gain : array, shape (ny,)
-        Of the sensors, as it is at the start: the filter's gain does not follow it.
-    follows : bool
-        Whether the gain's derivatives are wanted; False: a gain that stands still.
-
-    """
-
-    size: Float[np.ndarray, " nx"]
-    sensors: Float[np.ndarray, " ny"]
-    places: Float[np.ndarray, "m w"]
-    gain: Float[np.ndarray, " ny"]
-    follows: bool = True
+    size: Float[np.ndarray, " nx"]  # size of each state; its process noise over one sample is exp(noise) times that
+    sensors: Float[np.ndarray, " ny"]  # standard deviation of the measurement noise, in output units
+    places: Float[np.ndarray, "m w"]  # states and inputs over which a nonlinear plant is linearised
+    gain: Float[np.ndarray, " ny"]  # of the sensors, as it is at the start: the filter's gain does not follow it
+    follows: bool = True  # whether the gain's derivatives are wanted; False: a gain that stands still
 
     def correction(self, model: Model, point: Point, noise: Float[np.ndarray, " q"]) -> Float[np.ndarray, "ns1 nx ny"]:
         """Return the gain, then its derivatives in the order of `Layout`: theta, a free delay, the noise.
@@ -116,21 +101,18 @@ def _map_derivatives(model: Model, count: int) -> ca.Function:
 
 
 def kalman_gain(
-    a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"], q: Float[np.ndarray, "t nx"],
+    a: Float[np.ndarray, "t nx nx"],
+    c: Float[np.ndarray, "t ny nx"],
+    q: Float[np.ndarray, "t nx"],
     r: Float[np.ndarray, " ny"],
-) -> Float[np.ndarray, "t nx ny"]:  # fmt: skip
+) -> Float[np.ndarray, "t nx ny"]:
     """Return the predictor's steady-state gain of each plant; not finite where there is none.
 
     What no output shows, as the place of a free body under force sensors, would drift without bound: it is left out of
     the filter and not corrected.
 
-    Parameters
-    ----------
-    a, c : arrays
-        The plants over one sample.
-    q, r : arrays
-        Variances of the process noise per state, and of the measurement noise per output.
-
+    `a`, `c`: the plants over one sample; `q`, `r`: variances of the process noise per state, and of the measurement
+    noise per output.
     """
     with np.errstate(all="ignore"):
         scaled = c / np.sqrt(r)[:, None]
@@ -148,8 +130,8 @@ def _reduce_to_seen(
     _, values, _ = _decompose_observability(a[:1], c[:1])
     rank = max(int(np.count_nonzero(values[0] > UNOBSERVABLE * values[0, 0])), 1)
     if rank == a.shape[1]:
-        one = np.broadcast_to(np.eye(rank), a.shape)
-        return one, one
+        identity = np.broadcast_to(np.eye(rank), a.shape)
+        return identity, identity
     scale, _, vectors = _decompose_observability(a, c)
     chosen = vectors[:, :rank]
     return chosen * scale[:, None, :], (chosen / scale[:, None, :]).transpose(0, 2, 1)
@@ -172,15 +154,17 @@ def _decompose_observability(
 
 
 def _solve_riccati(
-    a: Float[np.ndarray, "t m m"], c: Float[np.ndarray, "t ny m"], q: Float[np.ndarray, "t m m"],
+    a: Float[np.ndarray, "t m m"],
+    c: Float[np.ndarray, "t ny m"],
+    q: Float[np.ndarray, "t m m"],
     r: Float[np.ndarray, " ny"],
-) -> Float[np.ndarray, "t m ny"]:  # fmt: skip
-    one = np.eye(a.shape[1])
+) -> Float[np.ndarray, "t m ny"]:
+    identity = np.eye(a.shape[1])
     x, g, h = (1.0 - LEAK) * a.transpose(0, 2, 1), c.transpose(0, 2, 1) @ (c / r[:, None]), q
     for _ in range(DOUBLINGS):
         if not np.all(np.isfinite(h)) or not np.all(np.isfinite(g)):
             return np.full((len(a), a.shape[1], c.shape[1]), np.nan)
-        w = _invert_each(one + g @ h)
+        w = _invert_each(identity + g @ h)
         after = h + x.transpose(0, 2, 1) @ h @ w @ x
         g = g + x @ w @ g @ x.transpose(0, 2, 1)
         x = x @ w @ x

@@ -54,30 +54,15 @@ class Slots:
 
 @record(eq=False)
 class Unknowns:
-    """The vector of all that a fit may change, with bounds and priors.
+    """The vector of all that a fit may change, with bounds and priors."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        One per value; an experiment's own are written EXPERIMENT.WHAT.
-    start, low, high : array, shape (n,)
-        First value and bounds.
-    prior_std : array, shape (n,)
-        Infinite where there is no prior; a prior is centred on `start`.
-    linear : array of bool, shape (n,)
-        What residuals are affine in: offsets, drifts, and initial states of linear plants.
-    shared : int
-        The first so many are parameters of the plants.
-
-    """
-
-    names: tuple[str, ...]
-    start: Float[np.ndarray, " n"]
+    names: tuple[str, ...]  # one per value; an experiment's own are written EXPERIMENT.WHAT
+    start: Float[np.ndarray, " n"]  # start, low, high: first value and bounds
     low: Float[np.ndarray, " n"]
     high: Float[np.ndarray, " n"]
-    prior_std: Float[np.ndarray, " n"]
-    linear: Bool[np.ndarray, " n"]
-    shared: int
+    prior_std: Float[np.ndarray, " n"]  # infinite where there is no prior; a prior is centred on `start`
+    linear: Bool[np.ndarray, " n"]  # what residuals are affine in: offsets, drifts, and initial states of linear plants
+    shared: int  # the first so many are parameters of the plants
 
     @property
     def precision(self) -> Float[np.ndarray, " n"]:
@@ -123,10 +108,15 @@ class _Builder:
         prior = None if value.prior_std is None else scale * value.prior_std
         return self.add(
             Parameter(
-                name=name, value=scale * value.value, unit=unit, free=True, min=max(scale * value.min, low),
-                max=min(scale * value.max, high), prior_std=prior,
+                name=name,
+                value=scale * value.value,
+                unit=unit,
+                free=True,
+                min=max(scale * value.min, low),
+                max=min(scale * value.max, high),
+                prior_std=prior,
             )
-        )  # fmt: skip
+        )
 
 
 def collect(
@@ -142,14 +132,10 @@ def collect(
     A band that leaves out 0 Hz does not see offsets and drifts, nor an initial state that is forgotten before the band
     filter has settled: those are then not estimated.
 
-    Raises
-    ------
-    EstimationError
-        A free parameter belongs to no plant of the experiments.
-
+    Raises EstimationError: a free parameter belongs to no plant of the experiments.
     """
     used = {name for e in experiments for name in e.plant.parameters if name not in e.parameters}
-    used |= {own.name for experiment in experiments for own in experiment.list_own().values()}
+    used |= {local.name for experiment in experiments for local in experiment.list_own().values()}
     for name in params.free_names:
         if name not in used:
             raise EstimationError(
@@ -178,14 +164,14 @@ def collect(
 def _make_model(experiment: Experiment, params: ParameterSet) -> Model:
     """Return an experiment's model in what is free of its plant, for all logs or for this one."""
     shared = [name for name in params.free_names if name not in experiment.parameters]
-    own = [name for name, parameter in experiment.list_own().items() if parameter.name in params.free_names]
-    return make_model(experiment.plant, experiment.apply_own(params), (*shared, *own), experiment.outputs)
+    local = [name for name, parameter in experiment.list_own().items() if parameter.name in params.free_names]
+    return make_model(experiment.plant, experiment.apply_own(params), (*shared, *local), experiment.outputs)
 
 
 def find_places(experiment: Experiment, model: Model, names: Sequence[str]) -> list[int]:
     """Return where the free parameters of an experiment's model are among the unknowns of these names."""
-    own = experiment.list_own()
-    return [names.index(own[name].name if name in own else name) for name in model.free]
+    local = experiment.list_own()
+    return [names.index(local[name].name if name in local else name) for name in model.free]
 
 
 def _limit(parameter: Parameter) -> Parameter:
@@ -211,11 +197,13 @@ def _make_slots(
             "give delay_s a value"
         )
     return Slots(
-        delay=delay, gain=gain, offset=_add_offsets(builder, experiment, level),
+        delay=delay,
+        gain=gain,
+        offset=_add_offsets(builder, experiment, level),
         drift=_add_drifts(builder, experiment) if level else no_drift,
         initial=_add_initial(builder, experiment, model, forgotten),
         noise=_add_noise(builder, experiment) if noise else (),
-    )  # fmt: skip
+    )
 
 
 def _add_zero(builder: _Builder, name: str, unit: str, linear: bool = True) -> Slot:
@@ -226,8 +214,8 @@ def _add_offsets(builder: _Builder, experiment: Experiment, level: bool) -> tupl
     if experiment.offset is True and level:
         units = experiment.plant.outputs
         return tuple(_add_zero(builder, f"{experiment.name}.offset.{o}", units[o]) for o in experiment.outputs)
-    known = experiment.offset if isinstance(experiment.offset, Mapping) else {}
-    return tuple(Slot(value=float(known.get(o, 0.0))) for o in experiment.outputs)
+    given = experiment.offset if isinstance(experiment.offset, Mapping) else {}
+    return tuple(Slot(value=float(given.get(o, 0.0))) for o in experiment.outputs)
 
 
 def _add_drifts(builder: _Builder, experiment: Experiment) -> tuple[tuple[Slot, ...], ...]:
@@ -243,27 +231,27 @@ def _add_drifts(builder: _Builder, experiment: Experiment) -> tuple[tuple[Slot, 
 def _add_initial(
     builder: _Builder, experiment: Experiment, model: Model, forgotten: bool
 ) -> tuple[tuple[Slot, ...], ...]:
-    """A known initial state is that of each stretch of the log; shots within a stretch start from unknown ones.
+    """A known initial state is that of each segment of the log; shots within one start from unknown ones.
 
     Friction that sticks soon stops a joint whatever its speed was: where nothing else tells it, it started at rest.
     """
     plant, initial = experiment.plant, experiment.initial_state
-    known = fill_vector("state", plant.states, dict(initial) if isinstance(initial, Mapping) else None)
-    starts = {stretch.start for stretch in experiment.stretches}
-    rows: list[tuple[Slot, ...]] = []
+    given = fill_vector("state", plant.states, dict(initial) if isinstance(initial, Mapping) else None)
+    starts = {rows.start for rows in experiment.log_segments}
+    initial_slots: list[tuple[Slot, ...]] = []
     stopped = _scale_stopped_speeds(builder, experiment, model)
-    for number, piece in enumerate(experiment.pieces):
-        if forgotten or (initial != "estimate" and piece.start in starts):
-            rows.append(tuple(Slot(value=float(v)) for v in known))
+    for number, rows in enumerate(experiment.segment_rows):
+        if forgotten or (initial != "estimate" and rows.start in starts):
+            initial_slots.append(tuple(Slot(value=float(v)) for v in given))
             continue
         label = f"{experiment.name}.initial{number + 1 if number else ''}"
-        scales = stopped if piece.start in starts else {}  # a shot within a stretch starts in the middle of a motion
+        scales = stopped if rows.start in starts else {}  # a shot within a segment starts in the middle of a motion
         unknown = [
             Parameter(name=f"{label}.{state}", value=0.0, unit=unit, free=True, prior_std=scales.get(state))
             for state, unit in plant.states.items()
         ]
-        rows.append(tuple(builder.add(entry, model.linear) for entry in unknown))
-    return tuple(rows)
+        initial_slots.append(tuple(builder.add(entry, model.linear) for entry in unknown))
+    return tuple(initial_slots)
 
 
 def _scale_stopped_speeds(builder: _Builder, experiment: Experiment, model: Model) -> dict[str, float]:
@@ -276,10 +264,12 @@ def _scale_stopped_speeds(builder: _Builder, experiment: Experiment, model: Mode
     if not model.sticks:
         return {}
     x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
-    velocities = ca.vertcat(*(one.velocity(x, p) for one in plant.friction.values() if one.jump is not None))
+    velocities = ca.vertcat(
+        *(friction.velocity(x, p) for friction in plant.friction.values() if friction.jump is not None)
+    )
     values = {entry.name: entry.value for entry in builder.entries}
-    own = experiment.list_own()
-    theta = np.array([values[own[name].name if name in own else name] for name in model.free])
+    local = experiment.list_own()
+    theta = np.array([values[local[name].name if name in local else name] for name in model.free])
     step = transition(linearise(replace(model, sticks=False, memory={})), theta, Clock(period=experiment.log.period))[0]
     nx, largest = model.nx, np.array([np.max(np.abs(samples)) for samples in input_samples(plant, experiment.log)])
     reached, moved = np.zeros(nx), step[:nx, nx : nx + largest.size]

@@ -22,11 +22,15 @@ Long sums are NumPy's own, or cut short: threads of the linear-algebra library c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from seaopt.codec import NullIs
+from seaopt.errors import EstimationError
 from seaopt.estimation.problem.correlation import choose_transform_size, load_transforms, parzen
 from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
@@ -51,7 +55,20 @@ class Covariance:
     """A covariance with names: ``matrix[i, j]`` belongs to ``names[i]``, ``names[j]``, in SI."""
 
     names: tuple[str, ...]
-    matrix: Float[np.ndarray, "p p"]
+    matrix: Annotated[Float[np.ndarray, "p p"], NullIs(value=math.inf)]
+
+    @classmethod
+    def _from_json(cls, content: Mapping[str, Any]) -> Covariance:
+        """Return the covariance of a file; refuse what is not square, or has a negative variance."""
+        read = cls(**content)
+        n = len(read.names)
+        if read.matrix.size != n * n or (n and read.matrix.shape != (n, n)):
+            raise EstimationError(f"matrix is not {n} by {n}, as names is long")
+        finite = np.isfinite(np.diag(read.matrix)) if n else np.zeros(0, dtype=bool)
+        least = np.linalg.eigvalsh(read.matrix[finite][:, finite]) if n else ()
+        if np.any(least < -1e-9 * np.max(np.diag(read.matrix)[finite], initial=0.0)):
+            raise EstimationError("has a negative variance")
+        return read
 
     def std(self, name: str) -> float:
         """Return the standard deviation of one parameter."""
@@ -80,16 +97,15 @@ def compute_white_meat(
     problem: FitProblem, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
 ) -> Float[np.ndarray, "n n"]:
     """Return B for white residuals: J^T J with the mean square of what the loss makes of each output's residuals."""
-    power = {
-        name: np.diagonal(sums.correlation[0]) / np.maximum(sums.count, 1.0) for name, sums in statistics.items()
-    }  # fmt: skip
+    power = {name: np.diagonal(sums.correlation[0]) / np.maximum(sums.count, 1.0) for name, sums in statistics.items()}
     return _sum_weighted(problem, z, lambda experiment, o, r: np.full(r.size, power[experiment.name][o]))
 
 
 def _sum_weighted(
-    problem: FitProblem, z: Float[np.ndarray, " n"],
+    problem: FitProblem,
+    z: Float[np.ndarray, " n"],
     weigh: Callable[[FitExperiment, int, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
-) -> Float[np.ndarray, "n n"]:  # fmt: skip
+) -> Float[np.ndarray, "n n"]:
     """Return J^T J with weights that come of the residuals, in sigma, of an experiment's output."""
     normal = np.zeros((1 + z.size, 1 + z.size))
     for experiment in problem.experiments:
@@ -103,9 +119,11 @@ def _sum_weighted(
 
 
 def compute_meat(
-    problem: FitProblem, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
+    problem: FitProblem,
+    z: Float[np.ndarray, " n"],
+    inverse: Float[np.ndarray, "n p"],
     statistics: StatisticsByExperiment,
-) -> Float[np.ndarray, "p p"]:  # fmt: skip
+) -> Float[np.ndarray, "p p"]:
     """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E: B for residuals of any colour."""
     p = inverse.shape[1]
     total = np.zeros((p, p))
@@ -118,27 +136,29 @@ def compute_meat(
 
 
 def _sum_twice(
-    experiment: FitExperiment, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
+    experiment: FitExperiment,
+    z: Float[np.ndarray, " n"],
+    inverse: Float[np.ndarray, "n p"],
     r: Float[np.ndarray, "lags1 ny ny"],
-) -> Float[np.ndarray, "2 p p"]:  # fmt: skip
+) -> Float[np.ndarray, "2 p p"]:
     """Return one experiment's part of the double sum, and of that what t = s gives."""
     total = np.zeros((2, *(inverse.shape[1],) * 2))
     reach, chunk = len(r) - 1, max(CACHED_SAMPLES, 4 * len(r))
-    pairs = [(segment, _map_to_influence(experiment, segment, inverse)) for segment in experiment.segments]
+    pairs = [(segment, map_to_influence(experiment, segment, inverse)) for segment in experiment.segments]
     if reach <= COMPILED_LAGS:
         point, weights = experiment.point(z), experiment.weights
         sums = [
             double_sum(experiment.model, segment.samples, point, segment.start(z), weights, into, r)
             for segment, into in pairs
         ]
-        if all(one is not None for one in sums):
+        if all(part is not None for part in sums):
             return np.sum(np.array(sums), axis=0)
     longest = reach + min(chunk, experiment.longest)
     whole, twice, together = (_Form.make(kept, n) for kept, n in ((r, longest), (r, reach), (r[:1], chunk)))
     for segment, into in pairs:
         tail = np.zeros((*into.shape[:2], 0))
         for _, columns, used in stream_columns(experiment, segment, z, chunk):
-            now = _influence(columns, used, into)
+            now = compute_influence(columns, used, into)
             with_tail = np.concatenate([tail, now], axis=2)
             total += whole(with_tail) - twice(tail), together(now)
             tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
@@ -152,7 +172,7 @@ def _at_least(matrix: Float[np.ndarray, "p p"], floor: Float[np.ndarray, "p p"])
     return floor + np.outer(scale, scale) * ((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def _map_to_influence(
+def map_to_influence(
     experiment: FitExperiment, segment: FitSegment, inverse: Float[np.ndarray, "n p"]
 ) -> Float[np.ndarray, "ny p nc"]:
     """Return what takes the columns of each output to their influence on the parameters."""
@@ -163,7 +183,7 @@ def _map_to_influence(
     return np.array(rows)
 
 
-def _influence(
+def compute_influence(
     columns: Float[np.ndarray, "m ny nc"], used: Bool[np.ndarray, "m ny"], into: Float[np.ndarray, "ny p nc"]
 ) -> Float[np.ndarray, "ny p m"]:
     """Return the influence of each sample; zero where it does not count."""

@@ -9,9 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.formatting import format_figure, html_paragraph, html_table
-from seaopt.records import PlotAccessor, record
-from seaopt.units import unit_after
+from seaopt.codec import OrInfinite, OrMinusInfinite, OrNaN
+from seaopt.records import PlotAccessor, Worded, record
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -20,27 +19,14 @@ GUESS = "guess"  # kind of the finding that names what nobody knew
 
 @record
 class FitFinding:
-    """One thing that whoever uses a fit should know.
+    """One thing that whoever uses a fit should know."""
 
-    Parameters
-    ----------
-    severity : "error", "warning" or "note"
-        The fit is not to be used; look at it; for information.
-    kind : str
-        For programs: "explained", "residual", "cause", "bound", "range", "samples", "held_out", "guess", "status", ...
-    where : str
-        EXPERIMENT.OUTPUT, an experiment, a parameter, or empty.
-    text : str
-        What it is and what to do.
-    preferred : mapping of name to (value, std)
-        What the logs would have in place of what was fixed, of a "cause".
-
-    """
-
-    severity: Severity
+    severity: Severity  # the fit is not to be used; look at it; for information
+    # for programs: "explained", "residual", "cause", "bound", "range", "samples", "held_out", "guess", "status"
     kind: str
-    where: str
-    text: str
+    where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
+    text: str  # what it is and what to do
+    # what the logs would have in place of what was fixed, of a "cause"
     preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
 
 
@@ -103,12 +89,12 @@ class OutputFit:
 
     """
 
-    fit_percent: float
+    fit_percent: OrNaN
     holdout_fit_percent: float | None
-    rms_residual: float
-    sigma: float
+    rms_residual: OrNaN
+    sigma: OrNaN
     unit: str
-    whiteness_p: float
+    whiteness_p: OrNaN
     band_fit_percent: float | None = None
     one_step_fit_percent: float | None = None
     explained: float | None = None
@@ -119,12 +105,14 @@ class OutputFit:
 class DerivedFigure:
     """A figure that follows from the parameters, or is an experiment's own, with its std from the covariance."""
 
+    json_keys = ("value", "unit", "std", "ci95")
+
     value: float
     unit: str
-    std: float
+    std: OrInfinite
 
     @property
-    def ci95(self) -> tuple[float, float]:
+    def ci95(self) -> tuple[OrMinusInfinite, OrInfinite]:
         """The 95 % interval."""
         return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
 
@@ -146,9 +134,9 @@ class Nuisance:
     substeps: int = 1
     drift: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
     noise: dict[str, float] = field(default_factory=dict[str, float])
-    std: dict[str, float] = field(default_factory=dict[str, float])
+    std: dict[str, OrInfinite] = field(default_factory=dict[str, float])
     plant: str = ""
-    hold: str = "zero"
+    hold: Literal["zero", "first"] = "zero"
 
     @property
     def fitted(self) -> dict[str, DerivedFigure]:
@@ -156,13 +144,9 @@ class Nuisance:
         values = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (gain, "-") for name, gain in self.gain.items()}
         return {key: DerivedFigure(value=values[key][0], unit=values[key][1], std=std) for key, std in self.std.items()}
 
-    def describe(self) -> list[str]:
-        """Return what was estimated of delay and gains, in words."""
-        return [f"{key} = {one.value:.5g} ± {one.std:.2g}{unit_after(one.unit)}" for key, one in self.fitted.items()]
-
 
 @record(eq=False, repr=False)
-class ModelledOutputs:
+class ModelledOutputs(Worded):
     """Measured and model outputs of an experiment on its clock; NaN where there is no value.
 
     `own` has the experiment's own unknowns that the model was simulated with, `band_fit_percent` is None of outputs
@@ -203,27 +187,10 @@ class ModelledOutputs:
         percents, rms = self.fit_percent, self.rms_residual
         return {
             name: {
-                "fit_percent": percents[name], "band_fit_percent": self.band_fit_percent.get(name),
-                "rms_residual": rms[name], "unit": self.units[name],
+                "fit_percent": percents[name],
+                "band_fit_percent": self.band_fit_percent.get(name),
+                "rms_residual": rms[name],
+                "unit": self.units[name],
             }
             for name in self.model
-        }  # fmt: skip
-
-    def __repr__(self) -> str:
-        lines = [f"Prediction of {self.name}: {self.time.size} samples, with initial states and offsets of its own"]
-        for name, row in self.to_dict().items():
-            band = row["band_fit_percent"]
-            in_band = "" if band is None else f", in the band {band:.2f} %"
-            rms = f"{row['rms_residual']:.4g}{unit_after(row['unit'])}"
-            lines.append(f"  {name}: fit {row['fit_percent']:.2f} %{in_band}, rms residual {rms}")
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        rows = [
-            (name, format_figure(row["fit_percent"], "%"), format_figure(row["band_fit_percent"], "%"),
-             format_figure(row["rms_residual"], unit_after(row["unit"]).strip()))
-            for name, row in self.to_dict().items()
-        ]  # fmt: skip
-        head, *_ = repr(self).splitlines()
-        table = html_table(("output", "fit", "in the band", "rms residual"), rows)
-        return html_paragraph(head) + table + self.plot.to_html()
+        }

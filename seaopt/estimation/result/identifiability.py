@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import OrInfinite
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import RANK, eliminate
 from seaopt.formatting import join_words
@@ -50,7 +51,7 @@ class Identifiability:
 
     rank: int
     free: int
-    condition: float
+    condition: OrInfinite
     unidentifiable: tuple[dict[str, float], ...]
     weak: tuple[dict[str, float], ...] = ()
     structural_rank: int = -1
@@ -125,11 +126,11 @@ def compute_structural_rank(problem: FitProblem, z: Float[np.ndarray, " n"]) -> 
         model, index, log = experiment.model, experiment.theta, experiment.segments[0].samples
         spans = [float(np.ptp(channel)) for channel in log.u]
         u = tuple(span * rng.normal(size=RICH) for span in spans)
-        piece = Segment(u=u, y=(np.zeros(RICH),) * model.ny, start_s=log.start_s)
+        rich = Segment(u=u, y=(np.zeros(RICH),) * model.ny, start_s=log.start_s)
         point = replace(experiment.point(z), correction=None)
-        passes = run_passes(model, piece, point, np.zeros((1, model.nx)))
+        passes = run_passes(model, rich, point, np.zeros(model.nx))
         for o in range(model.ny):
-            gram = passes.gram[0, o, 1 : 1 + index.size, 1 : 1 + index.size] / experiment.sigma[o] ** 2
+            gram = passes.gram[o, 1 : 1 + index.size, 1 : 1 + index.size] / experiment.sigma[o] ** 2
             information[index[:, None], index] += gram
     if not np.all(np.isfinite(information)):
         return -1
@@ -141,13 +142,8 @@ def compute_structural_rank(problem: FitProblem, z: Float[np.ndarray, " n"]) -> 
 def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
     """Return in words what cannot be identified.
 
-    Parameters
-    ----------
-    direction : mapping
-        Relative changes that have no effect.
-    alone_seen : bool
-        Whether the outputs depend on the parameter, if it is one alone.
-
+    `direction`: relative changes that have no effect; `alone_seen`: whether the outputs depend on the parameter, if
+    it is one alone.
     """
     names = sorted(direction)
     if len(names) == 1:

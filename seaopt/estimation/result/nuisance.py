@@ -24,24 +24,18 @@ def estimate_nuisance(
 ) -> tuple[Nuisance, dict[str, float | None]]:
     """Return a log's own initial state, offset and what else it leaves free, the plant's parameters being known.
 
-    Returns
-    -------
-    Nuisance
-        The estimates.
-    dict of output to float or None
-        Fit percent in the band; None without one.
-
+    The second result is the fit percent of each output in the band; None without one.
     """
     values = experiment.plant.complete(experiment.apply_own(params))
-    known = ParameterSet(values.values()).fix()
-    problem = pose_problem((replace(experiment, parameters={}),), known, loss=Squares(), band_hz=band_hz)
+    fixed = ParameterSet(values.values()).fix()
+    problem = pose_problem((replace(experiment, parameters={}),), fixed, loss=Squares(), band_hz=band_hz)
     solved = settle(problem, problem.evaluate(problem.unknowns.start), ITERATIONS, None)
     problem, z = solved.problem, solved.solution.z
     statistics = compute_statistics(problem, z)
-    (one,) = problem.experiments
+    (fitted,) = problem.experiments
     in_band = statistics[experiment.name].in_band
     shares = {name: in_band[name].fit_percent if in_band else None for name in experiment.outputs}
-    return describe_nuisance(one, z, statistics, np.zeros(z.size)), shares
+    return describe_nuisance(fitted, z, statistics, np.zeros(z.size)), shares
 
 
 def take_sensors(experiment: Experiment, fitted: Nuisance | None) -> Experiment:
@@ -56,9 +50,11 @@ def take_sensors(experiment: Experiment, fitted: Nuisance | None) -> Experiment:
 
 
 def describe_nuisance(
-    experiment: FitExperiment, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment | None,
+    experiment: FitExperiment,
+    z: Float[np.ndarray, " n"],
+    statistics: StatisticsByExperiment | None,
     variance: Float[np.ndarray, " n"],
-) -> Nuisance:  # fmt: skip
+) -> Nuisance:
     """Return an experiment's own unknowns; offsets that the fit did not see are what is left over on average."""
     slots, outputs, states = experiment.slots, experiment.data.outputs, experiment.data.plant.states
     offset = {name: slot.at(z) for name, slot in zip(outputs, slots.offset, strict=True)}

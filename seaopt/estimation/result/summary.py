@@ -25,7 +25,7 @@ from seaopt.estimation.result.covariance import (
     mark_unseen,
 )
 from seaopt.estimation.result.findings import DerivedFigure, OutputFit
-from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.result.fit_result import Fit, FitStatus, Minimum, Provenance
 from seaopt.estimation.result.identifiability import (
     Identifiability,
     assess_identifiability,
@@ -60,13 +60,13 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     statistics = compute_statistics(problem, z) if diagnostics else None
     seen_white, seen_robust, joint, unseen, variance = _compute_covariances(problem, evaluation, statistics)
     names = unknowns.names[:p]
-    known = assess_identifiability(evaluation.hessian, names, z[:p])
-    unseen = np.where([name in known.unidentified for name in names], 1.0, unseen)
+    identifiability = assess_identifiability(evaluation.hessian, names, z[:p])
+    unseen = np.where([name in identifiability.unidentified for name in names], 1.0, unseen)
     white, robust = mark_unseen(seen_white, unseen), mark_unseen(seen_robust, unseen)
     joint[:p, :p] = robust
     delayed = tuple(f"{e.name}.delay_s" for e in problem.experiments if e.slots.delay.index is not None)
-    if known.rank < known.free:
-        known = replace(known, structural_rank=compute_structural_rank(problem, z))
+    if identifiability.rank < identifiability.free:
+        identifiability = replace(identifiability, structural_rank=compute_structural_rank(problem, z))
     std = np.sqrt(np.diag(robust))
     fitted = params.with_parameters(
         *(
@@ -75,9 +75,9 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         )
     )
     sizes = _take_sizes(problem)
-    status, message = _find_status(solution, known, evaluation.hessian, names, solved.step_error)
+    status, message = _find_status(solution, identifiability, evaluation.hessian, names, solved.step_error)
     if status == "converged":
-        fitted, message = _mark_vague(fitted, sizes, known, message)
+        fitted, message = _mark_vague(fitted, sizes, identifiability, message)
         status = "converged" if all(fitted[name].identified for name in names) else "not_identifiable"
     outputs = describe_outputs(problem, z, statistics) if statistics is not None else {}
     if statistics is not None and not _explains_something(problem, outputs, statistics):
@@ -101,17 +101,17 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         covariance=Covariance(names=names, matrix=robust),
         white_covariance=Covariance(names=names, matrix=white),
         delay_covariance=Covariance(names=(*names, *delayed), matrix=joint) if delayed else None,
-        derived=_derive_figures(experiments, fitted, Covariance(names=names, matrix=seen_robust), known),
+        derived=_derive_figures(experiments, fitted, Covariance(names=names, matrix=seen_robust), identifiability),
         outputs=outputs,
         nuisance={
             experiment.name: describe_nuisance(experiment, z, statistics, variance)
             for experiment in problem.experiments
         },
-        identifiability=known,
+        identifiability=identifiability,
         cost=evaluation.cost,
         iterations=solution.iterations,
         samples=int(sum(float(np.sum(power.counts)) for power in evaluation.power.values())),
-        wall_s=time.perf_counter() - started,
+        provenance=Provenance(wall_s=time.perf_counter() - started),
         step_error_sigma=solved.step_error.output,
         step_error_parameter=solved.step_error.parameter,
         log_likelihood=_compute_log_likelihood(problem, evaluation),
@@ -129,9 +129,18 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
 def _take_sizes(problem: FitProblem) -> ParameterSet:
     """Return the parameters at their starts; a speed that smooths friction at its plant's own, for it may be tiny."""
     names = {problem.unknowns.names[i] for i in problem.find_smoothing()}
-    owns = {name: one for e in problem.experiments for name, one in e.data.plant.parameters.items() if name in names}
+    owns = {
+        name: parameter
+        for e in problem.experiments
+        for name, parameter in e.data.plant.parameters.items()
+        if name in names
+    }
     return problem.params.with_parameters(
-        *(replace(problem.params[name], value=one.value) for name, one in owns.items() if isinstance(one, Parameter))
+        *(
+            replace(problem.params[name], value=parameter.value)
+            for name, parameter in owns.items()
+            if isinstance(parameter, Parameter)
+        )
     )
 
 
@@ -160,9 +169,12 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 def _compute_covariances(
     problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
 ) -> tuple[
-    Float[np.ndarray, "p p"], Float[np.ndarray, "p p"], Float[np.ndarray, "q q"], Float[np.ndarray, " p"],
+    Float[np.ndarray, "p p"],
+    Float[np.ndarray, "p p"],
+    Float[np.ndarray, "q q"],
+    Float[np.ndarray, " p"],
     Float[np.ndarray, " n"],
-]:  # fmt: skip
+]:
     """Return the parameters' covariance for white residuals, for those that there are, and what is unseen.
 
     Both are over what is seen alone, and so is the third, of parameters and delays together; the fourth is how much of
@@ -179,12 +191,12 @@ def _compute_covariances(
     if not stated:
         return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), variance
     columns = inverse[:, stated]
-    known = (columns.T * prior) @ columns
+    from_priors = (columns.T * prior) @ columns
     white = inverse[stated][:, stated]
     if not problem.loss.quadratic:
         sums = statistics if statistics is not None else compute_statistics(problem, z)
-        white = columns.T @ compute_white_meat(problem, z, sums) @ columns + known
-    robust = white if statistics is None else compute_meat(problem, z, columns, statistics) + known
+        white = columns.T @ compute_white_meat(problem, z, sums) @ columns + from_priors
+    robust = white if statistics is None else compute_meat(problem, z, columns, statistics) + from_priors
     variance[stated] = np.diag(robust)
     return white[:p, :p], robust[:p, :p], robust[:q, :q].copy(), unseen[:p], variance
 
@@ -205,19 +217,20 @@ def _mark_unidentified(fitted: ParameterSet, names: Sequence[str]) -> ParameterS
 
 
 def _mark_vague(
-    fitted: ParameterSet, params: ParameterSet, known: Identifiability, message: str
+    fitted: ParameterSet, params: ParameterSet, identifiability: Identifiability, message: str
 ) -> tuple[ParameterSet, str]:
     """Mark those parameters as not identified that are less certain than their size: the log hardly shows them.
 
     Of several that hardly have an effect but together, a std beyond the value is enough: another start ends elsewhere.
     """
-    together = {name for direction in known.weak for name in _find_beyond(fitted, direction)}
+    together = {name for direction in identifiability.weak for name in _find_beyond(fitted, direction)}
     vague = {
         name: f"{name} = {p.value:.3g} ± {p.std:.2g}{unit_after(p.unit)}"
         for name, p in fitted.items()
-        if p.free and p.std is not None
+        if p.free
+        and p.std is not None
         and (name in together or p.std > VAGUE * max(abs(p.value), abs(params[name].value)))
-    }  # fmt: skip
+    }
     if not vague:
         return fitted, message
     message = f"the logs hardly show {', '.join(vague.values())}: excite more, fix it, or give it a prior"
@@ -231,24 +244,28 @@ def _find_beyond(fitted: ParameterSet, direction: Mapping[str, float]) -> list[s
 
 
 def _find_status(
-    solution: Solution[Evaluation], known: Identifiability, hessian: Float[np.ndarray, "n n"], names: tuple[str, ...],
+    solution: Solution[Evaluation],
+    identifiability: Identifiability,
+    hessian: Float[np.ndarray, "n n"],
+    names: tuple[str, ...],
     step: StepError,
-) -> tuple[str, str]:  # fmt: skip
-    if known.rank == known.free:
+) -> tuple[FitStatus, str]:
+    if identifiability.rank == identifiability.free:
         if not step.small:
             error = f"{step.output:.2g} sigma in an output and {step.parameter:.2g} std in a parameter"
             return "stalled", f"the finest integration steps still leave an error of {error}"
         weak = "; ".join(
-            f"{join_words(sorted(direction))} are only weakly distinguished (condition {known.condition:.2g}): "
-            "each would be known far better if the others were"
-            for direction in known.weak
+            f"{join_words(sorted(direction))} are only weakly distinguished (condition "
+            f"{identifiability.condition:.2g}): each would be known far better if the others were"
+            for direction in identifiability.weak
         )
         return solution.status, f"{solution.message}; {weak}" if weak else solution.message
     has_effect = {name: bool(hessian[i, i] > 0.0) for i, name in enumerate(names)}
     words = "; ".join(
-        describe_direction(direction, has_effect.get(min(direction), True)) for direction in known.unidentifiable
+        describe_direction(direction, has_effect.get(min(direction), True))
+        for direction in identifiability.unidentifiable
     )
-    if 0 <= known.structural_rank < known.free:
+    if 0 <= identifiability.structural_rank < identifiability.free:
         return "not_identifiable", f"{words}: fix one, give it a prior, or measure another output"
     return "not_identifiable", f"{words} in this log: excite more, fix one, or give it a prior"
 
@@ -265,7 +282,7 @@ def _compile_figures(plant: Plant) -> tuple[Any, dict[str, str]]:
 
 
 def _derive_figures(
-    experiments: tuple[Experiment, ...], fitted: ParameterSet, seen: Covariance, known: Identifiability
+    experiments: tuple[Experiment, ...], fitted: ParameterSet, seen: Covariance, identifiability: Identifiability
 ) -> dict[str, DerivedFigure]:
     """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g.
 
@@ -279,8 +296,8 @@ def _derive_figures(
         plant = experiment.plant
         function, units = _compile_figures(plant)
         values, slopes = (np.array(array) for array in function(plant.complete(experiment.apply_own(fitted)).vector))
-        own = {name: parameter.name for name, parameter in experiment.list_own().items()}
-        names = [own.get(name, "" if name in experiment.parameters else name) for name in plant.parameters]
+        local = {name: parameter.name for name, parameter in experiment.list_own().items()}
+        names = [local.get(name, "" if name in experiment.parameters else name) for name in plant.parameters]
         free = [name for name in seen.names if name in names]
         rows = [seen.names.index(name) for name in free]
         matrix = seen.matrix[rows][:, rows]
@@ -288,7 +305,7 @@ def _derive_figures(
         for i, (figure, unit) in enumerate(units.items()):
             name = f"{experiment.name}.{figure}" if np.any(slopes[i, alone]) else figure
             g = slopes[i, [names.index(parameter) for parameter in free]]
-            determined = known.determines(dict(zip(free, g.tolist(), strict=True)), sizes)
+            determined = identifiability.determines(dict(zip(free, g.tolist(), strict=True)), sizes)
             std = float(np.sqrt(max(float(g @ matrix @ g), 0.0))) if determined else np.inf
             out.setdefault(name, DerivedFigure(value=float(values[i, 0]), unit=unit, std=std))
     return out

@@ -1,1 +1,1 @@
-"""The solver: least squares, shooting, first guess and step size."""
+"""The solver: least squares, first guess and step size."""

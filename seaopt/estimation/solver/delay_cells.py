@@ -39,19 +39,19 @@ def search_delays(solved: Solved, max_iterations: int, callback: Callback | None
 def _search_further(solved: Solved, max_iterations: int, callback: Callback | None) -> Solved:
     """Return the best of a minimum and those at delays some samples away, of each free delay in turn."""
     for experiment in solved.problem.experiments:
-        problem, here = solved.problem, solved.solution.evaluation
-        place, unknowns = experiment.slots.delay.index, problem.unknowns
-        if place is None or not np.isfinite(here.cost):
+        problem, evaluation = solved.problem, solved.solution.evaluation
+        index, unknowns = experiment.slots.delay.index, problem.unknowns
+        if index is None or not np.isfinite(evaluation.cost):
             continue
-        others = {e.slots.delay.at(here.z) for e in problem.experiments} - {float(here.z[place])}
-        shift = _find_best_shift(experiment, here.z, unknowns.low[place], unknowns.high[place])
-        best = here
-        for delay in (*others, *([here.z[place] + shift] if shift else [])):
-            z = here.z.copy()
-            z[place] = np.clip(delay, unknowns.low[place], unknowns.high[place])
+        delays = {e.slots.delay.at(evaluation.z) for e in problem.experiments} - {float(evaluation.z[index])}
+        shift = _find_best_shift(experiment, evaluation.z, unknowns.low[index], unknowns.high[index])
+        best = evaluation
+        for delay in (*delays, *([evaluation.z[index] + shift] if shift else [])):
+            z = evaluation.z.copy()
+            z[index] = np.clip(delay, unknowns.low[index], unknowns.high[index])
             there = problem.evaluate(z)
             best = there if there.cost < best.cost else best
-        if best is not here:
+        if best is not evaluation:
             other = settle(problem, best, max_iterations, callback)
             solved = other if other.misfit < solved.misfit else solved
     return solved
@@ -100,16 +100,16 @@ def _settle_beside(
 ) -> Solved | None:
     """Return the minimum in an experiment's cell (0), or that before or after it; None where bounds forbid it."""
     problem, z, period = solved.problem, solved.solution.z.copy(), experiment.period
-    unknowns, place = problem.unknowns, experiment.slots.delay.index
-    assert place is not None
-    cell = np.ceil(z[place] / period - INSIDE) + way  # (cell - 1, cell] samples
+    unknowns, index = problem.unknowns, experiment.slots.delay.index
+    assert index is not None
+    cell = np.ceil(z[index] / period - INSIDE) + way  # (cell - 1, cell] samples
     low, high = unknowns.low.copy(), unknowns.high.copy()
-    low[place] = max(low[place], (cell - 1.0 + INSIDE) * period)
+    low[index] = max(low[index], (cell - 1.0 + INSIDE) * period)
     end = cell if experiment.data.hold == "zero" else cell - INSIDE
-    high[place] = min(high[place], end * period)
-    if not low[place] <= high[place]:
+    high[index] = min(high[index], end * period)
+    if not low[index] <= high[index]:
         return None
-    z[place] = np.clip(z[place], low[place], high[place])
+    z[index] = np.clip(z[index], low[index], high[index])
     inside = replace(problem, unknowns=replace(unknowns, low=low, high=high))
     other = settle(inside, inside.evaluate(z), max_iterations, callback)
     return replace(other, problem=replace(other.problem, unknowns=unknowns))

@@ -28,7 +28,7 @@ CANDIDATES = 128
 REFINED_CANDIDATES = 8
 MATCHED_POINTS = 60
 EXPLAINED_MISFIT = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
-LONGEST_STRETCH = 1 << 14  # samples of a stretch: resolution enough for a guess
+LONGEST_WINDOW = 1 << 14  # samples of a window: resolution enough for a guess
 
 
 @record(eq=False)
@@ -79,12 +79,12 @@ def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple
 def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target | None:
     data, log, band_hz = experiment.data, experiment.data.log, experiment.band_hz
     active = [n for n in data.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
-    if len(active) != 1 or len(data.stretches) != 1:
+    if len(active) != 1 or len(data.log_segments) != 1:
         return None
     whole = [o for o, output in enumerate(data.outputs) if np.all(np.isfinite(log[output]))]
     measured = [log[data.outputs[o]] for o in whole]
     try:
-        stretch_s = _choose_stretch(len(log)) * log.period
+        stretch_s = _choose_window(len(log)) * log.period
         estimated = responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)
     except LogError:
         return None
@@ -130,9 +130,9 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
 
 
 @lru_cache(maxsize=64)
-def _choose_stretch(n: int) -> int:
+def _choose_window(n: int) -> int:
     """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
-    length = min(n // 16, LONGEST_STRETCH)
+    length = min(n // 16, LONGEST_WINDOW)
     fast = [2**a * 3**b for a in range(15) for b in range(9) if 2**a * 3**b <= length]
     return max(fast, default=16)
 
@@ -201,8 +201,8 @@ def _misfit(
             slope = c @ moved + (dc @ x.T).transpose(2, 1, 0) + dg[:, rows, nx + target.input].T
             j = ((target.weight / response * target.shift)[:, :, None] * slope).reshape(r.size, -1)
             gradient[target.index] += (j.conj().T @ r.ravel()).real
-            place = np.array(target.index)
-            hessian[place[:, None], place] += (j.conj().T @ j).real
+            columns = np.array(target.index)
+            hessian[columns[:, None], columns] += (j.conj().T @ j).real
     return cost, gradient, hessian
 
 

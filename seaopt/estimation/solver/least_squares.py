@@ -21,7 +21,7 @@ from typing import Generic, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.problem.normal_equations import M, QuadraticModel, TrustRegionStep, find_arrow, solve_seen
+from seaopt.estimation.problem.normal_equations import M, QuadraticModel, find_arrow, solve_seen
 from seaopt.records import record
 
 Status = Literal["converged", "max_iterations", "stalled"]
@@ -43,14 +43,10 @@ STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a f
 
 @runtime_checkable
 class Objective(Protocol[M]):
-    """A sum of squares that can be minimised: its quadratic model at a point, and at the end of a step."""
+    """A sum of squares that can be minimised."""
 
     def evaluate(self, z: Float[np.ndarray, " n"]) -> M:
-        """Return the model at z."""
-        ...
-
-    def take_step(self, step: TrustRegionStep[M]) -> M:
-        """Return the model at the end of a step."""
+        """Return its quadratic model at z."""
         ...
 
 
@@ -81,83 +77,78 @@ def minimise(
 ) -> Solution[M]:
     """Minimise a sum of squares from `start`, inside the bounds.
 
-    Parameters
-    ----------
-    objective : Objective
-        Gives cost, gradient and Gauss-Newton Hessian at any point.
-    start : array, shape (n,), or QuadraticModel
-        First point, or the model there.
-    low, high : array, shape (n,)
-        Bounds.
-    first_radius : float
-        Of the region, over the size of the first point.
-    decrement : float
-        Squared standard deviations to the minimum at which to stop.
-    max_iterations : int
-        Evaluations after the first.
-    callback : callable, optional
-        Called with the iteration and the cost.
-    follow : callable, optional
-        (model, z) -> what it says of a z nearby if residuals are straight from there: then a last step needs no
-        evaluation of its own once the whole steps before it have shown how straight they are.
-    before : float
-        Of the search that this one goes on from.
-
+    `objective`: gives cost, gradient and Gauss-Newton Hessian at any point; `start`: first point, or the model
+    there; `low`, `high`: bounds; `first_radius`: of the region, over the size of the first point; `decrement`:
+    squared standard deviations to the minimum at which to stop; `max_iterations`: evaluations after the first;
+    `callback`: called with the iteration and the cost; `follow`: (model, z) -> what it says of a z nearby if
+    residuals are straight from there: then a last step needs no evaluation of its own once the whole steps before
+    it have shown how straight they are; `before`: of the search that this one goes on from.
     """
-    here = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
-    if not np.isfinite(here.cost):
+    current = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
+    if not np.isfinite(current.cost):
         message = "the simulation overflows at the first guess; start closer or check units"
-        return Solution(z=here.z, evaluation=here, status="stalled", message=message, iterations=0)
-    scale = _column_norms(here)
-    radius = first_radius * max(float(np.linalg.norm(scale * here.z)), 1.0)
+        return Solution(z=current.z, evaluation=current, status="stalled", message=message, iterations=0)
+    scale = _column_norms(current)
+    radius = first_radius * max(float(np.linalg.norm(scale * current.z)), 1.0)
     for iteration in range(1, max_iterations + 2):  # after the last step convergence is tested once more
-        blocked = find_blocked(here, low, high)
-        distance = here.distance_squared(~blocked)
-        if distance <= decrement + RELATIVE_DECREMENT * here.cost:
+        blocked = find_blocked(current, low, high)
+        distance = current.distance_squared(~blocked)
+        allowed = decrement + RELATIVE_DECREMENT * current.cost
+        if distance <= allowed:
             return Solution(
-                z=here.z, evaluation=here, status="converged", iterations=iteration - 1, before=before,
+                z=current.z,
+                evaluation=current,
+                status="converged",
+                iterations=iteration - 1,
+                before=before,
                 message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",
-            )  # fmt: skip
+            )
         if iteration > max_iterations:
             break
-        change, damping = _step(here, blocked, scale, radius)
-        step = TrustRegionStep(start=here, end=np.clip(here.z + change, low, high), damping=damping)
-        length = float(np.linalg.norm(np.where(here.linear, 0.0, scale * step.moved)))
-        if radius < ROUNDING_RADIUS * max(float(np.linalg.norm(scale * here.z)), 1e-300):
+        change, damping = _step(current, blocked, scale, radius)
+        end = np.clip(current.z + change, low, high)
+        moved = end - current.z
+        length = float(np.linalg.norm(np.where(current.linear, 0.0, scale * moved)))
+        if radius < ROUNDING_RADIUS * max(float(np.linalg.norm(scale * current.z)), 1e-300):
             near = distance < ROUNDING_DECREMENT
             left = f"{np.sqrt(distance):.1g} standard deviations are left" if near else "the gradient is not zero"
             return Solution(
-                z=here.z, evaluation=here, status="converged" if near else "stalled", iterations=iteration,
+                z=current.z,
+                evaluation=current,
+                status="converged" if near else "stalled",
+                iterations=iteration,
                 message=f"a smaller step would be lost in rounding, and {left}",
-            )  # fmt: skip
-        whole = damping == 0.0 and bool(np.all(step.end == here.z + change))
-        if follow is not None and whole and _is_straight(distance, before, decrement + RELATIVE_DECREMENT * here.cost):
-            there = follow(here, step.end)
+            )
+        whole = damping == 0.0 and bool(np.all(end == current.z + change))
+        if follow is not None and whole and _is_straight(distance, before, allowed):
+            trial = follow(current, end)
             # A bound that held so far need not hold there.
-            remaining = there.distance_squared(~find_blocked(there, low, high))
-            if remaining <= decrement + RELATIVE_DECREMENT * there.cost:
+            remaining = trial.distance_squared(~find_blocked(trial, low, high))
+            if remaining <= decrement + RELATIVE_DECREMENT * trial.cost:
                 if callback is not None:
-                    callback(iteration, there.cost)
+                    callback(iteration, trial.cost)
                 return Solution(
-                    z=there.z, evaluation=there, status="converged", iterations=iteration,
+                    z=trial.z,
+                    evaluation=trial,
+                    status="converged",
+                    iterations=iteration,
                     message=f"the minimum is within {distance / np.sqrt(before):.1g} standard deviations",
-                )  # fmt: skip
-        predicted = here.predict_fall(step.moved)
-        there = objective.take_step(step)
-        ratio = (here.cost - there.cost) / predicted if predicted > 0.0 and np.isfinite(there.cost) else -1.0
+                )
+        predicted = -float(current.gradient @ moved + 0.5 * moved @ current.hessian @ moved)
+        trial = objective.evaluate(end)
+        ratio = (current.cost - trial.cost) / predicted if predicted > 0.0 and np.isfinite(trial.cost) else -1.0
         if ratio < 0.25:
             radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius
         elif ratio > 0.75 or damping == 0.0:
             radius = max(radius, 2.0 * length)
         if ratio > 1e-4:
-            here, before = there, distance if whole else 0.0
-            scale = np.maximum(scale, _column_norms(here))
+            current, before = trial, distance if whole else 0.0
+            scale = np.maximum(scale, _column_norms(current))
         if callback is not None:
-            callback(iteration, here.cost)
+            callback(iteration, current.cost)
     return Solution(
-        z=here.z, evaluation=here, status="max_iterations", iterations=max_iterations,
-        message=STILL_MOVING,
-    )  # fmt: skip
+        z=current.z, evaluation=current, status="max_iterations", iterations=max_iterations, message=STILL_MOVING
+    )
 
 
 def _is_straight(distance: float, before: float, allowed: float) -> bool:
@@ -173,25 +164,25 @@ def _is_straight(distance: float, before: float, allowed: float) -> bool:
     return distance * ratio <= ROUNDING_DECREMENT and distance * ratio**2 <= 0.01 * allowed
 
 
-def _column_norms(here: QuadraticModel) -> Float[np.ndarray, " n"]:
+def _column_norms(model: QuadraticModel) -> Float[np.ndarray, " n"]:
     """Return the norms of the Jacobian's columns."""
-    return np.sqrt(np.maximum(np.diag(here.hessian), 1e-300))
+    return np.sqrt(np.maximum(np.diag(model.hessian), 1e-300))
 
 
 def find_blocked(
-    here: QuadraticModel, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+    model: QuadraticModel, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """Return which unknowns lie on a bound, to a ten-thousandth of a standard deviation, that descent would cross."""
-    near = 1e-4 / _column_norms(here)
-    return ((here.z - low <= near) & (here.gradient > 0.0)) | ((high - here.z <= near) & (here.gradient < 0.0))
+    near = 1e-4 / _column_norms(model)
+    return ((model.z - low <= near) & (model.gradient > 0.0)) | ((high - model.z <= near) & (model.gradient < 0.0))
 
 
 def _step(
-    here: QuadraticModel, blocked: Bool[np.ndarray, " n"], scale: Float[np.ndarray, " n"], radius: float
+    model: QuadraticModel, blocked: Bool[np.ndarray, " n"], scale: Float[np.ndarray, " n"], radius: float
 ) -> tuple[Float[np.ndarray, " n"], float]:
     """Return the step within the radius and its lambda; the linear unknowns follow the others."""
-    bound, follow = ~blocked & ~here.linear, ~blocked & here.linear
-    h, g = here.hessian, here.gradient
+    bound, follow = ~blocked & ~model.linear, ~blocked & model.linear
+    h, g = model.hessian, model.gradient
     matrix, gradient, response = h[bound][:, bound], g[bound], np.zeros((0, 0))
     if np.any(follow):
         right = np.column_stack([g[follow], h[follow][:, bound]])
@@ -211,9 +202,9 @@ def _step(
 def _make_damped_solver(matrix: Float[np.ndarray, "n n"]) -> tuple[DampedSolver, float]:
     """Return (lambda, b) -> (matrix + lambda)^-1 b over what is seen, and a bound on the largest eigenvalue."""
     if find_arrow(matrix) is not None:
-        one = np.eye(len(matrix))
+        identity = np.eye(len(matrix))
         largest = float(np.max(np.sum(np.abs(matrix), axis=1)))
-        return lambda damping, right: solve_seen(matrix + damping * one, right, UNSEEN), largest
+        return lambda damping, right: solve_seen(matrix + damping * identity, right, UNSEEN), largest
     values, vectors = np.linalg.eigh(matrix)
     values = np.maximum(values, 0.0)
     largest = float(np.max(values, initial=0.0))

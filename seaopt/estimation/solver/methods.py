@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError, require_seed
+from seaopt.estimation.problem.experiment import check_shots
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
 from seaopt.estimation.solver.settle import Solved, explains_little, settle, settle_roughly
-from seaopt.estimation.solver.stretches import find_start_on_stretches
+from seaopt.estimation.solver.shots import cut_problem, find_start_on_shots, grow_shots
 from seaopt.records import record
 
 FAR = 10.0  # times its start: a parameter whose standard deviation is larger than itself there has lost its effect
+ANOTHER_FIT = 2.0  # residual power in one go, over that on shots, that is no longer the same fit
 FURTHER = 5  # guesses of the frequency responses that are tried at most
 
 
@@ -65,37 +68,95 @@ class OutputError(Method):
         best, guesses = find_start(problem, self)
         solved = settle(problem, best, self.max_iterations, callback) if np.isfinite(best.cost) else None
         if solved is not None and self.search:
-            solved = self._bring_back(solved, callback)
+            solved = _bring_back(solved, self, callback)
         if solved is not None and not (self.search and (problem.seeks_play or _is_doubtful(solved, guesses))):
             return solved
         for start in _further_starts(problem, best, guesses, self) if self.search else ():
-            here = problem.evaluate(start)
-            if solved is not None and _is_hopeless(settle_roughly(problem, here), solved):
+            evaluation = problem.evaluate(start)
+            if solved is not None and _is_hopeless(settle_roughly(problem, evaluation), solved):
                 continue
-            other = settle(problem, here, self.max_iterations, callback)
+            other = settle(problem, evaluation, self.max_iterations, callback)
             solved = other if solved is None or other.misfit < solved.misfit else solved
             if not _is_doubtful(solved, guesses):
                 break
         return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
 
-    def _bring_back(self, solved: Solved, callback: Callback | None) -> Solved:
-        """Return the better of a minimum and one from where parameters that lost their effect are at their start again.
 
-        So friction's fall over a speed that becomes tiny: nothing brings it back, and the others have taken its place.
-        """
-        problem, evaluation, shared = solved.problem, solved.solution.evaluation, solved.problem.unknowns.shared
-        if not np.all(np.isfinite(evaluation.hessian)):
+@record
+class MultipleShooting(Method):
+    """Output error whose search begins on shots: each segment is cut, each shot starts from a state of its own.
+
+    For plants that are unstable, or a start far off: a simulation that restarts at intervals cannot diverge. The shots
+    grow until one is left: the result is that of `OutputError` wherever both find it. Where the plant diverges in one
+    pass the shots keep their own initial states, as the message states: the intervals are then wider.
+
+    Parameters
+    ----------
+    segments : int
+        Shots per log segment; a segment shorter than the longest may have fewer. Each shot needs a sample more than the
+        plant has states, and at least four.
+    max_iterations : int
+        Of least squares.
+    search : bool
+        Start from the logs' frequency responses where they explain the logs better than the given values.
+    seed : int
+        Of that search.
+
+    """
+
+    key: ClassVar[str] = "multiple_shooting"
+
+    segments: int = 50
+
+    def __post_init__(self) -> None:
+        if self.segments < 1:
+            raise EstimationError(f"MultipleShooting(segments={self.segments}): give at least 1")
+
+    def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
+        """Let the shots grow and settle in one go; or on shots of the first length if the plant runs away."""
+        for experiment in problem.experiments:
+            check_shots(
+                experiment.data, experiment.longest, self.segments, f"MultipleShooting(segments={self.segments})"
+            )
+        start, _ = find_start(problem, self)
+        shared, first = problem.unknowns.shared, start.z.copy()
+        if self.search and (not np.isfinite(start.cost) or explains_little(problem, start.power)):
+            predicting = find_predicting_start(problem, first, self.max_iterations)
+            first = first if predicting is None else predicting
+        z = first.copy()
+        for number, theta in enumerate(grow_shots(problem, first, self.segments, callback)):
+            if theta is None:
+                break
+            z[:shared] = theta
+            if not number:
+                first[:shared] = theta
+        _, z = cut_problem(problem, z, 1)
+        solved = settle(problem, problem.evaluate(z), self.max_iterations, callback)
+        if self.search and solved.follows_log:
+            solved = _bring_back(solved, self, callback)
+        if solved.follows_log:
             return solved
-        start, z = problem.unknowns.start[:shared], solved.solution.z[:shared]
-        variances = np.diag(invert(evaluation.hessian)[0])[:shared]
-        far = (np.abs(z) < np.abs(start) / FAR) | (np.abs(z) > FAR * np.abs(start))
-        lost = np.flatnonzero(far & (start != 0.0) & (variances > z**2))
-        if not lost.size:
-            return solved
-        again = solved.solution.z.copy()
-        again[lost] = start[lost]
-        other = settle(problem, problem.evaluate(again), self.max_iterations, callback)
-        return other if other.misfit < solved.misfit else solved
+        if self.search:
+            # Shots may follow a log that no input drives; a plant that is simulated in one go cannot.
+            other = OutputError(max_iterations=self.max_iterations, seed=self.seed).solve(problem, callback)
+            if other.follows_log:
+                return other
+        apart = self._settle_apart(problem, first, callback)
+        return solved if _explains_as_much(solved, apart) else apart
+
+    def _settle_apart(self, problem: FitProblem, z: Float[np.ndarray, " n"], callback: Callback | None) -> Solved:
+        """Settle on shots that keep initial states of their own, for a plant that runs away in one go."""
+        shots, values = cut_problem(problem, z, self.segments)
+        for experiment in shots.experiments:
+            settle_rows, longest = experiment.weights.settle, experiment.longest
+            if longest <= 2 * settle_rows:
+                raise EstimationError(
+                    f"experiment {experiment.name}: the plant runs away in simulation, and its shots have {longest} "
+                    f"samples, of which the band filter takes {settle_rows} to settle; use fewer segments or no band_hz"
+                )
+        solved = settle(shots, shots.evaluate(values), self.max_iterations, callback)
+        message = f"{solved.solution.message}; the plant runs away in one go: shots keep initial states of their own"
+        return replace(solved, solution=replace(solved.solution, message=message))
 
 
 @record
@@ -131,7 +192,9 @@ class PredictionError(Method):
         for start in (*([best.z] if np.isfinite(best.cost) else []), problem.unknowns.start):
             # A plant that already simulates well would be led away: held to the log, it may do without its input.
             z = best.z if follows and start is best.z else find_predicting_start(problem, start, self.max_iterations)
-            solved = _better(solved, None if z is None else self._settle_predicting(problem, z, callback))
+            found = None if z is None else self._settle_predicting(problem, z, callback)
+            if found is not None and (solved is None or found.misfit < solved.misfit):
+                solved = found
             if solved is not None and solved.solution.status == "converged":
                 break
         if self.search and (solved is None or _simulates_badly(solved)):
@@ -147,18 +210,18 @@ class PredictionError(Method):
         predicting = add_predictors(problem, start, follows=True)
         if predicting is None:
             return None
-        one = settle(predicting, predicting.evaluate(start), self.max_iterations, callback)
-        again = add_predictors(one.problem, one.solution.z, follows=True)
+        solved = settle(predicting, predicting.evaluate(start), self.max_iterations, callback)
+        again = add_predictors(solved.problem, solved.solution.z, follows=True)
         if again is not None and not problem.all_linear:
-            one = settle(again, again.evaluate(one.solution.z), self.max_iterations, callback)
-        return one
+            solved = settle(again, again.evaluate(solved.solution.z), self.max_iterations, callback)
+        return solved
 
 
 def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses.
 
     A guess that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode
-    a little off is out of phase after some periods. On short stretches, or held to the log, such a guess finds the
+    a little off is out of phase after some periods. On short shots, or held to the log, such a guess finds the
     mode.
     """
     if not method.search or not problem.unknowns.shared:
@@ -171,9 +234,9 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Fl
     first = problem.evaluate(problem.unknowns.start)
     best = first if guessed is None or guessed.cost > first.cost else guessed
     if guesses and (matched or problem.all_linear) and explains_little(problem, best.power):
-        # Of a linear plant the best initial states of stretches follow from one evaluation.
+        # Of a linear plant the best initial states of shots follow from one evaluation.
         z = (
-            find_start_on_stretches(problem, guesses[0])
+            find_start_on_shots(problem, guesses[0])
             if problem.all_linear
             else find_predicting_start(problem, guesses[0], method.max_iterations)
         )
@@ -182,10 +245,33 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Fl
     return best, guesses
 
 
-def _better(one: Solved | None, other: Solved | None) -> Solved | None:
-    if one is None or other is None:
-        return one or other
-    return other if other.misfit < one.misfit else one
+def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> Solved:
+    """Return the better of a minimum and one from where parameters that lost their effect are at their start again.
+
+    So friction's fall over a speed that becomes tiny: nothing brings it back, and the others have taken its place.
+    """
+    problem, evaluation, shared = solved.problem, solved.solution.evaluation, solved.problem.unknowns.shared
+    if not np.all(np.isfinite(evaluation.hessian)):
+        return solved
+    start, z = problem.unknowns.start[:shared], solved.solution.z[:shared]
+    variances = np.diag(invert(evaluation.hessian)[0])[:shared]
+    far = (np.abs(z) < np.abs(start) / FAR) | (np.abs(z) > FAR * np.abs(start))
+    lost = np.flatnonzero(far & (start != 0.0) & (variances > z**2))
+    if not lost.size:
+        return solved
+    again = solved.solution.z.copy()
+    again[lost] = start[lost]
+    other = settle(problem, problem.evaluate(again), method.max_iterations, callback)
+    return other if other.misfit < solved.misfit else solved
+
+
+def _explains_as_much(solved: Solved, other: Solved) -> bool:
+    """Tell whether a minimum has converged and leaves about as much of the logs as another: both see noise alone."""
+    power = other.solution.evaluation.power.items()
+    left = solved.solution.evaluation.power
+    return solved.solution.status == "converged" and all(
+        np.all(left[name].rms ** 2 < ANOTHER_FIT * there.rms**2) for name, there in power
+    )
 
 
 def _simulates_badly(solved: Solved) -> bool:

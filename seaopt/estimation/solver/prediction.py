@@ -92,7 +92,7 @@ def _make_predictor(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> St
         if not np.all(np.isfinite(correction)):
             return None
         settings = replace(still, correction=correction)
-        states = run_passes(model, short, settings, np.zeros((1, model.nx)), sums=False, states=True).states
+        states = run_passes(model, short, settings, np.zeros(model.nx), sums=False, states=True).states
         assert states is not None
         if not np.all(np.isfinite(states)):
             return None
@@ -106,9 +106,11 @@ def _guess_state_size(experiment: FitExperiment, point: Point) -> Float[np.ndarr
     """Return the size of each state that would show as the outputs' spread within ten samples."""
     model = experiment.model
     unit = SteadyStateFilter(
-        size=np.ones(model.nx), sensors=np.ones(model.ny), places=np.zeros((1, model.nx + model.nu)),
+        size=np.ones(model.nx),
+        sensors=np.ones(model.ny),
+        places=np.zeros((1, model.nx + model.nu)),
         gain=np.ones(model.ny),
-    )  # fmt: skip
+    )
     a, c = unit.linearise(model, point, point.theta[None])
     rows, power = [], np.eye(model.nx)
     for _ in range(10):

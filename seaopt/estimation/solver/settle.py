@@ -51,6 +51,13 @@ class Solved:
         rows = [(power.squares, power.counts) for power in evaluation.power.values()]
         return float(sum(np.sum(n * np.log(np.maximum(s, 1e-300) / np.maximum(n, 1.0))) for s, n in rows))
 
+    @property
+    def follows_log(self) -> bool:
+        """Whether the search has converged, and what it found explains the log."""
+        evaluation = self.solution.evaluation
+        found = self.solution.status == "converged" and bool(np.isfinite(evaluation.cost))
+        return found and not explains_little(self.problem, evaluation.power)
+
 
 def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
     """Minimise; estimate the unknown sigmas and refine the step until neither changes.
@@ -59,8 +66,8 @@ def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback
     where it swings in place of what drives it.
     """
 
-    def solve(stage: FitProblem, here: Evaluation) -> Solved:
-        return _settle(stage, here, max_iterations, callback)
+    def solve(stage: FitProblem, evaluation: Evaluation) -> Solved:
+        return _settle(stage, evaluation, max_iterations, callback)
 
     places, unknowns = problem.find_stopped(), problem.unknowns
     if not places or np.any(start.z[places] != 0.0):
@@ -85,10 +92,11 @@ def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem,
     if not places:
         return solve(problem, start)
 
-    def solve_stage(problem: FitProblem, here: Evaluation) -> Solved:
+    def solve_stage(problem: FitProblem, evaluation: Evaluation) -> Solved:
         low = unknowns.low.copy()
-        low[places] = np.maximum(low[places], here.z[places] * max(1.0 / FALL, _measure_stiffness(problem, here.z)))
-        return solve(replace(problem, unknowns=replace(unknowns, low=low)), here)
+        fall = max(1.0 / FALL, _measure_stiffness(problem, evaluation.z))
+        low[places] = np.maximum(low[places], fall * evaluation.z[places])
+        return solve(replace(problem, unknowns=replace(unknowns, low=low)), evaluation)
 
     stiffness = _measure_stiffness(problem, start.z)
     if stiffness > 1.0:  # too sharp to begin with
@@ -99,8 +107,9 @@ def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem,
     while np.any(solved.solution.z[places] <= solved.problem.unknowns.low[places]):
         if _measure_stiffness(problem, solved.solution.z) > HALF or not np.isfinite(solved.misfit):
             break
-        here = solved.solution.evaluation  # whose slope by the speeds is that of the best cost, and flattens towards 0
-        if 2.0 * float(here.gradient[places] @ here.z[places]) <= TOLD:
+        evaluation = solved.solution.evaluation
+        # The slope by the speeds is that of the best cost, and flattens towards 0.
+        if 2.0 * float(evaluation.gradient[places] @ evaluation.z[places]) <= TOLD:
             break
         sharper = solve_stage(solved.problem, solved.solution.evaluation)
         if not solved.misfit - sharper.misfit > TOLD:
@@ -119,59 +128,70 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
     if not np.isfinite(start.cost):
         solution = minimise(problem, start, unknowns.low, unknowns.high)
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
-    problem, here = choose_first_steps(problem, start)
+    problem, evaluation = choose_first_steps(problem, start)
     decrement = FLAT_DECREMENT if problem.predicts or problem.find_smoothing() else DECREMENT
     if any(experiment.model.sticks for experiment in problem.experiments):
         decrement = JUMPY_DECREMENT
     checks: Checks = {}
-    rough, before = problem.straight and not explains_little(problem, here.power), 0.0
+    rough, before = problem.straight and not explains_little(problem, evaluation.power), 0.0
     if rough:  # so good a start gives sigmas good enough to come near the minimum, and there they are estimated well
-        problem = problem.with_sigma(estimate_sigma(problem, here.power, here.z))
-        here = problem.assemble(here.passes)
+        problem = problem.with_sigma(estimate_sigma(problem, evaluation.power, evaluation.z))
+        evaluation = problem.assemble(evaluation.passes)
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
-            problem, here, unknowns.low, unknowns.high, decrement=ROUGH if rough else decrement,
-            max_iterations=max(max_iterations - iterations, 1), callback=callback,
-            follow=problem.follow if problem.straight and attempt else None, before=before,  # in true sigmas
-        )  # fmt: skip
-        here, iterations = solution.evaluation, iterations + solution.iterations
-        if not np.isfinite(here.cost):
+            problem,
+            evaluation,
+            unknowns.low,
+            unknowns.high,
+            decrement=ROUGH if rough else decrement,
+            max_iterations=max(max_iterations - iterations, 1),
+            callback=callback,
+            follow=problem.follow if problem.straight and attempt else None,
+            before=before,  # in true sigmas
+        )
+        evaluation, iterations = solution.evaluation, iterations + solution.iterations
+        if not np.isfinite(evaluation.cost):
             solution = replace(solution, iterations=iterations)
             return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
-        sigma = estimate_sigma(problem, here.power, here.z)
+        sigma = estimate_sigma(problem, evaluation.power, evaluation.z)
         settled = all(np.allclose(sigma[e.name], e.sigma, rtol=5e-3) for e in problem.experiments)
         before_refining = problem = problem.with_sigma(sigma)
         if problem.loss.quadratic:
-            here = problem.assemble(here.passes, here.z)  # other sigmas need no other passes
+            evaluation = problem.assemble(evaluation.passes, evaluation.z)  # other sigmas need no other passes
         elif not settled:
-            here = problem.evaluate(here.z)
-        problem, here, checks = refine_steps(problem, here, checks if settled else {})
+            evaluation = problem.evaluate(evaluation.z)
+        problem, evaluation, checks = refine_steps(problem, evaluation, checks if settled else {})
         done, spent = settled and not rough and problem is before_refining, iterations >= max_iterations
         rough, before = False, solution.before
         if done or spent or attempt == MAX_ROUNDS - 1:
-            solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
+            solution = replace(solution, z=evaluation.z, evaluation=evaluation, iterations=iterations)
             if not done and spent:
                 solution = replace(solution, status="max_iterations", message=STILL_MOVING)
             elif not done:
                 message = f"sigma or the integration step still changes after {MAX_ROUNDS} rounds; give sigma"
                 solution = replace(solution, status="stalled", message=message)
-            return Solved(problem=problem, solution=solution, step_error=find_worst(check_steps(problem, here, checks)))
+            worst = find_worst(check_steps(problem, evaluation, checks))
+            return Solved(problem=problem, solution=solution, step_error=worst)
     raise AssertionError  # the last attempt returns
 
 
 def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
     """Return a minimum near enough to be compared with others: sigma is estimated twice, the step chosen once."""
-    problem, here = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
+    problem, evaluation = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
     problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
     unknowns, solution = problem.unknowns, None
     for _ in range(ROUGH_ROUNDS):
-        problem = problem.with_sigma(estimate_sigma(problem, here.power, here.z))
+        problem = problem.with_sigma(estimate_sigma(problem, evaluation.power, evaluation.z))
         solution = minimise(
-            problem, problem.evaluate(here.z), unknowns.low, unknowns.high, decrement=NEAR,
+            problem,
+            problem.evaluate(evaluation.z),
+            unknowns.low,
+            unknowns.high,
+            decrement=NEAR,
             max_iterations=ROUGH_ITERATIONS,
-        )  # fmt: skip
-        here = solution.evaluation
-        if not np.isfinite(here.cost):
+        )
+        evaluation = solution.evaluation
+        if not np.isfinite(evaluation.cost):
             break
     assert solution is not None
     return Solved(problem=problem, solution=solution, step_error=StepError())
@@ -196,8 +216,8 @@ def estimate_sigma(
         # A constant output has no size of its own.
         floor = np.maximum(1e-9 * np.where(experiment.spread > 0.0, experiment.spread, 1.0), 1e-300)
         estimated = np.maximum(rms, floor)
-        known = experiment.data.sigma
+        given = experiment.data.sigma
         sigma[experiment.name] = np.array(
-            [known.get(name, float(s)) for name, s in zip(experiment.data.outputs, estimated, strict=True)]
+            [given.get(name, float(s)) for name, s in zip(experiment.data.outputs, estimated, strict=True)]
         )
     return sigma

@@ -57,23 +57,23 @@ def choose_first_steps(
 ) -> tuple[FitProblem, Evaluation]:
     """Return the problem with steps that do for a first search, `most` per sample at most, and its evaluation there."""
     while True:
-        finer = problem.map(lambda experiment, here=start: _choose_first_steps(experiment, here, most))
+        finer = problem.map(lambda experiment, evaluation=start: _choose_first_steps(experiment, evaluation, most))
         if finer == [experiment.count_steps(start.z) for experiment in problem.experiments]:
             return problem, start
         problem = _with_substeps(problem, finer)
         start = problem.evaluate(start.z)
 
 
-def _choose_first_steps(experiment: FitExperiment, here: Evaluation, most: int) -> int:
+def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most: int) -> int:
     """Return the steps that an experiment's first samples ask for."""
-    z, fine = here.passes.z, []
+    z, fine = evaluation.passes.z, []
     if experiment.model.linear or experiment.count_steps(z) >= most:
         return experiment.count_steps(z)
     halved = _halve_steps(experiment, z)
     for segment in experiment.segments:
-        edges = np.array([0, min(segment.samples.n, FIRST_SAMPLES)])
-        fine.append(halved.run(segment, z, edges=edges, sums=False, outputs=True))
-    error = _measure_output_error(experiment, z, here.passes.by_experiment[experiment.name], fine)
+        stop = min(segment.samples.n, FIRST_SAMPLES)
+        fine.append(halved.run(segment, z, stop=stop, sums=False, outputs=True))
+    error = _measure_output_error(experiment, z, evaluation.passes.by_experiment[experiment.name], fine)
     order = experiment.model.order
     return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR, order), most)
 
@@ -88,8 +88,8 @@ def hold_bristles(problem: FitProblem) -> FitProblem:
         return problem
     z, cost = problem.unknowns.start, np.nan
     while True:
-        here = problem.evaluate(z).cost
-        if np.isfinite(here) and abs(here - cost) <= SAME_COST * here:
+        new_cost = problem.evaluate(z).cost
+        if np.isfinite(new_cost) and abs(new_cost - cost) <= SAME_COST * new_cost:
             return problem
         steps = [experiment.count_steps(z) for experiment in problem.experiments]
         finer = [
@@ -98,47 +98,47 @@ def hold_bristles(problem: FitProblem) -> FitProblem:
         ]
         if finer == steps:
             return problem
-        problem, cost = _with_substeps(problem, finer), here
+        problem, cost = _with_substeps(problem, finer), new_cost
 
 
-def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
+def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
     """Return the problem with steps whose error is small, its evaluation there, and the errors that are known there.
 
     That of a step that was made finer is not: its order says how fine it must be, and the next minimum is looked at.
     """
     while True:
-        checks = check_steps(problem, here, checks)
-        substeps = [experiment.count_steps(here.z) for experiment in problem.experiments]
+        checks = check_steps(problem, evaluation, checks)
+        substeps = [experiment.count_steps(evaluation.z) for experiment in problem.experiments]
         finer = [
             _choose_steps(steps, checks[e.name].error, STEP_ERROR_SIGMA, e.model.order)
             for e, steps in zip(problem.experiments, substeps, strict=True)
         ]
         if finer == substeps:
-            return problem, here, checks
+            return problem, evaluation, checks
         trusted = all(new < MUCH_FINER * old for new, old in zip(finer, substeps, strict=True))
         problem = _with_substeps(problem, finer)
-        here = problem.evaluate(here.z)
+        evaluation = problem.evaluate(evaluation.z)
         if trusted:
-            return problem, here, checks
+            return problem, evaluation, checks
 
 
-def check_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> Checks:
+def check_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> Checks:
     """Return the step error of every experiment: known still, where neither its step nor the minimum has changed."""
 
     def check(experiment: FitExperiment) -> Check:
-        known, substeps = checks.get(experiment.name), experiment.count_steps(here.z)
-        if known is not None and known.substeps == substeps and _lies_near(here, known.z):
-            return known
-        return Check(error=measure_step_error(problem, experiment, here), z=here.z, substeps=substeps)
+        earlier, substeps = checks.get(experiment.name), experiment.count_steps(evaluation.z)
+        if earlier is not None and earlier.substeps == substeps and _lies_near(evaluation, earlier.z):
+            return earlier
+        return Check(error=measure_step_error(problem, experiment, evaluation), z=evaluation.z, substeps=substeps)
 
     return {e.name: made for e, made in zip(problem.experiments, problem.map(check), strict=True)}
 
 
 @np.errstate(all="ignore")
-def _lies_near(here: Evaluation, z: Float[np.ndarray, " n"]) -> bool:
+def _lies_near(evaluation: Evaluation, z: Float[np.ndarray, " n"]) -> bool:
     """Tell whether the step error at z holds here, too; it does not where derivatives are not finite."""
-    moved = here.z - z
-    distance = moved @ here.hessian @ moved
+    moved = evaluation.z - z
+    distance = moved @ evaluation.hessian @ moved
     return bool(np.isfinite(distance) and distance < NEARBY**2)
 
 
@@ -162,7 +162,7 @@ def _choose_steps(steps: int, error: StepError, allowed: float, order: int) -> i
 
 
 @np.errstate(all="ignore")
-def measure_step_error(problem: FitProblem, experiment: FitExperiment, here: Evaluation) -> StepError:
+def measure_step_error(problem: FitProblem, experiment: FitExperiment, evaluation: Evaluation) -> StepError:
     """Return the integration error of an experiment, from the change that steps of half the length bring.
 
     In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far
@@ -171,7 +171,7 @@ def measure_step_error(problem: FitProblem, experiment: FitExperiment, here: Eva
     """
     if experiment.model.linear:
         return StepError()
-    z, passes, n = here.passes.z, here.passes.by_experiment[experiment.name], here.z.size
+    z, passes, n = evaluation.passes.z, evaluation.passes.by_experiment[experiment.name], evaluation.z.size
     fine = _halve_steps(experiment, z).run_all(z)
     worst = _measure_output_error(experiment, z, passes, fine)
     weighted = replace(experiment, sigma=_floored_sigma(experiment))
@@ -207,8 +207,8 @@ def _measure_output_error(
     """Return the largest integration error in an output of an experiment, in sigma; see `measure_step_error`."""
     scale = experiment.point(z).gain / _floored_sigma(experiment)
     worst = 0.0
-    for one, two in zip(coarse, fine, strict=True):
-        assert one.outputs is not None and two.outputs is not None
-        change = float(np.max(np.abs(scale * (one.outputs - two.outputs)))) * _whole_error(experiment)
+    for rough, halved in zip(coarse, fine, strict=True):
+        assert rough.outputs is not None and halved.outputs is not None
+        change = float(np.max(np.abs(scale * (rough.outputs - halved.outputs)))) * _whole_error(experiment)
         worst = max(worst, change if np.isfinite(change) else np.inf)
     return worst

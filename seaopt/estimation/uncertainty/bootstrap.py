@@ -29,11 +29,11 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError, require_seed
 from seaopt.estimation.problem.correlation import autocorrelation
-from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment
+from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
-from seaopt.estimation.result.covariance import Covariance, compute_bread
+from seaopt.estimation.result.covariance import Covariance, compute_bread, compute_influence, map_to_influence
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.executors import map_ordered
@@ -75,7 +75,7 @@ class Bootstrap:
 
     @property
     def covariance(self) -> Covariance:
-        """Of the draws."""
+        """Covariance of the draws."""
         return Covariance(names=self.names, matrix=np.atleast_2d(np.cov(self.draws, rowvar=False)))
 
     def std(self, name: str) -> float:
@@ -91,13 +91,16 @@ class Bootstrap:
     def to_dict(self) -> dict[str, Any]:
         """Return the content as numbers, lists and text."""
         return {
-            "names": list(self.names), "draws": len(self.draws), "refit": self.refit, "blocks": dict(self.blocks),
+            "names": list(self.names),
+            "draws": len(self.draws),
+            "refit": self.refit,
+            "blocks": dict(self.blocks),
             "covariance": self.covariance.matrix,
             "parameters": {
                 name: {"value": value, "unit": unit, "std": self.std(name), "ci95": list(self.interval(name))}
                 for name, unit, value in zip(self.names, self.units, self.estimates.tolist(), strict=True)
             },
-        }  # fmt: skip
+        }
 
     def __repr__(self) -> str:
         how = "refits" if self.refit else "steps from the minimum"
@@ -115,9 +118,14 @@ class Bootstrap:
 
 
 def bootstrap(
-    fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False, block: int | None = None,
+    fit: Fit,
+    draws: int = 200,
+    seed: int = 0,
+    *,
+    refit: bool = False,
+    block: int | None = None,
     executor: Executor | None = None,
-) -> Bootstrap:  # fmt: skip
+) -> Bootstrap:
     """Return how the parameters vary when blocks of the residuals are resampled.
 
     Parameters
@@ -164,15 +172,20 @@ def bootstrap(
     residuals = minimum.residuals()
     rng = np.random.default_rng(require_seed(seed, EstimationError))
     names = problem.unknowns.names[: problem.unknowns.shared]
-    lengths = {name: _choose_length(own, block) for name, own in residuals.items()}
+    lengths = {name: _choose_length(residual, block) for name, residual in residuals.items()}
     if refit:
         values = _draw_refits(minimum, residuals, lengths, draws, rng, executor)
     else:
         values = _draw_steps(minimum, residuals, lengths, draws, rng)
     return Bootstrap(
-        names=names, units=tuple(fit.parameters[name].unit for name in names), estimates=minimum.z[: len(names)],
-        draws=values, blocks=lengths, refit=refit, reference=fit.covariance,
-    )  # fmt: skip
+        names=names,
+        units=tuple(fit.parameters[name].unit for name in names),
+        estimates=minimum.z[: len(names)],
+        draws=values,
+        blocks=lengths,
+        refit=refit,
+        reference=fit.covariance,
+    )
 
 
 def _check(fit: Fit, problem: FitProblem, draws: int, refit: bool, block: int | None) -> None:
@@ -243,9 +256,12 @@ class _Blocks:
 
 
 def _draw_blocks(
-    problem: FitProblem, lengths: Mapping[str, int], pools: Mapping[str, Float[np.ndarray, "_ ny"]], draws: int,
+    problem: FitProblem,
+    lengths: Mapping[str, int],
+    pools: Mapping[str, Float[np.ndarray, "_ ny"]],
+    draws: int,
     rng: np.random.Generator,
-) -> dict[str, _Blocks]:  # fmt: skip
+) -> dict[str, _Blocks]:
     """Return the blocks of each experiment."""
     blocks: dict[str, _Blocks] = {}
     for experiment in problem.experiments:
@@ -257,9 +273,8 @@ def _draw_blocks(
 
 
 def _draw_steps(
-    minimum: Minimum, residuals: ResidualsByExperiment, lengths: Mapping[str, int], draws: int,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "draws p"]:  # fmt: skip
+    minimum: Minimum, residuals: ResidualsByExperiment, lengths: Mapping[str, int], draws: int, rng: np.random.Generator
+) -> Float[np.ndarray, "draws p"]:
     """Return one Gauss-Newton step per draw."""
     problem, z = minimum.problem, minimum.z
     p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-1.0
@@ -269,18 +284,21 @@ def _draw_steps(
     inverse = invert(hessian)[0][:, :p]
     pools = {
         name: _make_pool(
-            [problem.loss.slope(s.weighted)[r] for s, r in zip(own.segments, _find_used_rows(own), strict=True)]
+            [
+                problem.loss.slope(s.weighted)[r]
+                for s, r in zip(residual.segments, _find_used_rows(residual), strict=True)
+            ]
         )
-        for name, own in residuals.items()
+        for name, residual in residuals.items()
     }
     blocks = _draw_blocks(problem, lengths, pools, draws, rng)
     moved = (rng.normal(size=(draws, z.size)) * prior) @ inverse
     for experiment in problem.experiments:
         first = 0
         for segment in experiment.segments:
+            into = map_to_influence(experiment, segment, inverse)
             for rows, columns, used in stream_columns(experiment, segment, z):
-                influence = _compute_influence(experiment, segment, columns, inverse) * used[:, :, None]
-                flat = influence.reshape(-1, p)
+                flat = compute_influence(columns, used, into).transpose(2, 0, 1).reshape(-1, p)
                 at = first + np.arange(rows.start, rows.start + len(columns))
                 for d in range(draws):
                     moved[d] += blocks[experiment.name].draw(d, at).ravel() @ flat
@@ -288,28 +306,20 @@ def _draw_steps(
     return z[:p] - moved
 
 
-def _compute_influence(
-    experiment: FitExperiment, segment: FitSegment, columns: Float[np.ndarray, "m ny nc"],
-    inverse: Float[np.ndarray, "n p"],
-) -> Float[np.ndarray, "m ny p"]:  # fmt: skip
-    """Return how much each residual, in sigma, moves each parameter."""
-    influence = np.empty((*columns.shape[:2], inverse.shape[1]))
-    for o, places in enumerate(experiment.columns(segment)):
-        used = np.flatnonzero(places >= 0)
-        influence[:, o] = columns[:, o, 1 + used] @ (inverse[places[used]] / experiment.sigma[o])
-    return influence
-
-
 def _draw_refits(
-    minimum: Minimum, residuals: ResidualsByExperiment, lengths: Mapping[str, int], draws: int,
-    rng: np.random.Generator, executor: Executor | None,
-) -> Float[np.ndarray, "draws p"]:  # fmt: skip
+    minimum: Minimum,
+    residuals: ResidualsByExperiment,
+    lengths: Mapping[str, int],
+    draws: int,
+    rng: np.random.Generator,
+    executor: Executor | None,
+) -> Float[np.ndarray, "draws p"]:
     """Return one fit per draw, of the model's outputs with the drawn residuals, from the minimum."""
     problem, z = minimum.problem, minimum.z
     unknowns, p = problem.unknowns, problem.unknowns.shared
     pools = {
-        name: _make_pool([s.raw[used] for s, used in zip(own.segments, _find_used_rows(own), strict=True)])
-        for name, own in residuals.items()
+        name: _make_pool([s.raw[used] for s, used in zip(residual.segments, _find_used_rows(residual), strict=True)])
+        for name, residual in residuals.items()
     }
     blocks = _draw_blocks(problem, lengths, pools, draws, rng)
 

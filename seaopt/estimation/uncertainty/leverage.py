@@ -57,7 +57,7 @@ def _compute_information(minimum: Minimum, experiment: FitExperiment) -> Float[n
     hessian = experiment.normal(experiment.run_all(z), z.size)[1:, 1:]
     columns = (places for segment in experiment.segments for places in experiment.columns(segment))
     touched = np.unique(np.concatenate(list(columns)))
-    rest = touched[touched >= unknowns.shared]
-    hessian[rest, rest] += unknowns.precision[rest]
-    kept = np.concatenate([np.arange(unknowns.shared), rest])
+    nuisance = touched[touched >= unknowns.shared]
+    hessian[nuisance, nuisance] += unknowns.precision[nuisance]
+    kept = np.concatenate([np.arange(unknowns.shared), nuisance])
     return eliminate(hessian[kept][:, kept], unknowns.shared)

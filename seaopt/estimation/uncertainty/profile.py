@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import to_content
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.problem.normal_equations import invert, solve_seen
 from seaopt.estimation.result.covariance import compute_bread
@@ -89,12 +90,7 @@ class Profile:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content as numbers, lists and text."""
-        return {
-            "name": self.name, "unit": self.unit, "estimate": self.estimate, "level": self.level,
-            "interval": list(self.interval), "closed": list(self.closed), "wald": list(self.wald),
-            "values": self.values, "rises": self.rises, "scale": self.scale, "refits": self.refits,
-            "message": self.message,
-        }  # fmt: skip
+        return to_content(self)
 
     def __repr__(self) -> str:
         low, high = self.interval
@@ -167,11 +163,19 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
     order = np.argsort(curve.values)
     estimate = float(minimum.z[curve.index])
     return Profile(
-        name=name, unit=fit.parameters[name].unit, estimate=estimate, level=level, interval=(low, high),
-        closed=(shut_low, shut_high), wald=(estimate - reach * std, estimate + reach * std),
-        values=np.array(curve.values)[order], rises=np.array(curve.rises)[order], scale=scale,
-        refits=len(curve.values) - 1, message=curve.warn(name),
-    )  # fmt: skip
+        name=name,
+        unit=fit.parameters[name].unit,
+        estimate=estimate,
+        level=level,
+        interval=(low, high),
+        closed=(shut_low, shut_high),
+        wald=(estimate - reach * std, estimate + reach * std),
+        values=np.array(curve.values)[order],
+        rises=np.array(curve.rises)[order],
+        scale=scale,
+        refits=len(curve.values) - 1,
+        message=curve.warn(name),
+    )
 
 
 def _measure_scale(fit: Fit, minimum: Minimum, name: str, coloured: bool) -> tuple[float, float]:
@@ -181,8 +185,8 @@ def _measure_scale(fit: Fit, minimum: Minimum, name: str, coloured: bool) -> tup
     if not problem.loss.quadratic:
         bread = compute_bread(problem, minimum.z) + np.diag(problem.unknowns.precision)
         curved = float(np.sqrt(invert(bread)[0][(problem.unknowns.names.index(name),) * 2]))
-    known = np.isfinite(curved) and np.isfinite(std) and curved > 0.0 and std > 0.0
-    return (std / curved) ** 2 if known else 1.0, std
+    finite = np.isfinite(curved) and np.isfinite(std) and curved > 0.0 and std > 0.0
+    return (std / curved) ** 2 if finite else 1.0, std
 
 
 class _ProfileCurve:
@@ -190,12 +194,12 @@ class _ProfileCurve:
 
     def __init__(self, minimum: Minimum, index: int, scale: float, std: float) -> None:
         self.problem, self.index, self.scale = minimum.problem, index, scale
-        here = self.problem.evaluate(minimum.z)
-        self.cost = here.cost
+        evaluation = self.problem.evaluate(minimum.z)
+        self.cost = evaluation.cost
         self.values, self.rises, self.points = [float(minimum.z[index])], [0.0], [minimum.z]
-        self.along = _find_direction(here.hessian, index)
-        known = np.isfinite(std) and std > 0.0
-        self.step = std if known else 0.1 * max(abs(self.values[0]), 1e-300)
+        self.along = _find_direction(evaluation.hessian, index)
+        finite = np.isfinite(std) and std > 0.0
+        self.step = std if finite else 0.1 * max(abs(self.values[0]), 1e-300)
 
     def refit_at(self, value: float) -> float:
         """Refit the others with the parameter at `value`, from the nearest refit, and return the scaled rise."""
@@ -268,9 +272,9 @@ class _ProfileCurve:
 
 def _find_direction(hessian: Float[np.ndarray, "n n"], index: int) -> Float[np.ndarray, " n"]:
     """Return how the others follow when one unknown moves by one: to first order, their best values."""
-    others = np.arange(len(hessian)) != index
+    remaining = np.arange(len(hessian)) != index
     step = np.ones(len(hessian))
-    step[others] = -solve_seen(hessian[others][:, others], hessian[others, index], 1e-12)
+    step[remaining] = -solve_seen(hessian[remaining][:, remaining], hessian[remaining, index], 1e-12)
     return step
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import stat
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -89,7 +90,10 @@ def sniff(path: Path) -> tuple[str, str, str]:
 
 
 def _first_bytes(path: Path) -> bytes:
-    look, folder = f"seaopt inspect {shlex.quote(str(path))}", shlex.quote(str(path.parent))
+    look, remedy = f"seaopt inspect {shlex.quote(str(path))}", f"check the path: ls {shlex.quote(str(path.parent))}"
+    names = sys.getfilesystemencoding()
+    if names != "utf-8" and not str(path).isascii():
+        remedy = f"names of files are {names} here: set PYTHONUTF8=1 if they are UTF-8, or {remedy}"
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
@@ -99,10 +103,10 @@ def _first_bytes(path: Path) -> bytes:
         with path.open("rb") as stream:
             head = stream.read(4096)
     except FileNotFoundError as error:
-        raise LogError(f"{path}: no such file; check the path: ls {folder}") from error
+        raise LogError(f"{path}: no such file; {remedy}") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise LogError(f"{path}: cannot be read ({reason}); check the path: ls {folder}") from error
+        raise LogError(f"{path}: cannot be read ({reason}); {remedy}") from error
     if not head.strip(b" \t\r\n"):
         raise LogError(f"{path}: the file is empty; record the log again, then look at it: {look}")
     return head

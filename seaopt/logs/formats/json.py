@@ -29,14 +29,18 @@ def open_json(path: Path) -> Source:
     fields = tuple(Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items())
     listed = ", ".join(f"{key} = {value}" for key, value in header.items())
     constants = {
-        key: (float(one), header_unit(key))
-        for key, one in header.items()
-        if name_kind(one) == "float64" and abs(one) <= LARGEST
+        key: (float(value), header_unit(key))
+        for key, value in header.items()
+        if name_kind(value) == "float64" and abs(value) <= LARGEST
     }
     return Source(
-        path=path, format="JSON", fields=fields, load=partial(_load, path), constants=constants,
+        path=path,
+        format="JSON",
+        fields=fields,
+        load=partial(_load, path),
+        constants=constants,
         notes=(f"header: {listed}"[:400],) if header else (),
-    )  # fmt: skip
+    )
 
 
 def _list_columns(path: Path, header: dict[str, Any]) -> tuple[dict[str, str], int]:

@@ -27,8 +27,18 @@ HEADER_BYTES = 128
 PEEK_BYTES = 1 << 16  # bytes that hold a variable's header
 COMPRESSED, MATRIX = 15, 14
 STRUCT, OPAQUE = 2, 17
-NUMBER_CLASSES = {6: "float64", 7: "float32", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16", 12: "int32",
-                  13: "uint32", 14: "int64", 15: "uint64"}  # fmt: skip
+NUMBER_CLASSES = {
+    6: "float64",
+    7: "float32",
+    8: "int8",
+    9: "uint8",
+    10: "int16",
+    11: "uint16",
+    12: "int32",
+    13: "uint32",
+    14: "int64",
+    15: "uint64",
+}
 OTHER_CLASSES = {1: "a cell array", 3: OBJECT, 4: "text", 5: "a sparse matrix", 16: "a function"}
 STORED_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 COMPLEX, LOGICAL = 0x08, 0x02
@@ -204,9 +214,9 @@ def _read_numbers(body: bytes, leaf: MatrixHeader, order: str) -> Shaped[np.ndar
     kind, start, size, _ = _read_element(body, leaf.data, order)
     if kind not in STORED_TYPES:
         raise ValueError(f'"{leaf.name}" is stored as type {kind}, which is not a number')
-    stored, own = np.dtype(order + STORED_TYPES[kind]), np.dtype(NUMBER_CLASSES[leaf.kind])
-    if stored.newbyteorder("=") != own and not (stored.itemsize < own.itemsize and stored.kind in "iu"):
-        raise ValueError(f'"{leaf.name}" is of {own} and stored as {stored}, which is no smaller whole number')
+    stored, declared = np.dtype(order + STORED_TYPES[kind]), np.dtype(NUMBER_CLASSES[leaf.kind])
+    if stored.newbyteorder("=") != declared and not (stored.itemsize < declared.itemsize and stored.kind in "iu"):
+        raise ValueError(f'"{leaf.name}" is of {declared} and stored as {stored}, which is no smaller whole number')
     if start + size > len(body) or size // stored.itemsize != np.prod(leaf.dims, dtype=float):
         raise ValueError(f'"{leaf.name}" claims {"x".join(map(str, leaf.dims))} elements and holds {size} bytes')
     return np.frombuffer(body, stored, count=size // stored.itemsize, offset=start).reshape(leaf.dims, order="F")

@@ -67,9 +67,7 @@ def open_mat4(path: Path) -> Source:
             if len(fields) > MAX_FIELDS:
                 break
             at = matrix.end
-    return Source(
-        path=path, format="MAT 4", fields=tuple(fields), load=make_row_loader(partial(_load, path, places))
-    )  # fmt: skip
+    return Source(path=path, format="MAT 4", fields=tuple(fields), load=make_row_loader(partial(_load, path, places)))
 
 
 def _load(path: Path, places: dict[str, tuple[Matrix, Place]], name: str, rows: slice) -> Any:
@@ -85,10 +83,10 @@ def _read_header(head: bytes, at: int) -> Matrix:
     """Return the variable whose header is the first of some bytes, which stand at `at` in the file."""
     order = "<" if struct.unpack_from("<i", head)[0] in range(100) else ">"
     code, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", head)
-    machine, rest = divmod(code, 1000)
-    stored, what = divmod(rest, 10)
-    known = machine == (order == ">") and stored < len(STORED) and what in (0, 1, 2) and imaginary in (0, 1)
-    if not known or min(rows, columns) < 0 or not 1 < length <= MAX_NAME or len(head) < HEADER + length:
+    machine, coded = divmod(code, 1000)
+    stored, what = divmod(coded, 10)
+    valid = machine == (order == ">") and stored < len(STORED) and what in (0, 1, 2) and imaginary in (0, 1)
+    if not valid or min(rows, columns) < 0 or not 1 < length <= MAX_NAME or len(head) < HEADER + length:
         raise ValueError(f"what stands at byte {at} is not the header of a variable")
     name = head[HEADER : HEADER + length]
     if name[-1:] != b"\0":
@@ -97,6 +95,10 @@ def _read_header(head: bytes, at: int) -> Matrix:
     dtype = np.dtype(order + STORED[stored])
     kind = "complex" if imaginary else OTHER[what] if what else KINDS[stored]
     return Matrix(
-        name=name[:-1].decode("latin-1"), shape=(rows, columns), stored=dtype.str, kind=kind, start=start,
+        name=name[:-1].decode("latin-1"),
+        shape=(rows, columns),
+        stored=dtype.str,
+        kind=kind,
+        start=start,
         end=start + rows * columns * dtype.itemsize * (1 + imaginary),
-    )  # fmt: skip
+    )

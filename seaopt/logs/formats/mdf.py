@@ -16,7 +16,9 @@ import zlib
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any
 
@@ -30,11 +32,11 @@ from seaopt.records import record
 NUMERIC_CONVERSIONS = frozenset({0, 1, 2, 4, 5, 6})  # conversions: none, linear, rational, tables of numbers
 INTEGER_TYPES, FLOAT_TYPES = frozenset({0, 1, 2, 3}), frozenset({4, 5})
 TIME_MASTER = 1
-HEADER = struct.Struct("<4s4xQQ")  # mark, length, count of links
+HEADER = "<4s4xQQ"  # mark, length, count of links
 FIRST = 64  # where the header block is, behind the identification
 MAX_BLOCKS = 1_000_000
 VARIABLE_LENGTH = 1  # of the flags of a channel group: its records have none of fixed length
-PACKED = struct.Struct("<2sBxIQQ")  # of a DZ: what was packed, how, a parameter, its length, the packed length
+PACKED = "<2sBxIQQ"  # of a DZ: what was packed, how, a parameter, its length, the packed length
 DEFLATE = (0, 1)  # plain, and transposed before
 WHOLE = "the file is damaged; copy or record it again"
 ChannelPlaces = Mapping[str, tuple[int, int]]
@@ -49,17 +51,19 @@ def open_mdf(path: Path) -> Source:
         check_size(path, sum(g.channel_group.cycles_nr * g.channel_group.samples_byte_nr for g in groups), "the file")
         names = Counter(channel.name for group in groups for channel in group.channels)
         for number, group in enumerate(groups):
-            labels = [_name_channel(channel.name, number, names) for channel in group.channels]
+            labels = [c.name if names[c.name] == 1 else f"{number}/{c.name}" for c in group.channels]
             master = file.masters_db.get(number)
             for index, (label, channel) in enumerate(zip(labels, group.channels, strict=True)):
-                is_master = index == master
+                is_time = index == master and channel.sync_type == TIME_MASTER
                 fields.append(
                     Field(
-                        name=label, kind=_name_kind(channel), length=int(group.channel_group.cycles_nr),
-                        unit=_find_unit(channel) or ("s" if is_master and channel.sync_type == TIME_MASTER else None),
+                        name=label,
+                        kind=_name_kind(channel),
+                        length=int(group.channel_group.cycles_nr),
+                        unit=channel.unit or getattr(channel.conversion, "unit", "") or ("s" if is_time else None),
                         clock=None if master is None else labels[master],
                     )
-                )  # fmt: skip
+                )
                 places[label] = (number, index)
     return Source(path=path, format="MDF", fields=tuple(fields), load=partial(_load, path, places))
 
@@ -89,10 +93,6 @@ def _open_file(path: Path, *, check: bool = False) -> Generator[Any]:
         sys.unraisablehook = hook
 
 
-def _name_channel(name: str, group: int, names: Mapping[str, int]) -> str:
-    return name if names[name] == 1 else f"{group}/{name}"
-
-
 def _name_kind(channel: Any) -> str:
     conversion = channel.conversion
     if conversion is not None and conversion.conversion_type not in NUMERIC_CONVERSIONS:
@@ -102,11 +102,6 @@ def _name_kind(channel: Any) -> str:
     if channel.data_type in INTEGER_TYPES:
         return f"{'int' if channel.data_type > 1 else 'uint'}{channel.bit_count}"
     return "text"
-
-
-def _find_unit(channel: Any) -> str | None:
-    conversion = channel.conversion
-    return channel.unit or (conversion.unit if conversion is not None else "") or None
 
 
 def _load(
@@ -119,9 +114,13 @@ def _load(
             start = rows.start or 0
             count = None if rows.stop is None else rows.stop - start
             samples, invalid = file.get(
-                group=group, index=index, record_offset=start, record_count=count, samples_only=True,
+                group=group,
+                index=index,
+                record_offset=start,
+                record_count=count,
+                samples_only=True,
                 ignore_invalidation_bits=False,
-            )  # fmt: skip
+            )
             values = np.array(samples, dtype=float).reshape(-1)
             if invalid is not None:
                 values[np.asarray(invalid, dtype=bool)] = np.nan
@@ -146,105 +145,100 @@ class Block:
 def check_blocks(path: Path) -> None:
     """Refuse a finished MDF file of which a data group holds other samples than its channel groups count.
 
-    Raises
-    ------
-    LogError
-        It does, or a block lies outside the file, or does not unpack to what it says.
-
+    Raises LogError: it does, or a block lies outside the file, or does not unpack to what it says.
     """
     with path.open("rb") as stream:
-        size, visited = path.stat().st_size, set[int]()
-        stream.seek(0)
         if stream.read(8) != b"MDF     ":  # one that its recorder did not finish has no counts yet
             return
-        for group in _walk_chain(path, stream, _read_block(path, stream, FIRST, size, visited).links[0], size, visited):
-            counted = _count_bytes(path, stream, group, size, visited)
-            held = sum(_measure_data(path, stream, group.links[2], size, visited))
-            if counted is not None and counted != held:
-                raise LogError(f"{path}: its records take {counted} bytes and {held} are there, {WHOLE}")
+        blocks = Blocks(path=path, stream=stream, size=path.stat().st_size)
+        for group in blocks.walk(blocks.read(FIRST).links[0]):
+            counted, present = blocks.count_bytes(group), sum(blocks.measure_data(group.links[2]))
+            if counted is not None and counted != present:
+                raise LogError(f"{path}: its records take {counted} bytes and {present} are there, {WHOLE}")
 
 
-def _read_block(path: Path, stream: IO[bytes], at: int, size: int, visited: set[int]) -> Block:
-    stream.seek(at)
-    head = stream.read(HEADER.size)
-    if len(head) < HEADER.size:
-        raise LogError(f"{path}: a block is to begin at byte {at} of {size}, {WHOLE}")
-    mark, length, count = HEADER.unpack(head)
-    if not mark.startswith(b"##") or at + length > size or HEADER.size + 8 * count > length:
-        raise LogError(f"{path}: the block at byte {at} is cut off or damaged; copy or record the file again")
-    if at in visited or len(visited) > MAX_BLOCKS:
-        raise LogError(f"{path}: its blocks lead back to byte {at}, {WHOLE}")
-    visited.add(at)
-    links = struct.unpack(f"<{count}Q", stream.read(8 * count))
-    return Block(mark=mark[2:], links=links, start=at + HEADER.size + 8 * count, end=at + length)
+@record(eq=False)
+class Blocks:
+    """The blocks of an open file, each of which is read once: links that lead back are damage."""
 
+    path: Path
+    stream: IO[bytes]
+    size: int
+    visited: set[int] = field(default_factory=set[int])
 
-def _walk_chain(path: Path, stream: IO[bytes], at: int, size: int, visited: set[int]) -> Iterator[Block]:
-    """Walk blocks of which each one's first link is the next."""
-    while at:
-        block = _read_block(path, stream, at, size, visited)
-        yield block
-        at = block.links[0]
+    def take(self, at: int, form: str) -> tuple[Any, ...]:
+        """Return the numbers that stand at a byte."""
+        self.stream.seek(at)
+        return struct.unpack(form, self.stream.read(struct.calcsize(form)))
 
+    def read(self, at: int) -> Block:
+        """Return the block that begins at a byte."""
+        if at + struct.calcsize(HEADER) > self.size:
+            raise LogError(f"{self.path}: a block is to begin at byte {at} of {self.size}, {WHOLE}")
+        mark, length, count = self.take(at, HEADER)
+        start = at + struct.calcsize(HEADER) + 8 * count
+        if not mark.startswith(b"##") or at + length > self.size or start > at + length:
+            raise LogError(f"{self.path}: the block at byte {at} is cut off or damaged; copy or record the file again")
+        if at in self.visited or len(self.visited) > MAX_BLOCKS:
+            raise LogError(f"{self.path}: its blocks lead back to byte {at}, {WHOLE}")
+        self.visited.add(at)
+        return Block(mark=mark[2:], links=self.take(start - 8 * count, f"<{count}Q"), start=start, end=at + length)
 
-def _count_bytes(path: Path, stream: IO[bytes], group: Block, size: int, visited: set[int]) -> int | None:
-    """Return the bytes that the channel groups' records take; None where some have no fixed length."""
-    stream.seek(group.start)
-    numbered = stream.read(1)[0]  # bytes of the number of its group before each record
-    total, fixed = 0, True
-    for one in _walk_chain(path, stream, group.links[1], size, visited):
-        stream.seek(one.start)
-        _, records, flags, _, data, invalid = struct.unpack("<QQHH4xII", stream.read(32))
-        fixed = fixed and not flags & VARIABLE_LENGTH
-        total += records * (numbered + data + invalid)
-        _check_channels(path, stream, one, data + invalid, size, visited)
-    return total if fixed else None
+    def walk(self, at: int) -> Iterator[Block]:
+        """Walk blocks of which each one's first link is the next."""
+        while at:
+            block = self.read(at)
+            yield block
+            at = block.links[0]
 
+    def count_bytes(self, group: Block) -> int | None:
+        """Return the bytes that the channel groups' records take; None where some have no fixed length."""
+        (numbered,) = self.take(group.start, "<B")  # bytes of the number of its group before each record
+        total, fixed = 0, True
+        for channels in self.walk(group.links[1]):
+            _, records, flags, _, data, invalid = self.take(channels.start, "<QQHH4xII")
+            fixed = fixed and not flags & VARIABLE_LENGTH
+            total += records * (numbered + data + invalid)
+            self.check_channels(channels, data + invalid)
+        return total if fixed else None
 
-def _check_channels(path: Path, stream: IO[bytes], group: Block, width: int, size: int, visited: set[int]) -> None:
-    """Refuse channels that reach beyond their record, in which the reader would look elsewhere."""
-    for channel in _walk_chain(path, stream, group.links[1], size, visited):
-        stream.seek(channel.start)
-        _, _, _, first_bit, first_byte, bits = struct.unpack("<BBBBII", stream.read(12))
-        if 8 * first_byte + first_bit + bits > 8 * width and bits < 1 << 31 and width:
-            raise LogError(f"{path}: a channel lies outside its record of {width} bytes, {WHOLE}")
+    def check_channels(self, group: Block, width: int) -> None:
+        """Refuse channels that reach beyond their record, in which the reader would look elsewhere."""
+        for channel in self.walk(group.links[1]):
+            first_bit, first_byte, bits = self.take(channel.start, "<3xBII")
+            if 8 * first_byte + first_bit + bits > 8 * width and bits < 1 << 31 and width:
+                raise LogError(f"{self.path}: a channel lies outside its record of {width} bytes, {WHOLE}")
 
+    def measure_data(self, at: int) -> Iterator[int]:
+        """Walk the data of a group, and return the bytes of each block, unpacked."""
+        if not at:
+            return
+        block = self.read(at)
+        if block.mark == b"DZ":
+            yield self.unpack(block)
+        elif block.mark == b"HL":
+            yield from self.measure_data(block.links[0])
+        elif block.mark in (b"DL", b"LD"):
+            for part in chain([block], self.walk(block.links[0])):
+                flags, count = self.take(part.start, "<3xBI")
+                invalid = part.mark == b"LD" and flags & 0x80
+                for link in part.links[1 : 1 + count * (2 if invalid else 1)]:
+                    yield from self.measure_data(link)
+        else:
+            yield block.end - block.start
 
-def _measure_data(path: Path, stream: IO[bytes], at: int, size: int, visited: set[int]) -> Iterator[int]:
-    """Walk the data of a group, and return the bytes of each block, unpacked."""
-    if not at:
-        return
-    block = _read_block(path, stream, at, size, visited)
-    if block.mark == b"DZ":
-        yield _unpack(path, stream, block)
-    elif block.mark == b"HL":
-        yield from _measure_data(path, stream, block.links[0], size, visited)
-    elif block.mark in (b"DL", b"LD"):
-        listed, count = block, 0
-        while True:
-            stream.seek(listed.start)
-            flags = stream.read(4)
-            count = struct.unpack("<I", stream.read(4))[0]
-            invalid = listed.mark == b"LD" and flags[3] & 0x80
-            for link in listed.links[1 : 1 + count * (2 if invalid else 1)]:
-                yield from _measure_data(path, stream, link, size, visited)
-            if not listed.links[0]:
-                return
-            listed = _read_block(path, stream, listed.links[0], size, visited)
-    else:
-        yield block.end - block.start
-
-
-def _unpack(path: Path, stream: IO[bytes], block: Block) -> int:
-    """Return the length of a compressed block unpacked, where that and its checksum are right."""
-    stream.seek(block.start)
-    _, how, columns, length, packed = PACKED.unpack(stream.read(PACKED.size))
-    if block.start + PACKED.size + packed > block.end or (how == 1 and not 0 < columns <= length):
-        raise LogError(f"{path}: a compressed block is cut off, {WHOLE}")
-    check_size(path, length, "a block")
-    if how in DEFLATE:
-        unpacker = zlib.decompressobj()
-        found = len(unpacker.decompress(stream.read(packed), length + 1))
-        if found != length or not unpacker.eof or unpacker.unused_data:
-            raise LogError(f"{path}: a compressed block does not unpack to the {length} bytes that it says, {WHOLE}")
-    return length
+    def unpack(self, block: Block) -> int:
+        """Return the length of a compressed block unpacked, where that and its checksum are right."""
+        _, how, columns, length, packed = self.take(block.start, PACKED)
+        begin = block.start + struct.calcsize(PACKED)
+        if begin + packed > block.end or (how == 1 and not 0 < columns <= length):
+            raise LogError(f"{self.path}: a compressed block is cut off, {WHOLE}")
+        check_size(self.path, length, "a block")
+        if how in DEFLATE:
+            unpacker = zlib.decompressobj()
+            found = len(unpacker.decompress(self.stream.read(packed), length + 1))
+            if found != length or not unpacker.eof or unpacker.unused_data:
+                raise LogError(
+                    f"{self.path}: a compressed block does not unpack to the {length} bytes that it says, {WHOLE}"
+                )
+        return length

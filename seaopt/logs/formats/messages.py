@@ -99,11 +99,7 @@ class Wire:
     def detect(cls, data: bytes, encoding: str) -> Wire:
         """Return the encoding of a message.
 
-        Raises
-        ------
-        ValueError
-            It is CDR of a kind that ROS does not write.
-
+        Raises ValueError: it is CDR of a kind that ROS does not write.
         """
         if encoding == "ros1":
             return cls(cdr=False)
@@ -210,8 +206,8 @@ def _take(
     if isinstance(node, StampNode):
         at = wire.align(at, 4)
         if isinstance(wanted, str):
-            seconds, rest = struct.unpack_from(wire.order + "iI", data, at)
-            out[wanted] = seconds * 1_000_000_000 + rest
+            seconds, nanoseconds = struct.unpack_from(wire.order + "iI", data, at)
+            out[wanted] = seconds * 1_000_000_000 + nanoseconds
         return at + 8
     if isinstance(node, TextNode):
         return _skip_text(wire, data, at)
@@ -226,8 +222,8 @@ def _take(
         at = wire.align(at, node.child.size)
         for index, name in branches.items():
             if isinstance(index, int) and index < count and isinstance(name, str):
-                place = at + index * node.child.size
-                out[name] = struct.unpack_from(wire.order + node.child.code, data, place)[0]
+                begin = at + index * node.child.size
+                out[name] = struct.unpack_from(wire.order + node.child.code, data, begin)[0]
         return at + count * node.child.size
     for index in range(count):
         at = _take(node.child, wire, data, at, branches.get(index), out)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.errors import LogError
+from seaopt.files import check_name
 from seaopt.logs.formats.source import Field, Source, Window
 from seaopt.units import header_unit
 
@@ -26,6 +28,7 @@ def open_parquet(path: Path) -> Source:
     """List the columns of a Parquet file."""
     import polars as pl
 
+    check_name(path, "Polars cannot open it: rename the file, or its folder", LogError)
     with _silence_panics():
         frame = pl.scan_parquet(path, glob=False)
         length = int(frame.select(pl.len()).collect().item())
@@ -53,8 +56,8 @@ def _silence_panics() -> Generator[None]:
 
 def _make_field(name: str, dtype: pl.DataType, length: int) -> Field:
     if dtype.is_temporal():  # seconds, counted from 1970 or from zero
-        known = str(dtype).startswith(("Datetime", "Duration"))
-        return Field(name=name, kind="float64" if known else str(dtype), length=length, unit="s")
+        counted = str(dtype).startswith(("Datetime", "Duration"))
+        return Field(name=name, kind="float64" if counted else str(dtype), length=length, unit="s")
     kind = "bool" if str(dtype) == "Boolean" else str(dtype).lower()
     return Field(name=name, kind=kind, length=length, unit=header_unit(name))
 

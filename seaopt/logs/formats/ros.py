@@ -91,7 +91,7 @@ def _list_recording(path: Path, form: str, open_file: BagOpener) -> Source:
     notes.insert(0, f"{count} messages; times count from {began} ({bag.start} ns)")
     return Source(
         path=path, format=form, fields=tuple(fields), load=partial(_load, path, open_file, nodes), notes=tuple(notes)
-    )  # fmt: skip
+    )
 
 
 def _decode_definition(topic: Topic) -> Node | None:
@@ -136,7 +136,11 @@ def _load(
     path: Path, open_file: BagOpener, nodes: Mapping[str, Node | None], names: Sequence[str], window: Window | None
 ) -> dict[str, Float[np.ndarray, " n"]]:
     with open_file(path) as bag:
-        topic = next(topic for topic in bag.topics.values() if _covers(topic.name, names))
+        topic = next(
+            topic
+            for topic in bag.topics.values()
+            if all(name == topic.name or name.startswith(f"{topic.name}.") for name in names)
+        )
         paths = {name.removeprefix(f"{topic.name}."): name for name in names if name != topic.name}
         span = _window_ns(bag, window) if window is not None and window.clock == topic.name else (None, None)
         take = _make_taker(topic, nodes[topic.name], paths) if paths else None
@@ -158,10 +162,6 @@ def _load(
     if topic.name in names:
         out[topic.name] = np.array(times, dtype=np.int64) * 1e-9
     return out
-
-
-def _covers(topic: str, names: Sequence[str]) -> bool:
-    return all(name == topic or name.startswith(f"{topic}.") for name in names)
 
 
 def _window_ns(bag: Bag, window: Window) -> tuple[int | None, int | None]:
@@ -231,19 +231,22 @@ def _wrap_rosbags(reader: Any, connections: Sequence[Any], start: int, encoding:
     """Return rosbags' reader as a Bag; a topic with several publishers has several connections."""
     topics: dict[str, Topic] = {}
     for connection in connections:
-        known = topics.get(connection.topic)
-        if known is not None and known.kind != connection.msgtype:
+        earlier = topics.get(connection.topic)
+        if earlier is not None and earlier.kind != connection.msgtype:
             raise ValueError(
-                f"topic {connection.topic} carries {known.kind} and {connection.msgtype}; "
+                f"topic {connection.topic} carries {earlier.kind} and {connection.msgtype}; "
                 "record them on topics of their own"
             )
         message_encoding = getattr(connection.ext, "serialization_format", encoding) or encoding
         definition = connection.msgdef
         topics[connection.topic] = Topic(
-            name=connection.topic, kind=connection.msgtype, encoding=message_encoding, definition=definition.data,
-            count=connection.msgcount + (known.count if known else 0),
+            name=connection.topic,
+            kind=connection.msgtype,
+            encoding=message_encoding,
+            definition=definition.data,
+            count=connection.msgcount + (earlier.count if earlier else 0),
             syntax=definition.format.name.lower().replace("none", ""),
-        )  # fmt: skip
+        )
 
     def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
         chosen = [connection for connection in connections if connection.topic == topic]
@@ -290,11 +293,13 @@ def _open_mcap_file(path: Path) -> Generator[Bag]:
             schema = summary.schemas.get(channel.schema_id)
             earlier = topics[channel.topic].count if channel.topic in topics else 0
             topics[channel.topic] = Topic(
-                name=channel.topic, kind=_long_type_name(schema.name) if schema else "",
-                count=earlier + counts.get(channel.id, 0), encoding=channel.message_encoding,
+                name=channel.topic,
+                kind=_long_type_name(schema.name) if schema else "",
+                count=earlier + counts.get(channel.id, 0),
+                encoding=channel.message_encoding,
                 definition=schema.data.decode(errors="replace") if schema else "",
                 syntax=_definition_syntax(schema.encoding) if schema else "",
-            )  # fmt: skip
+            )
 
         def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
             _check_mcap_data(path)

@@ -26,8 +26,9 @@ def assign_clocks(fields: Sequence[Field]) -> list[Field]:
     lengths = {field.name: field.length for field in fields}
     timed: list[Field] = []
     for field in fields:
-        clock = next((name for name in _clock_names(field.name) if _times(lengths, name, field)), None)
-        if clock is None:
+        alike = (name for name in _clock_names(field.name) if lengths.get(name) == field.length)
+        clock = next(alike, None)
+        if clock is None or field.length is None or not field.numeric:
             timed.append(field)
         else:
             timed.append(replace(field, clock=clock, unit="s" if field.name == clock else field.unit))
@@ -52,7 +53,3 @@ def _clock_names(name: str) -> list[str]:
             if (key == clock and depth == len(pieces) - 1) or key in values:
                 clocks.append(f"{struct}.{clock}")
     return clocks
-
-
-def _times(lengths: dict[str, int | None], clock: str, field: Field) -> bool:
-    return lengths.get(clock) is not None and lengths[clock] == field.length and field.numeric

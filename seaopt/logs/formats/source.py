@@ -271,11 +271,7 @@ def summarise_error(error: BaseException) -> str:
 def import_optional(module: str, extra: str, path: Path, form: str) -> Any:
     """Import an optional library.
 
-    Raises
-    ------
-    LogError
-        It is not installed; the message names the extra.
-
+    Raises LogError: it is not installed; the message names the extra.
     """
     try:
         with warnings.catch_warnings():

@@ -50,18 +50,18 @@ def open_tdms(path: Path) -> Source:
 
 def _measure_segments(path: Path) -> int | None:
     """Return the bytes of data in all segments, None with DAQmx data; npTDMS drops a last segment that was cut off."""
-    data, place, size, plain = 0, 0, path.stat().st_size, True
+    data, at, size, plain = 0, 0, path.stat().st_size, True
     with path.open("rb") as stream:
-        while place < size:
-            stream.seek(place)
+        while at < size:
+            stream.seek(at)
             lead = stream.read(LEAD_IN)
             contents = int.from_bytes(lead[4:8], "little")
             if len(lead) < LEAD_IN or lead[:4] != b"TDSm":
                 raise LogError(f"{path}: {CUT_OFF}")
             following, begin = struct.unpack(">QQ" if contents & BIG_ENDIAN else "<QQ", lead[12:])
-            data, place = data + following - begin, place + LEAD_IN + following
+            data, at = data + following - begin, at + LEAD_IN + following
             plain = plain and not contents & DAQMX
-    if place != size:
+    if at != size:
         raise LogError(f"{path}: {CUT_OFF}")
     return data if plain else None
 

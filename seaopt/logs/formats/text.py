@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, Where, Window, summarise_error
+from seaopt.logs.formats.source import Field, Source, Where, summarise_error
 from seaopt.logs.formats.text_layout import (
     BLANK,
     MAX_LINE,
@@ -50,23 +50,32 @@ def open_text(path: Path) -> Source:
     names = _name_columns(form.headers)
     fields = tuple(
         Field(
-            name=name, kind="float64" if numeric else "text", length=None, unit=unit, position=at,
+            name=name,
+            kind="float64" if numeric else "text",
+            length=None,
+            unit=unit,
+            position=at,
             header=header if header != name else None,
         )
         for at, (name, header, unit, numeric) in enumerate(
             zip(names, form.headers, form.units, form.numeric, strict=True), start=1
         )
         if name
-    )  # fmt: skip
+    )
     repeated = [field.name for field in fields if field.header is not None]
     notes = form.notes
     if repeated:
         named = ", ".join(repeated[:4]) + (", ..." if len(repeated) > 4 else "")
         notes = (*notes, f"headers that several columns have were numbered: {named}")
     return Source(
-        path=path, format="CSV", fields=fields, load=partial(_load, path, form), notes=notes,
-        constants=form.constants, load_where=partial(_load_where, path, form),
-    )  # fmt: skip
+        path=path,
+        format="CSV",
+        fields=fields,
+        load=lambda names, _: _load_blocks(path, form, names, _parse),  # without an index a window reads it whole
+        notes=notes,
+        constants=form.constants,
+        load_where=partial(_load_where, path, form),
+    )
 
 
 def _name_columns(headers: Sequence[str]) -> list[str]:
@@ -91,16 +100,10 @@ def _place_columns(form: TextLayout) -> dict[str, int]:
     return {name: at for at, name in enumerate(_name_columns(form.headers)) if name}
 
 
-def _load(path: Path, form: TextLayout, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return columns by header; text has no index, so a window reads it whole."""
-    return _load_blocks(path, form, names, _parse)
-
-
 def _load_where(path: Path, form: TextLayout, names: Sequence[str], where: Where) -> dict[str, Float[np.ndarray, " n"]]:
     """Return columns of the rows in which others have given values."""
     places = _place_columns(form)
-    ids = {places[name]: value for name, value in where.items()}
-    return _load_blocks(path, form, names, partial(_parse_where, ids))
+    return _load_blocks(path, form, names, partial(_parse_where, {places[name]: at for name, at in where.items()}))
 
 
 def _load_blocks(
@@ -153,7 +156,8 @@ class _GrowingColumns:
 
 def _read_blocks(path: Path, form: TextLayout) -> Generator[bytes]:
     """Return blocks of whole lines as UTF-8."""
-    with _open_file(path, form.encoding) as stream:
+    wide = form.encoding == "utf-16"
+    with path.open(encoding=form.encoding, newline="\n") if wide else path.open("rb") as stream:
         for _ in range(form.first):
             stream.readline()
         number = 0
@@ -184,12 +188,6 @@ def _find_first_line(path: Path, form: TextLayout, number: int) -> int:
     """Return the line on which a block begins; counted only to name a line, as it takes a while."""
     with closing(_read_blocks(path, form)) as blocks:
         return form.first + 1 + sum(block.count(b"\n") for block in islice(blocks, number))
-
-
-def _open_file(path: Path, encoding: str) -> IO[Any]:
-    if encoding == "utf-16":
-        return path.open(encoding=encoding, newline="\n")
-    return path.open("rb")
 
 
 def _check_lines(path: Path, form: TextLayout, block: bytes, number: int) -> None:
@@ -239,16 +237,23 @@ def _parse_where(
         frame = frame.filter(alike.fill_null(False))
     parsed: dict[str, Any] = {}
     for name, at in index.items():
-        text = frame[f"column_{at}"].str.strip_chars()
-        values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
-        wrong = (values.is_null() & ~text.str.to_lowercase().is_in(list(BLANK)).fill_null(True)) | values.is_infinite()
-        if wrong.fill_null(False).any():
-            cell = str(text.filter(wrong.fill_null(False))[0])[:60]
+        parsed[name], wrong = _parse_numbers(frame[f"column_{at}"], form)
+        if len(wrong):
             raise LogError(
-                f'{path}: "{cell}" in column "{name}" is not a finite number, in a row that where keeps; correct it'
+                f'{path}: "{str(wrong[0])[:60]}" in column "{name}" is not a finite number, in a row that where keeps; '
+                "correct it"
             )
-        parsed[name] = values.to_numpy()
     return parsed
+
+
+def _parse_numbers(column: pl.Series, form: TextLayout) -> tuple[Float[np.ndarray, " n"], pl.Series]:
+    """Return a column of texts as numbers, nan where it is blank, and the cells that are no finite number."""
+    import polars as pl
+
+    text = column.str.strip_chars()
+    values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
+    wrong = (values.is_null() & ~text.str.to_lowercase().is_in(list(BLANK)).fill_null(True)) | values.is_infinite()
+    return values.to_numpy(), text.filter(wrong.fill_null(False))
 
 
 def _replace_blanks(block: bytes, form: TextLayout) -> bytes:
@@ -286,12 +291,9 @@ def _parse_text(
         raise error_at(summarise_error(error)) from error
     parsed: dict[str, Any] = {}
     for name, at in index.items():
-        text = frame[f"column_{at}"].str.strip_chars()
-        values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
-        blank = text.is_null() | text.str.to_lowercase().is_in(list(BLANK))
-        if (values.is_null() & ~blank).any() or values.is_infinite().any():
+        parsed[name], wrong = _parse_numbers(frame[f"column_{at}"], form)
+        if len(wrong):
             raise error_at("a cell is not a number")
-        parsed[name] = values.to_numpy()
     return parsed
 
 

@@ -37,46 +37,24 @@ _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codec
 
 @record
 class TextLayout:
-    """How a text file is laid out.
-
-    Parameters
-    ----------
-    encoding : str
-    delimiter : str
-        A space stands for any run of blanks.
-    comma : bool
-        Whether the decimal sign is a comma.
-    headers, units : tuple
-        One a column; an empty header belongs to no column.
-    numeric : tuple of bool
-        Whether the column's first filled cell is a number.
-    first : int
-        Lines above the data.
-    constants : mapping of name to (number, unit or None)
-        Lines above the data such as "kp = 200" or "mass [kg]; 0.5".
-    notes : tuple of str
-
-    """
+    """How a text file is laid out."""
 
     encoding: str
-    delimiter: str
-    comma: bool
+    delimiter: str  # a space stands for any run of blanks
+    comma: bool  # whether the decimal sign is a comma
+    # headers, units: one a column; an empty header belongs to no column
     headers: tuple[str, ...]
     units: tuple[str | None, ...]
-    numeric: tuple[bool, ...]
-    first: int
+    numeric: tuple[bool, ...]  # whether the column's first filled cell is a number
+    first: int  # lines above the data
     notes: tuple[str, ...]
-    constants: Mapping[str, tuple[float, str | None]]
+    constants: Mapping[str, tuple[float, str | None]]  # lines above the data such as "kp = 200" or "mass [kg]; 0.5"
 
 
 def find_layout(path: Path) -> TextLayout:
     """Return the layout of a text file.
 
-    Raises
-    ------
-    LogError
-        The file is empty, is not text, has a line beyond 1 MiB, or no data below its header.
-
+    Raises LogError: the file is empty, is not text, has a line beyond 1 MiB, or no data below its header.
     """
     encoding, lines = _read_head(path)
     filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not _is_comment(line)]
@@ -108,10 +86,16 @@ def find_layout(path: Path) -> TextLayout:
         signs = sorted({sign for line in lines[:first] for sign in line if not sign.isascii()})
         notes.append(f"its header is no UTF-8 text and was read as Windows-1252: {' '.join(signs)}")
     return TextLayout(
-        encoding=encoding, delimiter=delimiter, comma=comma, headers=tuple(headers), units=tuple(units),
-        numeric=numeric, first=first, notes=tuple(notes),
+        encoding=encoding,
+        delimiter=delimiter,
+        comma=comma,
+        headers=tuple(headers),
+        units=tuple(units),
+        numeric=numeric,
+        first=first,
+        notes=tuple(notes),
         constants=_find_constants(lines[:first], delimiter, comma),
-    )  # fmt: skip
+    )
 
 
 def _read_unended(path: Path, encoding: str) -> str | None:
@@ -166,11 +150,11 @@ def _read_head(path: Path) -> tuple[str, list[str]]:
     encoding, text = _decode(path, encoding, raw)
     whole = len(raw) < HEAD_BYTES
     lines = text.rstrip("\x1a" if whole else "").split("\n", HEAD_LINES)
-    rest = len(lines) > HEAD_LINES  # the last item is all that is left
+    more = len(lines) > HEAD_LINES  # the last item is all that is left
     for number, line in enumerate(lines[:HEAD_LINES], start=1):
         if len(line) > MAX_LINE:
             raise line_length_error(path, number)
-    if not whole or rest:
+    if not whole or more:
         lines.pop()
     if len(lines) <= 1 and "\r" in text.rstrip("\r\n"):
         raise LogError(f"{path}: its lines end in CR alone; save it with LF line ends")
@@ -198,11 +182,7 @@ def _decode(path: Path, encoding: str, raw: bytes) -> tuple[str, str]:
 def _check_ascii(path: Path, data: list[str]) -> None:
     """Refuse bytes that are no UTF-8 among the data, where they may be damage and not a header's µ or °.
 
-    Raises
-    ------
-    LogError
-        There is one.
-
+    Raises LogError: there is such a byte.
     """
     for line in data:
         if not line.isascii():
@@ -231,10 +211,13 @@ def _is_comment(line: str) -> bool:
 def _find_delimiter(sample: list[str], header: str) -> tuple[str, bool]:
     """Return the delimiter and decimal sign that make most cells numbers."""
     best = max(
-        ((_score(sample, delimiter, comma), delimiter, comma) for delimiter in _DELIMITERS
-         for comma in ((False,) if delimiter == "," else (False, True))),
+        (
+            (_score(sample, delimiter, comma), delimiter, comma)
+            for delimiter in _DELIMITERS
+            for comma in ((False,) if delimiter == "," else (False, True))
+        ),
         key=lambda scored: scored[0],
-    )  # fmt: skip
+    )
     return (best[1], best[2]) if best[0] > 0 else (max(",;\t|", key=header.count), False)
 
 

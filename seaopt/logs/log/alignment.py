@@ -125,25 +125,21 @@ class Nearest:
 Rule = Hold | Linear | Nearest
 
 
-def check_increasing(time: Float[np.ndarray, " m"], place: str) -> None:
+def check_increasing(time: Float[np.ndarray, " m"], clock: str) -> None:
     """Refuse a clock that no rule can work on.
 
-    Raises
-    ------
-    LogError
-        It is empty, not a number somewhere, repeats or runs backwards.
-
+    Raises LogError: it is empty, not a number somewhere, repeats or runs backwards.
     """
     if time.size == 0:
-        raise LogError(f"{place} holds no sample; choose another channel or window_s")
+        raise LogError(f"{clock} holds no sample; choose another channel or window_s")
     if not np.all(np.isfinite(time)):
         row = int(np.flatnonzero(~np.isfinite(time))[0])
-        raise LogError(f"{place} is not a number in sample {row + 1}; remove that row")
+        raise LogError(f"{clock} is not a number in sample {row + 1}; remove that row")
     step = np.diff(time)
     if np.any(step <= 0):
         row = int(np.flatnonzero(step <= 0)[0]) + 1
         how = "repeats" if step[row - 1] == 0 else "runs backwards"
-        raise LogError(f"{place} {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows")
+        raise LogError(f"{clock} {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows")
 
 
 def _neighbours(

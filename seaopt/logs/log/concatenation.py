@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -57,21 +57,20 @@ def concatenate(logs: Sequence[Log], *, gap_s: float | None = None) -> Log:
                 f"{log.source}: starts at {times[-1][0]:g} s, before the log ahead of it ends at {times[-2][-1]:g} s; "
                 "order the logs, or give gap_s"
             )
-    values = {name: np.concatenate([log[name] for log in logs]) for name in first.signals}
     sources = ", ".join(dict.fromkeys(log.source for log in logs))
     notes = [f"{log.source}: {note}" for log in logs for note in log.notes]
     signals = {
-        name: replace(signal, values=values[name], origin=_merge_origins([log.signal(name).origin for log in logs]))
+        name: replace(signal, values=np.concatenate([log[name] for log in logs]), origin=_merge_origins(name, logs))
         for name, signal in first.signals.items()
     }
     note = f"{len(logs)} logs appended"
     return Log(time=np.concatenate(times), signals=signals, source=sources, notes=(*dict.fromkeys(notes), note))
 
 
-def _merge_origins(origins: list[Origin]) -> Origin:
+def _merge_origins(channel: str, logs: Sequence[Log]) -> Origin:
     """Return where an appended channel came from: what differs is listed, in the order of the logs."""
-    fields = ("file", "sha256", "column", "conversion")
-    return Origin(**{name: "; ".join(dict.fromkeys(getattr(origin, name) for origin in origins)) for name in fields})
+    origins = [asdict(log.signal(channel).origin) for log in logs]
+    return Origin(**{name: "; ".join(dict.fromkeys(origin[name] for origin in origins)) for name in origins[0]})
 
 
 def _check_alike(first: Log, log: Log) -> None:

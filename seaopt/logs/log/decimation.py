@@ -3,7 +3,7 @@ r"""Decimation: a lower sample rate behind an anti-alias filter.
 The filter is a linear-phase FIR low-pass (windowed sinc, Kaiser window of 80 dB; Oppenheim and Schafer, Discrete-Time
 Signal Processing, 3rd ed., sec. 7.5.3 and 4.6) whose delay is taken out, so that it shifts nothing in time. With
 :math:`f_N` half the new sample rate it passes 0 to 0.8 :math:`f_N` within 0.01 dB and takes 80 dB from :math:`f_N` on.
-Samples that the filter cannot reach with all its taps, at the ends of a stretch, are cut off rather than invented.
+Samples that the filter cannot reach with all its taps, at the ends of a segment, are cut off rather than invented.
 """
 
 from __future__ import annotations
@@ -24,48 +24,34 @@ MISSING_WEIGHT = 0.2  # of the filter's weight on missing samples, beyond which 
 
 
 def decimate(
-    log: Recording, period: float, stretches: Sequence[slice], factor: int
+    log: Recording, period: float, segments: Sequence[slice], factor: int
 ) -> tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]:
     """Return every `factor`-th sample behind the filter, and a note of what was done: see `Log.decimate`.
 
-    Parameters
-    ----------
-    log : Recording
-        Uniformly sampled.
-    period : float
-        Sample period in s.
-    stretches : sequence of slice
-        Rows between gaps, which are filtered each on its own.
-    factor : int
-        2 or more.
-
-    Raises
-    ------
-    LogError
-        No stretch is as long as the filter.
-
+    `log`: uniformly sampled, every `period` s. `segments`: rows between gaps, which are filtered each on its own.
+    Raises LogError: no segment is as long as the filter.
     """
     taps = _taps(factor)
     half = taps.size // 2
-    pieces = [stretch for stretch in stretches if stretch.stop - stretch.start > taps.size + factor]
-    if not pieces:
-        longest = max((stretch.stop - stretch.start for stretch in stretches), default=0)
+    long = [segment for segment in segments if segment.stop - segment.start > taps.size + factor]
+    if not long:
+        longest = max((segment.stop - segment.start for segment in segments), default=0)
         raise LogError(
             f"{log.source}: decimation by {factor} needs {taps.size + factor + 1} samples without a gap and the "
-            f"longest stretch has {longest}; decimate by less"
+            f"longest segment has {longest}; decimate by less"
         )
     # The filter has linear phase: an output stands for the middle of its taps.
-    time = np.concatenate([log.time[piece.start + half : piece.stop - half : factor] for piece in pieces])
+    time = np.concatenate([log.time[segment.start + half : segment.stop - half : factor] for segment in long])
     values = {
-        name: np.concatenate([_filter(signal.values[piece], taps, factor) for piece in pieces])
+        name: np.concatenate([_filter(signal.values[segment], taps, factor) for segment in long])
         for name, signal in log.signals.items()
     }
     rate_hz = sample_rate_hz(period) / factor
-    dropped = len(stretches) - len(pieces)
+    dropped = len(segments) - len(long)
     note = (
         f"decimated by {factor} to {rate_hz:.6g} Hz: pass band 0 to "
-        f"{0.5 * PASS_BAND * rate_hz:.4g} Hz, {half} samples cut at each end of each stretch"
-        + (f", {dropped} short stretch{'es' if dropped > 1 else ''} left out" if dropped else "")
+        f"{0.5 * PASS_BAND * rate_hz:.4g} Hz, {half} samples cut at each end of each segment"
+        + (f", {dropped} short segment{'s' if dropped > 1 else ''} left out" if dropped else "")
     )
     return time, values, note
 

@@ -36,11 +36,7 @@ def to_polars(log: Recording) -> pl.DataFrame:
 def to_pandas(log: Recording) -> pd.DataFrame:
     """Return a pandas frame of a log.
 
-    Raises
-    ------
-    LogError
-        pandas is not installed.
-
+    Raises LogError: pandas is not installed.
     """
     try:
         pandas = importlib.import_module("pandas")
@@ -54,11 +50,8 @@ def read_frame(
 ) -> tuple[dict[str, Float[np.ndarray, " n"]], dict[str, str], tuple[str, ...]]:
     """Return arrays and units by name, time among them, and notes: what `Log.from_frame` makes a log of.
 
-    Raises
-    ------
-    LogError
-        The data are not a frame, or a column is missing, not numeric, or given for two channels of one unit.
-
+    Raises LogError: the data are not a frame, or a column is missing, not numeric, or given for two channels of one
+    unit.
     """
     columns = [str(name) for name in getattr(frame, "columns", ())]
     if not columns:

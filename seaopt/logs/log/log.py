@@ -147,17 +147,17 @@ class Log:
 
     @property
     def segments(self) -> list[slice]:
-        """The stretches without a gap, as slices of at least two samples; a single sample between gaps is left out.
+        """The segments without a gap, as slices of at least two samples; a single sample between gaps is left out.
 
         Raises
         ------
         LogError
-            Inside a stretch a step differs by more than 5 % from the period: the log is not uniformly sampled.
+            Inside a segment a step differs by more than 5 % from the period: the log is not uniformly sampled.
 
         """
-        stretches = split_at_gaps(self.time, GAP * self.period)
-        for stretch in stretches:
-            worst = float(np.max(np.abs(np.diff(self.time[stretch]) - self.period)))
+        segments = split_at_gaps(self.time, GAP * self.period)
+        for segment in segments:
+            worst = float(np.max(np.abs(np.diff(self.time[segment]) - self.period)))
             if worst > JITTER_LIMIT * self.period:
                 round_rate = float(f"{1.0 / self.period:.3g}")
                 raise LogError(
@@ -166,7 +166,7 @@ class Log:
                     "log.restamp() where only the timestamps are rounded or late (in a problem file: "
                     f'resample = {{ rate_hz = {round_rate:g} }}, or resample = "restamp")'
                 )
-        return stretches
+        return segments
 
     def between(self, start_s: float, stop_s: float) -> Log:
         """Return the samples with start_s <= time - time[0] <= stop_s.
@@ -212,7 +212,7 @@ class Log:
             sample rate and 3.9 dB at half.
         bridge_s : float, optional
             Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out. A log
-            sampled at irregular times needs a longer one, or it falls apart into many short stretches.
+            sampled at irregular times needs a longer one, or it falls apart into many short segments.
 
         Returns
         -------
@@ -222,7 +222,7 @@ class Log:
         Raises
         ------
         LogError
-            The rate is not positive, or so low that interpolation would alias, or no stretch is long enough.
+            The rate is not positive, or so low that interpolation would alias, or no segment is long enough.
 
         Examples
         --------
@@ -247,7 +247,7 @@ class Log:
         Returns
         -------
         Log
-            With a note; each stretch between gaps on a line of its own through its timestamps, at one common period.
+            With a note; each segment between gaps on a line of its own through its timestamps, at one common period.
 
         Raises
         ------
@@ -274,20 +274,20 @@ class Log:
         Parameters
         ----------
         factor : int
-            2 or more; 1 keeps the log. Stretches between gaps are filtered each on its own.
+            2 or more; 1 keeps the log. Segments between gaps are filtered each on its own.
 
         Returns
         -------
         Log
             With a note that names the pass band and the samples that were cut at the ends: 25 periods of the new clock
-            at each end of each stretch. A short run of missing samples is bridged by a line for the filter, and the
+            at each end of each segment. A short run of missing samples is bridged by a line for the filter, and the
             output is missing where they carry more than 20 % of its weight. An input that was held is so no longer: fit
             with ``hold="first"``.
 
         Raises
         ------
         LogError
-            The factor is not a whole number, or no stretch is as long as the filter.
+            The factor is not a whole number, or no segment is as long as the filter.
 
         Examples
         --------

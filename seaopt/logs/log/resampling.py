@@ -1,6 +1,6 @@
 """A uniform clock: samples interpolated to one by a declared rule, or rounded timestamps straightened.
 
-Neither bridges a gap: the stretches between gaps keep their places, and no sample is invented there.
+Neither bridges a gap: the segments between gaps keep their places, and no sample is invented there.
 """
 
 from __future__ import annotations
@@ -28,11 +28,7 @@ Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], s
 def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None, bridge_s: float | None) -> Resampled:
     """Return time and channels on a uniform clock, and a note of what was done: see `Log.resample`.
 
-    Raises
-    ------
-    LogError
-        The rate is not positive, or so low that interpolation would alias, or no stretch is long enough.
-
+    Raises LogError: the rate is not positive, or so low that interpolation would alias, or no segment is long enough.
     """
     chosen = rule if rule is not None else Linear()
     if not isinstance(chosen, Hold | Linear | Nearest):
@@ -60,15 +56,15 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
     gaps = int(np.count_nonzero(np.diff(time) > longest_step))
     new_time: list[Float[np.ndarray, " _"]] = []
     new_values: dict[str, list[Float[np.ndarray, " _"]]] = {name: [] for name in log.signals}
-    for stretch in split_at_gaps(time, longest_step):
-        grid = _uniform_grid(time[stretch], float(time[0]), rate_hz)
+    for segment in split_at_gaps(time, longest_step):
+        grid = _uniform_grid(time[segment], float(time[0]), rate_hz)
         if grid.size < 2:
             continue
         new_time.append(grid)
         for name, parts in new_values.items():
-            parts.append(chosen(grid, time[stretch], log.signals[name].values[stretch]))
+            parts.append(chosen(grid, time[segment], log.signals[name].values[segment]))
     if not new_time:
-        raise LogError(f"{log.source}: no stretch without a gap holds 2 samples at {rate_hz:g} Hz; {HOW_TO_BRIDGE}")
+        raise LogError(f"{log.source}: no segment without a gap holds 2 samples at {rate_hz:g} Hz; {HOW_TO_BRIDGE}")
     note = f"resampled from {old_rate_hz:.6g} Hz to {rate_hz:g} Hz by {chosen}"
     if gaps:
         times = "1 step of time is" if gaps == 1 else f"{gaps} steps of time are"
@@ -87,18 +83,15 @@ def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) 
 def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tuple[Float[np.ndarray, " n"], str]:
     """Return the uniform clock behind rounded or late timestamps, and a note of what was done: see `Log.restamp`.
 
-    Raises
-    ------
-    LogError
-        Rounding alone does not explain the timestamps, and no rate is stated; or the stated one is not theirs.
-
+    Raises LogError: rounding alone does not explain the timestamps, and no rate is stated; or the stated one is not
+    theirs.
     """
     if rate_hz is not None:
         return _restamp_at(log, period, rate_hz)
     resolution = timestamp_resolution(log.time)
     uniform = log.time.copy()
-    for stretch in split_at_gaps(log.time, GAP * period):
-        stamps = log.time[stretch]
+    for segment in split_at_gaps(log.time, GAP * period):
+        stamps = log.time[segment]
         line = period * np.arange(stamps.size)
         # Rounding moves a stamp by at most half a step, so all of them lie within one step; two allow for the period.
         deviations = stamps - line
@@ -109,7 +102,7 @@ def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tupl
                 f"resample = {{ rate_hz = ... }}; or where a PC stamped the samples of a perfect clock, "
                 f'log.restamp(rate_hz=...), in a problem file resample = {{ rate_hz = ..., rule = "restamp" }}'
             )
-        uniform[stretch] = line + 0.5 * (np.min(deviations) + np.max(deviations))
+        uniform[segment] = line + 0.5 * (np.min(deviations) + np.max(deviations))
     rounded = f", rounded to {resolution:.3g} s," if resolution else ""
     return uniform, f"timestamps{rounded} put on a uniform clock of {sample_rate_hz(period):.6g} Hz"
 

@@ -23,21 +23,8 @@ def mask_saturated(
 ) -> Log:
     """Make the saturated samples of outputs missing.
 
-    Parameters
-    ----------
-    log : Log
-        The log.
-    outputs : collection of str
-        Channels to look at.
-    ranges : mapping of channel to (low, high)
-        Declared ranges of sensors, in SI: samples at an end or beyond it are saturated.
-    search : bool
-        Whether to look for clear flat tops, as the quality report does, where no range is declared.
-
-    Returns
-    -------
-    Log
-        The log itself where nothing is saturated.
+    `outputs`: channels to look at. `ranges`: declared (low, high) of sensors, in SI: samples at an end or beyond it are
+    saturated. `search`: whether to look for clear flat tops, as the quality report does, where no range is declared.
 
     Examples
     --------

@@ -20,51 +20,26 @@ MOVING_STD = 0.05  # of its standard deviation over the log: what makes a channe
 
 @record(eq=False)
 class ChannelQuality:
-    """Range and faults of one channel, in its SI unit; rows are counted from 0.
-
-    Parameters
-    ----------
-    name, unit : str
-    low, high, mean, std : float
-        Of the samples that are there; NaN where none is.
-    missing : RowRanges
-        Samples that are not finite.
-    beyond : array of int
-        Rows of numbers that no sensor gives; no figure is made of them.
-    quantum : float
-        Quantisation step; 0 where none is seen.
-    still : float
-        Share of samples equal to the last, as is usual for the channel.
-    held : int
-        Samples that each value is repeated, regularly; 1 where it is not.
-    stuck : RowRanges
-        RowRanges of equal samples that the channel's activity does not explain.
-    rails : tuple of Rail
-        Flat tops and bottoms.
-    outliers : array of int
-        Rows.
-    counter : CounterLosses or None
-        Lost samples, where the channel counts.
-    hum : Hum or None
-
-    """
+    """Range and faults of one channel, in its SI unit; rows are counted from 0."""
 
     name: str
     unit: str
+    # low, high, mean, std: of the samples that are there; NaN where none is
     low: float
     high: float
     mean: float
     std: float
-    missing: RowRanges
-    quantum: float
-    still: float
-    held: int
-    stuck: RowRanges
-    rails: tuple[Rail, ...]
-    outliers: Int[np.ndarray, " k"]
-    counter: CounterLosses | None
+    missing: RowRanges  # samples that are not finite
+    beyond: Int[np.ndarray, " b"]  # rows of numbers that no sensor gives; no figure is made of them
+    # What follows is a constant's, which has no faults besides.
+    quantum: float = 0.0  # quantisation step; 0 where none is seen
+    still: float = 1.0  # share of samples equal to the last, as is usual for the channel
+    held: int = 1  # samples that each value is repeated, regularly; 1 where it is not
+    stuck: RowRanges = field(default_factory=RowRanges)  # runs of equal samples that its activity does not explain
+    rails: tuple[Rail, ...] = ()  # flat tops and bottoms
+    outliers: Int[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, dtype=int))  # rows
+    counter: CounterLosses | None = None  # lost samples, where the channel counts
     hum: Hum | None = None
-    beyond: Int[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     @property
     def constant(self) -> bool:
@@ -97,10 +72,15 @@ def assess_channel(signal: Signal) -> ChannelQuality:
     if not present.size or present.min() == present.max():
         edge = float(present[0]) if present.size else np.nan
         return ChannelQuality(
-            name=signal.name, unit=signal.unit, low=edge, high=edge, mean=edge, std=0.0 if present.size else np.nan,
-            missing=missing, quantum=0.0, still=1.0, held=1, stuck=RowRanges(), rails=(),
-            outliers=np.zeros(0, dtype=int), counter=None, beyond=beyond,
-        )  # fmt: skip
+            name=signal.name,
+            unit=signal.unit,
+            low=edge,
+            high=edge,
+            mean=edge,
+            std=0.0 if present.size else np.nan,
+            missing=missing,
+            beyond=beyond,
+        )
     quantum, still = faults.find_quantisation(values), faults.measure_stillness(values)
     losses = faults.find_counter_losses(values)
     outliers = faults.find_outliers(values, quantum) if losses is None else np.zeros(0, dtype=int)
@@ -110,12 +90,22 @@ def assess_channel(signal: Signal) -> ChannelQuality:
         tame[outliers] = np.nan
     rails = tuple(faults.find_rails(tame, quantum, still)) if losses is None else ()
     return ChannelQuality(
-        name=signal.name, unit=signal.unit, low=float(present.min()), high=float(present.max()),
-        mean=float(present.mean()), std=float(present.std()), missing=missing, quantum=quantum, still=still,
+        name=signal.name,
+        unit=signal.unit,
+        low=float(present.min()),
+        high=float(present.max()),
+        mean=float(present.mean()),
+        std=float(present.std()),
+        missing=missing,
+        quantum=quantum,
+        still=still,
         held=faults.count_repeats(values) if still >= faults.HOLDS else 1,
         stuck=_off_rails(faults.find_stuck(values, quantum, still), values, rails) if losses is None else RowRanges(),
-        rails=rails, outliers=outliers, counter=losses, beyond=beyond,
-    )  # fmt: skip
+        rails=rails,
+        outliers=outliers,
+        counter=losses,
+        beyond=beyond,
+    )
 
 
 def _off_rails(runs: RowRanges, values: Float[np.ndarray, " n"], rails: Sequence[Rail]) -> RowRanges:
@@ -127,13 +117,7 @@ def _off_rails(runs: RowRanges, values: Float[np.ndarray, " n"], rails: Sequence
 def keep_runs_while_others_move(runs: RowRanges, others: Sequence[tuple[Float[np.ndarray, " n"], float]]) -> RowRanges:
     """Keep the runs of equal samples during which another channel moves; all where there is no other.
 
-    Parameters
-    ----------
-    runs : RowRanges
-        Of one channel.
-    others : sequence of (array, float)
-        The samples of the other channels and their standard deviations.
-
+    `others`: the samples of the other channels and their standard deviations.
     """
     active = [(values, std) for values, std in others if std > 0.0]
     if not active or not len(runs):

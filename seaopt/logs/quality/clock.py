@@ -17,37 +17,22 @@ ROUNDING_STEPS = 200_000  # steps of time that are enough to see the rounding of
 
 @record(eq=False)
 class ClockQuality:
-    """Rate, jitter, gaps and faults of a log's timestamps; rows are counted from 0.
-
-    Parameters
-    ----------
-    samples : int
-    period : float
-        Mean step between samples that are not across a gap, in s.
-    jitter_rms, jitter_max : float
-        Of those steps, from the period, in s.
-    rounding : float
-        Step that the timestamps are rounded to, in s; 0 where none is seen.
-    rounded_only : bool
-        Whether the rounding explains the jitter: behind it the sampling may be perfect.
-    not_numbers, backwards, repeated, gaps : array of int
-        Rows whose time is not a number, lies before or at that of the row ahead of it, or follows a gap.
-    lost : array of int
-        Samples that are missing in each gap.
-
-    """
+    """Rate, jitter, gaps and faults of a log's timestamps; rows are counted from 0."""
 
     samples: int
-    period: float
+    period: float  # mean step between samples that are not across a gap, in s
+    # jitter_rms, jitter_max: of those steps, from the period, in s
     jitter_rms: float
     jitter_max: float
-    rounding: float
-    rounded_only: bool
+    rounding: float  # step that the timestamps are rounded to, in s; 0 where none is seen
+    rounded_only: bool  # whether the rounding explains the jitter: behind it the sampling may be perfect
+    # not_numbers, backwards, repeated, gaps: rows whose time is not a number, lies before or at that of the row ahead
+    # of it, or follows a gap
     not_numbers: Int[np.ndarray, " a"]
     backwards: Int[np.ndarray, " b"]
     repeated: Int[np.ndarray, " c"]
     gaps: Int[np.ndarray, " d"]
-    lost: Int[np.ndarray, " d"]
+    lost: Int[np.ndarray, " d"]  # samples that are missing in each gap
 
     @property
     def rate_hz(self) -> float:
@@ -63,10 +48,7 @@ def sample_rate_hz(period: float) -> float:
 def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
     """Return rate, jitter, gaps and faults of the timestamps of a log or table.
 
-    Raises
-    ------
-    LogError
-        Fewer than two of them increase: there is no clock.
+    Raises LogError: fewer than two of them increase: there is no clock.
 
     Examples
     --------
@@ -103,9 +85,13 @@ def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
 
 
 def split_at_gaps(time: Float[np.ndarray, " n"], longest_step: float) -> list[slice]:
-    """Return the rows of the stretches without a longer step, of two samples or more each."""
-    breaks = np.flatnonzero(np.diff(time) > longest_step) + 1
-    return [slice(first, last) for first, last in pairwise([0, *breaks.tolist(), time.size]) if last - first >= 2]
+    """Return the rows of the segments without a longer step, of two samples or more each."""
+    return split_rows(np.flatnonzero(np.diff(time) > longest_step) + 1, time.size, 2)
+
+
+def split_rows(breaks: Int[np.ndarray, " k"], n: int, least: int = 1) -> list[slice]:
+    """Return the rows between breaks, of at least so many samples; a break is the first row of what follows."""
+    return [slice(first, last) for first, last in pairwise([0, *breaks.tolist(), n]) if last - first >= least]
 
 
 def timestamp_resolution(time: Float[np.ndarray, " n"]) -> float:
@@ -134,15 +120,15 @@ def timestamp_resolution(time: Float[np.ndarray, " n"]) -> float:
 
 
 def _rounding_explains(
-    stamps: Float[np.ndarray, " n"], step: Float[np.ndarray, " m"], across: Float[np.ndarray, " m"] | np.ndarray,
-    rounding: float, period: float,
-) -> bool:  # fmt: skip
-    """Return whether every stretch between gaps lies on a line through its timestamps, within their rounding."""
+    stamps: Float[np.ndarray, " n"],
+    step: Float[np.ndarray, " m"],
+    across: Float[np.ndarray, " m"] | np.ndarray,
+    rounding: float,
+    period: float,
+) -> bool:
+    """Return whether every segment between gaps lies on a line through its timestamps, within their rounding."""
     if np.any(step < 0.0):
         return False
-    breaks = np.flatnonzero(across) + 1
-    for first, last in pairwise([0, *breaks.tolist(), stamps.size]):
-        deviations = stamps[first:last] - period * np.arange(last - first)
-        if np.ptp(deviations) > 2.0 * rounding + 1e-9 * period:
-            return False
-    return True
+    segments = [stamps[rows] for rows in split_rows(np.flatnonzero(across) + 1, stamps.size)]
+    spans = [float(np.ptp(segment - period * np.arange(segment.size))) for segment in segments]
+    return max(spans) <= 2.0 * rounding + 1e-9 * period

@@ -18,34 +18,19 @@ LEAST_COHERENCE = 0.5  # of an output with the input, power-weighted; below it m
 
 @record
 class ThirdOctave:
-    """A band of a third of an octave.
+    """A band of a third of an octave."""
 
-    Parameters
-    ----------
-    low_hz, high_hz : float
-        Edges.
-    reach_hz : float
-        Highest frequency in it that is excited.
-    share : float
-        Of the input's power.
-    level_db : float
-        Power of the band, or density in it, whichever is nearer to its largest value anywhere, relative to that.
-    coherence : float or None
-        Of the output that answers best; None without outputs.
-    gain : float or None
-        Size of the response of the output that answers best over all bands, in its unit over the input's.
-    usable : bool
-        Whether a model can be identified from it: within 40 dB of the strongest, and coherence of 0.5 or more.
-
-    """
-
+    # low_hz, high_hz: edges
     low_hz: float
     high_hz: float
-    reach_hz: float
-    share: float
+    reach_hz: float  # highest frequency in it that is excited
+    share: float  # of the input's power
+    # power of the band, or density in it, whichever is nearer to its largest value anywhere, relative to that
     level_db: float
-    coherence: float | None
+    coherence: float | None  # of the output that answers best; None without outputs
+    # size of the response of the output that answers best over all bands, in its unit over the input's
     gain: float | None
+    # whether a model can be identified from it: within 40 dB of the strongest, and coherence of 0.5 or more
     usable: bool
 
     @property
@@ -65,7 +50,7 @@ class InputExcitation:
 
     @property
     def usable_hz(self) -> tuple[float, float] | None:
-        """The widest stretch of usable bands, in octaves; None where there is none.
+        """The widest run of usable bands, in octaves; None where there is none.
 
         A dip of the coherence within it is part of it, where the input excites: beside a sharp resonance the window
         leaks its power, and at an antiresonance little is left of the output.
@@ -117,12 +102,14 @@ class InputExcitation:
         usable = self.usable_hz
         if usable is None:
             return (
-                f"{self.channel} excites nothing that an output answers to: no parameter can be identified; check the "
-                "channels, and drive harder"
+                f"{self.channel} excites nothing to which an output responds: no parameter can be identified; check "
+                "the channels, and drive harder"
             )
         low, high = usable
-        what = "answered to" if self.bands[0].coherence is not None else "excited"
-        sentence = f"{self.channel} is {what} from {low:.3g} to {high:.3g} Hz"
+        if self.bands[0].coherence is not None:
+            sentence = f"the outputs respond to {self.channel} between {low:.3g} and {high:.3g} Hz"
+        else:
+            sentence = f"{self.channel} is excited between {low:.3g} and {high:.3g} Hz"
         if high < 0.8 * self.nyquist_hz:
             sentence += f"; nothing above {high:.3g} Hz"
         peak, half = self.peak_hz, self.rolls_off_hz
@@ -140,15 +127,7 @@ class InputExcitation:
 def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) -> InputExcitation | None:
     """Return which bands an input excites, and in which a model can be identified; None where it is constant.
 
-    Parameters
-    ----------
-    spectra : Spectra
-        Of input and outputs.
-    channel : str
-        The input.
-    outputs : sequence of str
-        Channels that may answer to it.
-
+    `spectra`: of input and outputs. `outputs`: channels that may answer to it.
     """
     f, power = spectra.frequency_hz[1:], spectra.power(channel)[1:]
     total = float(np.sum(power))
@@ -177,11 +156,14 @@ def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) ->
         best = max((float(weight @ coherence[row]) for coherence in coherences.values()), default=None)
         bands.append(
             ThirdOctave(
-                low_hz=float(edges[k]), high_hz=float(min(edges[k + 1], f[-1])),
+                low_hz=float(edges[k]),
+                high_hz=float(min(edges[k + 1], f[-1])),
                 reach_hz=float(np.max(f[row[power[row] >= REACHED * np.max(power[row])]])),
-                share=float(sums[k] / total), level_db=float(max(levels[k], -300.0)), coherence=best,
+                share=float(sums[k] / total),
+                level_db=float(max(levels[k], -300.0)),
+                coherence=best,
                 gain=float(weight @ gains[row]) if gains is not None else None,
                 usable=bool(levels[k] >= -RANGE_DB and (best is None or best >= LEAST_COHERENCE)),
             )
-        )  # fmt: skip
+        )
     return InputExcitation(channel=channel, bands=tuple(bands), nyquist_hz=float(f[-1]), output=loudest or "")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +19,7 @@ from seaopt.logs.quality.excitation import InputExcitation
 from seaopt.logs.quality.faults import CounterLosses, RowRanges
 from seaopt.logs.quality.lags import ChannelPair
 from seaopt.records import record
+from seaopt.signals import SAME_SIGN
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -60,7 +63,7 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as plain data."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return asdict(self)
 
 
 def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
@@ -72,18 +75,22 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
     ):
         if rows.size:
             text = f"{format_count(rows.size, 'row')} of {clock.samples} with {what}"
-            yield Finding(kind=kind, severity="error", count=int(rows.size), where_s=_places(time, rows), sentence=text)
+            yield _rows_finding(kind, "error", "", rows, time, text)
     share = clock.jitter_max / clock.period
     if share > JITTER_LIMIT:
         yield _jitter_finding(clock, share)
     if clock.gaps.size:
         total, longest = int(np.sum(clock.lost)), int(np.max(clock.lost))
         yield Finding(
-            kind="gap", severity="warning", count=int(clock.gaps.size), value=float(total), unit="samples",
+            kind="gap",
+            severity="warning",
+            count=int(clock.gaps.size),
+            value=float(total),
+            unit="samples",
             where_s=tuple((float(time[row - 1]), float(time[row])) for row in clock.gaps[:MAX_PLACES]),
             sentence=f"{format_count(clock.gaps.size, 'gap')}, {format_count(total, 'sample')} lost, {longest} in the "
-            "longest; a fit starts anew after each (gaps = \"split\")",
-        )  # fmt: skip
+            'longest; a fit starts anew after each (gaps = "split")',
+        )
 
 
 def _jitter_finding(clock: ClockQuality, share: float) -> Finding:
@@ -112,10 +119,7 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
         text = (
             f"{name} has {count} beyond any sensor (above {BEYOND:g}): nothing else here counts them; set them to NaN"
         )
-        yield Finding(
-            kind="beyond", severity="error", channel=name, count=int(channel.beyond.size), sentence=text,
-            where_s=_places(time, channel.beyond),
-        )  # fmt: skip
+        yield _rows_finding("beyond", "error", name, channel.beyond, time, text)
     if channel.missing.samples + channel.beyond.size == time.size:
         return
     if channel.constant:
@@ -140,10 +144,7 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
         text = (
             f"{format_count(channel.outliers.size, 'outlier')} in {name}; fit with loss=so.Huber(), or set them to NaN"
         )
-        yield Finding(
-            kind="outlier", severity="warning", channel=name, count=int(channel.outliers.size), sentence=text,
-            where_s=_places(time, channel.outliers),
-        )  # fmt: skip
+        yield _rows_finding("outlier", "warning", name, channel.outliers, time, text)
     if channel.counter is not None and channel.counter.rows.size:
         yield _counter_finding(name, channel.counter, time)
     if channel.hum is not None:
@@ -170,10 +171,7 @@ def _counter_finding(name: str, losses: CounterLosses, time: Float[np.ndarray, "
         f'lost that the clock does not show; read the log with counter=Counter(column="{name}"{per_count}), which '
         "opens the gaps"
     )
-    return Finding(
-        kind="gap", severity="error", channel=name, count=int(losses.rows.size), value=float(total), unit="samples",
-        where_s=_places(time, losses.rows), sentence=text,
-    )  # fmt: skip
+    return _rows_finding("gap", "error", name, losses.rows, time, text, value=float(total), unit="samples")
 
 
 def _check_rails(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
@@ -185,10 +183,16 @@ def _check_rails(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iter
         text += (
             ": it is clipped; a fit masks these samples of an output"
             if rail.clear
-            else f": clipped, or at rest there; if clipped, declare its range, saturation = {{ {name} = [low, high] }}"
+            else ": clipped, or at rest there; if clipped, declare its range, "
+            f"saturation = {{ {_spell_key(name)} = [low, high] }}"
         )
         severity: Severity = "warning" if rail.clear else "note"
         yield _runs_finding("clipping", severity, channel, rail.runs, time, text, value=rail.value)
+
+
+def _spell_key(name: str) -> str:
+    """Return a name as a key of TOML."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
 
 
 def _check_levels(channel: ChannelQuality) -> Iterator[Finding]:
@@ -204,9 +208,13 @@ def _check_levels(channel: ChannelQuality) -> Iterator[Finding]:
         text = f"{channel.name} moves in steps of {step}, {levels:.0f} over its range"
         text += "; use a finer range, or expect coloured residuals" if levels < COARSE_LEVELS else ""
         yield Finding(
-            kind="quantisation", severity="warning" if levels < COARSE_LEVELS else "note", channel=channel.name,
-            value=channel.quantum, unit=channel.unit, sentence=text,
-        )  # fmt: skip
+            kind="quantisation",
+            severity="warning" if levels < COARSE_LEVELS else "note",
+            channel=channel.name,
+            value=channel.quantum,
+            unit=channel.unit,
+            sentence=text,
+        )
 
 
 def _hum_finding(channel: ChannelQuality) -> Finding:
@@ -217,15 +225,20 @@ def _hum_finding(channel: ChannelQuality) -> Finding:
         f"{max(channel.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it (band_hz)"
     )
     return Finding(
-        kind="hum", severity="warning", channel=channel.name, count=len(channel.hum.lines_hz), value=channel.hum.rms,
-        unit=channel.unit, sentence=text,
-    )  # fmt: skip
+        kind="hum",
+        severity="warning",
+        channel=channel.name,
+        count=len(channel.hum.lines_hz),
+        value=channel.hum.rms,
+        unit=channel.unit,
+        sentence=text,
+    )
 
 
 def find_pair_faults(pair: ChannelPair, period: float, driven: bool) -> Iterator[Finding]:
     """Yield what is wrong between two channels; `driven`: the first is an input of the second."""
     name = f"{pair.first}, {pair.second}"
-    if {pair.first.casefold(), pair.second.casefold()} == {"f1", "f2"} and pair.flipped:
+    if {pair.first.casefold(), pair.second.casefold()} == set(SAME_SIGN) and pair.flipped:
         text = (
             f"{pair.second} has the opposite sign of {pair.first}; on the stand both are positive together: turn one "
             "around"
@@ -250,9 +263,13 @@ def describe_excitation(excitation: InputExcitation) -> Finding:
     """Return what can and cannot be identified with an input."""
     usable = excitation.usable_hz
     return Finding(
-        kind="excitation", severity="note" if usable else "warning", channel=excitation.channel,
-        value=usable[1] if usable else 0.0, unit="Hz", sentence=excitation.sentence,
-    )  # fmt: skip
+        kind="excitation",
+        severity="note" if usable else "warning",
+        channel=excitation.channel,
+        value=usable[1] if usable else 0.0,
+        unit="Hz",
+        sentence=excitation.sentence,
+    )
 
 
 def sort_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -265,16 +282,38 @@ def count_findings(findings: Sequence[Finding]) -> Mapping[str, int]:
     return {level: sum(finding.severity == level for finding in findings) for level in SEVERITIES}
 
 
-def _places(time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"]) -> tuple[tuple[float, float], ...]:
-    return tuple((float(time[row]), float(time[row])) for row in rows[:MAX_PLACES])
+def _rows_finding(
+    kind: str,
+    severity: Severity,
+    channel: str,
+    rows: Int[np.ndarray, " k"],
+    time: Float[np.ndarray, " n"],
+    text: str,
+    **fields: Any,
+) -> Finding:
+    where_s = tuple((float(time[row]), float(time[row])) for row in rows[:MAX_PLACES])
+    return Finding(
+        kind=kind, severity=severity, channel=channel, count=int(rows.size), where_s=where_s, sentence=text, **fields
+    )
 
 
 def _runs_finding(
-    kind: str, severity: Severity, channel: ChannelQuality, runs: RowRanges, time: Float[np.ndarray, " n"], text: str,
+    kind: str,
+    severity: Severity,
+    channel: ChannelQuality,
+    runs: RowRanges,
+    time: Float[np.ndarray, " n"],
+    text: str,
     value: float = 0.0,
-) -> Finding:  # fmt: skip
+) -> Finding:
     pairs = zip(runs.start[:MAX_PLACES], runs.stop[:MAX_PLACES], strict=True)
     return Finding(
-        kind=kind, severity=severity, channel=channel.name, count=runs.samples, value=value, unit=channel.unit,
-        where_s=tuple((float(time[a]), float(time[b - 1])) for a, b in pairs), sentence=text,
-    )  # fmt: skip
+        kind=kind,
+        severity=severity,
+        channel=channel.name,
+        count=runs.samples,
+        value=value,
+        unit=channel.unit,
+        where_s=tuple((float(time[a]), float(time[b - 1])) for a, b in pairs),
+        sentence=text,
+    )

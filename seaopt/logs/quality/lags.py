@@ -14,29 +14,15 @@ FLIPPED = 0.3  # correlation beyond which a negative sign is a flip
 
 @record
 class ChannelPair:
-    """The cross-correlation of two channels.
+    """The cross-correlation of two channels."""
 
-    Parameters
-    ----------
-    first, second : str
-        Channels; a positive lag says that the second is late.
-    lag_s : float
-        Where the correlation is largest in size, a fraction of a sample by a parabola through three.
-    correlation : float
-        There, with its sign.
-    leads : bool
-        Whether the second is clearly ahead: nothing within a tenth of that correlation where it is late.
-    flipped : bool
-        Whether the correlation within three samples of no lag is mostly negative.
-
-    """
-
+    # first, second: channels; a positive lag says that the second is late
     first: str
     second: str
-    lag_s: float
-    correlation: float
-    leads: bool
-    flipped: bool
+    lag_s: float  # where the correlation is largest in size, a fraction of a sample by a parabola through three
+    correlation: float  # there, with its sign
+    leads: bool  # whether the second is clearly ahead: nothing within a tenth of that correlation where it is late
+    flipped: bool  # whether the correlation within three samples of no lag is mostly negative
 
 
 def correlate_channels(spectra: Spectra, first: str, second: str) -> ChannelPair | None:

@@ -6,17 +6,17 @@ It reads a `Log`, or a `Table` as a file holds it, whose time may repeat or run 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import combinations, pairwise
+from dataclasses import asdict, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
-from seaopt.formatting import format_count, format_table, html_list, html_paragraph, html_table
+from seaopt.formatting import format_count
 from seaopt.logs.quality.channel import ChannelQuality, assess_channel, keep_runs_while_others_move
-from seaopt.logs.quality.clock import ClockQuality, assess_clock
+from seaopt.logs.quality.clock import ClockQuality, assess_clock, split_rows
 from seaopt.logs.quality.excitation import InputExcitation, assess_excitation
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.findings import (
@@ -29,22 +29,19 @@ from seaopt.logs.quality.findings import (
     sort_findings,
 )
 from seaopt.logs.quality.lags import ChannelPair, correlate_channels
-from seaopt.logs.quality.spectra import FEWEST_STRETCHES, SHORTEST_STRETCH, Spectra, compute_spectra, find_hum
+from seaopt.logs.quality.spectra import FEWEST_SEGMENTS, SHORTEST_SEGMENT, Spectra, compute_spectra, find_hum
 from seaopt.progress import Progress, count_off, divide, ignore
-from seaopt.records import record
-from seaopt.signals import Recording
+from seaopt.records import Result, Worded, record
+from seaopt.signals import HOLDING_NAMES, INPUT_NAMES, INPUT_UNITS, SAME_SIGN, Recording
 
 QUALITY_SCHEMA = "seaopt/quality/1"
-INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u", "v", "duty", "goal"})  # names of inputs, in any case
-HOLDING_NAMES = frozenset({"duty", "goal"})  # of inputs that hold a value for as long as they like
-INPUT_UNITS = frozenset({"A", "V"})
 CHANNELS, PAIRS = 0.6, 0.4  # of the time
-MOST_PAIRED = 100  # outputs; of more only F1 and F2 are correlated with each other
-ENOUGH_SAMPLES = FEWEST_STRETCHES * SHORTEST_STRETCH  # for spectra, in one stretch
+MOST_PAIRED = 100  # outputs; of more only `SAME_SIGN` are correlated with each other
+ENOUGH_SAMPLES = FEWEST_SEGMENTS * SHORTEST_SEGMENT  # for spectra, in one segment
 
 
-@record(eq=False)
-class Quality:
+@record(eq=False, repr=False)
+class Quality(Result, Worded):
     """Faults of a log's data, and what they excite; ``print(quality)`` is a report.
 
     Parameters
@@ -60,7 +57,7 @@ class Quality:
         Each input with each other channel, and the others with one another where they share a unit.
     excitation : mapping of input to InputExcitation
     spectra : Spectra or None
-        From which hum, pairs and excitation come; None where no stretch is long enough.
+        From which hum, pairs and excitation come; None where no segment is long enough.
     findings : tuple of Finding
         The most severe first.
     notes : tuple of str
@@ -80,15 +77,14 @@ class Quality:
     notes: tuple[str, ...] = ()
 
     @property
+    def met(self) -> bool:
+        """Whether no finding is an error."""
+        return all(finding.severity != "error" for finding in self.findings)
+
+    @property
     def ok(self) -> bool:
         """Whether there is neither an error nor a warning."""
         return all(finding.severity == "note" for finding in self.findings)
-
-    @property
-    def summary(self) -> str:
-        """Samples, length and rate in one line."""
-        clock = self.clock
-        return f"{clock.samples} samples, {self.duration_s:.6g} s at {clock.rate_hz:.6g} Hz, {describe_jitter(clock)}"
 
     def of(self, kind: str, channel: str | None = None) -> tuple[Finding, ...]:
         """Return the findings of a kind, of one channel if given."""
@@ -106,12 +102,15 @@ class Quality:
             "duration_s": self.duration_s,
             "rate_hz": clock.rate_hz,
             "jitter": {
-                "rms_s": clock.jitter_rms, "max_s": clock.jitter_max,
-                "max_percent": 100.0 * clock.jitter_max / clock.period, "rounding_s": clock.rounding,
+                "rms_s": clock.jitter_rms,
+                "max_s": clock.jitter_max,
+                "max_percent": 100.0 * clock.jitter_max / clock.period,
+                "rounding_s": clock.rounding,
                 "rounding_explains_it": clock.rounded_only,
             },
             "gaps": {
-                "count": int(clock.gaps.size), "samples_lost": int(np.sum(clock.lost)),
+                "count": int(clock.gaps.size),
+                "samples_lost": int(np.sum(clock.lost)),
                 "longest_samples": int(np.max(clock.lost, initial=0)),
             },
             "duplicates": int(clock.repeated.size),
@@ -119,26 +118,12 @@ class Quality:
             "time_missing": int(clock.not_numbers.size),
             "channels": {name: _channel_dict(channel) for name, channel in self.channels.items()},
             "inputs": list(self.inputs),
-            "pairs": [_fields(pair) for pair in self.pairs],
+            "pairs": [asdict(pair) for pair in self.pairs],
             "excitation": {name: _excitation_dict(excitation) for name, excitation in self.excitation.items()},
             "findings": [finding.to_dict() for finding in self.findings],
             "counts": dict(count_findings(self.findings)),
             "notes": list(self.notes),
-        }  # fmt: skip
-
-    def __repr__(self) -> str:
-        lines = [f"Quality of {self.source}: {self.summary}"]
-        lines += [f"  {note}" for note in self.notes]
-        lines += [f"  {row}" for row in format_table(map(format_channel, self.channels.values()), CHANNEL_HEAD)]
-        lines += [f"  {finding.severity}: {finding.sentence}" for finding in self.findings]
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return (
-            html_paragraph(f"{self.source}: {self.summary}")
-            + html_table(CHANNEL_HEAD, map(format_channel, self.channels.values()))
-            + html_list(f"{finding.severity}: {finding.sentence}" for finding in self.findings)
-        )
+        }
 
 
 @np.errstate(over="ignore", invalid="ignore")  # numbers near the largest float have no std, and are reported as such
@@ -188,11 +173,12 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
         for name, channel in channels.items()
     }
     # A constant has no spectrum, and a counter one that means nothing.
-    varying = {name: _drop_beyond(data.signals[name].values, channel) for name, channel in channels.items()
-               if _varies(channel)}  # fmt: skip
+    varying = {
+        name: _drop_beyond(data.signals[name].values, channel) for name, channel in channels.items() if _varies(channel)
+    }
     correlating("spectra and pairs of channels", 0.0)
     inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)
-    spectra = compute_spectra(varying, _stretches(clock, len(data)), clock.period)
+    spectra = compute_spectra(varying, _segments(clock, len(data)), clock.period)
     if spectra is not None:
         hums = {name: find_hum(spectra, name, inputs) for name in spectra.channels}
         channels = {name: replace(channel, hum=hums.get(name)) for name, channel in channels.items()}
@@ -206,9 +192,17 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     finite = data.time[np.isfinite(data.time)]
     progress(format_count(len(channels), "channel"), 1.0)
     return Quality(
-        source=data.source, duration_s=float(np.ptp(finite)), clock=clock, channels=channels, inputs=inputs,
-        pairs=pairs, excitation=excitation, spectra=spectra, findings=sort_findings(findings), notes=data.notes,
-    )  # fmt: skip
+        source=data.source,
+        duration_s=float(np.ptp(finite)),
+        clock=clock,
+        channels=channels,
+        inputs=inputs,
+        pairs=pairs,
+        excitation=excitation,
+        spectra=spectra,
+        findings=sort_findings(findings),
+        notes=data.notes,
+    )
 
 
 def _drop_beyond(values: Float[np.ndarray, " n"], channel: ChannelQuality) -> Float[np.ndarray, " n"]:
@@ -230,18 +224,17 @@ def _judge_stuck_runs(
     """Keep the runs of a channel as stuck during which another one moves."""
     if not len(channel.stuck):
         return channel
-    others = [
+    moving = [
         (data.signals[name].values, other.std)
         for name, other in channels.items()
         if name != channel.name and _varies(other)
     ]
-    return replace(channel, stuck=keep_runs_while_others_move(channel.stuck, others))
+    return replace(channel, stuck=keep_runs_while_others_move(channel.stuck, moving))
 
 
-def _stretches(clock: ClockQuality, n: int) -> list[slice]:
+def _segments(clock: ClockQuality, n: int) -> list[slice]:
     """Return the rows without a gap or a step backwards."""
-    breaks = np.unique(np.concatenate([clock.gaps, clock.backwards, clock.not_numbers]))
-    return [slice(first, last) for first, last in pairwise([0, *breaks.tolist(), n]) if last > first]
+    return split_rows(np.unique(np.concatenate([clock.gaps, clock.backwards, clock.not_numbers])), n)
 
 
 def _likely_inputs(channels: Mapping[str, ChannelQuality]) -> tuple[str, ...]:
@@ -258,7 +251,7 @@ def _is_speed(channel: ChannelQuality) -> bool:
 def _correlate_pairs(
     spectra: Spectra | None, inputs: Sequence[str], channels: Mapping[str, ChannelQuality]
 ) -> tuple[ChannelPair, ...]:
-    """Correlate inputs with outputs, and outputs of one unit, F1 and F2 among them, with each other."""
+    """Correlate inputs with outputs, and outputs of one unit, or of the same sign by their names, with each other."""
     if spectra is None:
         return ()
     outputs = [name for name in spectra.channels if name not in inputs]
@@ -267,9 +260,10 @@ def _correlate_pairs(
         wanted += [
             (a, b) for a, b in combinations(outputs, 2) if channels[a].unit and channels[a].unit == channels[b].unit
         ]
-    forces = {name.casefold(): name for name in outputs}
-    if "f1" in forces and "f2" in forces and not any(set(two) == {forces["f1"], forces["f2"]} for two in wanted):
-        wanted.append((forces["f1"], forces["f2"]))
+    named = {name.casefold(): name for name in outputs}
+    alike = tuple(named[name] for name in SAME_SIGN if name in named)
+    if len(alike) == 2 and alike not in wanted and alike[::-1] not in wanted:
+        wanted.append(alike)
     pairs = [correlate_channels(spectra, first, second) for first, second in wanted]
     return tuple(pair for pair in pairs if pair is not None)
 
@@ -286,11 +280,11 @@ def _list_unjudged(
     inputs: Sequence[str], spectra: Spectra | None, clock: ClockQuality, data: Recording
 ) -> list[Finding]:
     """Return what could not be looked at, and why."""
-    stretches = _stretches(clock, len(data))
-    if spectra is None and len(data) >= ENOUGH_SAMPLES and len(stretches) > 1:
-        longest = max(rows.stop - rows.start for rows in stretches)
+    segments = _segments(clock, len(data))
+    if spectra is None and len(data) >= ENOUGH_SAMPLES and len(segments) > 1:
+        longest = max(rows.stop - rows.start for rows in segments)
         text = (
-            f"{len(stretches) - 1} gaps leave stretches of at most {longest} samples, too short for spectra: hum, "
+            f"{len(segments) - 1} gaps leave segments of at most {longest} samples, too short for spectra: hum, "
             "delays, signs and excitation were not looked at; where the sampling is irregular, resample the log with "
             "bridge_s, in a problem file resample = { rate_hz = ..., bridge_s = ... }"
         )
@@ -304,32 +298,8 @@ def _list_unjudged(
     return [Finding(kind="unjudged", severity="note", sentence=text)]
 
 
-CHANNEL_HEAD = ("channel", "unit", "low", "high", "std", "missing", "step", "stuck", "saturated", "outliers", "hum")
-
-
-def format_channel(channel: ChannelQuality) -> tuple[str, ...]:
-    """Return a channel's figures for people, in the order of CHANNEL_HEAD."""
-    return (
-        channel.name, channel.unit or "-", f"{channel.low:.4g}", f"{channel.high:.4g}", f"{channel.std:.4g}",
-        str(channel.missing.samples), f"{channel.quantum:.3g}" if channel.quantum else "-", str(channel.stuck.samples),
-        str(channel.saturated), str(channel.outliers.size), f"{channel.hum.rms:.3g}" if channel.hum else "-",
-    )  # fmt: skip
-
-
-def describe_jitter(clock: ClockQuality) -> str:
-    """Return the clock's jitter for people."""
-    if clock.jitter_max <= 1e-6 * clock.period:
-        return "no jitter"
-    text = f"jitter {clock.jitter_rms / clock.period:.2%} rms, {clock.jitter_max / clock.period:.2%} at most"
-    return text + (f" (timestamps rounded to {clock.rounding:.3g} s)" if clock.rounded_only else "")
-
-
-def _fields(data: Any) -> dict[str, Any]:
-    return {name: getattr(data, name) for name in data.__dataclass_fields__}
-
-
 def _excitation_dict(excitation: InputExcitation) -> dict[str, Any]:
-    bands = [_fields(band) for band in excitation.bands]
+    bands = [asdict(band) for band in excitation.bands]
     for band in bands:
         band["told"] = band.pop("usable")  # the name in schema 1
     return {"told_hz": excitation.usable_hz, "sentence": excitation.sentence, "bands": bands}
@@ -337,13 +307,21 @@ def _excitation_dict(excitation: InputExcitation) -> dict[str, Any]:
 
 def _channel_dict(channel: ChannelQuality) -> dict[str, Any]:
     return {
-        "unit": channel.unit, "low": channel.low, "high": channel.high, "mean": channel.mean, "std": channel.std,
-        "missing": channel.missing.samples, "constant": channel.constant, "quantisation": channel.quantum,
-        "held": channel.held, "stuck": channel.stuck.samples, "saturated": channel.saturated,
+        "unit": channel.unit,
+        "low": channel.low,
+        "high": channel.high,
+        "mean": channel.mean,
+        "std": channel.std,
+        "missing": channel.missing.samples,
+        "constant": channel.constant,
+        "quantisation": channel.quantum,
+        "held": channel.held,
+        "stuck": channel.stuck.samples,
+        "saturated": channel.saturated,
         "rails": [
             {"side": rail.side, "value": rail.value, "samples": rail.runs.samples, "clear": rail.clear}
             for rail in channel.rails
         ],
         "outliers": int(channel.outliers.size),
-        "hum": _fields(channel.hum) if channel.hum else None,
-    }  # fmt: skip
+        "hum": asdict(channel.hum) if channel.hum else None,
+    }

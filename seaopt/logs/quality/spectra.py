@@ -1,7 +1,7 @@
-r"""Spectra of a log's channels on the same stretches: mains hum, excitation, coherence and delays.
+r"""Spectra of a log's channels on the same segments: mains hum, excitation, coherence and delays.
 
-Hann-windowed stretches that overlap by half (Welch 1967), none across a gap. Long logs are sampled: at most 64
-stretches of at most 32,768 samples, spread over the log.
+Hann-windowed segments that overlap by half (Welch 1967), none across a gap. Long logs are sampled: at most 64
+segments of at most 32,768 samples, spread over the log.
 """
 
 from __future__ import annotations
@@ -11,49 +11,41 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt import welch
 from seaopt.records import record
 
-SHORTEST_STRETCH, LONGEST_STRETCH = 32, 1 << 15  # samples in a stretch
-FEWEST_STRETCHES, MOST_STRETCHES = 4, 64
+SHORTEST_SEGMENT, LONGEST_SEGMENT = 32, 1 << 15  # samples in a segment
+FEWEST_SEGMENTS, MOST_SEGMENTS = 4, 64
 MAINS_HZ = (50.0, 60.0)
 HARMONICS = 5
 BESIDE_HZ = 12.0  # from a line: where the noise floor is read
 LINE_HEIGHT = 4.0  # times the noise floor: 6 dB
 OTHER_LINES = 3  # lines beside the mains' in the same channel that make a multisine
-BRIDGED_SHARE = 0.02  # share of a stretch's samples that may be missing: they are bridged by lines
+BRIDGED_SHARE = 0.02  # share of a segment's samples that may be missing: they are bridged by lines
 
 
 @record(eq=False)
 class Spectra:
-    """Windowed spectra of every channel, one row per stretch, from 0 Hz on.
-
-    Parameters
-    ----------
-    frequency_hz : array, shape (m,)
-    period : float
-        Seconds between samples.
-    channels : mapping of name to complex array, shape (stretches, m)
-        Channels that have samples missing in most stretches are left out, and then stretches that have holes.
-
-    """
+    """Windowed spectra of every channel, one row per segment, from 0 Hz on."""
 
     frequency_hz: Float[np.ndarray, " m"]
-    period: float
+    period: float  # seconds between samples
+    # channels that have samples missing in most segments are left out, and then segments that have holes
     channels: Mapping[str, Complex[np.ndarray, "d m"]]
 
     @property
-    def stretches(self) -> int:
-        """Number of stretches."""
+    def segments(self) -> int:
+        """Number of segments."""
         return next((len(rows) for rows in self.channels.values()), 0)
 
     @property
     def averages(self) -> float:
-        """Independent averages that the overlapping stretches are worth."""
-        return max(1.0, 0.947 * self.stretches)
+        """Independent averages that the overlapping segments are worth."""
+        return welch.count_averages(self.segments)
 
     def power(self, name: str) -> Float[np.ndarray, " m"]:
         """Return the mean power of each line, up to a factor common to all channels."""
-        return np.mean(np.abs(self.channels[name]) ** 2, axis=0)
+        return np.mean(welch.square(self.channels[name]), axis=0)
 
     def cross(self, first: str, second: str) -> Complex[np.ndarray, " m"]:
         """Return the mean cross-spectrum, first's conjugate times second."""
@@ -61,53 +53,40 @@ class Spectra:
 
     def coherence(self, first: str, second: str) -> Float[np.ndarray, " m"]:
         """Return the squared coherence of each line."""
-        floor = np.maximum(self.power(first) * self.power(second), 1e-300)
-        return np.abs(self.cross(first, second)) ** 2 / floor
+        return welch.coherence(self.cross(first, second), self.power(first), self.power(second))
 
 
 def compute_spectra(
-    channels: Mapping[str, Float[np.ndarray, " n"]], stretches: Sequence[slice], period: float
+    channels: Mapping[str, Float[np.ndarray, " n"]], segments: Sequence[slice], period: float
 ) -> Spectra | None:
-    """Return the spectra of the channels over the stretches without a gap; None where there is no stretch.
+    """Return the spectra of the channels over the segments without a gap; None where there is no segment.
 
-    Parameters
-    ----------
-    channels : mapping of name to array, shape (n,)
-        Samples.
-    stretches : sequence of slice
-        Rows without a gap.
-    period : float
-        Seconds between samples.
-
+    `segments`: rows without a gap. `period`: seconds between samples.
     """
-    total = sum(stretch.stop - stretch.start for stretch in stretches)
-    length = 2 * (min(max(total // 16, SHORTEST_STRETCH), LONGEST_STRETCH) // 2)
-    starts = np.array(
-        [row for rows in stretches for row in range(rows.start, rows.stop - length + 1, max(length // 2, 1))], dtype=int
-    )
-    if starts.size < FEWEST_STRETCHES:
+    total = sum(segment.stop - segment.start for segment in segments)
+    length = 2 * (min(max(total // 16, SHORTEST_SEGMENT), LONGEST_SEGMENT) // 2)
+    starts = welch.thin(welch.list_starts(segments, length), MOST_SEGMENTS)
+    if len(starts) < FEWEST_SEGMENTS:
         return None
-    if starts.size > MOST_STRETCHES:
-        starts = starts[np.linspace(0, starts.size - 1, MOST_STRETCHES).astype(int)]
     cuts = {name: np.stack([values[start : start + length] for start in starts]) for name, values in channels.items()}
-    # A channel with holes everywhere is left out; then a stretch with a hole in any other channel.
+    # A channel with holes everywhere is left out; then a segment with a hole in any other channel.
     holed = {name: np.mean(~np.isfinite(cut), axis=1) > BRIDGED_SHARE for name, cut in cuts.items()}
     kept = [name for name in cuts if np.mean(holed[name]) <= 0.5]
-    whole = ~np.any([holed[name] for name in kept], axis=0) if kept else np.zeros(starts.size, dtype=bool)
-    if np.count_nonzero(whole) < FEWEST_STRETCHES:
+    whole = ~np.any([holed[name] for name in kept], axis=0) if kept else np.zeros(len(starts), dtype=bool)
+    if np.count_nonzero(whole) < FEWEST_SEGMENTS:
         return None
-    window = np.hanning(length)
-    transforms = {name: _transform(cuts[name][whole], window) for name in kept}
+    window = welch.hann(length)
+    transforms = {name: welch.transform(_bridge(cuts[name][whole]), window) for name in kept}
     return Spectra(frequency_hz=np.fft.rfftfreq(length, period), period=period, channels=transforms)
 
 
-def _transform(cut: Float[np.ndarray, "d n"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "d m"]:
-    """Return the spectra of stretches without their means; missing samples are bridged."""
-    rows = np.arange(window.size)
+def _bridge(cut: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "d n"]:
+    """Put straight lines across the missing samples of segments, in place."""
+    rows = np.arange(cut.shape[1])
     for row in np.flatnonzero(~np.all(np.isfinite(cut), axis=1)):
         good = np.flatnonzero(np.isfinite(cut[row]))
         cut[row] = np.interp(rows, good, cut[row, good])
-    return np.fft.rfft((cut - cut.mean(axis=1, keepdims=True)) * window, axis=1)
+    return cut
 
 
 @record
@@ -121,17 +100,17 @@ class Hum:
 
 
 def find_hum(spectra: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
-    """Return the mains' lines of a channel, None where there are none or the stretches are too short to tell.
+    """Return the mains' lines of a channel, None where there are none or the segments are too short to tell.
 
-    A line stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median stretch: what comes and goes,
+    A line stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median segment: what comes and goes,
     such as a chirp, does not count, nor what an input is coherent with, such as a resonance there. Where other lines
     stand out as well it is a multisine.
     """
     f = spectra.frequency_hz
     width = f[1] - f[0]
-    if width > 1.5 or spectra.stretches < 6:
+    if width > 1.5 or spectra.segments < 6:
         return None
-    square = np.abs(spectra.channels[name]) ** 2
+    square = welch.square(spectra.channels[name])
     steady = np.median(square, axis=0)
     # What an input is coherent with is the plant's answer, not hum.
     coherences = [spectra.coherence(other, name) for other in inputs if other in spectra.channels and other != name]
@@ -159,7 +138,7 @@ def find_hum(spectra: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
                 mains_hz=mains,
                 lines_hz=tuple(line for line, _, _ in lines),
                 over_floor_db=tuple(round(float(height), 1) for _, height, _ in lines),
-                rms=float(np.sqrt(2.0 * power / (0.375 * n**2))),
+                rms=float(np.sqrt(2.0 * power / (welch.MEAN_SQUARE * n**2))),
             )
     return None
 

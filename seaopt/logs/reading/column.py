@@ -129,12 +129,7 @@ def spell_column(**keys: str | int) -> str:
 def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> int | None:
     """Return of how many bits the unsigned field seems to be in which small signed numbers were stored.
 
-    Parameters
-    ----------
-    values : array, shape (n,)
-        Samples.
-    low, high : float
-        The least and the greatest of them.
+    `low`, `high`: the least and the greatest of the samples.
 
     Examples
     --------

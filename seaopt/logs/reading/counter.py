@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from seaopt.errors import LogError
 from seaopt.formatting import format_count
+from seaopt.options import option
 from seaopt.records import record
 
 LARGEST = 2**53  # below which a float is every whole number
@@ -22,12 +23,6 @@ PROBE_SAMPLES = 1000  # samples that must look like a counter before all are loo
 class Counter:
     """A declared sample counter.
 
-    Parameters
-    ----------
-    column : str
-        A whole number that rises by one every `samples_per_count` samples.
-    samples_per_count : int
-
     Examples
     --------
     >>> import numpy as np
@@ -37,8 +32,8 @@ class Counter:
 
     """
 
-    column: str
-    samples_per_count: int = 1
+    column: str = option("A whole number that rises by one every `samples_per_count` samples.")
+    samples_per_count: int = option("Samples for one count.", default=1, least=1)
 
     def __post_init__(self) -> None:
         if not 1 <= self.samples_per_count <= MOST_PER_COUNT:

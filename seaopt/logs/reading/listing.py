@@ -33,7 +33,16 @@ class Contents:
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
-        rows = [_format_row(field) for field in self.fields[:MAX_ROWS]]
+        rows = [
+            (
+                field.name,
+                field.kind,
+                "" if field.length is None else str(field.length),
+                field.unit or "",
+                field.clock or "",
+            )
+            for field in self.fields[:MAX_ROWS]
+        ]
         lines = [f"{self.path}: {self.format}, {len(self.fields)} columns"]
         lines += format_table(rows, ("column", "kind", "samples", "unit", "clock"))
         lines += [f"... and {len(self.fields) - MAX_ROWS} more"] if len(self.fields) > MAX_ROWS else []
@@ -65,8 +74,3 @@ def contents(path: str | Path) -> Contents:
     require_type(path, (str, Path), "path", "give a path", LogError)
     source = open_source(Path(path))
     return Contents(path=str(path), format=source.format, fields=source.fields, notes=source.notes)
-
-
-def _format_row(field: Field) -> tuple[str, str, str, str, str]:
-    length = "" if field.length is None else str(field.length)
-    return field.name, field.kind, length, field.unit or "", field.clock or ""

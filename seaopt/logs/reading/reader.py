@@ -240,9 +240,9 @@ def _read_channels(
     for name, channel in chosen.channels.items():
         if channel.constant is not None:
             arrays[name] = np.full(clock.size, channel.constant)
-    others = [channel.clock for channel in read.values() if channel.clock != chosen.clock]
+    other_clocks = [channel.clock for channel in read.values() if channel.clock != chosen.clock]
     # Each other clock is read once, for all of its channels.
-    for other in dict.fromkeys(others):
+    for other in dict.fromkeys(other_clocks):
         group = {name: channel for name, channel in read.items() if channel.clock == other}
         columns, time = _read_clock(
             other, [channel.field.name for channel in group.values()], _widen_window(window, group)
@@ -250,11 +250,11 @@ def _read_channels(
         if all(channel.rule is None for channel in group.values()) and np.array_equal(time, clock):
             arrays |= _separate_arrays(group, columns)  # rows of one table, at the same instants
             continue
-        place = f'{other.source.path}: clock "{other.name}"' + (f" of {other.rows}" if other.rows else "")
-        check_increasing(time, place)
+        where = f'{other.source.path}: clock "{other.name}"' + (f" of {other.rows}" if other.rows else "")
+        check_increasing(time, where)
         for name, channel in group.items():
             if channel.rule is None:
-                raise LogError(f"{place}: has other instants than the log's clock; {HOW_TO_ALIGN}")
+                raise LogError(f"{where}: has other instants than the log's clock; {HOW_TO_ALIGN}")
             arrays[name] = channel.rule(clock, time, columns[channel.field.name])
             notes.append(_describe_alignment(name, channel, clock, time))
     return arrays, clock, notes

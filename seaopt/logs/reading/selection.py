@@ -7,6 +7,7 @@ import dataclasses
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -48,6 +49,30 @@ class ClockColumn:
 
 
 @record
+class FoundColumn:
+    """A column as it is declared, the file that has it, and its field there."""
+
+    column: Column
+    source: Source
+    field: Field
+
+    @property
+    def unit(self) -> str:
+        """Its unit: as given, else as the file says."""
+        unit = self.column.unit if self.column.unit is not None else self.field.unit
+        where = f'{self.source.path}: column "{self.field.name}"'
+        if unit is None:
+            spelt = spell_column(column=self.column.column, unit="...")
+            named = f'write it in the header\'s brackets, "{self.field.name} [unit]", or '
+            raise LogError(f"{where} has no unit; {named * (self.source.format == 'CSV')}give it: {spelt} (--unit)")
+        try:
+            factor(unit, si_unit(unit))
+        except SeaoptError as error:
+            raise type(error)(f"{where}: {error}") from error
+        return unit
+
+
+@record
 class SelectedChannel:
     """A channel before it is read."""
 
@@ -79,35 +104,25 @@ def select(
 ) -> Selection:
     """Return the log's clock and its channels.
 
-    Raises
-    ------
-    LogError
-        A column is missing, doubled or has no unit, the clock is not clear, or a channel is on another clock without a
-        rule.
-    UnitError
-        A unit is unknown or of the wrong dimension.
-
+    Raises LogError: a column is missing, doubled or has no unit, the clock is not clear, or a channel is on another
+    clock without a rule. Raises UnitError: a unit is unknown or of the wrong dimension.
     """
     if channels is not None and "time" in channels:
         raise LogError(f'{sources[0].path}: a channel is named "time"; rename it, time is the clock')
-    columns = None if channels is None else {name: as_column(column) for name, column in channels.items()}
-    constants = {name: column for name, column in (columns or {}).items() if column.from_header}
-    places = None
-    if columns is not None:
-        columns = {name: column for name, column in columns.items() if not column.from_header}
-        places = _find_columns(sources, columns)
-    clock = _find_log_clock(sources, time, None if places is None else list(places.values()), rate_hz)
+    declared = {name: as_column(column) for name, column in (channels or {}).items()}
+    columns = None if channels is None else _find_columns(sources, declared)
+    clock = _find_log_clock(sources, time, None if columns is None else list(columns.values()), rate_hz)
     notes = [note for source in sources for note in source.notes]
-    if columns is None or places is None:
-        columns, places, more = _select_every_channel(sources, clock, align)
+    if columns is None:
+        columns, more = _select_every_channel(sources, clock, align)
         notes += more
     if counter is not None:
         find_column([clock.source], "the counter", Column(column=counter.column))
     selected: dict[str, SelectedChannel] = {}
-    for name, column in columns.items():
-        source, field = places[name]
-        channel_clock = _find_channel_clock(sources, clock, column, source, field)
-        rule = column.align or align
+    for name, found in columns.items():
+        source, field = found.source, found.field
+        channel_clock = _find_channel_clock(clock, found)
+        rule = found.column.align or align
         # Rows of one table may be at the same instants; whether they are is seen on reading.
         if channel_clock != clock and rule is None and not (source.rows and clock.rows and source.path == clock.path):
             raise LogError(
@@ -115,49 +130,58 @@ def select(
                 f"{clock.path.name}; {HOW_TO_ALIGN}"
             )
         selected[name] = SelectedChannel(
-            column=column, source=source, field=field, unit=resolve_unit(source, column, field), clock=channel_clock,
+            column=found.column,
+            source=source,
+            field=field,
+            unit=found.unit,
+            clock=channel_clock,
             rule=rule if channel_clock != clock else None,
-        )  # fmt: skip
+        )
     origins = {
         name: ((str(channel.source.path), " ".join((channel.field.name, channel.source.rows)).strip()))
         for name, channel in selected.items()
         if not channel.column.shared
     }
     notes += check_distinct({name: (place, si_unit(selected[name].unit)) for name, place in origins.items()})
-    selected |= {name: _select_constant(sources, clock, name, column) for name, column in constants.items()}
-    ordered = {name: selected[name] for name in (channels if channels is not None else selected)}
+    for name, column in declared.items():
+        if column.from_header:
+            selected[name] = _select_constant(sources, clock, name, column)
+    ordered = {name: selected[name] for name in declared or selected}
     return Selection(clock=clock, channels=ordered, notes=tuple(notes))
 
 
-def _find_columns(sources: Sequence[Source], columns: Mapping[str, Column]) -> dict[str, tuple[Source, Field]]:
-    """Return file and field of each column; columns of the same rows share a source, and so a clock."""
-    found: dict[str, tuple[Source, Field]] = {}
+def _find_columns(sources: Sequence[Source], columns: Mapping[str, Column]) -> dict[str, FoundColumn]:
+    """Return the columns that are no constants; those of the same rows share a source, and so a clock."""
+    found = {name: find_column(sources, name, column) for name, column in columns.items() if not column.from_header}
     kept: dict[tuple[str, str], Source] = {}
-    for name, column in columns.items():
-        source, field = find_column(sources, name, column)
-        if column.where:
-            rows = keep_rows(source, column.where)
-            source = kept.setdefault((str(source.path), rows.rows), rows)
-        found[name] = source, field
+    for name, column in found.items():
+        if column.column.where:
+            rows = keep_rows(column.source, column.column.where)
+            found[name] = replace(column, source=kept.setdefault((str(rows.path), rows.rows), rows))
     return found
 
 
 def _select_constant(sources: Sequence[Source], clock: ClockColumn, name: str, column: Column) -> SelectedChannel:
     """Return a channel that has the value that a header states."""
     files = [source for source in sources if column.file is None or source.path == Path(column.file)]
-    known = {constant: source for source in files for constant in source.constants}
-    if column.column not in known:
+    stated = {constant: source for source in files for constant in source.constants}
+    if column.column not in stated:
         raise LogError(
             f'{_list_paths(files)}: the header states no constant "{column.column}" for {name}; '
-            f"{suggestion(str(column.column), known)}"
+            f"{suggestion(str(column.column), stated)}"
         )
-    source = known[str(column.column)]
+    source = stated[str(column.column)]
     value, unit = source.constants[str(column.column)]
     field = Field(name=str(column.column), kind="float64", length=None, unit=unit)
     return SelectedChannel(
-        column=column, source=source, field=field, unit=resolve_unit(source, column, field), clock=clock, rule=None,
+        column=column,
+        source=source,
+        field=field,
+        unit=FoundColumn(column=column, source=source, field=field).unit,
+        clock=clock,
+        rule=None,
         constant=value,
-    )  # fmt: skip
+    )
 
 
 def as_column(column: str | int | Column) -> Column:
@@ -165,12 +189,12 @@ def as_column(column: str | int | Column) -> Column:
     return column if isinstance(column, Column) else Column(column=column)
 
 
-def find_column(sources: Sequence[Source], name: str, column: Column) -> tuple[Source, Field]:
-    """Return the file and the field that a column names."""
+def find_column(sources: Sequence[Source], name: str, column: Column) -> FoundColumn:
+    """Return where a column is."""
     places = [source for source in sources if column.file is None or source.path == Path(column.file)]
     if not places:
-        known = ", ".join(str(source.path) for source in sources)
-        raise LogError(f'{name}: file = "{column.file}" is none of those read; give one of {known}')
+        paths = ", ".join(str(source.path) for source in sources)
+        raise LogError(f'{name}: file = "{column.file}" is none of those read; give one of {paths}')
     hits = [(source, field) for source in places for field in _match_fields(source, column.column)]
     if not hits:
         raise LogError(f"{_list_paths(places)}: {_explain_missing(places, name, column.column)}")
@@ -184,7 +208,7 @@ def find_column(sources: Sequence[Source], name: str, column: Column) -> tuple[S
     source, field = hits[0]
     if not field.numeric and source.format != "CSV":  # a text file names the cell, on reading
         raise LogError(f'{source.path}: "{field.name}" holds {field.kind}, not numbers; {field.remedy}')
-    return source, field
+    return FoundColumn(column=column, source=source, field=field)
 
 
 def _match_fields(source: Source, column: str | int) -> list[Field]:
@@ -221,59 +245,54 @@ def suggest_names(name: str, names: Sequence[str]) -> str:
     return text
 
 
-def resolve_unit(source: Source, column: Column, field: Field) -> str:
-    """Return a column's unit: as given, else as the file says."""
-    unit = column.unit if column.unit is not None else field.unit
-    if unit is None:
-        spelt = spell_column(column=column.column, unit="...")
-        brackets = f'write it in the header\'s brackets, "{field.name} [unit]", or ' if source.format == "CSV" else ""
-        raise LogError(f'{source.path}: column "{field.name}" has no unit; {brackets}give it: {spelt} (--unit)')
-    try:
-        factor(unit, si_unit(unit))
-    except SeaoptError as error:
-        raise type(error)(f'{source.path}: column "{field.name}": {error}') from error
-    return unit
-
-
 def _list_paths(sources: Sequence[Source]) -> str:
     return ", ".join(str(source.path) for source in sources)
 
 
-def _make_clock(source: Source, field: Field, column: Column) -> ClockColumn:
+def _make_clock(found: FoundColumn) -> ClockColumn:
+    column, source, field = found.column, found.source, found.field
     if column.unit is None and field.unit is None:
         raise ClockError(
             f'{source.path}: column "{field.name}" has no unit, and is the time; give it, in seconds if it is: '
             f"time={spell_column(column=column.column, unit='s')} (--unit time=s)",
             column=field.name,
         )
-    unit = resolve_unit(source, column, field)
-    if not same_dimension(unit, "s"):
-        raise UnitError(f'{source.path}: column "{field.name}" is in {unit}, not a unit of time; {advise_time(source)}')
+    if not same_dimension(found.unit, "s"):
+        raise UnitError(
+            f'{source.path}: column "{field.name}" is in {found.unit}, not a unit of time; {advise_time(source)}'
+        )
     return ClockColumn(
-        source=source, path=source.path, name=field.name, unit=unit, offset_s=column.clock_offset_s, rows=source.rows
+        source=source,
+        path=source.path,
+        name=field.name,
+        unit=found.unit,
+        offset_s=column.clock_offset_s,
+        rows=source.rows,
     )
 
 
 def _find_log_clock(
     sources: Sequence[Source],
     time: str | int | Column | None,
-    places: list[tuple[Source, Field]] | None,
+    channels: list[FoundColumn] | None,
     rate_hz: float | None,
 ) -> ClockColumn:
     """Return the log's clock: as given, else the one that all channels share."""
     if rate_hz is not None:
-        return _make_rate_clock(sources, time, places, rate_hz)
+        return _make_rate_clock(sources, time, channels, rate_hz)
     if time is not None:
         column = as_column(time)
         if column.where:
-            source, field = find_column(sources, "time", column)
-            return _make_clock(keep_rows(source, column.where), field, column)
-        if (len(sources) > 1 and column.file is None and places) or (places and places[0][0].rows):
+            found = find_column(sources, "time", column)
+            return _make_clock(replace(found, source=keep_rows(found.source, column.where)))
+        if channels and ((len(sources) > 1 and column.file is None) or channels[0].source.rows):
             # A header that several files have, or rows, is the clock of the first channel's.
-            sources = [places[0][0]] if _match_fields(places[0][0], column.column) else sources
-        return _make_clock(*find_column(sources, "time", column), column)
-    if places is None:
+            sources = [channels[0].source] if _match_fields(channels[0].source, column.column) else sources
+        return _make_clock(find_column(sources, "time", column))
+    if channels is None:
         places = [(source, field) for source in sources for field in source.fields if field.numeric]
+    else:
+        places = [(found.source, found.field) for found in channels]
     files = list(dict.fromkeys(str(source.path) for source, _ in places))
     if len(files) > 1:
         raise LogError(f"{', '.join(files)}: several files have several clocks; name the log's with time= (--time)")
@@ -291,19 +310,19 @@ def _find_log_clock(
             f"{source.path}: holds several clocks ({_list_names(names)}); name the log's with time= (--time)"
         )
     column = Column(column=clocks[0]) if clocks[0] is not None else _find_time_column(source)
-    return _make_clock(*find_column([source], "time", column), column)
+    return _make_clock(find_column([source], "time", column))
 
 
 def _make_rate_clock(
-    sources: Sequence[Source], time: object, places: list[tuple[Source, Field]] | None, rate_hz: float
+    sources: Sequence[Source], time: object, channels: list[FoundColumn] | None, rate_hz: float
 ) -> ClockColumn:
     """Return a clock of a stated rate, for a file that has none."""
     if time is not None:
         raise LogError(f"{_list_paths(sources)}: time and rate_hz are both given; keep one of them")
     if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float) or not 0.0 < rate_hz < 1e12:
         raise LogError(f"rate_hz = {rate_hz!r} is not a sample rate; give samples per second")
-    source = places[0][0] if places else sources[0]
-    if len(sources) > 1 or any(other is not source for other, _ in places or []):
+    source = channels[0].source if channels else sources[0]
+    if len(sources) > 1 or any(found.source is not source for found in channels or []):
         raise LogError(f"{_list_paths(sources)}: rate_hz is the clock of one table; read one file, without where")
     return ClockColumn(source=source, path=source.path, name=f"{rate_hz:g} Hz", unit="s", rate_hz=float(rate_hz))
 
@@ -313,7 +332,11 @@ def _find_time_column(source: Source) -> Column:
     names = [field.name for field in source.fields if field.numeric]
     named = [field for field in source.fields if field.numeric and is_time_name(field.header or field.name)]
     # Of several, T in degrees is a temperature.
-    times = [field.name for field in named if len(named) == 1 or _may_be_time(field.unit)]
+    times = [
+        field.name
+        for field in named
+        if len(named) == 1 or not field.unit or not is_unit(field.unit) or same_dimension(field.unit, "s")
+    ]
     if len(times) == 1:
         return Column(column=times[0])
     why = "no column is" if not times else f"{len(times)} columns are"
@@ -337,44 +360,31 @@ def is_time_name(name: str) -> bool:
     (True, True, False)
 
     """
-    return _last_part(name).casefold() in _TIME_NAMES
+    return re.split(r"[./]", bare_name(name))[-1].casefold() in _TIME_NAMES
 
 
-def _may_be_time(unit: str | None) -> bool:
-    return not unit or not is_unit(unit) or same_dimension(unit, "s")
-
-
-def _last_part(name: str) -> str:
-    return re.split(r"[./]", bare_name(name))[-1]
-
-
-def _find_channel_clock(
-    sources: Sequence[Source], clock: ClockColumn, column: Column, source: Source, field: Field
-) -> ClockColumn:
-    """Return the clock a channel is on."""
+def _find_channel_clock(clock: ClockColumn, found: FoundColumn) -> ClockColumn:
+    """Return the clock a channel is on: its own, the log's, the format's, or in another file one of the same name."""
+    column, source, field = found.column, found.source, found.field
+    reference = _find_reference(clock)
     if column.time is not None:
         time = as_column(column.time)
-        return _shift_clock(_make_clock(*find_column([source], f'time of "{field.name}"', time), time), column)
-    reference = _find_reference(clock)
-    if source is clock.source and (reference is None or field.clock == reference.clock):
-        if reference is None:
-            return _shift_clock(clock, column)
-        if None not in (field.length, reference.length) and field.length != reference.length:
+    elif source is clock.source and (reference is None or field.clock == reference.clock):
+        if reference is not None and None not in (lengths := {field.length, reference.length}) and len(lengths) > 1:
             raise LogError(
                 f'{source.path}: "{field.name}" has {field.length} samples and the clock "{clock.name}" '
                 f"{reference.length}; give it its own with {spell_column(column=field.name, time='...')}"
             )
         return _shift_clock(clock, column)
-    # Another clock: the format's own, or in another file the column named like the log's clock.
-    if field.clock is not None:
-        known = Column(column=field.clock)
+    elif field.clock is not None:
+        time = Column(column=field.clock)
     elif source is not clock.source:
-        same = [known.name for known in source.fields if known.name == clock.name]
-        known = Column(column=same[0], unit=clock.unit) if same else _find_time_column(source)
+        named = any(other.name == clock.name for other in source.fields)
+        time = Column(column=clock.name, unit=clock.unit) if named else _find_time_column(source)
     else:
         how = spell_column(column=field.name, time="...")
         raise LogError(f'{source.path}: "{field.name}" has no clock of its own; give it one: {how}')
-    return _shift_clock(_make_clock(*find_column([source], f'time of "{field.name}"', known), known), column)
+    return _shift_clock(_make_clock(find_column([source], f'time of "{field.name}"', time)), column)
 
 
 def _find_reference(clock: ClockColumn) -> Field | None:
@@ -383,17 +393,12 @@ def _find_reference(clock: ClockColumn) -> Field | None:
 
 
 def _shift_clock(clock: ClockColumn, column: Column) -> ClockColumn:
-    if not column.clock_offset_s:
-        return clock
-    return ClockColumn(
-        source=clock.source, path=clock.path, name=clock.name, unit=clock.unit,
-        offset_s=clock.offset_s + column.clock_offset_s, rows=clock.rows, rate_hz=clock.rate_hz,
-    )  # fmt: skip
+    return replace(clock, offset_s=clock.offset_s + column.clock_offset_s)
 
 
 def _select_every_channel(
     sources: Sequence[Source], clock: ClockColumn, align: Rule | None
-) -> tuple[dict[str, Column], dict[str, tuple[Source, Field]], list[str]]:
+) -> tuple[dict[str, FoundColumn], list[str]]:
     """Return every column of numbers on the clock; with a rule for all, those on other clocks too."""
     reference = _find_reference(clock)
     clock_names = {(str(source.path), field.clock) for source in sources for field in source.fields if field.clock}
@@ -410,11 +415,11 @@ def _select_every_channel(
     chosen = [
         (source, field)
         for source, field in numeric
-        if _is_on_clock(clock, reference, source, field) or _can_align(align, field)
+        if _is_on_clock(clock, reference, source, field) or (align is not None and field.clock is not None)
     ]
     taken = {(str(source.path), field.name) for source, field in chosen}
-    if rest := [field.name for source, field in numeric if (str(source.path), field.name) not in taken]:
-        notes.append(f'columns on other clocks than "{clock.name}" were left out: {_list_names(rest)}')
+    if other := [field.name for source, field in numeric if (str(source.path), field.name) not in taken]:
+        notes.append(f'columns on other clocks than "{clock.name}" were left out: {_list_names(other)}')
     if not chosen:
         raise LogError(
             f'{clock.path}: no column of numbers is on the clock "{clock.name}"; choose another time= (--time)'
@@ -423,14 +428,13 @@ def _select_every_channel(
     notes += unknown
     bare = [bare_name(field.name) if units[index] else field.name for index, (_, field) in enumerate(chosen)]
     counts = collections.Counter(bare)
-    columns: dict[str, Column] = {}
-    places: dict[str, tuple[Source, Field]] = {}
+    columns: dict[str, FoundColumn] = {}
     for name, unit, (source, field) in zip(bare, units, chosen, strict=True):
         key = name if counts[name] == 1 and name != "time" else field.name
         key = key if key not in columns else f"{source.path.name}:{field.name}"
-        columns[key] = Column(column=field.name, unit=unit, file=source.path)
-        places[key] = source, field
-    return columns, places, notes
+        column = Column(column=field.name, unit=unit, file=source.path)
+        columns[key] = FoundColumn(column=column, source=source, field=field)
+    return columns, notes
 
 
 def _is_on_clock(clock: ClockColumn, reference: Field | None, source: Source, field: Field) -> bool:
@@ -439,10 +443,6 @@ def _is_on_clock(clock: ClockColumn, reference: Field | None, source: Source, fi
     lengths = (field.length, reference.length)
     same = None in lengths or lengths[0] == lengths[1]
     return source is clock.source and field.clock == reference.clock and same
-
-
-def _can_align(align: Rule | None, field: Field) -> bool:
-    return align is not None and field.clock is not None
 
 
 def _list_names(names: Sequence[str]) -> str:
@@ -454,8 +454,8 @@ def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str
     declared = [field.unit for _, field in chosen]
     text = [source.format == "CSV" for source, _ in chosen]
     for source, field in chosen:
-        known = any(unit and is_unit(unit) for unit in declared)
-        if source.format == "CSV" and known and _is_unit_bracket(field) and not is_unit(field.unit or ""):
+        some_known = any(unit and is_unit(unit) for unit in declared)
+        if source.format == "CSV" and some_known and _is_unit_bracket(field) and not is_unit(field.unit or ""):
             _check_bracket(source, field)
     if any(csv and unit is not None and not is_unit(unit) for csv, unit in zip(text, declared, strict=True)):
         notes = ["brackets in the headers that are not units were taken as names; no unit is known"]
@@ -471,7 +471,7 @@ def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str
 def _check_bracket(source: Source, field: Field) -> None:
     """Refuse brackets that hold no unit, with the command that gives one."""
     try:
-        resolve_unit(source, Column(column=field.name), field)
+        si_unit(FoundColumn(column=Column(column=field.name), source=source, field=field).unit)
     except SeaoptError as error:
         bare = bare_name(field.name)
         name = bare if bare.isidentifier() else "F1"

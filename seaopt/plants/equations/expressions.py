@@ -70,8 +70,13 @@ _ARITHMETIC: Mapping[str, Callable[[Any, Any], Any]] = {
 }
 _COMPARISON, _SUM, _TERM, _SIGN, _POWER = 1, 2, 3, 4, 5
 _BINDING = dict.fromkeys(_COMPARISONS, _COMPARISON) | {
-    "+": _SUM, "-": _SUM, "*": _TERM, "/": _TERM, "^": _POWER, "**": _POWER,
-}  # fmt: skip
+    "+": _SUM,
+    "-": _SUM,
+    "*": _TERM,
+    "/": _TERM,
+    "^": _POWER,
+    "**": _POWER,
+}
 _TOKEN = re.compile(
     r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
     r"|(?P<name>[^\W\d]\w*)|(?P<sign>\*\*|[<>=!]=|[-+*/^(),<>])|(?P<other>\S)"
@@ -93,27 +98,11 @@ Explain = Callable[[str], str | None]  # why a name may not stand in a text; Non
 def parse(text: str, symbols: Mapping[str, Any], place: str, explain: Explain = lambda name: None) -> Any:
     r"""Return the CasADi expression that a text stands for.
 
-    Parameters
-    ----------
-    text : str
-        In the grammar above, of at most 10,000 characters.
-    symbols : mapping of name to SX
-        What the text may name, besides the functions and `pi`.
-    place : str
-        What the text is, for messages, such as "f.omega".
-    explain : callable ``name -> text or None``, optional
-        Why a name that is not among the symbols may not stand here, for messages; None where it is not known.
-
-    Returns
-    -------
-    casadi.SX
-        A scalar.
-
-    Raises
-    ------
-    PlantError
-        The text is not in the grammar, names what is not known, is too long, or is no finite number; the message is
-        one line, and a note of the error shows the place in the text.
+    `text`: in the grammar above, of at most 10,000 characters. `symbols`: what the text may name, besides the functions
+    and `pi`. `place`: what the text is, for messages, such as "f.omega". `explain`: why a name that is not among the
+    symbols may not stand here, for messages; None where it is not known. Returned: a scalar. Raises PlantError: the
+    text is not in the grammar, names what is not known, is too long, or is no finite number; the message is one line,
+    and a note of the error shows the place in the text.
 
     Examples
     --------
@@ -200,13 +189,13 @@ class _Parser:
         value = self.read_operand(depth)
         while _BINDING.get(self.next.text, 0) > binding:
             operator = self.take()
-            own = _BINDING[operator.text]
+            strength = _BINDING[operator.text]
             if start in self.conditions:
-                what = "compare two numbers at a time" if own == _COMPARISON else "a comparison is no number"
+                what = "compare two numbers at a time" if strength == _COMPARISON else "a comparison is no number"
                 raise self.error(operator, f"{what}; write if_else(a > b, then, else)")
             # What stands behind a power is a factor of its own, so that powers start at their right.
-            right = self.read_number(_SIGN, depth + 1) if own == _POWER else self.read_number(own, depth)
-            if own == _COMPARISON:
+            right = self.read_number(_SIGN, depth + 1) if strength == _POWER else self.read_number(strength, depth)
+            if strength == _COMPARISON:
                 value = ca.SX(_COMPARISONS[operator.text](value, right))
                 self.conditions.add(start)
             else:

@@ -22,22 +22,12 @@ from seaopt.records import record
 
 @record(eq=False)
 class StoredFunction:
-    """A function of namespaces (or of scalars), as the expressions that it returned for symbols.
+    """A function of namespaces (or of scalars), as the expressions that it returned for symbols."""
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Of the symbols that the expressions depend on.
-    places : tuple of (int, str or None)
-        Where each of them comes from: which argument, and which of its attributes (None: the argument itself).
-    layout : mapping, tuple, str or int
-        What is returned; a whole number stands for that output of the function.
-
-    """
-
-    function: Any
+    function: Any  # of the symbols that the expressions depend on
+    # where each of them comes from: which argument, and which of its attributes (None: the argument itself)
     places: tuple[tuple[int, str | None], ...]
-    layout: Any
+    layout: Any  # what is returned; a whole number stands for that output of the function
 
     def __call__(self, *arguments: Any) -> Any:
         """Return what the stored function returned, at these arguments."""
@@ -48,12 +38,8 @@ class StoredFunction:
 def store_function(function: Callable[..., Any], *arguments: Iterable[str] | str) -> StoredFunction:
     """Return a function as its expressions.
 
-    Parameters
-    ----------
-    function : callable
-        Returns expressions, alone or in mappings and tuples (with texts among them).
-    *arguments : names, or one name
-        The attributes of each argument; a single text stands for an argument that is one symbol.
+    `function`: returns expressions, alone or in mappings and tuples (with texts among them). `*arguments`: the
+    attributes of each argument; a single text stands for an argument that is one symbol.
 
     Examples
     --------
@@ -71,13 +57,13 @@ def store_function(function: Callable[..., Any], *arguments: Iterable[str] | str
             symbols[index, None] = ca.SX.sym(names)
             given.append(symbols[index, None])
         else:
-            own = {name: ca.SX.sym(name) for name in names}
-            symbols |= {(index, name): symbol for name, symbol in own.items()}
-            given.append(SimpleNamespace(**own))
+            attributes = {name: ca.SX.sym(name) for name in names}
+            symbols |= {(index, name): symbol for name, symbol in attributes.items()}
+            given.append(SimpleNamespace(**attributes))
     leaves: list[Any] = []
     layout = _take_leaves(function(*given), leaves)
     # What the expressions do not depend on need not be there when they are evaluated.
-    used = {place: symbol for place, symbol in symbols.items() if any(ca.depends_on(leaf, symbol) for leaf in leaves)}
+    used = {origin: symbol for origin, symbol in symbols.items() if any(ca.depends_on(leaf, symbol) for leaf in leaves)}
     return StoredFunction(
         function=ca.Function("stored", list(used.values()), leaves), places=tuple(used), layout=layout
     )
@@ -112,34 +98,44 @@ def store_plant(plant: Any) -> dict[str, Any]:
     def store(function: Callable[..., Any] | None, *arguments: Iterable[str] | str) -> Any:
         return function if function is None or _has_name(function) else store_function(function, *arguments)
 
-    def store_friction(one: Friction) -> Friction:
+    def store_friction(friction: Friction) -> Friction:
         return replace(
-            one, velocity=store(one.velocity, x, p), force=store(one.force, "velocity", (*p, *one.rated)),
-            effort=store(one.effort, p), slopes=store(one.slopes, (*p, *one.rated)),
-            jump=store(one.jump, "speed", (*p, *one.rated)), loads=store(one.loads, x, u, p),
-            bristles=None if one.bristles is None else replace(
-                one.bristles, coordinate=store(one.bristles.coordinate, x, p),
-                stiffness=store(one.bristles.stiffness, p), damping=store(one.bristles.damping, p),
-                rate=store(one.bristles.rate, "z", "velocity", (*p, *one.rated)),
+            friction,
+            velocity=store(friction.velocity, x, p),
+            force=store(friction.force, "velocity", (*p, *friction.rated)),
+            effort=store(friction.effort, p),
+            slopes=store(friction.slopes, (*p, *friction.rated)),
+            jump=store(friction.jump, "speed", (*p, *friction.rated)),
+            loads=store(friction.loads, x, u, p),
+            bristles=None
+            if friction.bristles is None
+            else replace(
+                friction.bristles,
+                coordinate=store(friction.bristles.coordinate, x, p),
+                stiffness=store(friction.bristles.stiffness, p),
+                damping=store(friction.bristles.damping, p),
+                rate=store(friction.bristles.rate, "z", "velocity", (*p, *friction.rated)),
             ),
-        )  # fmt: skip
+        )
 
-    def store_port(one: Port) -> Port:
-        return replace(one, ratio=store(one.ratio, p), held=_store_maker(one.held), probe=_store_maker(one.probe))
+    def store_port(port: Port) -> Port:
+        return replace(port, ratio=store(port.ratio, p), held=_store_maker(port.held), probe=_store_maker(port.probe))
 
     content |= {name: store(getattr(plant, name), "t", x, u, p) for name in ("f", "h")}
     content |= {"derived": store(plant.derived, p), "energy": store(plant.energy, x, p)}
     if plant.actuation is not None:
         content["actuation"] = replace(
-            plant.actuation, effort=store(plant.actuation.effort, p), speed=store(plant.actuation.speed, x, p),
+            plant.actuation,
+            effort=store(plant.actuation.effort, p),
+            speed=store(plant.actuation.speed, x, p),
             largest=store(plant.actuation.largest, p),
-        )  # fmt: skip
+        )
     if plant.winding is not None:
         content["winding"] = replace(plant.winding, effort=store(plant.winding.effort, p))
     if plant.spring is not None:
         content["spring"] = replace(plant.spring, deflection=store(plant.spring.deflection, x, p))
-    content["ports"] = tuple(store_port(one) for one in plant.ports)
-    content["friction"] = {name: store_friction(one) for name, one in plant.friction.items()}
+    content["ports"] = tuple(store_port(port) for port in plant.ports)
+    content["friction"] = {name: store_friction(friction) for name, friction in plant.friction.items()}
     return content
 
 

@@ -37,34 +37,21 @@ COLD = (0.0, 0.0)
 
 @record
 class HeatGuard:
-    """The two-state estimate of a winding's temperature at a sample rate, and what it allows.
+    """The two-state estimate of a winding's temperature at a sample rate, and what it allows."""
 
-    Parameters
-    ----------
-    a_11, a_12, a_21, a_22, b_1, b_2 : float
-        A, and b in K/W.
-    resistance, slope : float
-        Of the winding at the ambient temperature, ohm, and per kelvin above it.
-    allowed_rise : float
-        H, K above the ambient.
-    share : float
-        s.
-    ambient : float
-        degC that was assumed.
-
-    """
-
+    # a_11, a_12, a_21, a_22, b_1, b_2: A, and b in K/W
     a_11: float
     a_12: float
     a_21: float
     a_22: float
     b_1: float
     b_2: float
+    # resistance, slope: of the winding at the ambient temperature, ohm, and per kelvin above it
     resistance: float
     slope: float
-    allowed_rise: float
-    share: float
-    ambient: float
+    allowed_rise: float  # H, K above the ambient
+    share: float  # s
+    ambient: float  # degC that was assumed
 
     @classmethod
     def of_rating(
@@ -72,21 +59,9 @@ class HeatGuard:
     ) -> HeatGuard:
         """Return the guard of a motor.
 
-        Parameters
-        ----------
-        rating : MotorRating
-            Of the motor: `seaopt.plants.rate_motor`.
-        sample_time_s : float
-            Of the law.
-        approach_s : float, optional
-            tau; a twentieth of the winding's time constant if left out.
-        margin_K : float
-            How far below its largest temperature the winding is to stay, for what the network leaves out.
-
-        Raises
-        ------
-        ControlError
-            A number is out of range.
+        `sample_time_s`: of the law. `approach_s`: tau; a twentieth of the winding's time constant if left out.
+        `margin_K`: how far below its largest temperature the winding is to stay, for what the network leaves out.
+        Raises ControlError: a number is out of range.
 
         Examples
         --------
@@ -111,21 +86,24 @@ class HeatGuard:
         a = modes @ np.diag(np.exp(rates * sample_time_s)) @ inverse
         b = modes @ np.diag(np.expm1(rates * sample_time_s) / rates) @ inverse[:, 0] / rating.winding
         return cls(
-            a_11=float(a[0, 0]), a_12=float(a[0, 1]), a_21=float(a[1, 0]), a_22=float(a[1, 1]), b_1=float(b[0]),
-            b_2=float(b[1]), resistance=rating.resistance, slope=rating.slope,
-            allowed_rise=rating.allowed_rise - margin_K, share=-math.expm1(-sample_time_s / tau),
+            a_11=float(a[0, 0]),
+            a_12=float(a[0, 1]),
+            a_21=float(a[1, 0]),
+            a_22=float(a[1, 1]),
+            b_1=float(b[0]),
+            b_2=float(b[1]),
+            resistance=rating.resistance,
+            slope=rating.slope,
+            allowed_rise=rating.allowed_rise - margin_K,
+            share=-math.expm1(-sample_time_s / tau),
             ambient=rating.ambient,
-        )  # fmt: skip
+        )
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> HeatGuard:
         """Return the guard of its fields.
 
-        Raises
-        ------
-        ControlError
-            One is missing or not a finite number.
-
+        Raises ControlError: one is missing or not a finite number.
         """
         values: dict[str, float] = {}
         for field in fields(cls):

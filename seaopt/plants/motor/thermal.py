@@ -25,7 +25,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, fields, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -35,8 +34,8 @@ from seaopt.errors import PlantError, require_number
 from seaopt.formatting import html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import Plant, find_range
-from seaopt.plants.roles import Friction, PlantMaker, Winding
+from seaopt.plants.plant import Plant, find_range, refuse_clash
+from seaopt.plants.roles import Friction, Winding, change_ports, with_values
 from seaopt.records import record
 
 COPPER = 0.00393  # 1/K, at 20 to 25 degC
@@ -110,20 +109,20 @@ def winding() -> Plant:
 
     """
     return Plant(
-        name="winding", states=dict.fromkeys(RISES, "K"), inputs={"I": "A"},
-        outputs=dict.fromkeys(TEMPERATURES, "degC"), parameters={item.name: item for item in PARAMETERS},
-        f=lambda t, x, u, p: _warm(u.I, x, p), h=lambda t, x, u, p: _read_temperatures(x, p),
-    )  # fmt: skip
+        name="winding",
+        states=dict.fromkeys(RISES, "K"),
+        inputs={"I": "A"},
+        outputs=dict.fromkeys(TEMPERATURES, "degC"),
+        parameters={item.name: item for item in PARAMETERS},
+        f=lambda t, x, u, p: _warm(u.I, x, p),
+        h=lambda t, x, u, p: _read_temperatures(x, p),
+    )
 
 
 def add_heat(plant: Plant) -> Plant:
     """Return a plant whose motor warms up.
 
-    Raises
-    ------
-    PlantError
-        The plant's actuation is no current, or it has one of the names.
-
+    Raises PlantError: the plant's actuation is no current, or it has one of the names.
     """
     actuation = plant.actuation
     if actuation is None or plant.inputs[actuation.input] != "A":
@@ -131,10 +130,7 @@ def add_heat(plant: Plant) -> Plant:
             f'plant {plant.name}: part "thermal" needs the current that heats the winding; give the role '
             "actuation = Actuation(input, effort) with an input in A"
         )
-    taken = {*plant.states, *plant.outputs, *plant.parameters, *plant.inputs}
-    clash = [name for name in (*RISES, *TEMPERATURES, *(item.name for item in PARAMETERS)) if name in taken]
-    if clash:
-        raise PlantError(f'plant {plant.name}: part "thermal" has "{clash[0]}", which the plant has, too')
+    refuse_clash(plant, "thermal", (*RISES, *TEMPERATURES, *(item.name for item in PARAMETERS)))
     source = actuation.input
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
@@ -144,17 +140,16 @@ def add_heat(plant: Plant) -> Plant:
         return {**plant.h(t, x, u, p), **_read_temperatures(x, p)}
 
     return replace(
-        plant, name=f"{plant.name} with heat", f=f, h=h,
+        plant,
+        name=f"{plant.name} with heat",
+        f=f,
+        h=h,
         winding=Winding(rises=RISES, temperatures=TEMPERATURES, effort=actuation.effort, unit=actuation.unit),
         states={**plant.states, **dict.fromkeys(RISES, "K")},
         outputs={**plant.outputs, **dict.fromkeys(TEMPERATURES, "degC")},
         parameters={**plant.parameters, **{item.name: item for item in PARAMETERS}},
-        ports=tuple(port.change_makers(_add_again) for port in plant.ports),
-    )  # fmt: skip
-
-
-def _add_again(make: PlantMaker) -> Plant:
-    return add_heat(make())
+        ports=change_ports(plant.ports, add_heat),
+    )
 
 
 @memo
@@ -165,33 +160,34 @@ def freeze_heat(plant: Plant) -> Plant:
         return plant
     still = dict.fromkeys(winding.rises, 0.0)
 
-    def fill(x: Any) -> SimpleNamespace:
-        return SimpleNamespace(**{**vars(x), **still})
-
-    def freeze(one: Friction) -> Friction:
-        velocity, loads = one.velocity, one.loads
+    def freeze(friction: Friction) -> Friction:
+        velocity, loads = friction.velocity, friction.loads
         return replace(
-            one, velocity=lambda x, p: velocity(fill(x), p),
-            loads=None if loads is None else lambda x, u, p: loads(fill(x), u, p),
-        )  # fmt: skip
+            friction,
+            velocity=lambda x, p: velocity(with_values(x, still), p),
+            loads=None if loads is None else lambda x, u, p: loads(with_values(x, still), u, p),
+        )
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        return {name: rate for name, rate in plant.f(t, fill(x), u, p).items() if name not in still}
+        return {name: rate for name, rate in plant.f(t, with_values(x, still), u, p).items() if name not in still}
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        return {name: value for name, value in plant.h(t, fill(x), u, p).items() if name not in winding.temperatures}
+        return {
+            name: value
+            for name, value in plant.h(t, with_values(x, still), u, p).items()
+            if name not in winding.temperatures
+        }
 
     return replace(
-        plant, f=f, h=h, winding=None,
+        plant,
+        f=f,
+        h=h,
+        winding=None,
         states={name: unit for name, unit in plant.states.items() if name not in still},
         outputs={name: unit for name, unit in plant.outputs.items() if name not in winding.temperatures},
-        friction={name: freeze(one) for name, one in plant.friction.items()},
-        ports=tuple(port.change_makers(_freeze_again) for port in plant.ports),
-    )  # fmt: skip
-
-
-def _freeze_again(make: PlantMaker) -> Plant:
-    return freeze_heat(make())
+        friction={name: freeze(friction) for name, friction in plant.friction.items()},
+        ports=change_ports(plant.ports, freeze_heat),
+    )
 
 
 @record
@@ -347,10 +343,12 @@ class MotorRating:
         """Return what heat does by itself, 1/s, with what the growing resistance adds at a constant current."""
         flow = 1.0 / self.to_case
         fed_back = self.slope * current_A**2
-        return np.array([
-            [(fed_back - flow) / self.winding, flow / self.winding],
-            [flow / self.case, -(flow + 1.0 / self.to_air) / self.case],
-        ])  # fmt: skip
+        return np.array(
+            [
+                [(fed_back - flow) / self.winding, flow / self.winding],
+                [flow / self.case, -(flow + 1.0 / self.to_air) / self.case],
+            ]
+        )
 
     def time_constants_s(self, current_A: float = 0.0) -> tuple[float, float]:
         """Return the two time constants, the shorter first; infinite where the winding runs away."""
@@ -371,10 +369,13 @@ class MotorRating:
     def to_dict(self) -> dict[str, Any]:
         """Return what goes into controller.json: the network, and what it allows."""
         return asdict(self) | {
-            "continuous_A": self.continuous_A, "continuous_effort": self.continuous_effort,
-            "peak_s": PEAK_S, "peak_A": self.peak_A(), "peak_effort": self.peak_effort(),
+            "continuous_A": self.continuous_A,
+            "continuous_effort": self.continuous_effort,
+            "peak_s": PEAK_S,
+            "peak_A": self.peak_A(),
+            "peak_effort": self.peak_effort(),
             "time_constants_s": list(self.time_constants_s()),
-        }  # fmt: skip
+        }
 
     def _limit(self, current_A: float) -> float:
         return current_A if self.largest_A is None else min(current_A, self.largest_A)
@@ -437,10 +438,19 @@ def rate_motor(plant: Plant, params: ParameterSet, largest: float | None = None)
         elif plant.inputs[source] == "V" or source == "duty":  # `seaopt.plants.drives`
             largest_V = largest * (p.V_s if source == "duty" else 1.0)
     return MotorRating(
-        resistance=resistance, slope=p.R * p.alpha_cu, to_case=p.R_wc, to_air=p.R_ca, winding=p.C_w, case=p.C_c,
-        ambient=p.T_ambient, hottest=p.T_max, per_ampere=float(winding.effort(p)), unit=winding.unit,
-        largest_A=largest_A, largest_V=largest_V,
-    )  # fmt: skip
+        resistance=resistance,
+        slope=p.R * p.alpha_cu,
+        to_case=p.R_wc,
+        to_air=p.R_ca,
+        winding=p.C_w,
+        case=p.C_c,
+        ambient=p.T_ambient,
+        hottest=p.T_max,
+        per_ampere=float(winding.effort(p)),
+        unit=winding.unit,
+        largest_A=largest_A,
+        largest_V=largest_V,
+    )
 
 
 def find_warm_range(plant: Plant, params: ParameterSet) -> tuple[float, float] | None:

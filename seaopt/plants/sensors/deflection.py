@@ -26,7 +26,7 @@ import casadi as ca
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants.plant import CompletedParameters, Plant, name_parameters
-from seaopt.plants.roles import PlantMaker, Sensing
+from seaopt.plants.roles import Sensing, change_ports
 from seaopt.units import ROTARY
 
 NOMINAL = "k_n"
@@ -41,11 +41,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
 def read_deflection(plant: Plant) -> Plant:
     """Return a plant with one more output, tau_d or F_d: what two encoders make of the spring's deflection.
 
-    Raises
-    ------
-    PlantError
-        The plant states no spring, or not what is regulated, or has such an output.
-
+    Raises PlantError: the plant states no spring, or not what is regulated, or has such an output.
     """
     spring, sensing = plant.spring, plant.sensing
     if spring is None or sensing is None or not sensing.regulated:
@@ -61,17 +57,14 @@ def read_deflection(plant: Plant) -> Plant:
         return {**plant.h(t, x, u, p), name: getattr(p, NOMINAL) * deflection(x, p)}
 
     return replace(
-        plant, name=f"{plant.name} with deflection_sensor", h=h, outputs={**plant.outputs, name: unit},
+        plant,
+        name=f"{plant.name} with deflection_sensor",
+        h=h,
+        outputs={**plant.outputs, name: unit},
         parameters={**plant.parameters, NOMINAL: f"{unit}/{spring.unit}"},
-        sensing=replace(
-            sensing, regulated=(*sensing.regulated, name), from_encoders=(*sensing.from_encoders, name)
-        ),
-        ports=tuple(port.change_makers(_read_deflection_of) for port in plant.ports),
-    )  # fmt: skip
-
-
-def _read_deflection_of(make: PlantMaker) -> Plant:
-    return read_deflection(make())
+        sensing=replace(sensing, regulated=(*sensing.regulated, name), from_encoders=(*sensing.from_encoders, name)),
+        ports=change_ports(plant.ports, read_deflection),
+    )
 
 
 def weigh_encoders(plant: Plant, output: str) -> dict[str, Any]:

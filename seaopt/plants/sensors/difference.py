@@ -22,7 +22,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.errors import PlantError, require_number, require_type, suggestion
+from seaopt.errors import PlantError, require_type, suggestion
+from seaopt.options import check_options, option
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import Plant
 from seaopt.plants.roles import Sampling
@@ -32,15 +33,6 @@ from seaopt.records import record
 @record
 class Difference:
     """A speed that a device computed from a position, sample by sample.
-
-    Parameters
-    ----------
-    of : str
-        The position: a state of the plant, or an output that is one.
-    samples : int
-        Over how many samples of the log it is taken.
-    lag_hz : float, optional
-        Bandwidth of the first-order lag behind it; none if left out.
 
     Raises
     ------
@@ -55,16 +47,15 @@ class Difference:
 
     """
 
-    of: str
-    samples: int = 1
-    lag_hz: float | None = None
+    of: str = option("The position that the device differences: a state of the plant, or an output that is one.")
+    samples: int = option("Over how many samples of the log it is taken.", default=1, least=1, most=100)
+    lag_hz: float | None = option(
+        "Corner of the first-order filter behind it; none where left out.", default=None, unit="Hz", above=0.0
+    )
 
     def __post_init__(self) -> None:
         require_type(self.of, str, "of (of a Difference)", "give the name of a position", PlantError)
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or not 1 <= self.samples <= 100:
-            raise PlantError(f"samples = {self.samples!r} of a Difference is not a whole number of 1 to 100; give one")
-        if self.lag_hz is not None and not 0.0 < require_number(self.lag_hz, "lag_hz", PlantError) < math.inf:
-            raise PlantError(f"lag_hz = {self.lag_hz!r} of a Difference is not a frequency; give Hz, or leave it out")
+        check_options(self, PlantError, "Difference: ")
 
     def share(self, period_s: float) -> float:
         """Return a: how much of the way to each difference the lag goes; 1 without one."""
@@ -88,11 +79,7 @@ class Difference:
 def add_difference(plant: Plant, name: str, difference: Difference, period_s: float) -> Plant:
     """Return a plant with one more output: the speed that a device which samples with this period computes.
 
-    Raises
-    ------
-    PlantError
-        The plant has such an output, or no such position, or samples with another period.
-
+    Raises PlantError: the plant has such an output, or no such position, or samples with another period.
     """
     if name in plant.outputs:
         raise PlantError(f'plant {plant.name} has an output "{name}" of its own; name the difference otherwise')
@@ -105,11 +92,11 @@ def add_difference(plant: Plant, name: str, difference: Difference, period_s: fl
 def _add(plant: Plant, name: str, difference: Difference, period_s: float) -> Plant:
     position = find_state(plant, difference.of)
     unit = f"{plant.states[position]}/s"
-    held = [f"{name}_held_{i}" for i in range(1, difference.samples + 1)]
-    rate = {position: 1.0 / (difference.samples * period_s), held[-1]: -1.0 / (difference.samples * period_s)}
-    shifts = zip([position, *held], held, strict=False)
+    memories = [f"{name}_held_{i}" for i in range(1, difference.samples + 1)]
+    rate = {position: 1.0 / (difference.samples * period_s), memories[-1]: -1.0 / (difference.samples * period_s)}
+    shifts = zip([position, *memories], memories, strict=False)
     sets: dict[str, Mapping[str, float]] = {now: {before: 1.0} for before, now in shifts}
-    states, reading, share = dict.fromkeys(held, plant.states[position]), rate, difference.share(period_s)
+    states, reading, share = dict.fromkeys(memories, plant.states[position]), rate, difference.share(period_s)
     if difference.lag_hz is not None:
         behind = f"{name}_lagged"
         states[behind] = unit
@@ -124,9 +111,13 @@ def _add(plant: Plant, name: str, difference: Difference, period_s: float) -> Pl
 
     before, made = (plant.sampling.sets, plant.sampling.differences) if plant.sampling is not None else ({}, {})
     return replace(
-        plant, f=f, h=h, states={**plant.states, **states}, outputs={**plant.outputs, name: unit},
+        plant,
+        f=f,
+        h=h,
+        states={**plant.states, **states},
+        outputs={**plant.outputs, name: unit},
         sampling=Sampling(period_s=period_s, sets={**before, **sets}, differences={**made, name: difference}),
-    )  # fmt: skip
+    )
 
 
 def read_positions(plant: Plant, differences: Mapping[str, Difference]) -> Plant:
@@ -151,8 +142,8 @@ def find_state(plant: Plant, position: str) -> str:
             f"to the model; give one of {', '.join(plant.states)}"
         )
     if position not in plant.states:
-        known = [*plant.states, *plant.outputs]
+        positions = [*plant.states, *plant.outputs]
         raise PlantError(
-            f'plant {plant.name} has no position "{position}" to difference; {suggestion(position, known)}'
+            f'plant {plant.name} has no position "{position}" to difference; {suggestion(position, positions)}'
         )
     return position

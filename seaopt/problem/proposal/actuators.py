@@ -22,9 +22,7 @@ from seaopt.units import unit_after
 PRIOR = 0.05  # share that a data sheet's value may be off
 WIDE = (0.5, 2.0)  # of an inertia that somebody estimated: its range
 INERTIA_OVER_POINT = 4.0 / 3.0  # of a slender link about its end
-_DRIVES: dict[str, tuple[str, ...]] = {
-    "V": ("voltage_input",), "duty": ("duty_input",), "goal": ("position_servo",),
-}  # fmt: skip
+_DRIVES: dict[str, tuple[str, ...]] = {"V": ("voltage_input",), "duty": ("duty_input",), "goal": ("position_servo",)}
 
 
 @record
@@ -48,30 +46,14 @@ class Facts:
 
 @record
 class Proposed:
-    """An actuator as it goes into a problem file.
-
-    Parameters
-    ----------
-    lines : tuple of ParameterLine
-    plants : mapping of name to options
-        Of each [plant.NAME].
-    measured : str
-        What a controller regulates; "" where nothing can be.
-    design : str
-        The plant that it is designed on.
-    robust_to : tuple of str
-        The plants that it must hold on besides.
-    ranges : mapping of name to (low, high)
-        Of what nobody measured.
-
-    """
+    """An actuator as it goes into a problem file."""
 
     lines: tuple[ParameterLine, ...]
-    plants: Mapping[str, Mapping[str, object]]
-    measured: str
-    design: str
-    robust_to: tuple[str, ...]
-    ranges: Mapping[str, tuple[float, float]]
+    plants: Mapping[str, Mapping[str, object]]  # of each [plant.NAME]
+    measured: str  # what a controller regulates; "" where nothing can be
+    design: str  # the plant that it is designed on
+    robust_to: tuple[str, ...]  # the plants that it must hold on besides
+    ranges: Mapping[str, tuple[float, float]]  # of what nobody measured
 
 
 class _Lines:
@@ -136,9 +118,11 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     lines.free("f_c", 0.2 * lines.defaults["J_m"].value * 100.0, max=10.0)
     seen = (effort and (motor or "deflection" in facts.outputs)) or (moves and (motor or link))
     lines.perhaps(
-        "k_s", "Stiffness of the spring k_s", told=seen,
+        "k_s",
+        "Stiffness of the spring k_s",
+        told=seen,
         why="fitted" if seen else "no log tells it: J_m, b_r and f_c are right only in their ratio to it",
-    )  # fmt: skip
+    )
     if moves:
         lines.free("J_l")
         lines.free("d_l", 0.1)
@@ -166,9 +150,12 @@ def _add_torque_constant(lines: _Lines, facts: Facts, *, effort: bool) -> None:
     """Add K_tau and eta, of which a log tells the product at most; a commanded torque makes them one."""
     if facts.input == "torque":
         side = lines.interview.ask(
-            "torque_at", "Is the commanded torque that of the motor or of the output, behind the gear?", "output",
-            "as drives of robots take it", ("output", "motor"),
-        )  # fmt: skip
+            "torque_at",
+            "Is the commanded torque that of the motor or of the output, behind the gear?",
+            "output",
+            "as drives of robots take it",
+            ("output", "motor"),
+        )
         gear = float(lines.lines[0].value)
         lines.add("K_tau", f"{1.0 / gear if side == 'output' else 1.0:.10g}", "torque_at")
         if effort:
@@ -195,15 +182,22 @@ def _add_drive(lines: _Lines, facts: Facts) -> None:
         lines.known("V_s", "Supply voltage V_s", why="a usual one")
     if facts.input == "goal":
         lines.known(
-            "k_p", "Gain k_p of the position loop: current in A for one rad of error at the motor", 10.0,
+            "k_p",
+            "Gain k_p of the position loop: current in A for one rad of error at the motor",
+            10.0,
             "no log tells it: all torques are in its ratio",
-        )  # fmt: skip
+        )
 
 
 def _finish_rotary(
-    lines: _Lines, facts: Facts, plants: dict[str, Mapping[str, object]], options: Mapping[str, object], *,
-    effort: bool, both: bool,
-) -> Proposed:  # fmt: skip
+    lines: _Lines,
+    facts: Facts,
+    plants: dict[str, Mapping[str, object]],
+    options: Mapping[str, object],
+    *,
+    effort: bool,
+    both: bool,
+) -> Proposed:
     """Return the actuator with the plants that its controller is for: the link held, and as it hangs from the joint."""
     measured = "tau_s" if effort else "tau_d" if both else ""
     if facts.input == "goal" or not measured:  # a firmware's loop is closed already
@@ -219,7 +213,7 @@ def _finish_rotary(
     robust_to = tuple(name for name in plants if name == "hanging")
     return Proposed(
         lines=tuple(lines.lines), plants=plants, measured=measured, design="held", robust_to=robust_to, ranges=ranges
-    )  # fmt: skip
+    )
 
 
 def _add_payload(
@@ -233,18 +227,21 @@ def _add_payload(
         return {}
     ranges: dict[str, tuple[float, float]] = {}
     mass = lines.interview.optional(
-        "m", "Mass of the link that will hang from the joint, in kg, or unknown",
+        "m",
+        "Mass of the link that will hang from the joint, in kg, or unknown",
         "the controller is then certified with the link held, and not on one that moves",
-    )  # fmt: skip
+    )
     if mass is None:
         return ranges
     lines.add("m", f"{mass:.10g}", "m")
     reach = lines.known("L", "Distance L from its centre of mass to the joint", why="a usual one; measure it")
     if "free" not in plants:
         inertia = lines.known(
-            "J_l", "Its inertia J_l about the joint", float(f"{INERTIA_OVER_POINT * mass * reach**2:.3g}"),
+            "J_l",
+            "Its inertia J_l about the joint",
+            float(f"{INERTIA_OVER_POINT * mass * reach**2:.3g}"),
             "a third more than that of a point mass",
-        )  # fmt: skip
+        )
         lines.known("d_l", "Damping d_l at the joint", 0.1, "a usual one")
         ranges["J_l"] = (WIDE[0] * inertia, WIDE[1] * inertia)
     plants["hanging"] = {"kind": "rotary", "link": _LINKS["hanging"], **options}
@@ -266,9 +263,11 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     lines.free("f_c", 5.0)
     seen = bool(forces) and placed
     lines.perhaps(
-        "k", "Stiffness of the spring k", told=seen,
+        "k",
+        "Stiffness of the spring k",
+        told=seen,
         why="fitted" if seen else "no log tells it: J, b_r and f_c are right only in their ratio to it",
-    )  # fmt: skip
+    )
     if len(forces) == 2:
         lines.free("m_l", min=1e-3)
     moves = "swing" in facts.places
@@ -287,9 +286,10 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     ranges: dict[str, tuple[float, float]] = {}
     if not moves:
         inertia = interview.optional(
-            "I_p", "Inertia of the link that the actuator will swing, about its pivot, in kg m^2, or unknown",
+            "I_p",
+            "Inertia of the link that the actuator will swing, about its pivot, in kg m^2, or unknown",
             "the output was held; without it the certificate says nothing of a link that moves",
-        )  # fmt: skip
+        )
         if inertia is not None:
             lines.known("L_a", "Lever arm L_a of the force about the pivot", why="a usual one; measure it")
             lines.known("m", "Mass of the link", why="a usual one; weigh it")
@@ -299,9 +299,13 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
             ranges["I_p"] = (WIDE[0] * inertia, WIDE[1] * inertia)
     measured = "F1" if "F1" in forces else "F2"
     return Proposed(
-        lines=tuple(lines.lines), plants=plants, measured=measured, design="held",
-        robust_to=tuple(name for name in plants if name == "swing"), ranges=ranges,
-    )  # fmt: skip
+        lines=tuple(lines.lines),
+        plants=plants,
+        measured=measured,
+        design="held",
+        robust_to=tuple(name for name in plants if name == "swing"),
+        ranges=ranges,
+    )
 
 
 def screw_travel(lines: Sequence[ParameterLine]) -> float:

@@ -179,9 +179,9 @@ def _describe_clock(log: DescribedLog) -> list[tuple[str, str]]:
             rows.append(('resample = "restamp"', "the timestamps are rounded"))
         else:
             rate = float(f"{clock.rate_hz:.3g}")
-            rows.append((
-                f"resample = {{ rate_hz = {rate:.10g}, bridge_s = {BRIDGE / rate:.3g} }}", "the clock is irregular",
-            ))  # fmt: skip
+            rows.append(
+                (f"resample = {{ rate_hz = {rate:.10g}, bridge_s = {BRIDGE / rate:.3g} }}", "the clock is irregular")
+            )
     return rows
 
 

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from seaopt.errors import LogError, ProblemError
+from seaopt.files import check_name
 from seaopt.formatting import format_count, join_words
 from seaopt.logs.quality.clock import assess_clock
 from seaopt.problem.proposal.actuators import (
@@ -88,7 +89,7 @@ class Proposal:
     @property
     def open(self) -> tuple[Question, ...]:
         """The guesses that no result rests on: what a fit finds, and what is chosen, as the bandwidth is."""
-        return tuple(one for one in self.guesses if one.entry not in self.guessed and one.key != "roles")
+        return tuple(guess for guess in self.guesses if guess.entry not in self.guessed and guess.key != "roles")
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a column with numbers near the largest float
@@ -99,21 +100,20 @@ def propose(
 
     `progress` is called before each log is read, and before each is looked at.
 
-    Raises
-    ------
-    SeaoptError
-        A log cannot be read or lies outside the folder, or an answer is not one.
-
+    Raises SeaoptError: a log cannot be read or lies outside the folder, or an answer is not one.
     """
     interview = Interview(answers)
     reading, looking = divide(progress, READING, LOOKING)
     surveys = [_survey(path, interview) for path in count_off(logs, "reading log", reading)]
-    turns, doubt = is_rotary([one for survey in surveys for one in survey.columns])
+    turns, doubt = is_rotary([column for survey in surveys for column in survey.columns])
     if doubt:
         kind = interview.ask(
-            "actuator", "Is the actuator rotary (a gear) or linear (a screw)?", "rotary" if turns else "linear", doubt,
+            "actuator",
+            "Is the actuator rotary (a gear) or linear (a screw)?",
+            "rotary" if turns else "linear",
+            doubt,
             ("rotary", "linear"),
-        )  # fmt: skip
+        )
         turns = kind == "rotary"
     assignments = [_assign(survey, interview, turns) for survey in surveys]
     pairs = list(zip(surveys, assignments, strict=True))
@@ -126,26 +126,31 @@ def propose(
         names = join_words([f"{log.survey.name} ({log.roles.input})" for log in described])
         raise ProblemError(f"{names} are driven by different inputs; write a problem file for each: seaopt new LOG")
     facts = Facts(
-        input=described[0].roles.input, places=tuple(dict.fromkeys(log.plant for log in described)),
-        outputs=frozenset(role for log in described for role in log.outputs), gear_ratio=_find_ratio(described),
-    )  # fmt: skip
+        input=described[0].roles.input,
+        places=tuple(dict.fromkeys(log.plant for log in described)),
+        outputs=frozenset(role for log in described for role in log.outputs),
+        gear_ratio=_find_ratio(described),
+    )
     actuator = (propose_rotary if turns else propose_linear)(interview, facts)
     text = write_problem_text(title or described[0].survey.path.stem, described, actuator, interview)
     return Proposal(
-        text=text, columns=tuple(row for log in described for row in _list_columns(log)),
+        text=text,
+        columns=tuple(row for log in described for row in _list_columns(log)),
         questions=tuple(interview.questions),
-        guesses=tuple(one for one in interview.questions if one.key not in interview.answers),
-        guessed=tuple(interview.list_guessed()), notes=tuple(note for log in described for note in _list_notes(log)),
-    )  # fmt: skip
+        guesses=tuple(question for question in interview.questions if question.key not in interview.answers),
+        guessed=tuple(interview.list_guessed()),
+        notes=tuple(note for log in described for note in _list_notes(log)),
+    )
 
 
 def _survey(path: Path, interview: Interview) -> Survey:
     key = f"time:{path.name}"
     survey = survey_log(path, interview.answers.get(key))
     if len(survey.clocks) > 1 and survey.clock is not None:
-        interview.ask(key, f"Which column of {path.name} is the time?", survey.clock.name, "the first of them",
-                      survey.clocks)  # fmt: skip
-    columns = tuple(_settle_m(one, survey, interview) for one in survey.columns)
+        interview.ask(
+            key, f"Which column of {path.name} is the time?", survey.clock.name, "the first of them", survey.clocks
+        )
+    columns = tuple(_settle_m(column, survey, interview) for column in survey.columns)
     return replace(survey, columns=columns)
 
 
@@ -153,29 +158,38 @@ def _settle_m(column: SurveyedColumn, survey: Survey, interview: Interview) -> S
     """Return a column of which the m at the end of its name is settled: beside signs of a gear it is the motor."""
     if not is_m_open(column.header):
         return column
-    geared = any(one.header.quantity == "torque" or LINK_END.search(one.name) for one in survey.columns)
-    meaning = "motor" if geared else interview.ask(
-        f"m:{column.name}", f'Is "{column.name}" in metres, or an angle of the motor?', "metres",
-        "no column is a torque, nor of a link", ("metres", "motor"),
-    )  # fmt: skip
+    geared = any(column.header.quantity == "torque" or LINK_END.search(column.name) for column in survey.columns)
+    meaning = (
+        "motor"
+        if geared
+        else interview.ask(
+            f"m:{column.name}",
+            f'Is "{column.name}" in metres, or an angle of the motor?',
+            "metres",
+            "no column is a torque, nor of a link",
+            ("metres", "motor"),
+        )
+    )
     return replace(column, header=read_header(column.name, metres=False)) if meaning == "motor" else column
 
 
 def _assign(survey: Survey, interview: Interview, turns: bool) -> Assignment:
     """Return the roles of a log's columns, which are asked for one by one where the guess is not right."""
     roles = assign(survey, rotary=turns, given={})
-    whole = interview.ask(
-        "roles", "Are these the right columns?", "yes", "by names and samples", ("yes", "no"),
-    )  # fmt: skip
+    whole = interview.ask("roles", "Are these the right columns?", "yes", "by names and samples", ("yes", "no"))
     if whole == "yes":
         return _check_outputs(roles, survey)
-    known = {one.name: role for role, one in roles.columns.items()}
+    known = {column.name: role for role, column in roles.columns.items()}
     choices = (*INPUTS, *(ROTARY_OUTPUTS if turns else LINEAR_OUTPUTS), "none")
     given = {
-        one.name: interview.ask(
-            f"role:{one.name}", f'What is column "{one.name}"?', known.get(one.name, "none"), "by its name", choices
+        column.name: interview.ask(
+            f"role:{column.name}",
+            f'What is column "{column.name}"?',
+            known.get(column.name, "none"),
+            "by its name",
+            choices,
         )
-        for one in survey.columns
+        for column in survey.columns
     }
     chosen = [role for role in given.values() if role in INPUTS]
     if len(chosen) != 1:
@@ -199,8 +213,9 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
     unit, sure = survey.clock_unit()
     key = f"unit:{survey.clock.name}" if survey.clock is not None else ""
     if survey.clock is not None and not sure:
-        unit = interview.ask(key, f'Unit of the time "{survey.clock.name}"?', unit, "by the size of its steps",
-                             ("s", "ms", "us", "ns"))  # fmt: skip
+        unit = interview.ask(
+            key, f'Unit of the time "{survey.clock.name}"?', unit, "by the size of its steps", ("s", "ms", "us", "ns")
+        )
     clock = None
     if survey.clock is None:
         text = f"Sample rate of {survey.name}, which has no clock, in Hz"
@@ -210,9 +225,17 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
         rate = clock.rate_hz
     units, scales = _ask_units(roles, interview)
     log = DescribedLog(
-        survey=survey, roles=roles, name=_spell_name(survey.path.stem, at), file=_relative(survey.path, folder),
-        plant="", units=units, scales=scales, time_unit=unit, clock=clock, rate_hz=rate,
-    )  # fmt: skip
+        survey=survey,
+        roles=roles,
+        name=_spell_name(survey.path.stem, at),
+        file=_relative(survey.path, folder),
+        plant="",
+        units=units,
+        scales=scales,
+        time_unit=unit,
+        clock=clock,
+        rate_hz=rate,
+    )
     log = replace(log, scales=scales | _find_signs(log))
     log = replace(log, plant=_ask_link(log, interview))
     return replace(log, traits=_look_at(log))
@@ -244,12 +267,7 @@ def _list_notes(log: DescribedLog) -> Iterator[str]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    try:
-        path.name.encode()
-    except UnicodeEncodeError:
-        raise ProblemError(
-            f"{path}: a problem file cannot name it, for its name is not UTF-8; rename the log"
-        ) from None
+    check_name(path.name, "a problem file cannot name it: rename the log", ProblemError)
     try:
         return path.resolve().relative_to(folder.resolve()).as_posix()
     except ValueError:
@@ -261,7 +279,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 def _spell_name(stem: str, at: int) -> str:
     """Return an experiment's name: letters, digits, _ and -, the first a letter."""
-    text = "".join(one if one.isascii() and (one.isalnum() or one in "_-") else "_" for one in stem)[:60]
+    text = "".join(letter if letter.isascii() and (letter.isalnum() or letter in "_-") else "_" for letter in stem)[:60]
     return text if text[:1].isalpha() else f"log{at + 1}_{text}".rstrip("_")
 
 
@@ -280,7 +298,7 @@ def _ask_units(roles: Assignment, interview: Interview) -> tuple[dict[str, str],
             )
             unit, scales[role] = "rad", 2.0 * math.pi / turn
         elif role == "duty" and unit != "percent" and column.largest > 1.5:
-            full = next((one for one in FULL_DUTIES if one >= column.largest), FULL_DUTIES[-1])
+            full = next((duty for duty in FULL_DUTIES if duty >= column.largest), FULL_DUTIES[-1])
             scales[role] = 1.0 / interview.number(
                 f"duty:{column.name}", f'Number of "{column.name}" at full duty', full, "the next usual one"
             )
@@ -294,9 +312,15 @@ def _ask_units(roles: Assignment, interview: Interview) -> tuple[dict[str, str],
 def _choices_of(role: str) -> tuple[str, ...]:
     angle = ("rad", "deg", COUNTS)
     return {
-        "I": ("A", "mA"), "torque": ("N m", "mN m"), "V": ("V", "mV"), "duty": ("-", "percent"), "F1": ("N", "kN"),
-        "F2": ("N", "kN"), "q": ("m", "mm", "um"), "tau_s": ("N m", "mN m"),
-    }.get(role, angle)  # fmt: skip
+        "I": ("A", "mA"),
+        "torque": ("N m", "mN m"),
+        "V": ("V", "mV"),
+        "duty": ("-", "percent"),
+        "F1": ("N", "kN"),
+        "F2": ("N", "kN"),
+        "q": ("m", "mm", "um"),
+        "tau_s": ("N m", "mN m"),
+    }.get(role, angle)
 
 
 def _find_signs(log: DescribedLog) -> dict[str, float]:
@@ -319,13 +343,19 @@ def _ask_link(log: DescribedLog, interview: Interview) -> str:
     roles, key = log.roles, f"link:{log.survey.name}"
     if not roles.rotary:
         return "swing" if "phi" in roles.columns else "held"
-    units = {role: factor(log.units[role], "rad") * log.scales.get(role, 1.0) for role in ("theta_m", "theta_l")
-             if role in log.units}  # fmt: skip
+    units = {
+        role: factor(log.units[role], "rad") * log.scales.get(role, 1.0)
+        for role in ("theta_m", "theta_l")
+        if role in log.units
+    }
     held, why = is_held(roles, units.get("theta_l", 1.0), units.get("theta_m", 1.0))
     return interview.ask(
-        key, f"In {log.survey.name}, is the link held, free, or hanging (gravity pulls it back)?",
-        "held" if held else "free", why, ("held", "free", "hanging"),
-    )  # fmt: skip
+        key,
+        f"In {log.survey.name}, is the link held, free, or hanging (gravity pulls it back)?",
+        "held" if held else "free",
+        why,
+        ("held", "free", "hanging"),
+    )
 
 
 def _find_ratio(logs: Sequence[DescribedLog]) -> float | None:
@@ -345,16 +375,27 @@ def _list_columns(log: DescribedLog) -> list[ProposedColumn]:
     survey = log.survey
     rows: list[ProposedColumn] = []
     if survey.clock is not None:
-        rows.append(ProposedColumn(
-            log=survey.name, column=survey.clock.name, role="time", unit=log.time_unit, description="time",
-            doubt=doubt_clock(survey),
-        ))  # fmt: skip
+        rows.append(
+            ProposedColumn(
+                log=survey.name,
+                column=survey.clock.name,
+                role="time",
+                unit=log.time_unit,
+                description="time",
+                doubt=doubt_clock(survey),
+            )
+        )
     for role, column in log.roles.columns.items():
-        rows.append(ProposedColumn(
-            log=survey.name, column=column.name, role="input" if role == log.roles.input else role,
-            unit=column.header.unit or log.units[role], description=DESCRIPTIONS[role],
-            doubt=log.roles.doubts.get(column.name, ""),
-        ))  # fmt: skip
+        rows.append(
+            ProposedColumn(
+                log=survey.name,
+                column=column.name,
+                role="input" if role == log.roles.input else role,
+                unit=column.header.unit or log.units[role],
+                description=DESCRIPTIONS[role],
+                doubt=log.roles.doubts.get(column.name, ""),
+            )
+        )
     for name, why in {**log.roles.unused, **survey.left_out}.items():
         text = f"not used: {why}"
         rows.append(ProposedColumn(log=survey.name, column=name, role="", unit="", description=text, doubt=""))

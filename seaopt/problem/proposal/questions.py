@@ -20,31 +20,14 @@ THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})")  # or a German decimal
 
 @record
 class Question:
-    """What the logs do not say.
+    """What the logs do not say."""
 
-    Parameters
-    ----------
-    key : str
-        For the answers.
-    text : str
-        In words, with the unit.
-    guess : str
-        What is taken where nobody answers.
-    why : str
-        Where the guess is from.
-    choices : tuple of str
-        The answers that count; empty for a number.
-    open : bool
-        Whether "unknown" is an answer.
-
-    """
-
-    key: str
-    text: str
-    guess: str
-    why: str
-    choices: tuple[str, ...] = ()
-    open: bool = False
+    key: str  # for the answers
+    text: str  # in words, with the unit
+    guess: str  # what is taken where nobody answers
+    why: str  # where the guess is from
+    choices: tuple[str, ...] = ()  # the answers that count; empty for a number
+    open: bool = False  # whether "unknown" is an answer
 
     @property
     def label(self) -> str:
@@ -60,16 +43,14 @@ class Question:
     def read(self, answer: str) -> str:
         """Return an answer as it counts.
 
-        Raises
-        ------
-        ProblemError
-            It is none of the choices, or no positive number.
-
+        Raises ProblemError: it is none of the choices, or no positive number.
         """
         text = answer.strip()
         if self.choices:
-            found = [one for one in self.choices if one.casefold() == text.casefold()]
-            found = found or [one for one in self.choices if text and one.casefold().startswith(text.casefold())]
+            found = [choice for choice in self.choices if choice.casefold() == text.casefold()]
+            found = found or [
+                choice for choice in self.choices if text and choice.casefold().startswith(text.casefold())
+            ]
             if len(found) != 1:
                 raise ProblemError(f'"{printable(text)}" is not an answer; {suggestion(text, self.choices)}')
             return found[0]
@@ -102,7 +83,7 @@ class Interview:
     ) -> str:
         """Return the answer to a question, or its guess."""
         question = Question(key=key, text=text, guess=guess, why=why, choices=tuple(choices), open=open)
-        if all(question.key != one.key for one in self.questions):
+        if all(question.key != other.key for other in self.questions):
             self.questions.append(question)
         return question.read(self.answers[key]) if key in self.answers else guess
 
@@ -123,9 +104,9 @@ class Interview:
     def mark(self, *keys: str) -> str:
         """Return what of these answers is a guess, as the end of a comment."""
         reasons = [
-            one.why or one.text
-            for one in self.questions
-            if one.key in keys and (one.key not in self.answers or one.key in self.assumed)
+            question.why or question.text
+            for question in self.questions
+            if question.key in keys and (question.key not in self.answers or question.key in self.assumed)
         ]
         return f"guessed: {'; '.join(reasons)}" if reasons else ""
 
@@ -135,9 +116,9 @@ class Interview:
         What nobody knows and a fit finds is none of it, nor is the bandwidth that is asked for.
         """
         open_keys = [
-            one.key
-            for one in self.questions
-            if one.key not in self.answers and one.guess != UNKNOWN and one.key not in WISHES
+            question.key
+            for question in self.questions
+            if question.key not in self.answers and question.guess != UNKNOWN and question.key not in WISHES
         ]
         return list(dict.fromkeys(name_entry(key) for key in (*open_keys, *self.assumed)))
 

@@ -14,9 +14,7 @@ from seaopt.units import header_unit
 INPUTS = ("I", "torque", "V", "duty", "goal")  # what may drive a motor; of each kind of command its own plant
 LINEAR_OUTPUTS = ("F1", "F2", "q", "screw", "phi")  # screw: the motor's angle, which is q over the lead
 ROTARY_OUTPUTS = ("tau_s", "theta_m", "theta_l", "deflection")
-OF_INPUT: dict[str, Quantity] = {
-    "I": "current", "torque": "torque", "V": "voltage", "duty": "duty", "goal": "angle",
-}  # fmt: skip
+OF_INPUT: dict[str, Quantity] = {"I": "current", "torque": "torque", "V": "voltage", "duty": "duty", "goal": "angle"}
 OF_OUTPUT: dict[str, Quantity] = {
     "F1": "force", "F2": "force", "q": "length", "screw": "angle", "phi": "angle",
     "tau_s": "torque", "theta_m": "angle", "theta_l": "angle", "deflection": "angle",
@@ -35,28 +33,13 @@ STILL = 0.02  # of the motor's motion: a link that moves less is held
 
 @record(eq=False)
 class Assignment:
-    """Roles of a log's columns.
+    """Roles of a log's columns."""
 
-    Parameters
-    ----------
-    rotary : bool
-        A gear's actuator, else a screw's.
-    input : str
-        One of `INPUTS`.
-    columns : mapping of role to SurveyedColumn
-        The input's and the outputs'.
-    unused : mapping of column to str
-        Why other columns are not used.
-    doubts : mapping of column to str
-        What of it is a guess, in a sentence.
-
-    """
-
-    rotary: bool
-    input: str
-    columns: Mapping[str, SurveyedColumn]
-    unused: Mapping[str, str]
-    doubts: Mapping[str, str]
+    rotary: bool  # a gear's actuator, else a screw's
+    input: str  # one of `INPUTS`
+    columns: Mapping[str, SurveyedColumn]  # the input's and the outputs'
+    unused: Mapping[str, str]  # why other columns are not used
+    doubts: Mapping[str, str]  # what of it is a guess, in a sentence
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -66,7 +49,7 @@ class Assignment:
 
 def is_rotary(columns: Sequence[SurveyedColumn]) -> tuple[bool, str]:
     """Return whether an actuator turns, and why that is a guess; "" where its columns leave no doubt."""
-    kinds = {one.header.quantity for one in columns}
+    kinds = {column.header.quantity for column in columns}
     linear, turning = kinds & {"force", "length"}, kinds & {"torque"}
     if linear and not turning:
         return False, "" if "force" in kinds else "a column is a length, and none a torque"
@@ -77,8 +60,12 @@ def is_rotary(columns: Sequence[SurveyedColumn]) -> tuple[bool, str]:
 
 def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignment:
     """Return the roles of a log's columns; `given` are those that are known, column to role ("" for none)."""
-    free = [one for one in survey.columns if one.name not in given and one.header.quantity not in ("other", "time")]
-    columns = {given[one.name]: one for one in survey.columns if given.get(one.name)}
+    free = [
+        column
+        for column in survey.columns
+        if column.name not in given and column.header.quantity not in ("other", "time")
+    ]
+    columns = {given[column.name]: column for column in survey.columns if given.get(column.name)}
     doubts: dict[str, str] = {}
     role = next((role for role in columns if role in INPUTS), None)
     if role is None:
@@ -89,18 +76,23 @@ def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignm
     else:
         columns = {role: columns.pop(role), **columns}
     # Of two columns of one role, the measured one, and then the first, is taken.
-    free.sort(key=lambda one: (one.header.commanded, not one.header.measured))
+    free.sort(key=lambda column: (column.header.commanded, not column.header.measured))
     place = _place_rotary if rotary else _place_linear
-    doubts |= place([one for one in free if not one.header.commanded], columns)
-    used = {one.name for one in columns.values()}
+    doubts |= place([column for column in free if not column.header.commanded], columns)
+    used = {column.name for column in columns.values()}
     return Assignment(
-        rotary=rotary, input=role, columns=columns, doubts=doubts,
+        rotary=rotary,
+        input=role,
+        columns=columns,
+        doubts=doubts,
         unused={
-            one.name: "as answered" if one.name in given else _explain_unused(one, role, columns, rotary=rotary)
-            for one in survey.columns
-            if one.name not in used
+            column.name: "as answered"
+            if column.name in given
+            else _explain_unused(column, role, columns, rotary=rotary)
+            for column in survey.columns
+            if column.name not in used
         },
-    )  # fmt: skip
+    )
 
 
 def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, SurveyedColumn], *, rotary: bool) -> str:
@@ -125,28 +117,24 @@ def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, Sur
 def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str, SurveyedColumn, str]:
     """Return the input's role, its column, and why that is a guess, if it is one.
 
-    Raises
-    ------
-    LogError
-        No column drives a motor.
-
+    Raises LogError: no column drives a motor.
     """
     for role, quantity in OF_INPUT.items():
-        named = [one for one in columns if one.header.quantity == quantity]
+        named = [column for column in columns if column.header.quantity == quantity]
         if role in ("torque", "goal"):  # which are measured as often
-            named = [one for one in named if one.header.commanded]
+            named = [column for column in named if column.header.commanded]
         if role == "goal":
-            named += [one for one in columns if one.header.commanded and not one.header.quantity]
+            named += [column for column in columns if column.header.commanded and not column.header.quantity]
         if not named:
             continue
         # A current that was commanded is there before the one that was measured.
-        best = min(named, key=lambda one: (not one.header.commanded, one.header.side == "link"))
-        others = [one.name for one in named if one is not best]
+        best = min(named, key=lambda column: (not column.header.commanded, column.header.side == "link"))
+        others = [column.name for column in named if column is not best]
         return role, best, f"the input, and not {', '.join(others)}" if others else ""
-    likely = [one for one in columns if not one.header.quantity]
-    likely = likely or [one for one in columns if one.header.quantity in ("torque", "angle")]
+    likely = [column for column in columns if not column.header.quantity]
+    likely = likely or [column for column in columns if column.header.quantity in ("torque", "angle")]
     if not likely:
-        names = join_words([one.name for one in survey.columns])
+        names = join_words([column.name for column in survey.columns])
         raise LogError(
             f"{survey.name}: no column drives a motor, of {names}; log its current as well, or the torque, voltage, "
             "duty or goal that it is sent"
@@ -159,48 +147,56 @@ def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str,
 def _place_rotary(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> dict[str, str]:
     """Give a rotary actuator's columns their roles; return what is a guess."""
     doubts: dict[str, str] = {}
-    torques = [one for one in columns if one.header.quantity == "torque"]
+    torques = [column for column in columns if column.header.quantity == "torque"]
     if torques and "tau_s" not in roles:
         # A drive's own torque is its current times a constant; the sensor's is the spring's.
         order = {"spring": 0, "link": 1, "": 2, "motor": 3}
-        best = min(torques, key=lambda one: order[one.header.side])
+        best = min(torques, key=lambda column: order[column.header.side])
         roles["tau_s"] = best
         if len(torques) > 1 and best.header.side != "spring":
             doubts[best.name] = f"the torque at the spring, of {len(torques)} torques"
-    angles = [one for one in columns if one.header.quantity == "angle"]
-    for one in angles:
-        side = "deflection" if one.header.deflection else {"motor": "theta_m", "link": "theta_l"}.get(one.header.side)
+    angles = [column for column in columns if column.header.quantity == "angle"]
+    for column in angles:
+        side = (
+            "deflection"
+            if column.header.deflection
+            else {"motor": "theta_m", "link": "theta_l"}.get(column.header.side)
+        )
         if side is not None:
-            roles.setdefault(side, one)
-    named = {id(one) for one in roles.values()}
+            roles.setdefault(side, column)
+    named = {id(column) for column in roles.values()}
     open_angles = sorted(
-        (one for one in angles if id(one) not in named and not one.header.deflection and not one.header.side),
-        key=lambda one: -one.swing,
+        (
+            column
+            for column in angles
+            if id(column) not in named and not column.header.deflection and not column.header.side
+        ),
+        key=lambda column: -column.swing,
     )
-    for one, role in zip(open_angles, [r for r in ("theta_m", "theta_l") if r not in roles], strict=False):
-        roles[role] = one
-        doubts[one.name] = f"the {DESCRIPTIONS[role]}, as its header does not say which angle"
+    for column, role in zip(open_angles, [r for r in ("theta_m", "theta_l") if r not in roles], strict=False):
+        roles[role] = column
+        doubts[column.name] = f"the {DESCRIPTIONS[role]}, as its header does not say which angle"
     return doubts | _place_unnamed(columns, roles, ("tau_s", "theta_m", "theta_l"))
 
 
 def _place_linear(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> dict[str, str]:
     """Give a screw's columns their roles; return what is a guess."""
     doubts: dict[str, str] = {}
-    forces = [one for one in columns if one.header.quantity == "force"]
-    for one in forces:
-        if one.header.number is not None:
-            roles.setdefault(f"F{one.header.number}", one)
-    for one in forces:
+    forces = [column for column in columns if column.header.quantity == "force"]
+    for column in forces:
+        if column.header.number is not None:
+            roles.setdefault(f"F{column.header.number}", column)
+    for column in forces:
         rest = [role for role in ("F1", "F2") if role not in roles]
-        if one not in roles.values() and rest:
-            roles[rest[0]] = one
-            doubts[one.name] = f"the {DESCRIPTIONS[rest[0]]}, {rest[0]}, as its header has no number"
-    for one in columns:
-        link = one.header.side == "link"
-        if one.header.quantity == "length":
-            roles.update({} if link or "q" in roles else {"q": one})
-        elif one.header.quantity == "angle":
-            roles.setdefault("phi" if link else "screw", one)
+        if column not in roles.values() and rest:
+            roles[rest[0]] = column
+            doubts[column.name] = f"the {DESCRIPTIONS[rest[0]]}, {rest[0]}, as its header has no number"
+    for column in columns:
+        link = column.header.side == "link"
+        if column.header.quantity == "length":
+            roles.update({} if link or "q" in roles else {"q": column})
+        elif column.header.quantity == "angle":
+            roles.setdefault("phi" if link else "screw", column)
     return doubts | _place_unnamed(columns, roles, ("F1", "F2"))
 
 
@@ -210,12 +206,12 @@ def _place_unnamed(
     """Take columns whose headers say nothing as what is measured, where nothing else is."""
     if len(roles) > 1:
         return {}
-    blank = [one for one in columns if not one.header.quantity and one not in roles.values()]
-    for role, one in zip(wanted, blank, strict=False):
-        roles[role] = one
+    blank = [column for column in columns if not column.header.quantity and column not in roles.values()]
+    for role, column in zip(wanted, blank, strict=False):
+        roles[role] = column
     return {
-        one.name: f"the {DESCRIPTIONS[role]}, as nothing else is measured"
-        for role, one in zip(wanted, blank, strict=False)
+        column.name: f"the {DESCRIPTIONS[role]}, as nothing else is measured"
+        for role, column in zip(wanted, blank, strict=False)
     }
 
 

@@ -59,27 +59,14 @@ class SurveyedColumn:
 
 @record(eq=False)
 class Survey:
-    """What is in one log.
-
-    Parameters
-    ----------
-    path : Path
-    clock : SurveyedColumn or None
-        The column of times; None where the file has none.
-    clocks : tuple of str
-        Columns that may be the time by their names; none where the clock was found by its samples.
-    columns : tuple of SurveyedColumn
-        All others that hold numbers and vary.
-    left_out : mapping of column to str
-        Why other columns cannot be used: text, constants, and those without a number.
-
-    """
+    """What is in one log."""
 
     path: Path
-    clock: SurveyedColumn | None
+    clock: SurveyedColumn | None  # the column of times; None where the file has none
+    # columns that may be the time by their names; none where the clock was found by its samples
     clocks: tuple[str, ...]
-    columns: tuple[SurveyedColumn, ...]
-    left_out: Mapping[str, str]
+    columns: tuple[SurveyedColumn, ...]  # all others that hold numbers and vary
+    left_out: Mapping[str, str]  # why other columns cannot be used: text, constants, and those without a number
 
     @property
     def name(self) -> str:
@@ -99,10 +86,7 @@ class Survey:
 def survey_log(path: Path, clock: str | None = None) -> Survey:
     r"""Read every column of a log; `clock` names the time where the file leaves that open.
 
-    Raises
-    ------
-    LogError
-        The file cannot be read, or holds no numbers that vary.
+    Raises LogError: the file cannot be read, or holds no numbers that vary.
 
     Examples
     --------
@@ -127,21 +111,24 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     if chosen is None:
         chosen = next((name for name, samples in values.items() if _runs_on(samples)), None)
     columns = {name: SurveyedColumn(header=header, values=values[name]) for name, header in headers.items()}
-    moving = [one for name, one in columns.items() if name != chosen and name not in times and one.swing > 0.0]
+    moving = [column for name, column in columns.items() if name != chosen and name not in times and column.swing > 0.0]
     if not moving:
         raise LogError(f"{path}: no column varies; record a log in which the actuator moves")
     copies = _find_copies(moving)
-    moving = [one for one in moving if one.name not in copies]
+    moving = [column for column in moving if column.name not in copies]
     still = {
-        name: "constant" if np.any(np.isfinite(one.values)) else "holds no number"
-        for name, one in columns.items()
-        if one.swing == 0.0 and name != chosen
+        name: "constant" if np.any(np.isfinite(column.values)) else "holds no number"
+        for name, column in columns.items()
+        if column.swing == 0.0 and name != chosen
     }
     words = {field.name: "text" for field in held.fields if not field.numeric}
     return Survey(
-        path=path, clock=columns[chosen] if chosen is not None else None, clocks=tuple(times or own),
-        columns=tuple(moving), left_out=words | still | copies,
-    )  # fmt: skip
+        path=path,
+        clock=columns[chosen] if chosen is not None else None,
+        clocks=tuple(times or own),
+        columns=tuple(moving),
+        left_out=words | still | copies,
+    )
 
 
 def _read_raw(path: Path, names: Sequence[str], clock: str | None) -> dict[str, Float[np.ndarray, " n"]]:
@@ -166,25 +153,27 @@ def _runs_on(values: Float[np.ndarray, " n"]) -> bool:
 def _find_copies(columns: Sequence[SurveyedColumn]) -> dict[str, str]:
     """Return the columns that are another one but for a factor, as raw counts beside newtons, and what they are."""
     kept, copies = list[SurveyedColumn](), dict[str, str]()
-    for one in sorted(columns, key=lambda column: not column.header.unit):
+    for column in sorted(columns, key=lambda column: not column.header.unit):
         for other in kept:
-            if one.header.quantity != other.header.quantity or one.values.size < ENOUGH:
+            if column.header.quantity != other.header.quantity or column.values.size < ENOUGH:
                 continue
-            slope, share = regress(one.values, other.values)
+            slope, share = regress(column.values, other.values)
             if share > SAME:
-                copies[one.name] = f"{slope:.4g} times {other.name}"
+                copies[column.name] = f"{slope:.4g} times {other.name}"
                 break
         else:
-            kept.append(one)
+            kept.append(column)
     return copies
 
 
 def find_leader(columns: Sequence[SurveyedColumn]) -> SurveyedColumn:
     """Return the column that the others follow: what drives an actuator is there before anything answers."""
-    used = [one for one in columns if one.values.size >= ENOUGH]
+    used = [column for column in columns if column.values.size >= ENOUGH]
     if not used:
         return columns[0]
-    return max(used, key=lambda one: sum(_lead(one.values, other.values) for other in used if other is not one))
+    return max(
+        used, key=lambda column: sum(_lead(column.values, other.values) for other in used if other is not column)
+    )
 
 
 def _lead(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> float:

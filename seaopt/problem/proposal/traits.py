@@ -27,41 +27,20 @@ OUTLIERS = 3  # from which a log asks for a loss that bears them
 
 @record(eq=False)
 class Traits:
-    """What a log shows.
+    """What a log shows."""
 
-    Parameters
-    ----------
-    delay_s : float or None
-        By how much its outputs are late, beyond the plant's own lag; None where that is not seen.
-    outliers : int
-        Samples of outputs that stand far off.
-    standing : tuple of str
-        Positions that stand still time and again while they are driven.
-    unexcited : str
-        What to say where nothing can be identified; empty where something can.
-
-    """
-
+    # by how much its outputs are late, beyond the plant's own lag; None where that is not seen
     delay_s: float | None = None
-    outliers: int = 0
-    standing: tuple[str, ...] = ()
-    unexcited: str = ""
+    outliers: int = 0  # samples of outputs that stand far off
+    standing: tuple[str, ...] = ()  # positions that stand still time and again while they are driven
+    unexcited: str = ""  # what to say where nothing can be identified; empty where something can
 
 
 def find_traits(table: Table, source: str, outputs: Sequence[str], positions: Sequence[str], *, held: bool) -> Traits:
     """Return what a log shows.
 
-    Parameters
-    ----------
-    table : Table
-        Its input and its outputs.
-    source : str
-        The input.
-    outputs, positions : sequence of str
-        What is fitted, and which of it are positions.
-    held : bool
-        Whether the input holds each value until the next sample; a measured one does not.
-
+    `outputs`: what is fitted. `positions`: which of it are positions. `held`: whether the input holds each value until
+    the next sample; a measured one does not.
     """
     quality = assess_quality(table, inputs=[source])
     excitation = quality.excitation.get(source)

@@ -48,10 +48,24 @@ SIDE_WORDS: dict[Side, frozenset[str]] = {
         "gelenk", "abtrieb", "last", "pendulum", "pendel", "lever", "hebel", "phi", "thetal",
     }),
 }  # fmt: skip
-COMMAND_WORDS = frozenset({
-    "cmd", "command", "commanded", "goal", "ref", "reference", "target", "set", "setpoint", "des", "desired", "soll",
-    "demand", "sp",
-})  # fmt: skip
+COMMAND_WORDS = frozenset(
+    {
+        "cmd",
+        "command",
+        "commanded",
+        "goal",
+        "ref",
+        "reference",
+        "target",
+        "set",
+        "setpoint",
+        "des",
+        "desired",
+        "soll",
+        "demand",
+        "sp",
+    }
+)
 MEASURED_WORDS = frozenset({"act", "actual", "meas", "measured", "ist", "present", "fb", "feedback"})
 DEFLECTION_WORDS = frozenset({"deflection", "defl", "compression", "auslenkung", "federweg", "twist", "stretch"})
 # Within a longer word, as German composes them: Motorstrom, Gelenkwinkel, Sollposition.
@@ -79,33 +93,16 @@ _QUANTITY_OF: dict[str, Quantity] = {
 
 @record
 class Header:
-    """What a column's name says.
+    """What a column's name says."""
 
-    Parameters
-    ----------
-    name : str
-        As the file has it.
-    quantity : str
-        "" where the name does not say.
-    side : "motor", "link", "spring" or ""
-        Of which part of the actuator.
-    unit : str
-        From brackets or a suffix; "counts" of an encoder's steps, "" where there is none.
-    commanded, measured, deflection : bool
-        Whether the name says so.
-    number : int or None
-        Of F1, F2.
-
-    """
-
-    name: str
-    quantity: Quantity
-    side: Side
-    unit: str
-    commanded: bool = False
-    measured: bool = False
-    deflection: bool = False
-    number: int | None = None
+    name: str  # as the file has it
+    quantity: Quantity  # "" where the name does not say
+    side: Side  # of which part of the actuator
+    unit: str  # from brackets or a suffix; "counts" of an encoder's steps, "" where there is none
+    commanded: bool = False  # whether the name says so
+    measured: bool = False  # whether the name says so
+    deflection: bool = False  # whether the name says so
+    number: int | None = None  # of F1, F2
 
 
 def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> Header:
@@ -139,10 +136,15 @@ def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> H
         own = "speed"
     quantity = "voltage" if bare == "V" else own or _decide(kinds, place=place, counts=COUNTS in (stated, suffix))
     return Header(
-        name=name, quantity=quantity, side=_find_side(words), unit=stated or suffix,
-        commanded=bool(_matches(words, COMMAND_WORDS)), measured=bool(_matches(words, MEASURED_WORDS)),
-        deflection=bool(_matches(words, DEFLECTION_WORDS)), number=_find_number(words),
-    )  # fmt: skip
+        name=name,
+        quantity=quantity,
+        side=_find_side(words),
+        unit=stated or suffix,
+        commanded=bool(_matches(words, COMMAND_WORDS)),
+        measured=bool(_matches(words, MEASURED_WORDS)),
+        deflection=bool(_matches(words, DEFLECTION_WORDS)),
+        number=_find_number(words),
+    )
 
 
 def is_m_open(header: Header) -> bool:

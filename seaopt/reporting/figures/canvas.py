@@ -41,6 +41,10 @@ class PlainFigure(Figure):
         code = base64.b64encode(render_figure(self, "svg")).decode("ascii")
         return f'<img src="data:image/svg+xml;base64,{code}" alt="figure" style="background:white;max-width:100%">'
 
+    def _repr_png_(self) -> bytes:
+        """Return the figure as pixels, for what shows a stored notebook and draws no vectors in it."""
+        return render_figure(self, "png")
+
 
 class PlainAxes(Axes):
     """Axes of a plain figure; a notebook shows the figure that they are in."""
@@ -49,6 +53,10 @@ class PlainAxes(Axes):
         figure = self.get_figure(root=True)
         return figure._repr_html_() if isinstance(figure, PlainFigure) else ""
 
+    def _repr_png_(self) -> bytes | None:
+        figure = self.get_figure(root=True)
+        return figure._repr_png_() if isinstance(figure, PlainFigure) else None
+
 
 def new_figure(width: float, height: float) -> PlainFigure:
     """Return an empty figure of a size in inches."""
@@ -56,9 +64,13 @@ def new_figure(width: float, height: float) -> PlainFigure:
 
 
 def add_axes(
-    figure: Figure, heights: Sequence[float], left: float, *, corner: tuple[float, float] = (0.0, 0.0),
+    figure: Figure,
+    heights: Sequence[float],
+    left: float,
+    *,
+    corner: tuple[float, float] = (0.0, 0.0),
     title: bool = True,
-) -> tuple[Axes, ...]:  # fmt: skip
+) -> tuple[Axes, ...]:
     """Return axes one above the other, which share x, with this package's grid.
 
     Margins are the same on every panel: axes stand in line on a sheet, and nothing has to be measured.
@@ -86,9 +98,10 @@ def add_axes(
         box = (corner[0] + left, height - above - own, WIDTH - left - RIGHT, own)
         scale = (width, height, width, height)
         axis = figure.add_axes(
-            tuple(part / whole for part, whole in zip(box, scale, strict=True)), axes_class=PlainAxes,
+            tuple(part / whole for part, whole in zip(box, scale, strict=True)),
+            axes_class=PlainAxes,
             sharex=axes[0] if axes else None,
-        )  # fmt: skip
+        )
         axes.append(axis)
         above += own + BETWEEN
     for axis in axes:
@@ -131,9 +144,15 @@ def add_legend(axes: Sequence[Axes]) -> None:
         handles = {label: line for label, line in label_lines(axis).items() if label not in known}
         if handles:
             axis.legend(
-                list(handles.values()), list(handles), fontsize="small", frameon=True, framealpha=0.75,
-                edgecolor="none", borderpad=0.2, loc="best",
-            )  # fmt: skip
+                list(handles.values()),
+                list(handles),
+                fontsize="small",
+                frameon=True,
+                framealpha=0.75,
+                edgecolor="none",
+                borderpad=0.2,
+                loc="best",
+            )
         known |= handles.keys()
 
 

@@ -15,8 +15,7 @@ from seaopt.plants.friction import take_sliding
 from seaopt.reporting.figures.loop import Plants
 from seaopt.reporting.figures.panel import NAMES_LEFT, Panel
 from seaopt.robustness import Certificate
-from seaopt.robustness.certificate.certificate import Requirement
-from seaopt.robustness.certificate.failures import usage_of
+from seaopt.robustness.certificate.requirement import Requirement, usage_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,8 +41,7 @@ def label_requirement(row: Requirement) -> str:
         return BY_REQUIREMENT[row.name].label
     if row.name in FROM_DRAWS:
         return FROM_DRAWS[row.name]
-    name = row.name.removesuffix("_s")
-    return name.replace("_", " ") + (" [s]" if name != row.name else "")
+    return row.name.removesuffix("_s").replace("_", " ")
 
 
 def requirements_panel(certificate: Certificate) -> Panel:
@@ -61,13 +59,23 @@ def requirements_panel(certificate: Certificate) -> Panel:
         (axis,) = axes
         places = np.arange(len(labels))[::-1]
         for met, colour, marker in ((True, BLUE, "o"), (False, VERMILION, "X")):
-            rows = [(place, min(used, MOST_USED)) for place, (used, row) in zip(places, most.values(), strict=True)
-                    if row.met == met]  # fmt: skip
+            rows = [
+                (place, min(used, MOST_USED))
+                for place, (used, row) in zip(places, most.values(), strict=True)
+                if row.met == met
+            ]
             if rows:
                 at = np.array(rows, dtype=float)
                 axis.hlines(at[:, 0], 0.0, 100.0 * at[:, 1], color=colour, linewidth=1.2)
-                axis.plot(100.0 * at[:, 1], at[:, 0], marker, color=colour, markersize=7, linestyle="",
-                          label="met" if met else "not met")  # fmt: skip
+                axis.plot(
+                    100.0 * at[:, 1],
+                    at[:, 0],
+                    marker,
+                    color=colour,
+                    markersize=7,
+                    linestyle="",
+                    label="met" if met else "not met",
+                )
         axis.axvline(100.0, color=LIMIT, linestyle="--", linewidth=0.9, label="limit")
         axis.set_yticks(places, labels)
         axis.set_ylim(-0.6, len(labels) - 0.4)
@@ -76,11 +84,15 @@ def requirements_panel(certificate: Certificate) -> Panel:
         axis.set_xlabel("used of the limit [%]")
 
     return Panel(
-        name="requirements", hover="", title="How much of each limit is used", draw=draw,
+        name="requirements",
+        hover="",
+        title="How much of each limit is used",
+        draw=draw,
         heights=(max(0.35 + 0.12 * len(labels), 0.6),),
         caption="Of each requirement the plant, draw or run that uses most of its limit. Beyond 100 % it is not met; "
-        f"what uses more than {100 * MOST_USED:g} % stands there.", left=NAMES_LEFT,
-    )  # fmt: skip
+        f"what uses more than {100 * MOST_USED:g} % stands there.",
+        left=NAMES_LEFT,
+    )
 
 
 def worst_panel(certificate: Certificate) -> Panel:
@@ -110,9 +122,12 @@ def worst_panel(certificate: Certificate) -> Panel:
         axis.set_ylabel("|S| [dB]")
 
     return Panel(
-        name="worst", title="Sensitivity, nominal and at the worst found", draw=draw, link="frequency",
+        name="worst",
+        title="Sensitivity, nominal and at the worst found",
+        draw=draw,
+        link="frequency",
         caption="Sensitivity of every plant at the nominal parameters, and at those that draws and search found worst.",
-    )  # fmt: skip
+    )
 
 
 def draws_panel(certificate: Certificate) -> Panel:
@@ -133,8 +148,9 @@ def draws_panel(certificate: Certificate) -> Panel:
             stable = np.isfinite(x)
             axis.plot(x[stable], share[stable], color=colour, linewidth=1.5, drawstyle="steps-post", label=name)
             if np.isfinite(certificate.worst[name].ms):
-                axis.plot([certificate.worst[name].ms], [100.0], "v", color=colour, markersize=7,
-                          label=f"{name}, worst found")  # fmt: skip
+                axis.plot(
+                    [certificate.worst[name].ms], [100.0], "v", color=colour, markersize=7, label=f"{name}, worst found"
+                )
         if ms is not None:
             axis.axvline(ms, color=LIMIT, linestyle="--", linewidth=0.9, label=f"limit {ms:g}")
         axis.set_xlabel("Ms [-]")
@@ -142,10 +158,12 @@ def draws_panel(certificate: Certificate) -> Panel:
 
     count = max(peaks.size for peaks in drawn.values())
     return Panel(
-        name="draws", title=f"Ms over {count} draws", draw=draw,
+        name="draws",
+        title=f"Ms over {count} draws",
+        draw=draw,
         caption="Share of the draws whose Ms is at most the one on the axis; triangles: the worst case found by draws "
         f"and search. {certificate.monte_carlo}.",
-    )  # fmt: skip
+    )
 
 
 def friction_panel(certificate: Certificate) -> Panel:
@@ -183,10 +201,14 @@ def friction_panel(certificate: Certificate) -> Panel:
 
     said = " ".join(f"{name}: {margin.describe()}." for name, margin in margins.items())
     return Panel(
-        name="friction", title="Friction margin", draw=draw, heights=(0.5 + 0.12 * len(names),), left=NAMES_LEFT,
+        name="friction",
+        title="Friction margin",
+        draw=draw,
+        heights=(0.5 + 0.12 * len(names),),
+        left=NAMES_LEFT,
         hover="",
         caption=f"{said} What has no bound stands at the right edge, what is not shown at the left one.",
-    )  # fmt: skip
+    )
 
 
 def impedance_panel(controller: Controller) -> Panel:
@@ -217,7 +239,11 @@ def impedance_panel(controller: Controller) -> Panel:
         lower.set_xlabel("frequency [Hz]")
 
     return Panel(
-        name="impedance", title="Impedance at link 2", draw=draw, heights=(0.9, 0.7), link="frequency",
+        name="impedance",
+        title="Impedance at link 2",
+        draw=draw,
+        heights=(0.9, 0.7),
+        link="frequency",
         caption="Impedance that a hand at link 2 meets, link 1 held. Where Re Z is not below zero the actuator is "
         "passive: nothing passive that it touches there is made unstable by it.",
-    )  # fmt: skip
+    )

@@ -47,8 +47,12 @@ def outputs_panel(prediction: ModelledOutputs, span_s: tuple[float, float] | Non
         from seaopt.reporting.figures.canvas import BLUE, MEASURED
 
         for axis, name in zip(axes, names, strict=True):
-            axis.plot(*thin_series(time[near], prediction.measured[name][near]), color=MEASURED, linewidth=2.2,
-                      label="measured")  # fmt: skip
+            axis.plot(
+                *thin_series(time[near], prediction.measured[name][near]),
+                color=MEASURED,
+                linewidth=2.2,
+                label="measured",
+            )
             axis.plot(*thin_series(time[near], prediction.model[name][near]), color=BLUE, linewidth=1.0, label="model")
             axis.set_ylabel(label_channel(name, prediction.units[name]))
             axis.margins(x=0.0)
@@ -57,11 +61,14 @@ def outputs_panel(prediction: ModelledOutputs, span_s: tuple[float, float] | Non
     where = "the second with the largest motion" if span_s is None else f"{low:g} to {high:g} s"
     percents = ", ".join(f"{name} {percent:.2f} %" for name, percent in prediction.fit_percent.items())
     return Panel(
-        name=f"outputs_{prediction.name}", title=f"{prediction.name}: measured and model", draw=draw,
-        heights=_stack(len(names)), link=f"time {prediction.name}",
+        name=f"outputs_{prediction.name}",
+        title=f"{prediction.name}: measured and model",
+        draw=draw,
+        heights=_stack(len(names)),
+        link=f"time {prediction.name}",
         caption=f"Measured and model outputs over {where}; fit over the whole log: {percents}. "
         + describe_thinning(int(np.count_nonzero(near))),
-    )  # fmt: skip
+    )
 
 
 def find_busiest(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"]) -> tuple[float, float]:
@@ -93,10 +100,13 @@ def residuals_panel(prediction: ModelledOutputs) -> Panel:
         f"{name} {rms:.3g}{unit_after(prediction.units[name])}" for name, rms in prediction.rms_residual.items()
     )
     return Panel(
-        name=f"residuals_{prediction.name}", title=f"{prediction.name}: residual", draw=draw,
-        heights=_stack(len(names)), link=f"whole {prediction.name}",
+        name=f"residuals_{prediction.name}",
+        title=f"{prediction.name}: residual",
+        draw=draw,
+        heights=_stack(len(names)),
+        link=f"whole {prediction.name}",
         caption=f"Measured minus model over the whole log; root mean square: {size}. {describe_thinning(time.size)}",
-    )  # fmt: skip
+    )
 
 
 def spectrum_panel(prediction: ModelledOutputs) -> Panel:
@@ -109,8 +119,9 @@ def spectrum_panel(prediction: ModelledOutputs) -> Panel:
         for axis, name in zip(axes, names, strict=True):
             measured, model = prediction.measured[name], prediction.model[name]
             for values, colour, label in (
-                (measured, MEASURED, "measured"), (measured - model, BLUE, "measured - model")
-            ):  # fmt: skip
+                (measured, MEASURED, "measured"),
+                (measured - model, BLUE, "measured - model"),
+            ):
                 f, density = amplitude_density(values, period)
                 axis.plot(f, density, color=colour, linewidth=1.1, label=label)
             axis.set_ylabel(label_channel(name, f"{unit_after(prediction.units[name]).strip() or '1'}/√Hz"))
@@ -120,11 +131,14 @@ def spectrum_panel(prediction: ModelledOutputs) -> Panel:
         axes[-1].set_xlabel("frequency [Hz]")
 
     return Panel(
-        name=f"spectrum_{prediction.name}", title=f"{prediction.name}: spectra", draw=draw,
-        heights=_stack(len(names)), link="frequency",
+        name=f"spectrum_{prediction.name}",
+        title=f"{prediction.name}: spectra",
+        draw=draw,
+        heights=_stack(len(names)),
+        link="frequency",
         caption="Amplitude spectral density of what was measured and of what the model leaves (Welch, Hann window). "
         "What is left should be flat, as the sensor's noise is.",
-    )  # fmt: skip
+    )
 
 
 def amplitude_density(
@@ -178,11 +192,14 @@ def autocorrelation_panel(diagnostics: Diagnostics, experiment: str) -> Panel:
         axes[-1].set_xlabel("lag [samples]")
 
     return Panel(
-        name=f"autocorrelation_{experiment}", title=f"{experiment}: the residual's own correlation", draw=draw,
-        heights=_stack(len(outputs)), link=f"lag {experiment}",
+        name=f"autocorrelation_{experiment}",
+        title=f"{experiment}: the residual's own correlation",
+        draw=draw,
+        heights=_stack(len(outputs)),
+        link=f"lag {experiment}",
         caption="Correlation of the weighted residual with itself. Shaded: what one lag of a hundred exceeds by "
         "chance, were the residual white.",
-    )  # fmt: skip
+    )
 
 
 def input_correlation_panel(diagnostics: Diagnostics, experiment: str) -> Panel:
@@ -201,11 +218,14 @@ def input_correlation_panel(diagnostics: Diagnostics, experiment: str) -> Panel:
         axes[-1].set_xlabel("lag [samples]")
 
     return Panel(
-        name=f"inputs_{experiment}", title=f"{experiment}: the residual against inputs", draw=draw,
-        heights=_stack(len(outputs)), link=f"lag {experiment}",
+        name=f"inputs_{experiment}",
+        title=f"{experiment}: the residual against inputs",
+        draw=draw,
+        heights=_stack(len(outputs)),
+        link=f"lag {experiment}",
         caption="Correlation of the weighted residual with the inputs. Shaded: what one lag of a hundred exceeds by "
         "chance. A residual that follows an input is something that the model lacks.",
-    )  # fmt: skip
+    )
 
 
 def parameters_panel(fit: Fit) -> Panel:
@@ -220,13 +240,29 @@ def parameters_panel(fit: Fit) -> Panel:
         (axis,) = axes
         places = np.arange(len(free))[::-1]
         axis.hlines(places, [1e-300], [_percent(one.std, one.value) for one in free], color=BLUE, linewidth=1.0)
-        axis.plot([_percent(one.std, one.value) for one in free], places, "o", color=BLUE, markersize=6,
-                  label="95 % interval, fitted")  # fmt: skip
-        before = [(place, _percent(one.prior_std, one.value)) for place, one in zip(places, free, strict=True)
-                  if one.prior_std is not None]  # fmt: skip
+        axis.plot(
+            [_percent(one.std, one.value) for one in free],
+            places,
+            "o",
+            color=BLUE,
+            markersize=6,
+            label="95 % interval, fitted",
+        )
+        before = [
+            (place, _percent(one.prior_std, one.value))
+            for place, one in zip(places, free, strict=True)
+            if one.prior_std is not None
+        ]
         if before:
-            axis.plot([width for _, width in before], [place for place, _ in before], "D", color=MEASURED,
-                      fillstyle="none", markersize=7, label="95 % interval, known before")  # fmt: skip
+            axis.plot(
+                [width for _, width in before],
+                [place for place, _ in before],
+                "D",
+                color=MEASURED,
+                fillstyle="none",
+                markersize=7,
+                label="95 % interval, known before",
+            )
         axis.set_yticks(places, [one.name for one in free])
         axis.set_ylim(-0.6, len(free) - 0.4)
         widths = [_percent(one.std, one.value) for one in free] + [width for _, width in before]
@@ -236,11 +272,14 @@ def parameters_panel(fit: Fit) -> Panel:
         axis.set_xlabel("half of the 95 % interval [% of the value]")
 
     return Panel(
-        name="parameters", hover="", title="How well the parameters are known", draw=draw,
+        name="parameters",
+        hover="",
+        title="How well the parameters are known",
+        draw=draw,
         heights=(max(0.35 + 0.14 * len(free), 0.6),),
         caption="Half of each fitted parameter's 95 % interval, in percent of its value, on a logarithmic axis: the "
         "further left, the better known.",
-    )  # fmt: skip
+    )
 
 
 def _percent(std: float | None, value: float) -> float:
@@ -267,15 +306,25 @@ def correlation_panel(fit: Fit) -> Panel:
         for row in range(n):
             for column in range(n):
                 value = matrix[row, column]
-                axis.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=8,
-                          color="white" if abs(value) > 0.7 else "black")  # fmt: skip
+                axis.text(
+                    column,
+                    row,
+                    f"{value:.2f}",
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="white" if abs(value) > 0.7 else "black",
+                )
 
     return Panel(
-        name="correlation", hover="", title="Correlation of the parameters' errors", draw=draw,
+        name="correlation",
+        hover="",
+        title="Correlation of the parameters' errors",
+        draw=draw,
         heights=(float(np.clip(0.35 + 0.16 * len(names), 0.7, 2.4)),),
         caption="Correlation coefficients of the fitted parameters' errors. Near ±1 the logs tell a combination of the "
         "two, not each by itself.",
-    )  # fmt: skip
+    )
 
 
 def _stack(count: int) -> tuple[float, ...]:
@@ -316,5 +365,7 @@ def choose_experiments(fit: Fit, experiment: str | None) -> tuple[Experiment, ..
 
 PredictionPanel = Callable[[ModelledOutputs], Panel]
 PREDICTION_PANELS: Mapping[str, PredictionPanel] = {
-    "outputs": outputs_panel, "residuals": residuals_panel, "spectrum": spectrum_panel
-}  # fmt: skip
+    "outputs": outputs_panel,
+    "residuals": residuals_panel,
+    "spectrum": spectrum_panel,
+}

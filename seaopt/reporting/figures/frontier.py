@@ -34,19 +34,27 @@ def frontier_panel(frontier: Frontier, figure: str) -> Panel:
         from seaopt.reporting.figures.canvas import BLUE, MEASURED, VERMILION
 
         (axis,) = axes
-        known = [(row.bandwidth_hz, y, row.feasible) for y, row in zip(values, frontier.rows, strict=True)
-                 if y is not None]  # fmt: skip
+        known = [
+            (row.bandwidth_hz, y, row.feasible) for y, row in zip(values, frontier.rows, strict=True) if y is not None
+        ]
         axis.plot([x for x, _, _ in known], [y for _, y, _ in known], color=MEASURED, linewidth=0.8, zorder=1)
         for met, colour, label_ in ((True, BLUE, "every limit met"), (False, VERMILION, "a limit missed")):
             points = [(x, y) for x, y, good in known if good == met]
             if points:
                 look: dict[str, Any] = {
-                    "color": colour, "markerfacecolor": colour if met else "white", "label": label_, "markersize": 5
-                }  # fmt: skip
+                    "color": colour,
+                    "markerfacecolor": colour if met else "white",
+                    "label": label_,
+                    "markersize": 5,
+                }
                 axis.plot(*zip(*points, strict=True), "o", **look)
-        bounds = [(row.bandwidth_hz, row.free_law.bound) for row in frontier.rows
-                  if row.free_law is not None and row.free_law.bound is not None
-                  and OBJECTIVES[row.free_law.objective] == figure]  # fmt: skip
+        bounds = [
+            (row.bandwidth_hz, row.free_law.bound)
+            for row in frontier.rows
+            if row.free_law is not None
+            and row.free_law.bound is not None
+            and OBJECTIVES[row.free_law.objective] == figure
+        ]
         if bounds:
             axis.plot(*zip(*bounds, strict=True), "_", color=MEASURED, markersize=9, label="any linear law, at best")
         if not known:

@@ -47,9 +47,14 @@ def region_panel(region: ImpedanceRegion, asked: Impedance | None = None) -> Pan
         for impedance, marker, label in ((region.stiffest, "^", "stiffest"), (asked, "D", "asked")):
             if impedance is not None:
                 axis.plot(
-                    [impedance.damping], [impedance.stiffness], marker, color=LIMIT, markersize=6, linestyle="",
+                    [impedance.damping],
+                    [impedance.stiffness],
+                    marker,
+                    color=LIMIT,
+                    markersize=6,
+                    linestyle="",
                     label=label,
-                )  # fmt: skip
+                )
         axis.set_xlim(region.damping[0], region.damping[-1])
         axis.set_ylim(region.stiffness[0], region.stiffness[-1])
         axis.set_xlabel(f"damping D_v [{called.damping}]")
@@ -57,7 +62,11 @@ def region_panel(region: ImpedanceRegion, asked: Impedance | None = None) -> Pan
 
     said = "; ".join(region.describe())
     return Panel(
-        name="impedance_region", title="What may be rendered at the link", draw=draw, heights=(1.3,), hover="",
+        name="impedance_region",
+        title="What may be rendered at the link",
+        draw=draw,
+        heights=(1.3,),
+        hover="",
         caption="Inside, no passive linear environment makes the sampled loop unstable; everywhere else one does: "
         f"{said}.",
-    )  # fmt: skip
+    )

@@ -13,10 +13,11 @@ from seaopt.logs import Log, Quality, Table
 from seaopt.logs.quality.channel import ChannelQuality
 from seaopt.logs.quality.clock import ClockQuality
 from seaopt.logs.quality.faults import RowRanges
-from seaopt.logs.quality.report import describe_jitter
 from seaopt.reporting.figures.fit import label_channel
 from seaopt.reporting.figures.panel import Panel
 from seaopt.reporting.figures.thinning import STRETCHES, break_at, describe_thinning, thin_series
+from seaopt.reporting.sections.kinds.quality import describe_jitter
+from seaopt.welch import MEAN_SQUARE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,9 +56,12 @@ def clock_panel(data: Log | Table, quality: Quality) -> Panel:
         axis.margins(x=0.0)
 
     return Panel(
-        name="clock", title=f"Clock: {describe_jitter(clock)}", draw=draw, link="log time",
+        name="clock",
+        title=f"Clock: {describe_jitter(clock)}",
+        draw=draw,
+        link="log time",
         caption=f"Steps of time between samples. {describe_thinning(time.size)}",
-    )  # fmt: skip
+    )
 
 
 def excitation_panel(quality: Quality) -> Panel:
@@ -85,9 +89,12 @@ def excitation_panel(quality: Quality) -> Panel:
         scale_log(axes)
 
     return Panel(
-        name="excitation", title="What the inputs excite", draw=draw, link="log frequency",
+        name="excitation",
+        title="What the inputs excite",
+        draw=draw,
+        link="log frequency",
         caption="Coherence of the best output with the input, band by band; shaded: where a model can be identified.",
-    )  # fmt: skip
+    )
 
 
 def channel_panel(data: Log | Table, quality: Quality, name: str) -> Panel:
@@ -116,9 +123,12 @@ def channel_panel(data: Log | Table, quality: Quality, name: str) -> Panel:
         axis.margins(x=0.0)
 
     return Panel(
-        name=f"channel_{name}", title=f"{name} over time", draw=draw, link="log time",
+        name=f"channel_{name}",
+        title=f"{name} over time",
+        draw=draw,
+        link="log time",
         caption=f"The channel {name} as logged, with what is wrong with it marked. {describe_thinning(time.size)}",
-    )  # fmt: skip
+    )
 
 
 def density_panel(quality: Quality, name: str) -> Panel:
@@ -160,7 +170,7 @@ def _density(quality: Quality, name: str) -> Float[np.ndarray, " m"]:
     assert spectra is not None
     n = 2 * (spectra.frequency_hz.size - 1)
     with np.errstate(over="ignore", invalid="ignore"):  # numbers near the largest float have no power
-        return np.sqrt(2.0 * spectra.power(name)[1:] * spectra.period / (0.375 * n))  # Hann's mean square is 3/8
+        return np.sqrt(2.0 * spectra.power(name)[1:] * spectra.period / (MEAN_SQUARE * n))
 
 
 def _label(channel: ChannelQuality) -> str:
@@ -168,9 +178,13 @@ def _label(channel: ChannelQuality) -> str:
 
 
 def _draw_series(
-    axis: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Int[np.ndarray, " k"],
-    colour: str, label: str,
-) -> None:  # fmt: skip
+    axis: Axes,
+    time: Float[np.ndarray, " n"],
+    values: Float[np.ndarray, " n"],
+    gaps: Int[np.ndarray, " k"],
+    colour: str,
+    label: str,
+) -> None:
     """Draw a channel over time, with nothing across a gap."""
     gaps = gaps[(gaps > 0) & (gaps < time.size)] if gaps.size <= MOST_MARKS else gaps[:0]
     ends = [0, *gaps.tolist(), time.size]

@@ -57,9 +57,7 @@ def _looks(loops: Mapping[str, Loop]) -> Iterator[tuple[str, Loop, dict[str, Any
 
     for number, (name, loop) in enumerate(loops.items()):
         style = STYLES[(number // len(COLOURS)) % len(STYLES)]
-        yield name, loop, {
-            "color": COLOURS[number % len(COLOURS)], "linestyle": style, "linewidth": 1.4, "label": name
-        }  # fmt: skip
+        yield name, loop, {"color": COLOURS[number % len(COLOURS)], "linestyle": style, "linewidth": 1.4, "label": name}
 
 
 def _frequencies(loop: Loop) -> Float[np.ndarray, " m"]:
@@ -107,10 +105,13 @@ def step_panel(
 
     unit = unit_after(command.reference_unit)
     return Panel(
-        name="step", title=f"Step of {size:g}{unit}", draw=draw, heights=(1.0, 0.7),
+        name="step",
+        title=f"Step of {size:g}{unit}",
+        draw=draw,
+        heights=(1.0, 0.7),
         caption=f"{measured} and the {command.word} after a step of the reference by {size:g}{unit}: the linear loop, "
         "sampled, without limit and noise.",
-    )  # fmt: skip
+    )
 
 
 def _is_stable(loop: Loop) -> bool:
@@ -143,10 +144,14 @@ def bode_panel(controller: Controller, plants: Plants | None = None) -> Panel:
         scale_log(axes)
 
     return Panel(
-        name="bode", title="Open loop", draw=draw, heights=(1.0, 0.7), link="frequency",
+        name="bode",
+        title="Open loop",
+        draw=draw,
+        heights=(1.0, 0.7),
+        link="frequency",
         caption="Open loop L = C_y P with hold and delay: where its size crosses 0 dB the phase's distance from -180 "
         "degrees is the phase margin.",
-    )  # fmt: skip
+    )
 
 
 def nyquist_panel(controller: Controller, plants: Plants | None = None) -> Panel:
@@ -185,9 +190,16 @@ def nyquist_panel(controller: Controller, plants: Plants | None = None) -> Panel
 
 
 def _magnitude_panel(
-    controller: Controller, plants: Plants | None, values: Callable[[Loop, Any], Any], name: str, title: str,
-    ylabel: str, caption: str, lines: Callable[[Axes], None], decibels: bool = True,
-) -> Panel:  # fmt: skip
+    controller: Controller,
+    plants: Plants | None,
+    values: Callable[[Loop, Any], Any],
+    name: str,
+    title: str,
+    ylabel: str,
+    caption: str,
+    lines: Callable[[Axes], None],
+    decibels: bool = True,
+) -> Panel:
     """Draw the size of a closed-loop function, and its limits as `lines`."""
     loops = loops_of(controller, plants)
 
@@ -232,13 +244,25 @@ def sensitivity_panel(controller: Controller, plants: Plants | None = None) -> P
         if ms is not None:
             _draw_level(axis, float(_decibel(ms)), f"Ms = {ms:g}")
         if slow:
-            axis.plot([LOWEST_HZ, slow], [-3.0103, -3.0103], color=LIMIT, linestyle=":", linewidth=1.2,
-                      label=f"-3 dB up to {slow:g} Hz")  # fmt: skip
+            axis.plot(
+                [LOWEST_HZ, slow],
+                [-3.0103, -3.0103],
+                color=LIMIT,
+                linestyle=":",
+                linewidth=1.2,
+                label=f"-3 dB up to {slow:g} Hz",
+            )
 
     return _magnitude_panel(
-        controller, plants, lambda loop, f: loop.sensitivity(f), "sensitivity", "Sensitivity", "|S| [dB]",
-        "Sensitivity |S| = |1/(1 + L)|: what feedback leaves of a disturbance. Its peak is Ms.", lines,
-    )  # fmt: skip
+        controller,
+        plants,
+        lambda loop, f: loop.sensitivity(f),
+        "sensitivity",
+        "Sensitivity",
+        "|S| [dB]",
+        "Sensitivity |S| = |1/(1 + L)|: what feedback leaves of a disturbance. Its peak is Ms.",
+        lines,
+    )
 
 
 def complementary_panel(controller: Controller, plants: Plants | None = None) -> Panel:
@@ -250,10 +274,15 @@ def complementary_panel(controller: Controller, plants: Plants | None = None) ->
             _draw_level(axis, float(_decibel(mt)), f"Mt = {mt:g}")
 
     return _magnitude_panel(
-        controller, plants, lambda loop, f: 1.0 - loop.sensitivity(f), "complementary", "Complementary sensitivity",
-        "|T| [dB]", "Complementary sensitivity |T| = |L/(1 + L)|: what errors of the model at high frequency act on.",
+        controller,
+        plants,
+        lambda loop, f: 1.0 - loop.sensitivity(f),
+        "complementary",
+        "Complementary sensitivity",
+        "|T| [dB]",
+        "Complementary sensitivity |T| = |L/(1 + L)|: what errors of the model at high frequency act on.",
         lines,
-    )  # fmt: skip
+    )
 
 
 def tracking_panel(controller: Controller, plants: Plants | None = None) -> Panel:
@@ -267,10 +296,15 @@ def tracking_panel(controller: Controller, plants: Plants | None = None) -> Pane
         axis.axvline(spec.bandwidth_hz, color=LIMIT, linestyle="--", linewidth=0.9, label="bandwidth asked")
 
     return _magnitude_panel(
-        controller, plants, lambda loop, f: loop.tracking(f), "tracking", "Tracking",
+        controller,
+        plants,
+        lambda loop, f: loop.tracking(f),
+        "tracking",
+        "Tracking",
         f"|{spec.regulated}/reference| [dB]",
-        f"{spec.regulated} over its reference; the bandwidth is where it has fallen by 3 dB.", lines,
-    )  # fmt: skip
+        f"{spec.regulated} over its reference; the bandwidth is where it has fallen by 3 dB.",
+        lines,
+    )
 
 
 def noise_panel(controller: Controller, plants: Plants | None = None) -> Panel:
@@ -282,10 +316,16 @@ def noise_panel(controller: Controller, plants: Plants | None = None) -> Panel:
             _draw_level(axis, limit, f"noise gain {limit:g}")
 
     return _magnitude_panel(
-        controller, plants, lambda loop, f: loop.noise(f), "noise", "Noise gain", f"|C_y S| [{unit}]",
+        controller,
+        plants,
+        lambda loop, f: loop.noise(f),
+        "noise",
+        "Noise gain",
+        f"|C_y S| [{unit}]",
         f"Motor {controller.command.mechanics.word} that noise on {controller.signals[0]} makes, per unit of noise.",
-        lines, decibels=False,
-    )  # fmt: skip
+        lines,
+        decibels=False,
+    )
 
 
 LoopPanel = Callable[[Controller, Plants | None], Panel]

@@ -34,8 +34,9 @@ def octave_panel(ranking: Ranking, experiment: str, output: str) -> Panel:
         edges = np.array([*lows, bands[-1].high_hz])
         for row, colour in zip(ranking.rows, COLOURS * 9, strict=False):
             rms = np.sqrt([max(band.power[row.name], 1e-300) for band in bands])
-            axis.plot(edges, np.append(rms, rms[-1]), drawstyle="steps-post", color=colour, linewidth=1.8,
-                      label=row.name)  # fmt: skip
+            axis.plot(
+                edges, np.append(rms, rms[-1]), drawstyle="steps-post", color=colour, linewidth=1.8, label=row.name
+            )
         scale_log(axes)
         scale_log(axes, "y")
         axis.margins(x=0.0)
@@ -43,9 +44,12 @@ def octave_panel(ranking: Ranking, experiment: str, output: str) -> Panel:
         axis.set_xlabel("frequency [Hz]")
 
     return Panel(
-        name=f"octaves_{experiment}_{output}", title=f"{experiment}: residual of {output}", draw=draw, link="frequency",
+        name=f"octaves_{experiment}_{output}",
+        title=f"{experiment}: residual of {output}",
+        draw=draw,
+        link="frequency",
         caption="Residuals of the fits that are compared, octave by octave: where one falls short.",
-    )  # fmt: skip
+    )
 
 
 def evidence_panel(ranking: Ranking) -> Panel:
@@ -66,7 +70,11 @@ def evidence_panel(ranking: Ranking) -> Panel:
         axis.set_xlabel("effective BIC above the best [-]")
 
     return Panel(
-        name="evidence", title="Evidence against each fit", draw=draw, heights=(0.5 + 0.12 * len(ranking.rows),),
-        left=NAMES_LEFT, hover="",
+        name="evidence",
+        title="Evidence against each fit",
+        draw=draw,
+        heights=(0.5 + 0.12 * len(ranking.rows),),
+        left=NAMES_LEFT,
+        hover="",
         caption="How far the effective BIC of each fit lies above the best one's, on an axis that is linear up to 10.",
-    )  # fmt: skip
+    )

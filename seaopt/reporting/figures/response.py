@@ -88,8 +88,12 @@ def _model_curves(magnitude: Axes, phase: Axes, curves: Sequence[Curve], f: Any)
         else:
             angle = angle - 360.0 * np.round(np.median(angle - branch) / 360.0)
         look: dict[str, Any] = {
-            "color": curve.colour, "linestyle": curve.style, "linewidth": 1.4, "zorder": 3, "label": curve.label
-        }  # fmt: skip
+            "color": curve.colour,
+            "linestyle": curve.style,
+            "linewidth": 1.4,
+            "zorder": 3,
+            "label": curve.label,
+        }
         magnitude.plot(f, 20 * np.log10(np.maximum(np.abs(response), 1e-12)), **look)
         phase.plot(f, angle, **look)
     return branch

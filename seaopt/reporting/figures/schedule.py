@@ -38,9 +38,12 @@ def gains_panel(schedule: ScheduledController) -> Panel:
         axis.set_ylabel("gain, of its largest [-]")
 
     return Panel(
-        name="schedule_gains", title="Gains over the variable", draw=draw, link=schedule.over,
+        name="schedule_gains",
+        title="Gains over the variable",
+        draw=draw,
+        link=schedule.over,
         caption="Tuned at the points, interpolated on the lines between them.",
-    )  # fmt: skip
+    )
 
 
 def bandwidth_panel(schedule: ScheduledController) -> Panel:
@@ -57,9 +60,13 @@ def bandwidth_panel(schedule: ScheduledController) -> Panel:
         axis.plot([x for x, _ in known], [y for _, y in known], "o-", color=BLUE, markersize=3, label="schedule")
         others = [(value, measure_alone(schedule, value)) for value in schedule.points]
         axis.plot(
-            [x for x, y in others if y], [y for _, y in others if y], "s--", color=VERMILION, markersize=3,
+            [x for x, y in others if y],
+            [y for _, y in others if y],
+            "s--",
+            color=VERMILION,
+            markersize=3,
             label=f"the law of {schedule.over} = {schedule.fallback:g} everywhere",
-        )  # fmt: skip
+        )
         asked = [schedule.asked_hz(x) for x in schedule.points]
         axis.plot(schedule.points, asked, ":", color=MEASURED, label="asked")
         axis.set_ylim(0.0, 1.15 * max([*asked, *(y for _, y in known), *(y or 0.0 for _, y in others)]))
@@ -67,9 +74,12 @@ def bandwidth_panel(schedule: ScheduledController) -> Panel:
         axis.set_ylabel("bandwidth [Hz]")
 
     return Panel(
-        name="schedule_bandwidth", title="Bandwidth on the design plant", draw=draw, link=schedule.over,
+        name="schedule_bandwidth",
+        title="Bandwidth on the design plant",
+        draw=draw,
+        link=schedule.over,
         caption="With the variable standing still.",
-    )  # fmt: skip
+    )
 
 
 def measure_alone(schedule: ScheduledController, value: float) -> float | None:
@@ -106,9 +116,12 @@ def sensitivity_panel(schedule: ScheduledController, certificate: ScheduleCertif
         axis.set_ylabel("Ms [-]")
 
     return Panel(
-        name="schedule_ms", title="Largest Ms of all plants", draw=draw, link=schedule.over,
+        name="schedule_ms",
+        title="Largest Ms of all plants",
+        draw=draw,
+        link=schedule.over,
         caption="With the variable standing still, at the points and between them.",
-    )  # fmt: skip
+    )
 
 
 def _label(schedule: ScheduledController) -> str:

@@ -48,8 +48,13 @@ def simulation_panel(verification: Verification, row: Outcome) -> Panel:
         upper, lower = axes
         upper.plot(*thin_series(time, trace.reference[0][visible]), color=MEASURED, linewidth=1.8, label="reference")
         upper.plot(*thin_series(time, trace.outputs[name][0][visible]), color=BLUE, linewidth=1.0, label=name)
-        lower.plot(*thin_series(time, trace.current[0][visible]), drawstyle="steps-post", color=VERMILION,
-                   linewidth=0.9, label=controller.command.word)  # fmt: skip
+        lower.plot(
+            *thin_series(time, trace.current[0][visible]),
+            drawstyle="steps-post",
+            color=VERMILION,
+            linewidth=0.9,
+            label=controller.command.word,
+        )
         if limit is not None and row.saturated > 0.0:
             for side in (-limit, limit):
                 lower.axhline(side, color=LIMIT, linestyle=":", linewidth=0.9, label="limit")
@@ -64,10 +69,11 @@ def simulation_panel(verification: Verification, row: Outcome) -> Panel:
     return Panel(
         name=f"simulation_{row.plant}_{row.scenario}",
         title=f"{row.plant}, {row.scenario}{drawn}{cut if row.passed else ': FAILED'}",
-        draw=draw, heights=(0.8, 0.5),
+        draw=draw,
+        heights=(0.8, 0.5),
         caption=f"{name} and {controller.command.word} of {row.scenario} on {row.plant}"
         + ("." if row.passed else f": {row.reason}. Yellow: the window that is judged."),
-    )  # fmt: skip
+    )
 
 
 def _visible_until(trace: Playback) -> float:
@@ -106,8 +112,15 @@ def bandwidth_panel(sweeps: Sequence[LargeSignal]) -> Panel:
             axis.plot(sweep.amplitude_N, line, color=colour, linewidth=1.3, label=f"{sweep.plant}, predicted")
             axis.plot(sweep.amplitude_N, points, "o", color=colour, markersize=4, label=f"{sweep.plant}, simulated")
             saturated = np.any(sweep.saturated, axis=1)
-            axis.plot(sweep.amplitude_N[saturated], points[saturated], "s", color=colour, markersize=8,
-                      fillstyle="none", label="the command saturates")  # fmt: skip
+            axis.plot(
+                sweep.amplitude_N[saturated],
+                points[saturated],
+                "s",
+                color=colour,
+                markersize=8,
+                fillstyle="none",
+                label="the command saturates",
+            )
             if sweep.friction_N:
                 axis.axvline(sweep.friction_N, color=colour, linestyle=":", linewidth=1.0, label="dry friction")
         scale_log(axes)
@@ -116,10 +129,13 @@ def bandwidth_panel(sweeps: Sequence[LargeSignal]) -> Panel:
         axis.set_ylabel("bandwidth [Hz]")
 
     return Panel(
-        name="bandwidth", title="Bandwidth against amplitude", draw=draw, heights=(1.2,),
+        name="bandwidth",
+        title="Bandwidth against amplitude",
+        draw=draw,
+        heights=(1.2,),
         caption="Bandwidth against the amplitude of a sine, simulated and predicted by describing functions: below its "
         "dry friction a plant sticks, at large amplitudes the command saturates.",
-    )  # fmt: skip
+    )
 
 
 def _units(sweeps: Sequence[LargeSignal]) -> str:
@@ -145,9 +161,12 @@ def amplitude_panel(sweep: LargeSignal) -> Panel:
         axis.set_ylabel("|F/F_ref| [dB]")
 
     return Panel(
-        name=f"amplitude_{sweep.plant}", title=f"{sweep.plant}: gain at amplitudes", draw=draw, link="frequency",
+        name=f"amplitude_{sweep.plant}",
+        title=f"{sweep.plant}: gain at amplitudes",
+        draw=draw,
+        link="frequency",
         caption="First harmonic of what is measured over the reference's amplitude; dots: the command saturates.",
-    )  # fmt: skip
+    )
 
 
 def saturation_panel(sweep: LargeSignal) -> Panel:
@@ -166,10 +185,12 @@ def saturation_panel(sweep: LargeSignal) -> Panel:
         axis.set_ylabel(f"amplitude [{sweep.unit}]")
 
     return Panel(
-        name=f"saturation_{sweep.plant}", title=f"{sweep.plant}: where the command saturates", draw=draw,
+        name=f"saturation_{sweep.plant}",
+        title=f"{sweep.plant}: where the command saturates",
+        draw=draw,
         link="frequency",
         caption="The amplitude of a sinusoidal reference at which the linear loop's command reaches its limit.",
-    )  # fmt: skip
+    )
 
 
 def environment_panels(stability: StabilityMap) -> list[Panel]:
@@ -188,10 +209,14 @@ def _environment_panel(stability: StabilityMap, number: int) -> Panel:
 
         (axis,) = axes
         axis.pcolormesh(
-            stability.mass, stability.stiffness, (~stable).T.astype(float),
-            cmap=ListedColormap([STABLE_COLOUR, UNSTABLE_COLOUR]), norm=BoundaryNorm([0, 0.5, 1], 2), shading="nearest",
+            stability.mass,
+            stability.stiffness,
+            (~stable).T.astype(float),
+            cmap=ListedColormap([STABLE_COLOUR, UNSTABLE_COLOUR]),
+            norm=BoundaryNorm([0, 0.5, 1], 2),
+            shading="nearest",
             rasterized=True,
-        )  # fmt: skip
+        )
         if len(edge):
             axis.plot(edge[:, 0], edge[:, 1], ".", color=VERMILION, markersize=3, label="edge of stability")
         axis.set_xscale("log")
@@ -204,9 +229,10 @@ def _environment_panel(stability: StabilityMap, number: int) -> Panel:
 
     share = 100.0 * float(np.mean(stable))
     return Panel(
-        name=f"environment_{number + 1}", hover="",
+        name=f"environment_{number + 1}",
+        hover="",
         title=f"Damper of {damping:g} {called.damping}: stable in {share:.3g} %",
         draw=draw,
         caption=f"Blue: the loop is stable with such a {called.inertia_word} on link 2, tied to the ground by a spring "
         f"and a damper of {damping:g} {called.damping}; orange: it is not.",
-    )  # fmt: skip
+    )

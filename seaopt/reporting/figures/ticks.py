@@ -90,9 +90,12 @@ def find_ticks(axes: Axes, name: str) -> Side:
         return Side(axes=axes, name=name, major=np.empty(0), labels=(), minor=np.empty(0))
     labels, seen = axis.get_major_formatter().format_ticks(major), _in_view(axis, major)
     return Side(
-        axes=axes, name=name, major=major[seen], minor=minor[_in_view(axis, minor)],
+        axes=axes,
+        name=name,
+        major=major[seen],
+        minor=minor[_in_view(axis, minor)],
         labels=tuple(label for label, shown in zip(labels, seen, strict=True) if shown),
-    )  # fmt: skip
+    )
 
 
 def _in_view(axis: Any, values: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:

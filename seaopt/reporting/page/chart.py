@@ -114,10 +114,15 @@ def _make_chart(panel: Panel) -> Chart:
     svg = _fit_to_page(render_figure(figure, "svg").decode("utf-8"), name, f"{panel.title}. {panel.caption}")
     entries = tuple(_make_entry(label, artists, name) for label, artists in key.items())
     return Chart(
-        name=name, title=printable(panel.title), caption=printable(panel.caption), link=panel.link, svg=svg,
-        axes=json.dumps(panes, separators=(",", ":")) if panel.hover else "", hover=panel.hover,
+        name=name,
+        title=printable(panel.title),
+        caption=printable(panel.caption),
+        link=panel.link,
+        svg=svg,
+        axes=json.dumps(panes, separators=(",", ":")) if panel.hover else "",
+        hover=panel.hover,
         key=entries if len(entries) > 1 else (),
-    )  # fmt: skip
+    )
 
 
 def _artists(axis: Axes) -> list[Any]:
@@ -165,9 +170,12 @@ def _make_entry(label: str, artists: list[tuple[str, Any]], name: str) -> KeyEnt
     colour = np.atleast_2d(colour)[0] if not isinstance(colour, str) else colour
     dash = {"--": "6 3", "-.": "7 3 2 3", ":": "2 3"}.get(style, "")
     return KeyEntry(
-        label=printable(label), ids=tuple(f"{name}-{gid}" for gid, _ in artists), colour=to_hex(colour), dash=dash,
+        label=printable(label),
+        ids=tuple(f"{name}-{gid}" for gid, _ in artists),
+        colour=to_hex(colour),
+        dash=dash,
         marker=style in ("None", "none", "") or not line,
-    )  # fmt: skip
+    )
 
 
 def _fit_to_page(svg: str, name: str, alternative: str) -> str:

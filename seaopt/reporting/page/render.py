@@ -31,13 +31,21 @@ def _make_environment() -> Environment:
     from markupsafe import Markup
 
     environment = Environment(
-        loader=PackageLoader("seaopt.reporting.page", "templates"), autoescape=True, trim_blocks=True,
-        lstrip_blocks=True, undefined=StrictUndefined, finalize=_show,
-    )  # fmt: skip
+        loader=PackageLoader("seaopt.reporting.page", "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+        finalize=_show,
+    )
     environment.filters |= {
-        "number": format_number, "band": _format_band, "interval": _format_interval, "percent": _format_percent,
-        "unit": _format_unit, "slug": make_slug,
-    }  # fmt: skip
+        "number": format_number,
+        "band": _format_band,
+        "interval": _format_interval,
+        "percent": _format_percent,
+        "unit": _format_unit,
+        "slug": make_slug,
+    }
     folder = files("seaopt.reporting.page").joinpath("templates")
     fixed: dict[str, Any] = {
         name: Markup(folder.joinpath(file).read_text(encoding="utf-8"))  # noqa: S704

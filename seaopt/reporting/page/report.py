@@ -9,12 +9,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from markupsafe import Markup
+
 from seaopt.control import Controller, ForceMPC, ScheduledController, Scorecard, scorecard
 from seaopt.control.deploy.export import export
 from seaopt.control.impedance.scorecard import HEADS
-from seaopt.control.laws.command import name_gain_units
-from seaopt.control.laws.limits import BY_REQUIREMENT
-from seaopt.control.laws.verdict import list_design_figures
 from seaopt.errors import FileError, SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.files import read_json, write_json, write_text
@@ -36,19 +35,27 @@ from seaopt.reporting.figures.schedule import schedule_panels
 from seaopt.reporting.page.chart import Chart, make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_template
-from seaopt.reporting.verdict import UNMET, judge_results
+from seaopt.reporting.sections import describe
+from seaopt.reporting.sections.html import render_section
+from seaopt.reporting.sections.verdict import UNMET, judge_results
 from seaopt.robustness import Certificate, ScheduleCertificate
-from seaopt.robustness.certificate.compensation import FRICTION_COMPENSATION
-from seaopt.robustness.certificate.failures import group_failures
 from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.judgement import Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.verification import Verification, describe_witness
 
 Result = (
-    Fit | Ranking | Controller | ForceMPC | Certificate | Verification | StabilityMap | ScheduledController
-    | ScheduleCertificate | LargeSignal
-)  # fmt: skip
+    Fit
+    | Ranking
+    | Controller
+    | ForceMPC
+    | Certificate
+    | Verification
+    | StabilityMap
+    | ScheduledController
+    | ScheduleCertificate
+    | LargeSignal
+)
 KINDS = (
     Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, ScheduledController,
     ScheduleCertificate,
@@ -208,17 +215,25 @@ def _sort_results(results: Sequence[Result]) -> Material:
             "write_report got no result; give a Fit, a Ranking, a Controller, a Certificate or a Verification"
         )
     if certificate is not None:
-        controller = controller or certificate.controller
-        simulation, verification = certificate.simulated, verification or certificate.runs
+        controller = certificate.controller if controller is None else controller
+        simulation, verification = certificate.simulated, certificate.runs if verification is None else verification
         if simulation is not None:
             coupled = coupled or simulation.environments
             large = large or simulation.large_signal
     return Material(
-        fit=fit, ranking=ranking, controller=controller, mpc=mpc, certificate=certificate, verification=verification,
-        coupled=coupled, large=large, surveys=fit_surveys(fit) if fit is not None else {},
+        fit=fit,
+        ranking=ranking,
+        controller=controller,
+        mpc=mpc,
+        certificate=certificate,
+        verification=verification,
+        coupled=coupled,
+        large=large,
+        surveys=fit_surveys(fit) if fit is not None else {},
         diagnostics=diagnose(fit) if fit is not None and fit.minimum is not None else None,
-        schedule=schedule if swept is None else swept.schedule, swept=swept,
-    )  # fmt: skip
+        schedule=schedule if swept is None else swept.schedule,
+        swept=swept,
+    )
 
 
 def _select(results: Sequence[Result], kind: type) -> Any:
@@ -233,10 +248,14 @@ def _select(results: Sequence[Result], kind: type) -> Any:
 def list_plates(material: Material) -> list[Plate]:
     """Return every figure that the results allow, in the order of the page."""
     return [
-        *_plates_of_controller(material), *_plates_of_schedule(material), *_plates_of_fit(material),
+        *_plates_of_controller(material),
+        *_plates_of_schedule(material),
+        *_plates_of_fit(material),
         *_plates_of_certificate(material),
-        *_plates_of_simulation(material), *_plates_of_parameters(material), *_plates_of_logs(material),
-    ]  # fmt: skip
+        *_plates_of_simulation(material),
+        *_plates_of_parameters(material),
+        *_plates_of_logs(material),
+    ]
 
 
 def _plates_of_controller(material: Material) -> list[Plate]:
@@ -266,16 +285,22 @@ def _plates_of_fit(material: Material) -> list[Plate]:
         if name in material.surveys:
             responses = response_panels(experiment, material.surveys[name], _models(material))
             text = sentence(material.surveys[name], fit, name)
-            plates.append(Plate(
-                name=f"response_{name}", part="fit", heading=f"{name} in frequency", panels=tuple(responses), text=text
-            ))  # fmt: skip
+            plates.append(
+                Plate(
+                    name=f"response_{name}",
+                    part="fit",
+                    heading=f"{name} in frequency",
+                    panels=tuple(responses),
+                    text=text,
+                )
+            )
     if material.diagnostics is not None:
         for name in material.diagnostics.outputs:
             panels = [fits.autocorrelation_panel(material.diagnostics, name)]
             panels.append(fits.input_correlation_panel(material.diagnostics, name))
-            plates.append(Plate(
-                name=f"residual_{name}", part="diagnostics", heading=f"What {name} leaves", panels=tuple(panels)
-            ))  # fmt: skip
+            plates.append(
+                Plate(name=f"residual_{name}", part="diagnostics", heading=f"What {name} leaves", panels=tuple(panels))
+            )
     if material.ranking is not None:
         panels = [evidence_panel(material.ranking), *octave_panels(material.ranking)]
         plates.append(Plate(name="ranking", part="ranking", heading="", panels=tuple(panels)))
@@ -308,14 +333,17 @@ def _plates_of_simulation(material: Material) -> list[Plate]:
     for name in dict.fromkeys(row.plant for row in played.rows) if played is not None else ():
         assert played is not None
         panels = simulations.simulation_panels(played, name)
-        plates.append(Plate(
-            name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=tuple(panels)
-        ))  # fmt: skip
+        plates.append(
+            Plate(name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=tuple(panels))
+        )
     if material.large:
         panels = [simulations.bandwidth_panel(material.large)]
         plates.append(Plate(name="bandwidth", part="amplitude", heading="", panels=tuple(panels)))
-        panels = [each for sweep in material.large
-                  for each in (simulations.amplitude_panel(sweep), simulations.saturation_panel(sweep))]  # fmt: skip
+        panels = [
+            each
+            for sweep in material.large
+            for each in (simulations.amplitude_panel(sweep), simulations.saturation_panel(sweep))
+        ]
         plates.append(Plate(name="amplitude", part="amplitude", heading="", panels=tuple(panels)))
     if material.coupled is not None:
         panels = simulations.environment_panels(material.coupled)
@@ -326,10 +354,15 @@ def _plates_of_simulation(material: Material) -> list[Plate]:
     rendered = None if material.certificate is None else material.certificate.impedance
     if rendered is not None:
         panels = [region_panel(rendered.region, rendered.rendering.impedance)]
-        plates.append(Plate(
-            name="impedance_region", part="contact", heading="Stiffness and damping at the link",
-            panels=tuple(panels), text=". ".join(rendered.lines()) + ".",
-        ))  # fmt: skip
+        plates.append(
+            Plate(
+                name="impedance_region",
+                part="contact",
+                heading="Stiffness and damping at the link",
+                panels=tuple(panels),
+                text=". ".join(rendered.lines()) + ".",
+            )
+        )
     return plates
 
 
@@ -353,41 +386,72 @@ def _plates_of_logs(material: Material) -> list[Plate]:
             replace(panel, name=f"log_{one.name}_{panel.name}", link=f"{one.name}, {panel.link}")
             for panel in logs.log_panels(one.log, one.log.quality)
         )
-        plates.append(Plate(name=f"log_{one.name}", part=f"log {one.name}", heading="", panels=panels))
+        plates.append(Plate(name=f"log_{one.name}", part="logs", heading=one.name, panels=panels))
     return plates
 
 
 def _render(
-    material: Material, drawn: Mapping[str, Sequence[DrawnPlate]], title: str, files: Sequence[Path | str],
-    command: str, expectations: Sequence[tuple[bool, str]],
-) -> str:  # fmt: skip
+    material: Material,
+    drawn: Mapping[str, Sequence[DrawnPlate]],
+    title: str,
+    files: Sequence[Path | str],
+    command: str,
+    expectations: Sequence[tuple[bool, str]],
+) -> str:
     """Return the page."""
     fit, controller, certificate = material.fit, material.controller, material.certificate
     experiments = fit.experiments if fit is not None else ()
     runs = material.verification
     apart = runs if certificate is None or runs is not certificate.runs else None  # else the certificate speaks of them
     judged = judge_results(
-        fit=fit, controller=controller or material.schedule, mpc=material.mpc,
-        certificate=certificate or material.swept, verification=apart, expectations=expectations,
-    )  # fmt: skip
+        fit=fit,
+        controller=material.schedule if controller is None else controller,
+        mpc=material.mpc,
+        certificate=material.swept if certificate is None else certificate,
+        verification=apart,
+        expectations=expectations,
+    )
     sound = fit is None or fit.met
     return render_template(
-        "page.html.jinja", title=title, verdicts=judged, glance=list_figures(material),
-        expectations=expectations, doubt="" if sound else UNMET,
-        plates=drawn, fit=fit, diagnostics=material.diagnostics, ranking=material.ranking, controller=controller,
-        mpc=material.mpc, certificate=certificate, verification=material.verification, large=material.large,
-        coupled=material.coupled, simulated=None if certificate is None else certificate.simulated,
-        limited=[] if controller is None else list_design_figures(controller.spec, controller.design_loop),
-        schedule=material.schedule, swept=material.swept,
-        units={} if controller is None else name_gain_units(controller.command),
-        card=_score(controller), card_heads=HEADS,
+        "page.html.jinja",
+        title=title,
+        verdicts=judged,
+        glance=list_figures(material),
+        expectations=expectations,
+        described=describe_parts(
+            controller,
+            material.schedule,
+            material.swept,
+            material.mpc,
+            fit,
+            certificate,
+            *(e.log.quality for e in experiments),
+        ),
+        doubt="" if sound else UNMET,
+        plates=drawn,
+        fit=fit,
+        diagnostics=material.diagnostics,
+        ranking=material.ranking,
+        controller=controller,
+        certificate=certificate,
+        verification=material.verification,
+        large=material.large,
+        coupled=material.coupled,
+        simulated=None if certificate is None else certificate.simulated,
+        card=_score(controller),
+        card_heads=HEADS,
         header=None if controller is None else write_header(controller, fit_met=sound),
-        forces=_describe_forces(controller), swinging=_swings(certificate),
-        requirements=[] if certificate is None else group_requirements(certificate),
         failures=[] if material.verification is None else list_failed_runs(material.verification),
-        logs=[(one, one.log.quality) for one in experiments],
         provenance=describe_provenance(experiments, files, command),
-    )  # fmt: skip
+    )
+
+
+def describe_parts(*results: object) -> dict[str, list[Markup]]:
+    """Return the sections of results, those that there are, by the part of the page where they stand."""
+    parts: dict[str, list[Markup]] = {}
+    for section in (each for result in results if result is not None for each in describe(result)):
+        parts.setdefault(section.part, []).append(Markup(render_section(section)))  # noqa: S704 - escaped there
+    return parts
 
 
 def _score(controller: Controller | None) -> Scorecard | None:
@@ -439,37 +503,6 @@ def list_figures(material: Material) -> list[tuple[str, str, str]]:
     return figures
 
 
-@record(eq=False)
-class RequirementRow:
-    """A requirement in words; of several that are missed in the same way, the worst and how many."""
-
-    label: str
-    value: float
-    limit: float
-    sense: str
-    unit: str
-    met: bool
-    where: str
-    count: int
-
-
-def group_requirements(certificate: Certificate) -> list[RequirementRow]:
-    """Return what is missed, each kind once with its count, and then what is met."""
-    units = {name: limit.unit for name, limit in BY_REQUIREMENT.items()}
-    command = certificate.controller.command
-    units |= {"max_noise_gain": command.gain_unit, FRICTION_COMPENSATION: command.mechanics.damping}
-    groups = [(one.worst, one.count) for one in group_failures(certificate.requirements)]
-    groups += [(row, 1) for row in certificate.requirements if row.met]
-    return [
-        RequirementRow(
-            label=certificates.label_requirement(row), value=row.value, limit=row.limit, sense=row.sense,
-            unit=units.get(row.name, ""), met=row.met, where=row.where,
-            count=count,
-        )
-        for row, count in groups
-    ]  # fmt: skip
-
-
 def list_failed_runs(verification: Verification) -> list[str]:
     """Return what failed in simulation: the same kind of fault on a plant once, with its first run and a count."""
     kinds: dict[tuple[str, str], list[Outcome]] = {}
@@ -490,25 +523,3 @@ def write_header(controller: Controller, *, fit_met: bool = True) -> tuple[bool,
             return True, next(path for path in paths if path.name.endswith("_gains.h")).read_text(encoding="utf-8")
     except SeaoptError as error:
         return False, str(error)
-
-
-def _swings(certificate: Certificate | None) -> bool:
-    """Tell whether some plant's -3 dB bandwidth says nothing: its tracking band does not start at 0 Hz."""
-    plants = certificate.plants.values() if certificate is not None else ()
-    return any(figures.tracking_band_hz is not None and figures.tracking_band_hz[0] > 1.0 for figures in plants)
-
-
-def _describe_forces(controller: Controller | None) -> str:
-    """Return what the limit of the command allows, and what the motor can do without overheating."""
-    if controller is None:
-        return ""
-    slow, band, unit = controller.force_limit(0.0), controller.spec.bandwidth_hz, controller.command.reference_unit
-    sentences = [] if controller.rating is None else [f"Motor: {line}." for line in controller.rating.describe()]
-    if slow is not None and controller.command_limit is not None:
-        sentences.insert(
-            0,
-            f"The limit of {controller.command.show(controller.command_limit)} allows a reference of "
-            f"{format_number(slow)} {unit} at rest and {format_number(controller.force_limit(band))} {unit} at "
-            f"{band:g} Hz, whatever the gains.",
-        )
-    return " ".join(sentences)

@@ -192,9 +192,14 @@ def bracket(
         search.stable &= bool(np.all(_measure(search, search.boxes.centre)))
     except ControlError as error:
         return Bracket(
-            ms_lower=float(known[0]), ms_upper=np.inf, mt_lower=float(known[1]), mt_upper=np.inf, bounded_stable=False,
-            boxes=0, left_out=str(error),
-        )  # fmt: skip
+            ms_lower=float(known[0]),
+            ms_upper=np.inf,
+            mt_lower=float(known[1]),
+            mt_upper=np.inf,
+            bounded_stable=False,
+            boxes=0,
+            left_out=str(error),
+        )
     return _conclude(search)
 
 
@@ -209,15 +214,25 @@ def _conclude(search: _BranchAndBound) -> Bracket:
     ms, mt = (float(value) if bounded else np.inf for value in upper)
     reason = "a plant of the set is worse than the bound, which is therefore void; the model was not enclosed"
     return Bracket(
-        ms_lower=float(search.lower[0]), ms_upper=ms, mt_lower=float(search.lower[1]), mt_upper=mt,
-        bounded_stable=bounded, boxes=search.count, parameters=search.parameters, left_out=reason if void else "",
-    )  # fmt: skip
+        ms_lower=float(search.lower[0]),
+        ms_upper=ms,
+        mt_lower=float(search.lower[1]),
+        mt_upper=mt,
+        bounded_stable=bounded,
+        boxes=search.count,
+        parameters=search.parameters,
+        left_out=reason if void else "",
+    )
 
 
 def _start(
-    controller: Controller, plant: Plant, unknown: Uncertainty, tolerance: float, known: Float[np.ndarray, " 2"],
+    controller: Controller,
+    plant: Plant,
+    unknown: Uncertainty,
+    tolerance: float,
+    known: Float[np.ndarray, " 2"],
     severity: float,
-) -> _BranchAndBound:  # fmt: skip
+) -> _BranchAndBound:
     within = build_region(plant, replace(unknown, nominal=controller.delay(unknown.nominal)))
     boxes = within.cover(controller.sample_time_s)
     _check_digits(controller, plant, within, boxes)
@@ -229,13 +244,25 @@ def _start(
     middle, half = 0.5 * (FIRST_EDGES[1:] + FIRST_EDGES[:-1]), 0.5 * np.diff(FIRST_EDGES)
     no_bound = np.full(count * half.size, np.inf)
     arcs = Arcs(
-        box=np.repeat(np.arange(count), half.size), middle=np.tile(middle, count), half=np.tile(half, count),
-        s=no_bound, t=no_bound,
-    )  # fmt: skip
+        box=np.repeat(np.arange(count), half.size),
+        middle=np.tile(middle, count),
+        half=np.tile(half, count),
+        s=no_bound,
+        t=no_bound,
+    )
     return _BranchAndBound(
-        controller=controller, plant=plant, unknown=unknown, within=within, tolerance=tolerance, boxes=boxes, arcs=arcs,
-        hardness=hardness, lower=known.copy(), upper=np.zeros(2), severity=severity,
-    )  # fmt: skip
+        controller=controller,
+        plant=plant,
+        unknown=unknown,
+        within=within,
+        tolerance=tolerance,
+        boxes=boxes,
+        arcs=arcs,
+        hardness=hardness,
+        lower=known.copy(),
+        upper=np.zeros(2),
+        severity=severity,
+    )
 
 
 def _check_digits(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> None:

@@ -167,12 +167,16 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     held = {name: value for name, value in read_conditions(plant, nominal).items() if name not in ends}
     certain = held | pinned
     return Region(
-        names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
-        slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
-        high=np.array([*(unknown.nominal[n].max for n in names), *[np.inf] * len(wide)], dtype=float), ball=ball,
-        fixed=certain, nominal=nominal,
+        names=(*names, *wide),
+        centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
+        slopes=slopes,
+        low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
+        high=np.array([*(unknown.nominal[n].max for n in names), *[np.inf] * len(wide)], dtype=float),
+        ball=ball,
+        fixed=certain,
+        nominal=nominal,
         lead_s=sum(certain.get(name, 0.0) for name in DELAYS) + plant.drive_offset_s,
-    )  # fmt: skip
+    )
 
 
 def _merge_delays(

@@ -20,6 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from seaopt.codec import OrInfinite
 from seaopt.control import Controller, GainTable
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -55,8 +56,8 @@ class StretchBound:
     plant: str
     low: float
     high: float
-    ms: float
-    change: float
+    ms: OrInfinite
+    change: OrInfinite
     reason: str
 
     @property
@@ -66,9 +67,15 @@ class StretchBound:
 
 
 def bound_stretch(
-    name: str, middle: Controller, table: GainTable, plant: Plant, params: ParameterSet, low: float, high: float,
+    name: str,
+    middle: Controller,
+    table: GainTable,
+    plant: Plant,
+    params: ParameterSet,
+    low: float,
+    high: float,
     budget: Budget = BUDGET,
-) -> StretchBound:  # fmt: skip
+) -> StretchBound:
     """Bound Ms of a scheduled law on a stretch between two neighbouring points.
 
     Parameters

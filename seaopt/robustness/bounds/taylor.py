@@ -83,9 +83,14 @@ def build_basis(size: int, degree: int) -> Basis:
     first, second = first[order], second[order]
     starts = np.searchsorted(target[first, second], np.arange(degrees.size))
     return Basis(
-        size=size, degree=degree, powers=powers, target=target, until=until, degrees=degrees,
+        size=size,
+        degree=degree,
+        powers=powers,
+        target=target,
+        until=until,
+        degrees=degrees,
         pairs=(first, second, starts),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)  # not a record: the algebra below makes them by position

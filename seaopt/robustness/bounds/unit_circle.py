@@ -142,10 +142,13 @@ def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, bal
     size = np.maximum(np.abs(d.c), 1e-300)
     by_box = np.abs(d.g[:, :-1]) + np.sum(np.abs(d.h[:, :-1]), axis=2)
     return ArcBounds(
-        s=top_s, t=top_t, by_box=by_box / size[:, None], by_angle=np.abs(d.g[:, -1]) / size,
+        s=top_s,
+        t=top_t,
+        by_box=by_box / size[:, None],
+        by_angle=np.abs(d.g[:, -1]) / size,
         remainder=sum(_weigh_remainders(remainders, powers) for (_, remainders), powers in parts) / size,
         gradients=np.stack([slope_s[:, :-1], slope_t[:, :-1]]),
-    )  # fmt: skip
+    )
 
 
 def _keeps_degree(controller: Controller, plant: ImpulseTransfer) -> Bool[np.ndarray, " b"]:
@@ -225,9 +228,10 @@ def _expand_powers(
     second = [w**j, 1j * once * turn, -(once * turn + twice * turn**2)]
     far = np.abs(w) + half[:, None]
     steep = (
-        j * far ** np.maximum(j - 1, 0) + 3 * j * (j - 1) * far ** np.maximum(j - 2, 0)
+        j * far ** np.maximum(j - 1, 0)
+        + 3 * j * (j - 1) * far ** np.maximum(j - 2, 0)
         + j * (j - 1) * (j - 2) * far ** np.maximum(j - 3, 0)
-    )  # fmt: skip
+    )
     second_bounds = _bound_derivatives(second, steep, half[:, None])
     value = first[0] * second[0]
     slope = first[1] * second[0] + first[0] * second[1]
@@ -288,9 +292,11 @@ def _divide(n: ArcModel, d: ArcModel) -> ArcModel:
     remainder = np.where(least > 0.0, miss / least, np.inf)
     good = np.isfinite(remainder) & np.isfinite(c)
     return ArcModel(
-        c=np.where(good, c, 0.0), g=np.where(good[:, None], g, 0.0), h=np.where(good[:, None, None], h, 0.0),
+        c=np.where(good, c, 0.0),
+        g=np.where(good[:, None], g, 0.0),
+        h=np.where(good[:, None, None], h, 0.0),
         r=np.where(good, remainder, np.inf),
-    )  # fmt: skip
+    )
 
 
 def _bound_magnitude(
@@ -307,9 +313,12 @@ def _bound_magnitude(
 
 
 def _bound_quadratic(
-    top: Float[np.ndarray, " p"], a: Float[np.ndarray, "p k"], b: Float[np.ndarray, "p k k"],
-    at: Float[np.ndarray, "p b"], width: Float[np.ndarray, "p b"],
-) -> Float[np.ndarray, " p"]:  # fmt: skip
+    top: Float[np.ndarray, " p"],
+    a: Float[np.ndarray, "p k"],
+    b: Float[np.ndarray, "p k k"],
+    at: Float[np.ndarray, "p b"],
+    width: Float[np.ndarray, "p b"],
+) -> Float[np.ndarray, " p"]:
     """Return a bound on top + a e + e b e over the cube, where at + width e is in the unit ball.
 
     A coordinate outside the ball along which it cannot but rise or fall is put at its end. What is left is split into

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import field, fields, replace
+from dataclasses import field, replace
 from functools import partial
 from typing import Any
 
@@ -12,42 +12,32 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
+from seaopt.codec import to_content
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.laws.limits import BY_NAME, BY_REQUIREMENT
+from seaopt.control.laws.limits import BY_NAME
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.law import describe_integrators
-from seaopt.errors import ControlError, FileError, SeaoptError
+from seaopt.errors import ControlError
 from seaopt.estimation import warn_unidentified
 from seaopt.executors import Shared, map_ordered
 from seaopt.files import seal
-from seaopt.formatting import (
-    MISSING,
-    format_band,
-    format_figure,
-    format_number,
-    format_values,
-    html_list,
-    html_paragraph,
-    html_table,
-)
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes, remembers, split_friction
 from seaopt.progress import Progress, ignore
-from seaopt.records import PlotAccessor, Result, record
+from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.compensation import (
-    FRICTION_COMPENSATION,
     CompensationDraws,
     describe_compensation,
-    find_nominal_compensation,
     list_compensation,
 )
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
-from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
-from seaopt.robustness.certificate.impedance import CertifiedImpedance, ImpedanceDraws, certify_impedance
+from seaopt.robustness.certificate.friction import FrictionDraws
+from seaopt.robustness.certificate.impedance import CertifiedImpedance
+from seaopt.robustness.certificate.requirement import DESIGN_PLANT, LIMIT_CYCLE, Requirement
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
@@ -57,19 +47,15 @@ from seaopt.robustness.certificate.simulated import (
     simulate_steps,
 )
 from seaopt.robustness.uncertainty.draws import Varied
-from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, format_draws
-from seaopt.robustness.uncertainty.plant_margins import PlantMargins, plant_margins
-from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
+from seaopt.robustness.uncertainty.plant_margins import PlantMargins
+from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cycles, seek_limit_cycles
 from seaopt.robustness.verification.verification import Verification
 
 ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
-MIN_FRICTION_MARGIN = "min_friction_margin"
-KEPT_TO = 1e-3  # share of a limit by which a row that is read may be beyond it: figures are known to less
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
-LIMIT_CYCLE = "limit_cycle"
 NO_MODEL = "nothing drawn or simulated: measured points alone, without a model"
-DESIGN_PLANT = "design plant"  # where its own limits are judged
 DESIGN_NAMES = ("design", DESIGN_PLANT)  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
@@ -77,50 +63,12 @@ _REPORTED = (
 )  # fmt: skip
 
 
-def find_sense(name: str) -> str:
-    """Return what a requirement's value must be to its limit, as a sign, of a law that was tuned."""
-    if name in BY_REQUIREMENT:
-        return BY_REQUIREMENT[name].symbol
-    return "≥" if name == FRICTION_COMPENSATION or name.startswith("min_") else "≤"
-
-
-@record
-class Requirement:
-    """One figure against its limit; `where` names the plant, and the parameters that decide if a draw does.
-
-    `sense` is what the value must be to the limit, as a sign, and follows from the name where it is left out: of draws
-    and worst cases at most that. `tolerance` is the share of the limit by which the value may be beyond it.
-    """
-
-    name: str
-    limit: float
-    value: float
-    met: bool
-    where: str
-    sense: str = ""
-    tolerance: float = KEPT_TO
-
-    def __post_init__(self) -> None:
-        if not self.sense:
-            object.__setattr__(self, "sense", find_sense(self.name))
-
-    @property
-    def keeps(self) -> bool:
-        """Whether the value keeps the limit but for its tolerance; what is met may need more, as a stable loop."""
-        slack = self.tolerance * (abs(self.limit) or 1.0)
-        if self.sense == "=":
-            return abs(self.value - self.limit) <= slack
-        return self.value >= self.limit - slack if self.sense == "≥" else self.value <= self.limit + slack
-
-
-@record(eq=False)
-class Certificate(Result):
+@record(eq=False, repr=False)
+class Certificate(Result, Worded):
     """What `certify` returns.
 
     Parameters
     ----------
-    passed : bool
-        Every requirement is met.
     requirements : tuple of Requirement
     plants : mapping of name to LoopFigures
         At the nominal parameters. A plant with friction is there twice, as NAME sliding and NAME stuck, here and in
@@ -170,7 +118,6 @@ class Certificate(Result):
 
     plot = PlotAccessor("seaopt.reporting.plots:CertificatePlots")
 
-    passed: bool
     requirements: tuple[Requirement, ...]
     plants: Mapping[str, LoopFigures]
     margins: Mapping[str, PlantMargins]
@@ -198,7 +145,7 @@ class Certificate(Result):
     @property
     def met(self) -> bool:
         """Whether every requirement is met."""
-        return self.passed
+        return all(row.met for row in self.requirements)
 
     @property
     def linear_models(self) -> dict[str, Plant]:
@@ -206,9 +153,14 @@ class Certificate(Result):
         return split_friction(self.models, self.parameters, [varied.name for varied in self.varied])
 
     def with_simulation(
-        self, *, sensors: Sensors | None = None, current_step_A: float = 0.0, seed: int = 1,
-        executor: Executor | None = None, progress: Progress = ignore,
-    ) -> Certificate:  # fmt: skip
+        self,
+        *,
+        sensors: Sensors | None = None,
+        current_step_A: float = 0.0,
+        seed: int = 1,
+        executor: Executor | None = None,
+        progress: Progress = ignore,
+    ) -> Certificate:
         """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
 
         `certify` does this unless it is told not to; here it is done again, with other sensors, say. Each scenario
@@ -242,15 +194,20 @@ class Certificate(Result):
         if not self.models:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
         simulations = self._simulate(sensors, current_step_A, seed, executor, progress)
-        runs = simulations.verification or simulations.left_out["simulation"]
-        requirements = (*self._drop_runs(), *_require_runs(runs))
-        passed = all(row.met for row in requirements)
-        return replace(self, simulated=simulations, requirements=requirements, passed=passed)
+        runs = simulations.verification
+        rows = require_runs(simulations.left_out["simulation"] if runs is None else runs)
+        requirements = (*self._drop_runs(), *rows)
+        return replace(self, simulated=simulations, requirements=requirements)
 
     def with_steps(
-        self, progress: Progress = ignore, executor: Executor | None = None, *, sensors: Sensors | None = None,
-        current_step_A: float = 0.0, seed: int = 1,
-    ) -> Certificate:  # fmt: skip
+        self,
+        progress: Progress = ignore,
+        executor: Executor | None = None,
+        *,
+        sensors: Sensors | None = None,
+        current_step_A: float = 0.0,
+        seed: int = 1,
+    ) -> Certificate:
         """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
 
         Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
@@ -259,8 +216,8 @@ class Certificate(Result):
         """
         played = self.play_steps(progress, executor, sensors=sensors, current_step_A=current_step_A, seed=seed)
         others = (row for row in self._drop_runs() if row.name != LIMIT_CYCLE)
-        requirements = (*others, *played._require_cycles(), *_require_runs(played.steps or ""))
-        return replace(played, requirements=requirements, passed=all(row.met for row in requirements))
+        requirements = (*others, *played._require_cycles(), *require_runs("" if played.steps is None else played.steps))
+        return replace(played, requirements=requirements)
 
     def _drop_runs(self) -> tuple[Requirement, ...]:
         """Return what is required besides simulated runs, which are played again."""
@@ -280,9 +237,14 @@ class Certificate(Result):
         return self.steps if isinstance(self.steps, Verification) else None
 
     def play_steps(
-        self, progress: Progress = ignore, executor: Executor | None = None, *, sensors: Sensors | None = None,
-        current_step_A: float = 0.0, seed: int = 1,
-    ) -> Certificate:  # fmt: skip
+        self,
+        progress: Progress = ignore,
+        executor: Executor | None = None,
+        *,
+        sensors: Sensors | None = None,
+        current_step_A: float = 0.0,
+        seed: int = 1,
+    ) -> Certificate:
         """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
         if not self.models:
             return replace(self, steps=NO_MODEL)
@@ -290,14 +252,14 @@ class Certificate(Result):
             self.controller,
             self.models,
             self.parameters,
-            self._draws(),
+            self.list_draws(),
             executor,
             progress,
             sensors=sensors,
             current_step_A=current_step_A,
             seed=seed,
         )
-        shown_of = {name: name not in self.friction or self.friction[name].shown for name in self.models}
+        shown_of = {name: self.shows_friction_harmless(name) for name in self.models}
         seek = partial(_seek_cycles, Shared((self.controller, self.models, self.parameters)))
         cycles: dict[str, tuple[FoundCycle, ...]] = {}
         for name, found in zip(shown_of, map_ordered(seek, shown_of.items(), executor), strict=True):
@@ -306,18 +268,20 @@ class Certificate(Result):
                 cycles[name] = (*found, *ends)
         return replace(self, steps=steps, cycles=cycles)
 
+    def shows_friction_harmless(self, name: str) -> bool:
+        """Tell whether a model has no friction at the nominal parameters, or one that is shown to leave it stable."""
+        return name not in self.friction or self.friction[name].shown
+
     def _require_cycles(self) -> list[Requirement]:
         """Return the limit cycles that last; those that steps end in are required of the steps."""
         return [
-            Requirement(
-                name=LIMIT_CYCLE, limit=0.0, value=cycle.force_N, met=False, where=f"{name}: {cycle}",
-            )
+            Requirement(name=LIMIT_CYCLE, limit=0.0, value=cycle.force_N, met=False, plant=name, text=str(cycle))
             for name, cycles in self.cycles.items()
             for cycle in cycles
             if cycle.predicted is not None and cycle.lasts
-        ]  # fmt: skip
+        ]
 
-    def _draws(self) -> dict[str, list[ParameterSet]]:
+    def list_draws(self) -> dict[str, list[ParameterSet]]:
         """Return the worst draws of each plant, of those with friction sliding and stuck, without what is nominal."""
         draws: dict[str, list[ParameterSet]] = {name: [] for name in self.models}
         for name, model in self.models.items():
@@ -327,14 +291,25 @@ class Certificate(Result):
         return draws
 
     def _simulate(
-        self, sensors: Sensors | None, current_step_A: float, seed: int, executor: Executor | None = None,
+        self,
+        sensors: Sensors | None,
+        current_step_A: float,
+        seed: int,
+        executor: Executor | None = None,
         progress: Progress = ignore,
-    ) -> Simulated:  # fmt: skip
+    ) -> Simulated:
         return run_simulations(
-            self.controller, self.models, self.parameters, draws=self._draws(), sensors=sensors,
-            current_step_A=current_step_A, seed=seed,
-            steps=self.steps if isinstance(self.steps, Verification) else None, executor=executor, progress=progress,
-        )  # fmt: skip
+            self.controller,
+            self.models,
+            self.parameters,
+            draws=self.list_draws(),
+            sensors=sensors,
+            current_step_A=current_step_A,
+            seed=seed,
+            steps=self.steps if isinstance(self.steps, Verification) else None,
+            executor=executor,
+            progress=progress,
+        )
 
     @classmethod
     def from_dict(
@@ -344,7 +319,7 @@ class Certificate(Result):
         models: Mapping[str, Plant],
         parameters: ParameterSet,
     ) -> Certificate:
-        """Return the certificate of a robustness.json; nominal figures and simulations are computed again.
+        """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated.
 
         Raises
         ------
@@ -352,106 +327,37 @@ class Certificate(Result):
             A field is missing or malformed, it was edited or written by hand, or nothing is required in it.
 
         """
-        # Deferred, as pydantic takes long to import.
-        from seaopt.robustness.certificate.stored import CERTIFY_AGAIN, read_certificate, read_requirements
+        from seaopt.robustness.certificate.stored import build_certificate  # deferred, as pydantic takes long to import
 
-        stored = read_certificate(content)
-        requirements = read_requirements(stored.requirements)
-        if controller.design is not None:  # certified too where nobody listed it
-            models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
-        varied = tuple(Varied(**row.model_dump()) for row in stored.varied)
-        states = {
-            name: split_friction({name: plant}, parameters, [row.name for row in varied])
-            for name, plant in models.items()
-        }
-        models = {
-            name: plant for name, plant in models.items() if any(state in stored.plants for state in states[name])
-        }
-        known = {state: plant for name in models for state, plant in states[name].items()}
-        for name in stored.plants:
-            if name not in known:
-                raise FileError(f'robustness.json: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
-        drawn = None if stored.impedance is None else stored.impedance.draws
-        try:
-            linear = {name: known[name] for name in stored.plants}
-            bounds = {name: plant.worst.bounds for name, plant in stored.plants.items()}
-            certificate = cls(
-                passed=all(row.met for row in requirements),
-                requirements=requirements,
-                plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
-                margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
-                worst={
-                    name: combine_worst(
-                        [measure_worst(controller, plant, parameters, at) for at in stored.plants[name].worst.cases]
-                    )
-                    for name, plant in linear.items()
-                },
-                monte_carlo=MonteCarlo(**stored.monte_carlo.model_dump()),
-                controller=controller,
-                models=models,
-                parameters=parameters,
-                varied=varied,
-                brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
-                friction=find_nominal_margins(controller, models, parameters),
-                friction_draws={
-                    name: FrictionDraws(**one.draws.model_dump())
-                    for name, one in stored.friction.items()
-                    if one.draws is not None
-                },
-                compensation=find_nominal_compensation(controller, models, parameters),
-                compensation_draws={
-                    name: CompensationDraws(**one.draws.model_dump())
-                    for name, one in stored.compensation.items()
-                    if one.draws is not None
-                },
-                impedance=certify_impedance(
-                    controller,
-                    models,
-                    parameters,
-                    None if drawn is None else ImpedanceDraws(**drawn.model_dump()),
-                ),
-                constrained=stored.read_constrained(),
-                remarks=tuple(stored.remarks),
-            )
-            runs = certificate.constrained
-            certificate = (
-                certificate.play_steps()
-                if runs is None
-                else certificate.play_steps(sensors=runs.sensors, current_step_A=runs.current_step_A, seed=runs.seed)
-            )
-            played = stored.simulation
-            if played is None:
-                return certificate
-            sensors = Sensors(**played.sensors.model_dump())
-            return replace(certificate, simulated=certificate._simulate(sensors, played.current_step_A, played.seed))
-        except SeaoptError as error:
-            raise FileError(f"robustness.json: {error}; {CERTIFY_AGAIN}") from error
+        return build_certificate(content, controller, models, parameters)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/2), with its digest."""
-        return seal({
-            "schema": ROBUSTNESS_SCHEMA,
-            "met": self.met,
-            "passed": self.passed,
-            "requirements": [_list_fields(row) for row in self.requirements],
-            "plants": {
-                name: {key: getattr(figures, key) for key in _REPORTED}
-                | self.margins[name].to_dict()
-                | {"worst": self._worst_dict(name)}
-                for name, figures in self.plants.items()
-            },
-            "friction": {name: self._friction_dict(name) for name in self._frictions},
-            "compensation": list_compensation(self.compensation, self.compensation_draws),
-            "monte_carlo": _list_fields(self.monte_carlo),
-            "varied": [_list_fields(varied) for varied in self.varied],
-            "remarks": list(self.remarks),
-            "notes": list(self.notes),
-            "impedance": None if self.impedance is None else self.impedance.to_dict(),
-            "constrained": None if self.constrained is None else self.constrained.to_dict(),
-            "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
-            "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
-            "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
-        })  # fmt: skip
+        return seal(
+            {
+                "schema": ROBUSTNESS_SCHEMA,
+                "met": self.met,
+                "passed": self.met,
+                "requirements": [row.to_dict() for row in self.requirements],
+                "plants": {
+                    name: {key: getattr(figures, key) for key in _REPORTED}
+                    | self.margins[name].to_dict()
+                    | {"worst": self._worst_dict(name)}
+                    for name, figures in self.plants.items()
+                },
+                "friction": {name: self._friction_dict(name) for name in self._frictions},
+                "compensation": list_compensation(self.compensation, self.compensation_draws),
+                "monte_carlo": to_content(self.monte_carlo),
+                "varied": to_content(self.varied),
+                "remarks": list(self.remarks),
+                "notes": list(self.notes),
+                "impedance": None if self.impedance is None else self.impedance.to_dict(),
+                "constrained": None if self.constrained is None else self.constrained.to_dict(),
+                "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
+                "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
+                "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
+            }
+        )
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -480,10 +386,17 @@ class Certificate(Result):
         )
         constrained = () if self.constrained is None else self.constrained.notes
         return (
-            *constrained, *self._law_notes(), *self.remarks, *warn_unidentified(self.parameters, used), *friction,
+            *constrained,
+            *self._law_notes(),
+            *self.remarks,
+            *warn_unidentified(self.parameters, used),
+            *friction,
             *describe_compensation(self.controller, self.compensation, self.compensation_draws),
-            *self._ideal_notes(), *outside, *little, *lifted,
-        )  # fmt: skip
+            *self._ideal_notes(),
+            *outside,
+            *little,
+            *lifted,
+        )
 
     def _law_notes(self) -> tuple[str, ...]:
         """Say how many integrators a law of one's own has, which nothing else of it tells."""
@@ -507,10 +420,11 @@ class Certificate(Result):
         worst = self.worst[name]
         ms, mt = worst.largest
         largest = {
-            "ms": {"value": ms.ms, "parameters": ms.parameters}, "mt": {"value": mt.mt, "parameters": mt.parameters}
-        }  # fmt: skip
+            "ms": {"value": ms.ms, "parameters": ms.parameters},
+            "mt": {"value": mt.mt, "parameters": mt.parameters},
+        }
         bounds = self.brackets[name].to_dict() if name in self.brackets else {}
-        return _list_fields(worst.witness) | {"largest": largest} | bounds
+        return to_content(worst.witness) | {"largest": largest} | bounds
 
     @property
     def _frictions(self) -> tuple[str, ...]:
@@ -533,9 +447,9 @@ class Certificate(Result):
         stable = True if margin is not None and margin.shown and not cycles else None
         entry: dict[str, Any] = {"sector_stable": stable, "limit_cycles": [cycle.to_dict() for cycle in cycles]}
         if margin is not None:
-            entry |= _list_fields(margin) | {"draws": None}
+            entry |= to_content(margin) | {"draws": None}
         if name in self.friction_draws:
-            entry["draws"] = _list_fields(self.friction_draws[name])
+            entry["draws"] = to_content(self.friction_draws[name])
         return entry
 
     def _describe_cycles(self, name: str) -> str:
@@ -554,46 +468,6 @@ class Certificate(Result):
             return "; no simulated step ends in a limit cycle, and with several frictions none can be predicted"
         return "; no limit cycle is predicted, and no simulated step ends in one"
 
-    def __repr__(self) -> str:
-        lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}", *(f"  note: {note}" for note in self.notes)]
-        for name in self.plants:
-            lines += self._plant_lines(name)
-        if self.varied:
-            lines.append(f"  varied: {'; '.join(map(str, self.varied))}")
-        lines.append(f"  {self.draws}")
-        lines += [f"  {line}" for line in (self.runs.describe_steps() if self.runs is not None else [])]
-        lines += [f"  {line}" for line in (self.simulated.lines() if self.simulated is not None else [])]
-        lines += [f"  impedance: {line}" for line in (self.impedance.lines() if self.impedance is not None else [])]
-        for row in self.requirements:
-            if not row.met:
-                lines.append(f"  NOT MET: {row.name} = {row.value:.6g}, limit {row.limit:.6g} ({row.where})")
-        return "\n".join(lines)
-
-    def _plant_lines(self, name: str) -> list[str]:
-        figures, margins, worst = self.plants[name], self.margins[name], self.worst[name]
-        lines = [
-            f"  {name}: {'stable' if figures.stable else 'UNSTABLE'}, Ms {figures.ms:.4g}, Mt {figures.mt:.4g} "
-            f"(worst case {worst.ms:.4g}, {worst.mt:.4g}), tracking band {format_band(figures.tracking_band_hz, 'Hz')}"
-        ]
-        if figures.stable:
-            up, down = (
-                format_number(db, missing="none") for db in (margins.margins.gain_up_db, margins.margins.gain_down_db)
-            )
-            late, phase = margins.sampled_delay_s, format_number(figures.phase_margin_deg, missing="none")
-            lines.append(
-                f"    margins: gain {up} dB up, {down} down, phase {phase} deg, delay "
-                + (f"{1e3 * late:.4g} ms" if late is not None else f"beyond {1e3 * margins.searched_delay_s:.3g} ms")
-                + f", disk {figures.disk_margin:.3g}"
-            )
-        if worst.parameters:
-            lines.append(f"    worst case at {_format_place(worst)}")
-        if name in self.brackets:
-            lines.append(f"    {self.brackets[name].statement}")
-        return lines
-
-    def _repr_html_(self) -> str:
-        return format_certificate(self) + self.plot.to_html()
-
 
 def _seek_cycles(
     loops: Shared[tuple[Controller, Mapping[str, Plant], ParameterSet]], model: tuple[str, bool]
@@ -602,60 +476,3 @@ def _seek_cycles(
     controller, models, parameters = loops.value
     name, shown = model
     return seek_limit_cycles(controller, models[name], parameters, shown=shown)
-
-
-def _require_runs(runs: Verification | str) -> tuple[Requirement, ...]:
-    return tuple(Requirement(**_list_fields(row)) for row in require_runs(runs))
-
-
-def _format_place(worst: Worst) -> str:
-    """Return the parameters of the worst case, and those of the largest Ms or Mt where they are others."""
-    others = (f"; largest {name} at {format_values(one.parameters)}" for name, one in worst.elsewhere.items())
-    return format_values(worst.parameters) + "".join(others)
-
-
-def _list_fields(data: Any) -> dict[str, Any]:
-    return {field.name: getattr(data, field.name) for field in fields(data)}
-
-
-_PLANT_HEAD = (
-    "plant", "stable", "Ms", "Mt", "worst Ms", "worst Mt", "gain margin", "phase margin", "delay margin",
-    "disk margin", "tracking band", "worst case at",
-)  # fmt: skip
-
-
-def format_certificate(certificate: Certificate) -> str:
-    """Return as HTML the plants, the draws, every requirement with what decides it, and what was simulated."""
-    verdict = html_paragraph(f"Certificate: {'passed' if certificate.passed else 'FAILED'}")
-    plants = html_table(_PLANT_HEAD, [_format_plant(certificate, name) for name in certificate.plants])
-    required = html_table(
-        ("requirement", "where", "value", "limit", "met"),
-        [
-            (row.name, row.where, format_figure(row.value), f"{row.sense} {format_figure(row.limit)}",
-             "yes" if row.met else "NO")
-            for row in sorted(certificate.requirements, key=lambda row: row.met)
-        ],
-    )  # fmt: skip
-    varied = html_paragraph(f"varied: {'; '.join(map(str, certificate.varied))}") if certificate.varied else ""
-    steps = certificate.runs.describe_steps() if certificate.runs is not None else []
-    simulated = html_list([*steps, *(certificate.simulated.lines() if certificate.simulated is not None else [])])
-    return (
-        verdict
-        + html_list(certificate.notes)
-        + plants
-        + varied
-        + (format_draws(certificate.monte_carlo) if certificate.models else html_paragraph(NO_MODEL))
-        + required
-        + simulated
-    )
-
-
-def _format_plant(certificate: Certificate, name: str) -> tuple[str, ...]:
-    figures, worst, margins = certificate.plants[name], certificate.worst[name], certificate.margins[name]
-    late = margins.sampled_delay_s
-    return (
-        name, "yes" if figures.stable else "NO", *map(format_figure, (figures.ms, figures.mt, worst.ms, worst.mt)),
-        format_figure(figures.gain_margin_db, "dB"), format_figure(figures.phase_margin_deg, "deg"),
-        format_figure(None if late is None else 1e3 * late, "ms"), format_figure(figures.disk_margin),
-        format_band(figures.tracking_band_hz, "Hz", MISSING), _format_place(worst),
-    )  # fmt: skip

@@ -27,18 +27,15 @@ from seaopt.formatting import format_count
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import has_friction, split_friction
+from seaopt.plants.friction import has_friction, name_states, split_friction
 from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.certificate.certificate import (
     DESIGN_NAMES,
-    DESIGN_PLANT,
-    MIN_FRICTION_MARGIN,
     NO_MODEL,
     Certificate,
-    Requirement,
 )
 from seaopt.robustness.certificate.compensation import (
     find_compensation_at_draws,
@@ -49,6 +46,7 @@ from seaopt.robustness.certificate.compensation import (
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
 from seaopt.robustness.certificate.measured_draws import Loops, measure_draws, search_worst
+from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, Requirement, Spot
 from seaopt.robustness.certificate.requirements import (
     compensation_requirements,
     design_requirements,
@@ -56,7 +54,6 @@ from seaopt.robustness.certificate.requirements import (
     eigenvalue_requirements,
     friction_requirements,
     impedance_requirements,
-    measured_design_requirements,
     measured_requirements,
     plant_requirements,
 )
@@ -193,23 +190,34 @@ def certify(
     unknown = combine_uncertainty(parameters, others, ranges, models, find_own_drive(controller, parameters))
     _check_delay(controller, unknown.ranges)
     nominal, varied = unknown.nominal, unknown.varied()
-    plants = split_friction(models, nominal, [row.name for row in varied])
+    names = [row.name for row in varied]
+    plants = split_friction(models, nominal, names)
+    spots = {label: Spot(*state) for label, state in name_states(models, nominal, names).items()}
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
     drawing, searching, rubbing, rendering, stepping, simulating = divide(
-        progress, DRAW * samples * len(plants), (SEARCH + BOUND * (bounds is not None)) * len(plants),
-        FRICTION * len(plants), IMPEDANCE * min(samples, IMPEDANCE_DRAWS) * (controller.outer is not None),
-        STEPS * len(models), SIMULATIONS * len(models) * simulations,
-    )  # fmt: skip
+        progress,
+        DRAW * samples * len(plants),
+        (SEARCH + BOUND * (bounds is not None)) * len(plants),
+        FRICTION * len(plants),
+        IMPEDANCE * min(samples, IMPEDANCE_DRAWS) * (controller.outer is not None),
+        STEPS * len(models),
+        SIMULATIONS * len(models) * simulations,
+    )
     loops = Shared(Loops(controller=controller, models=models, plants=plants, unknown=unknown, bounds=bounds))
     failures, drawn, drawn_ms = measure_draws(loops, samples, rng, executor, drawing)
     worst, brackets = search_worst(loops, drawn, executor, searching)
     monte_carlo = MonteCarlo(
-        samples=samples, failures=failures.count, seed=seed, confidence=confidence,
+        samples=samples,
+        failures=failures.count,
+        seed=seed,
+        confidence=confidence,
         failure_probability_bound=failure_bound(samples, failures.count, confidence),
-        unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
-    )  # fmt: skip
+        unstable=failures.unstable,
+        over_ms=failures.over_ms,
+        over_mt=failures.over_mt,
+    )
     rubbing("friction at the draws", 0.0)
     friction = find_nominal_margins(controller, models, nominal)
     friction_draws = find_margins_at_draws(loops, friction, samples, rng, min_friction_margin, executor)
@@ -221,26 +229,38 @@ def certify(
     gravity = find_gravity_cases(loops, samples, rng, executor)
     ripple = find_ripple_cases(loops, samples, rng, executor)
     requirements = (
-        *_design_requirements(controller, nominal, [row.name for row in varied]),
-        *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
-        *draw_requirements(monte_carlo, worst, max_failure_probability),
-        *friction_requirements(friction, friction_draws, min_friction_margin),
+        *_design_requirements(controller, nominal, names),
+        *(row for name, spot in spots.items() for row in plant_requirements(controller, spot, figures[name])),
+        *draw_requirements(monte_carlo, {spots[name]: one for name, one in worst.items()}, max_failure_probability),
+        *friction_requirements(friction, friction_draws, min_friction_margin, controller.command.mechanics.damping),
         *compensation_requirements(controller, compensation, compensation_draws),
         *eigenvalue_requirements(controller, models, gravity, ripple),
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
         *impedance_requirements(impedance),
     )
     certificate = Certificate(
-        passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
-        margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
-        monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
-        brackets=brackets, friction=friction, friction_draws=friction_draws, compensation=compensation,
-        compensation_draws=compensation_draws, impedance=impedance, drawn_ms=drawn_ms,
+        requirements=requirements,
+        plants=figures,
+        margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()},
+        worst=worst,
+        monte_carlo=monte_carlo,
+        controller=controller,
+        models=models,
+        parameters=nominal,
+        varied=varied,
+        brackets=brackets,
+        friction=friction,
+        friction_draws=friction_draws,
+        compensation=compensation,
+        compensation_draws=compensation_draws,
+        impedance=impedance,
+        drawn_ms=drawn_ms,
         remarks=(
-            *_remark_measured(controller, measured or {}), *_remark_delay(controller, parameters),
+            *_remark_measured(controller, measured or {}),
+            *_remark_delay(controller, parameters),
             *_remark_amplitude(controller, models, nominal),
         ),
-    )  # fmt: skip
+    )
     certificate = certificate.with_steps(stepping, executor)
     if simulations:
         certificate = certificate.with_simulation(
@@ -251,9 +271,11 @@ def certify(
 
 
 def _add_warm_winding(
-    ranges: Mapping[str, tuple[float, float]], models: Mapping[str, Plant], parameters: Fit | ParameterSet,
+    ranges: Mapping[str, tuple[float, float]],
+    models: Mapping[str, Plant],
+    parameters: Fit | ParameterSet,
     others: ParameterSet,
-) -> dict[str, tuple[float, float]]:  # fmt: skip
+) -> dict[str, tuple[float, float]]:
     """Return the ranges with the temperatures of every winding that changes its loop, and those given for the air."""
     known = parameters.parameters if isinstance(parameters, Fit) else parameters
     values = others.with_parameters(*known.values())
@@ -310,9 +332,14 @@ def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nomin
 
 
 def _check_arguments(
-    controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float,
-    max_failure_probability: float | None, min_friction_margin: float | None,
-) -> None:  # fmt: skip
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    samples: int,
+    seed: int,
+    confidence: float,
+    max_failure_probability: float | None,
+    min_friction_margin: float | None,
+) -> None:
     require_type(controller, Controller, "controller", "give a Controller; a ForceMPC to certify_mpc", ControlError)
     if not isinstance(plants, Mapping):
         raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
@@ -341,9 +368,14 @@ def _check_arguments(
 
 
 def _certify_points(
-    controller: Controller, plants: Mapping[str, Plant], parameters: Fit | ParameterSet,
-    measured: Mapping[str, MeasuredResponse], *, seed: int, confidence: float,
-) -> Certificate:  # fmt: skip
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    parameters: Fit | ParameterSet,
+    measured: Mapping[str, MeasuredResponse],
+    *,
+    seed: int,
+    confidence: float,
+) -> Certificate:
     """Certify a controller that was designed on a measured response: on measured points, without any model."""
     if plants:
         raise ControlError(
@@ -356,18 +388,22 @@ def _certify_points(
             'it was designed on first: measured={"frf:chirp": response}'
         )
     requirements = (
-        *measured_design_requirements(controller, *next(iter(measured.items()))),
+        *measured_requirements(controller, *next(iter(measured.items())), "design plant"),
         *(row for name, one in measured.items() for row in measured_requirements(controller, name, one)),
     )
-    nothing_drawn = MonteCarlo(
-        samples=0, failures=0, seed=seed, confidence=confidence, failure_probability_bound=1.0
-    )  # fmt: skip
+    nothing_drawn = MonteCarlo(samples=0, failures=0, seed=seed, confidence=confidence, failure_probability_bound=1.0)
     return Certificate(
-        passed=all(row.met for row in requirements), requirements=requirements, plants={}, margins={}, worst={},
-        monte_carlo=nothing_drawn, controller=controller, models={},
-        parameters=parameters.parameters if isinstance(parameters, Fit) else parameters, steps=NO_MODEL,
+        requirements=requirements,
+        plants={},
+        margins={},
+        worst={},
+        monte_carlo=nothing_drawn,
+        controller=controller,
+        models={},
+        parameters=parameters.parameters if isinstance(parameters, Fit) else parameters,
+        steps=NO_MODEL,
         remarks=_remark_measured(controller, measured),
-    )  # fmt: skip
+    )
 
 
 def _with_design(
@@ -422,4 +458,4 @@ def _design_requirements(controller: Controller, nominal: ParameterSet, varied: 
     assert controller.design is not None
     plant, values = controller.design
     named = values.with_parameters(*(nominal[name] for name in nominal if name in {*plant.parameters, DRIVE_DELAY}))
-    return design_requirements(controller, split_friction({DESIGN_PLANT: plant}, named, varied), named)
+    return design_requirements(controller, plant, named, varied)

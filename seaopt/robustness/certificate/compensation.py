@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from seaopt.codec import OrInfinite
 from seaopt.control import Controller, Law, Loop, runnable
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
 from seaopt.control.loops.compensation.stability import CompensationMargin
@@ -72,7 +73,7 @@ class CompensationDraws:
 
     samples: int
     shown: int
-    least_slope: float
+    least_slope: OrInfinite
     parameters: dict[str, float]
 
     def __str__(self) -> str:
@@ -98,9 +99,12 @@ def find_nominal_compensation(
 
 
 def find_compensation_at_draws(
-    loops: Shared[Loops], nominal: Mapping[str, CompensationMargin], samples: int, rng: np.random.Generator,
+    loops: Shared[Loops],
+    nominal: Mapping[str, CompensationMargin],
+    samples: int,
+    rng: np.random.Generator,
     executor: Executor | None = None,
-) -> dict[str, CompensationDraws]:  # fmt: skip
+) -> dict[str, CompensationDraws]:
     """Return the same over draws, of the plants for which it is shown at the nominal parameters."""
     enough, count = {name: margin for name, margin in nominal.items() if margin.shown}, min(samples, MARGIN_DRAWS)
     if not enough or not count:
@@ -112,9 +116,11 @@ def find_compensation_at_draws(
         margins = list(judge_draws(partial(_find_margins, margin.multiplier), loops, name, own, executor))
         least = int(np.argmin([one.slope for one in margins]))
         found[name] = CompensationDraws(
-            samples=count, shown=sum(one.shown for one in margins), least_slope=margins[least].slope,
+            samples=count,
+            shown=sum(one.shown for one in margins),
+            least_slope=margins[least].slope,
             parameters=own[least],
-        )  # fmt: skip
+        )
     return found
 
 
@@ -272,14 +278,21 @@ def _find_largest_eigenvalue(controller: Controller, plant: Plant, params: Param
     if slopes.ripple is not None:
         d[signals.index(slopes.ripple[0])] -= slopes.ripple[1]
     whole = Law(
-        a=law.a, b=np.column_stack([law.b_reference, -b]), c=law.c, d=np.append(law.d_reference, -d),
+        a=law.a,
+        b=np.column_stack([law.b_reference, -b]),
+        c=law.c,
+        d=np.append(law.d_reference, -d),
         sample_time_s=law.sample_time_s,
-    )  # fmt: skip
+    )
     sliding = take_sliding(plant, params)
     sampled = sample(
-        sliding, controller.delay(params), tuple(signals), controller.command.per_effort, law.sample_time_s,
+        sliding,
+        controller.delay(params),
+        tuple(signals),
+        controller.command.per_effort,
+        law.sample_time_s,
         controller.compute_delay_samples,
-    )  # fmt: skip
+    )
     return float(np.max(np.abs(Loop(plant=sampled, law=whole).eigenvalues())))
 
 

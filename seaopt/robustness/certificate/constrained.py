@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict, field, replace
+from dataclasses import field, replace
 from functools import partial
 from typing import Any
 
@@ -25,17 +25,18 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
+from seaopt.codec import to_content
 from seaopt.control import Controller, ForceMPC, ForceRun, MPCStep, close_loop
 from seaopt.control.loops.sampled_plant import DELAYS, conditions, find_delay, read_conditions, whole_samples
 from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.errors import ControlError, SeaoptError, require_seed
 from seaopt.executors import Shared, map_ordered
-from seaopt.formatting import format_count, format_values
+from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import deflection_row, output_function
 from seaopt.progress import Progress, count_off, ignore
-from seaopt.records import record
+from seaopt.records import Result, record
 from seaopt.robustness.uncertainty.draws import Uncertainty
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
@@ -57,7 +58,7 @@ DIVERGED, OVER_BOUND, UNSETTLED, RINGS = "diverged", "over a bound", "not settle
 
 
 @record
-class ConstrainedRuns:
+class ConstrainedRuns(Result):
     """Runs with limits active: how many failed, by what, and the worst of them.
 
     Parameters
@@ -81,8 +82,9 @@ class ConstrainedRuns:
         What the law reads with, and what its command is rounded to.
     unit : str
         Of the ring: N, or N m of a torque.
-    where : str
-        The first run that failed, with its parameters; "" where none did.
+    plant, run, text, parameters
+        Of the first run that failed: the plant, the number of its draw, what happened, and what was drawn; empty
+        where none did.
     remedy : str
         What stands in its way, found by playing it again at other parameters, and what to do about it.
     left_out : tuple of str
@@ -108,13 +110,21 @@ class ConstrainedRuns:
     sensors: Sensors = field(default_factory=Sensors)
     current_step_A: float = 0.0
     unit: str = LINEAR.unit
-    where: str = ""
+    plant: str = ""
+    run: str = ""
+    text: str = ""
+    parameters: Mapping[str, float] = field(default_factory=dict[str, float])
     remedy: str = ""
     left_out: tuple[str, ...] = ()
 
+    @property
+    def met(self) -> bool:
+        """Whether no run failed."""
+        return not self.failures
+
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as they stand in robustness.json under "constrained"."""
-        return asdict(self) | {"left_out": list(self.left_out)}
+        return {"met": self.met, **to_content(self)}
 
     def __str__(self) -> str:
         kinds = (
@@ -137,8 +147,9 @@ class ConstrainedRuns:
         """What a certificate remarks of these runs."""
         return (
             "margins, worst cases and draws are of the linear region, in which no limit of the plan is active",
-            str(self), *self.left_out,
-        )  # fmt: skip
+            str(self),
+            *self.left_out,
+        )
 
 
 @record(eq=False)
@@ -188,10 +199,20 @@ class _Bench:
 
 
 def run_constrained(
-    mpc: ForceMPC, law: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, *, runs: int, seed: int,
-    confidence: float, tolerance: float, sensors: Sensors, current_step_A: float, executor: Executor | None = None,
+    mpc: ForceMPC,
+    law: Controller,
+    plants: Mapping[str, Plant],
+    unknown: Uncertainty,
+    *,
+    runs: int,
+    seed: int,
+    confidence: float,
+    tolerance: float,
+    sensors: Sensors,
+    current_step_A: float,
+    executor: Executor | None = None,
     progress: Progress = ignore,
-) -> ConstrainedRuns:  # fmt: skip
+) -> ConstrainedRuns:
     """Draw and simulate runs with limits active.
 
     Parameters
@@ -213,26 +234,26 @@ def run_constrained(
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name not in DELAYS}
     parts = [
         _Run(
-            draw={name: float(column[k]) for name, column in drawn.items() if name not in placed}, seed=seed + k,
+            draw={name: float(column[k]) for name, column in drawn.items() if name not in placed},
+            seed=seed + k,
             references=_draw_references(mpc, rng),
         )
         for k in range(runs)
-    ]  # fmt: skip
+    ]
     bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, current_step_A=current_step_A)
     played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, executor)
     kinds: list[str] = []
-    worst, remedy, outcomes = "", "", list[_Outcome]()
+    failed_run, outcomes = dict[str, Any](), list[_Outcome]()
     for k in count_off(range(runs), "limits active, run", progress):
         of_plants = dict(zip(plants, next(played), strict=True))
         outcomes += of_plants.values()
         failed = [name for name, one in of_plants.items() if one.kind]
         kinds.append(of_plants[failed[0]].kind if failed else "")
-        if failed and not worst:
+        if failed and not failed_run:
             name, plant, draw = failed[0], plants[failed[0]], parts[k].draw
-            drawn_here = {key: draw[key] for key in draw if key in place_values(plant, unknown.nominal, draw)}
-            at = f"; {format_values(drawn_here)}" if drawn_here else ""
-            worst = f"{name}, run {k}, seed {seed}: {of_plants[name].text}{at}"
-            remedy = _find_remedy(bench, name, plant, unknown.nominal, drawn_here, of_plants[name], parts[k])
+            used = {key: draw[key] for key in draw if key in place_values(plant, unknown.nominal, draw)}
+            remedy = _find_remedy(bench, name, plant, unknown.nominal, used, of_plants[name], parts[k])
+            failed_run.update(plant=name, run=str(k + 1), text=of_plants[name].text, parameters=used, remedy=remedy)
     failures, steps = sum(map(bool, kinds)), sum(one.steps for one in outcomes)
     missing = (
         f"{name} has no {signal}: its bounds are not checked there"
@@ -242,21 +263,32 @@ def run_constrained(
     )
     kept = (f"runs with limits active start at rest at zero: {name} is not drawn there" for name in placed & {*drawn})
     return ConstrainedRuns(
-        runs=runs, failures=failures, seed=seed, diverged=kinds.count(DIVERGED), over_bound=kinds.count(OVER_BOUND),
-        not_settled=kinds.count(UNSETTLED), ringing=kinds.count(RINGS), confidence=confidence,
-        failure_probability_bound=failure_bound(runs, failures, confidence), bound_tolerance=tolerance,
-        largest_violation=max(one.violation for one in outcomes), largest_ring=max(one.ring for one in outcomes),
+        runs=runs,
+        failures=failures,
+        seed=seed,
+        diverged=kinds.count(DIVERGED),
+        over_bound=kinds.count(OVER_BOUND),
+        not_settled=kinds.count(UNSETTLED),
+        ringing=kinds.count(RINGS),
+        confidence=confidence,
+        failure_probability_bound=failure_bound(runs, failures, confidence),
+        bound_tolerance=tolerance,
+        largest_violation=max(one.violation for one in outcomes),
+        largest_ring=max(one.ring for one in outcomes),
         at_limit=sum(one.at_limit for one in outcomes) / max(steps, 1),
         fallback=sum(one.unsolved for one in outcomes) / max(steps, 1),
-        iterations=max(one.iterations for one in outcomes), sensors=sensors,
-        current_step_A=current_step_A, unit=law.command.reference_unit, where=worst, remedy=remedy,
+        iterations=max(one.iterations for one in outcomes),
+        sensors=sensors,
+        current_step_A=current_step_A,
+        unit=law.command.reference_unit,
+        **failed_run,
         left_out=(*missing, *kept),
-    )  # fmt: skip
+    )
 
 
 def _draw_references(
     mpc: ForceMPC, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the reference of a run, and the disturbance of its command, which lasts a phase and what is judged."""
     rest, phase, last = _count_samples(mpc)
     force = rng.choice([-1.0, 1.0]) * rng.uniform(*STEP_SHARES) * abs(mpc.static_gain) * mpc.command_limit
@@ -287,11 +319,17 @@ def _play(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run) -> _Ou
         kind: str, text: str, violation: float = 0.0, signal: str = "", at_limit: int = 0, ring: float = 0.0
     ) -> _Outcome:
         return _Outcome(
-            kind=kind, text=text, violation=violation, signal=signal, at_limit=at_limit, ring=ring, steps=len(steps),
+            kind=kind,
+            text=text,
+            violation=violation,
+            signal=signal,
+            at_limit=at_limit,
+            ring=ring,
+            steps=len(steps),
             unsolved=sum(not step.solved for step in steps),
             late=sum(step.status.startswith(UNFINISHED) and not step.solved for step in steps),
             iterations=max((step.iterations for step in steps), default=0),
-        )  # fmt: skip
+        )
 
     try:
         run = _simulate(bench, plant, values, drawn, steps)
@@ -319,17 +357,32 @@ def _simulate(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run, st
         return steps[-1].current_A, steps[-1].state
 
     return close_loop(
-        law, mpc.start, plant, values, reference, measured=mpc.measured, sample_time_s=mpc.sample_time_s,
-        delay_samples=mpc.compute_delay_samples, preview_samples=mpc.spec.preview_samples, sensors=bench.sensors,
-        current_step_A=bench.current_step_A, current_limit_A=mpc.command_limit, disturbance_A=disturbance,
+        law,
+        mpc.start,
+        plant,
+        values,
+        reference,
+        measured=mpc.measured,
+        sample_time_s=mpc.sample_time_s,
+        delay_samples=mpc.compute_delay_samples,
+        preview_samples=mpc.spec.preview_samples,
+        sensors=bench.sensors,
+        current_step_A=bench.current_step_A,
+        current_limit_A=mpc.command_limit,
+        disturbance_A=disturbance,
         seed=drawn.seed,
-    )  # fmt: skip
+    )
 
 
 def _find_remedy(
-    bench: _Bench, name: str, plant: Plant, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome,
+    bench: _Bench,
+    name: str,
+    plant: Plant,
+    nominal: ParameterSet,
+    draw: Mapping[str, float],
+    failed: _Outcome,
     drawn: _Run,
-) -> str:  # fmt: skip
+) -> str:
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
     mpc, play = bench.mpc, partial(_play, bench, drawn=drawn)
     if failed.late:
@@ -386,9 +439,7 @@ def _judge(mpc: ForceMPC, plant: Plant, run: ForceRun, target: Float[np.ndarray,
     return "", ""
 
 
-def _find_ring(
-    bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run, run: ForceRun
-) -> tuple[float, str]:  # fmt: skip
+def _find_ring(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run, run: ForceRun) -> tuple[float, str]:
     """Return the peak of what swings at the end of a run, 0 for nothing, and a sentence where it is a fault.
 
     What rounding makes comes and goes, so that half of the runs that ring look as if they died out. What dies out is

@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from seaopt.codec import OrInfinite
 from seaopt.control import Controller
 from seaopt.control.laws.friction_margin import find_friction_margin, find_friction_margins
 from seaopt.control.loops.absolute_stability import FrictionMargin
@@ -49,8 +50,8 @@ class FrictionDraws:
 
     samples: int
     shown: int
-    least_slope: float
-    factor: float
+    least_slope: OrInfinite
+    factor: OrInfinite
     parameters: dict[str, float]
 
     def __str__(self) -> str:
@@ -72,9 +73,13 @@ def find_nominal_margins(
 
 
 def find_margins_at_draws(
-    loops: Shared[Loops], nominal: Mapping[str, FrictionMargin], samples: int, rng: np.random.Generator,
-    required: float | None = None, executor: Executor | None = None,
-) -> dict[str, FrictionDraws]:  # fmt: skip
+    loops: Shared[Loops],
+    nominal: Mapping[str, FrictionMargin],
+    samples: int,
+    rng: np.random.Generator,
+    required: float | None = None,
+    executor: Executor | None = None,
+) -> dict[str, FrictionDraws]:
     """Return margins at draws, of plants for which stability, or the slope required, is shown at nominal parameters.
 
     Those that have friction at draws alone are among them.
@@ -82,9 +87,10 @@ def find_margins_at_draws(
     unknown, count = loops.value.unknown, min(samples, MARGIN_DRAWS)
     varied = [row.name for row in unknown.varied()]
     enough = {
-        name: nominal.get(name) for name, model in loops.value.models.items()
+        name: nominal.get(name)
+        for name, model in loops.value.models.items()
         if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
-    }  # fmt: skip
+    }
     if not count or not enough:
         return {}
     draws = unknown.list_draws(count, rng)

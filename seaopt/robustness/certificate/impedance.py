@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from seaopt.codec import OrMinusInfinite
 from seaopt.control import Controller, Impedance, ImpedanceRegion, Rendering, passive_region, render
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
@@ -49,7 +50,7 @@ class ImpedanceDraws:
     samples: int
     stable: int
     passive: int
-    margin: float
+    margin: OrMinusInfinite
     parameters: dict[str, float]
 
     def __str__(self) -> str:
@@ -92,12 +93,16 @@ class CertifiedImpedance:
 
     def to_dict(self) -> dict[str, Any]:
         """Return all of it, for robustness.json."""
-        return {"plant": self.plant} | self.rendering.to_dict() | {
-            "region": self.region.to_dict(),
-            "stuck": None if self.stuck is None else self.stuck.to_dict(),
-            "draws": None if self.draws is None else asdict(self.draws),
-            "steps": [asdict(step) for step in self.steps],
-        }  # fmt: skip
+        return (
+            {"plant": self.plant}
+            | self.rendering.to_dict()
+            | {
+                "region": self.region.to_dict(),
+                "stuck": None if self.stuck is None else self.stuck.to_dict(),
+                "draws": None if self.draws is None else asdict(self.draws),
+                "steps": [asdict(step) for step in self.steps],
+            }
+        )
 
     def lines(self) -> list[str]:
         """Return the findings, one line each."""
@@ -106,17 +111,24 @@ class CertifiedImpedance:
         stuck = [] if self.stuck is None else [f"with its friction stuck: {self.stuck.describe()[0]}"]
         drawn = [] if self.draws is None else [str(self.draws)]
         return [
-            f"{head}{self.plant}: {'; '.join(self.rendering.describe())}", *stuck, *drawn,
-            *(step.describe(self.rendering.outer.place_unit) for step in self.steps), *self.region.describe(),
-        ]  # fmt: skip
+            f"{head}{self.plant}: {'; '.join(self.rendering.describe())}",
+            *stuck,
+            *drawn,
+            *(step.describe(self.rendering.outer.place_unit) for step in self.steps),
+            *self.region.describe(),
+        ]
 
 
 def certify_impedance(
-    controller: Controller, models: Mapping[str, Plant], parameters: ParameterSet, draws: ImpedanceDraws | None = None
+    controller: Controller,
+    models: Mapping[str, Plant],
+    parameters: ParameterSet,
+    draws: ImpedanceDraws | None = None,
+    steps: tuple[ImpedanceStep, ...] | None = None,
 ) -> CertifiedImpedance | None:
     """Measure the impedance of a controller's outer loop at the nominal parameters; None where it has none.
 
-    `draws` is what `draw_impedance` found.
+    `draws` is what `draw_impedance` found; `steps` what was simulated, which is simulated if left out.
 
     Raises
     ------
@@ -131,11 +143,13 @@ def certify_impedance(
     impedance, model = outer.impedance, models[name]
     sliding, *others = split_friction({name: model}, parameters).values()
     return CertifiedImpedance(
-        plant=name, rendering=render(controller, sliding, parameters, impedance),
+        plant=name,
+        rendering=render(controller, sliding, parameters, impedance),
         region=passive_region(controller, sliding, parameters, velocity_filter_s=impedance.velocity_filter_s),
-        stuck=render(controller, others[0], parameters, impedance) if others else None, draws=draws,
-        steps=play_impedance_steps(controller, model, parameters),
-    )  # fmt: skip
+        stuck=render(controller, others[0], parameters, impedance) if others else None,
+        draws=draws,
+        steps=play_impedance_steps(controller, model, parameters) if steps is None else steps,
+    )
 
 
 def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
@@ -152,9 +166,12 @@ def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
 
 
 def draw_impedance(
-    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None,
+    loops: Shared[Loops],
+    samples: int,
+    rng: np.random.Generator,
+    executor: Executor | None = None,
     progress: Progress = ignore,
-) -> ImpedanceDraws | None:  # fmt: skip
+) -> ImpedanceDraws | None:
     """Judge the impedance of a controller's outer loop at draws; None where it has none, or nothing is drawn."""
     count, known = min(samples, IMPEDANCE_DRAWS), loops.value
     if known.controller.outer is None or not count:

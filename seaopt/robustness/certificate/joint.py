@@ -28,8 +28,9 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import Result, record
-from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, Certificate
+from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import CONFIDENCE, certify
+from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst, place_values
 
@@ -103,10 +104,9 @@ class JointTuning(Result):
         if self.certificate is None:
             return self.controller.explanation
         broken = next(row for row in self.certificate.requirements if not row.met)
-        missed = f"{broken.name} = {broken.value:.4g}, limit {broken.limit:.4g} ({broken.where})"
         if self.status == "rounds":
-            return f"{len(self.rounds)} rounds were too few: {missed}; give more rounds, or a larger reserve"
-        return f"no witness is left that the tuner has not met: {missed}"
+            return f"{len(self.rounds)} rounds were too few: {broken}; give more rounds, or a larger reserve"
+        return f"no witness is left that the tuner has not met: {broken}"
 
     @property
     def summary(self) -> str:
@@ -208,9 +208,18 @@ def tune_certified(
         certificate = None
         if controller.feasible:
             certificate = certify(
-                controller, plants, parameters, ranges=ranges, others=others, samples=samples, seed=seed + number - 1,
-                confidence=share, simulations=False, executor=executor, progress=certifying,
-            )  # fmt: skip
+                controller,
+                plants,
+                parameters,
+                ranges=ranges,
+                others=others,
+                samples=samples,
+                seed=seed + number - 1,
+                confidence=share,
+                simulations=False,
+                executor=executor,
+                progress=certifying,
+            )
         added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
         done.append(
             Round(

@@ -122,9 +122,12 @@ def measure_draws(
 
 
 def _measure_block(
-    loops: Shared[Loops], values: Mapping[str, Float[np.ndarray, " _"]], size: int, executor: Executor | None,
+    loops: Shared[Loops],
+    values: Mapping[str, Float[np.ndarray, " _"]],
+    size: int,
+    executor: Executor | None,
     progress: Progress,
-) -> Iterator[tuple[str, BatchFigures]]:  # fmt: skip
+) -> Iterator[tuple[str, BatchFigures]]:
     """Yield the figures of every plant at draws, which are cut where no executor has a say in it."""
     names, slices = list(loops.value.plants), [slice(k, k + DRAW_BLOCK) for k in range(0, size, DRAW_BLOCK)]
     threads = 2 if executor is None else 1
@@ -185,9 +188,12 @@ def select_own(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[d
 
 
 def judge_draws(
-    judge: Callable[[Shared[Loops], str, Sequence[Draw]], Sequence[Case]], loops: Shared[Loops], name: str,
-    draws: Sequence[Draw], executor: Executor | None,
-) -> Iterator[Case]:  # fmt: skip
+    judge: Callable[[Shared[Loops], str, Sequence[Draw]], Sequence[Case]],
+    loops: Shared[Loops],
+    name: str,
+    draws: Sequence[Draw],
+    executor: Executor | None,
+) -> Iterator[Case]:
     """Yield what a judgement makes of every draw on the plant of a name, in order.
 
     Parameters

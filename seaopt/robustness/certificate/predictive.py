@@ -22,12 +22,14 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
+from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
-from seaopt.robustness.certificate.certificate import Certificate, Requirement
+from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import CONFIDENCE, STEPS, certify, find_own_drive
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, run_constrained
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
 from seaopt.robustness.verification.verification import check_sensors
 
@@ -63,11 +65,16 @@ def linear_spec(spec: MPCSpec) -> ControllerSpec:
         if limit.has_field and limit.name != "bandwidth_hz"
     }
     return ControllerSpec(
-        structure=CUSTOM, measured=spec.measured, bandwidth_hz=spec.bandwidth_hz,
+        structure=CUSTOM,
+        measured=spec.measured,
+        bandwidth_hz=spec.bandwidth_hz,
         bandwidth_range_hz=(min(15.0, spec.bandwidth_hz), max(60.0, spec.bandwidth_hz)),
-        sample_rate_hz=spec.sample_rate_hz, min_filter_samples=False, bandwidth_tolerance=MPC_BANDWIDTH_TOLERANCE,
-        **levels, **{name: getattr(spec, name) for name in DELAY_KEYS},
-    )  # fmt: skip
+        sample_rate_hz=spec.sample_rate_hz,
+        min_filter_samples=False,
+        bandwidth_tolerance=MPC_BANDWIDTH_TOLERANCE,
+        **levels,
+        **{name: getattr(spec, name) for name in DELAY_KEYS},
+    )
 
 
 def certify_mpc(
@@ -147,10 +154,19 @@ def certify_mpc(
     law = linear_controller(mpc)
     check_sensors(sensors, law, {"design": mpc.design[0], **plants})
     certificate = certify(
-        law, plants, parameters, ranges=ranges, others=others, seed=seed, confidence=confidence,
-        max_failure_probability=max_failure_probability, simulations=False, executor=executor, progress=linearly,
+        law,
+        plants,
+        parameters,
+        ranges=ranges,
+        others=others,
+        seed=seed,
+        confidence=confidence,
+        max_failure_probability=max_failure_probability,
+        simulations=False,
+        executor=executor,
+        progress=linearly,
         **linear,
-    )  # fmt: skip
+    )
     if real:
         certificate = certificate.with_steps(
             sensors=sensors, current_step_A=current_step_A, seed=seed, executor=executor, progress=stepping
@@ -159,27 +175,44 @@ def certify_mpc(
     known = known.with_parameters(*(values[name] for name in values if name not in known))
     drive = find_own_drive(law, parameters)
     constrained = run_constrained(
-        mpc, law, models, combine_uncertainty(parameters, known, dict(ranges or {}), models, drive), runs=runs,
-        seed=seed, confidence=confidence, tolerance=bound_tolerance, sensors=sensors or Sensors(),
-        current_step_A=current_step_A, executor=executor, progress=simulating,
-    )  # fmt: skip
-    requirements = (*certificate.requirements, *_require_runs(constrained, max_failure_probability))
-    return replace(
-        certificate, constrained=constrained, requirements=requirements, passed=all(row.met for row in requirements)
+        mpc,
+        law,
+        models,
+        combine_uncertainty(parameters, known, dict(ranges or {}), models, drive),
+        runs=runs,
+        seed=seed,
+        confidence=confidence,
+        tolerance=bound_tolerance,
+        sensors=sensors or Sensors(),
+        current_step_A=current_step_A,
+        executor=executor,
+        progress=simulating,
     )
+    requirements = (*certificate.requirements, *_require_runs(constrained, max_failure_probability))
+    return replace(certificate, constrained=constrained, requirements=requirements)
 
 
 def _require_runs(runs: ConstrainedRuns, max_failure_probability: float | None) -> tuple[Requirement, ...]:
     """Return what the runs with limits active require."""
     failures = Requirement(
-        name=CONSTRAINED_FAILURES, limit=0.0, value=float(runs.failures), met=not runs.failures,
-        where=runs.where or f"{runs.runs} runs, seed {runs.seed}",
-    )  # fmt: skip
+        name=CONSTRAINED_FAILURES,
+        limit=0.0,
+        value=float(runs.failures),
+        met=runs.met,
+        plant=runs.plant,
+        scenario="limits active",
+        draw=DrawnAt(parameters=runs.parameters, number=runs.run, seed=runs.seed),
+        text=runs.text or format_count(runs.runs, "run"),
+        remedy=runs.remedy,
+    )
     if max_failure_probability is None:
         return (failures,)
     bound = runs.failure_probability_bound
     probability = Requirement(
-        name=CONSTRAINED_PROBABILITY, limit=max_failure_probability, value=bound,
-        met=bound <= max_failure_probability, where=f"{runs.failures} failures in {runs.runs} runs",
-    )  # fmt: skip
+        name=CONSTRAINED_PROBABILITY,
+        limit=max_failure_probability,
+        value=bound,
+        met=bound <= max_failure_probability,
+        text=f"{format_count(runs.failures, 'failure')} in {format_count(runs.runs, 'run')}",
+    )
     return failures, probability

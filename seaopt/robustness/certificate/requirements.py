@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.laws.limits import LIMIT_ROUNDING, MeasuredLoop, PortFigures
+from seaopt.control.laws.limits import BY_NAME, LIMIT_ROUNDING, MeasuredLoop, PortFigures, Scope
 from seaopt.control.laws.passivity import measure_port
-from seaopt.control.laws.verdict import Verdict, judge
+from seaopt.control.laws.verdict import judge
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.port import port_of
-from seaopt.formatting import format_values
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.robustness.certificate.certificate import KEPT_TO, MIN_FRICTION_MARGIN, Requirement
+from seaopt.plants.friction import friction_states, has_friction
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
     GRAVITY_COMPENSATION,
@@ -31,106 +31,124 @@ from seaopt.robustness.certificate.compensation import (
 )
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
+from seaopt.robustness.certificate.requirement import (
+    DESIGN_PLANT,
+    KEPT_TO,
+    MIN_FRICTION_MARGIN,
+    SPECTRAL_RADIUS,
+    DrawnAt,
+    Requirement,
+    Spot,
+)
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.impedance_steps import AT_REST
 
 NO_FRICTION = "no friction: any margin holds"
-WITNESS_REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
+WITNESS_REMEDY = "tune with that plant in robust_to, a larger reserve or a lower bandwidth"
+PASSIVE = "passive_band_hz"
+UNSTABLE_LOOP = "the loop is UNSTABLE"
 
 
-def design_requirements(controller: Controller, states: Mapping[str, Plant], values: ParameterSet) -> list[Requirement]:
-    """Return what is required of the design plant at the nominal parameters `values`.
-
-    Of two `states` the first is the plant sliding, the second the plant stuck.
-    """
-    figures = {name: controller.close(plant, values).figures() for name, plant in states.items()}
-    (name, achieved), *stuck = figures.items()
-    spec, band = controller.spec, controller.spec.passive_band_hz
-    port = None
+def design_requirements(
+    controller: Controller, plant: Plant, values: ParameterSet, varied: Collection[str] = ()
+) -> list[Requirement]:
+    """Return what is required of the design plant at the nominal `values`; of one that is stuck only some limits."""
+    states = friction_states(plant) if has_friction(plant, values, varied) else {"": plant}
+    figures = {state: controller.close(variant, values).figures() for state, variant in states.items()}
+    (state, achieved), *stuck = figures.items()
+    band, port = controller.spec.passive_band_hz, None
     if band is not None and controller.design is not None:
-        held = port_of(states[name], controller.delay(values), controller.signals, controller.command.per_effort)
+        held = port_of(states[state], controller.delay(values), controller.signals, controller.command.per_effort)
         port = measure_port(held, controller.law, controller.sample_time_s, controller.compute_delay_samples, band)
-    verdicts = judge(spec, controller.measure(name, achieved, port), "design plant")
+    rows = _judge(controller, controller.measure("", achieved, port), "design plant", Spot(DESIGN_PLANT, state))
     for other, loop in stuck:
-        verdicts += judge(spec, MeasuredLoop(name=other, figures=loop), "design plant", stuck=True)
-    return [_make_requirement(verdict, _place_passive(verdict, port, band)) for verdict in verdicts]
+        measured = controller.measure("", loop)
+        rows += _judge(controller, measured, "design plant", Spot(DESIGN_PLANT, other), stuck=True)
+    if band is None or port is None:
+        return rows
+    return [_place_passive(row, port, band) if row.name == PASSIVE else row for row in rows]
 
 
-def plant_requirements(controller: Controller, name: str, figures: LoopFigures) -> list[Requirement]:
+def plant_requirements(controller: Controller, spot: Spot, figures: LoopFigures) -> list[Requirement]:
     """Return what is required of every plant at the nominal parameters, but for friction margins."""
-    spec = replace(controller.spec, min_friction_margin=None)
-    verdicts = judge(spec, MeasuredLoop(name=name, figures=figures), "every plant")
     return [
-        _make_requirement(verdict, "" if figures.stable or verdict.limit.has_field else ": the loop is UNSTABLE")
-        for verdict in verdicts
+        replace(row, text="" if figures.stable or row.name != SPECTRAL_RADIUS else UNSTABLE_LOOP)
+        for row in _judge(controller, controller.measure("", figures), "every plant", spot)
+        if row.name != MIN_FRICTION_MARGIN
     ]
 
 
-def measured_requirements(controller: Controller, name: str, measured: MeasuredResponse) -> list[Requirement]:
-    """Return what is required on a measured response: the limits of every plant, of every response in the discs."""
-    return plant_requirements(controller, *_measure_discs(controller, name, measured))
-
-
-def measured_design_requirements(controller: Controller, name: str, measured: MeasuredResponse) -> list[Requirement]:
-    """Return what is required on the measured response that a controller was designed on, of the design plant alone."""
-    on, figures = _measure_discs(controller, name, measured)
-    return [
-        _make_requirement(verdict, "")
-        for verdict in judge(controller.spec, controller.measure(on, figures), "design plant")
-    ]
-
-
-def _measure_discs(controller: Controller, name: str, measured: MeasuredResponse) -> tuple[str, LoopFigures]:
+def measured_requirements(
+    controller: Controller, name: str, measured: MeasuredResponse, scope: Scope = "every plant"
+) -> list[Requirement]:
+    """Return the limits of a scope on a measured response, of every response in the discs."""
     plant = controller.spec.see_response(measured, controller.command)
     figures = DiscLoop(plant=plant, law=controller.law).figures(controller.spec.bandwidth_hz)
-    return f"{name} (on measured points, at {100 * measured.confidence:.4g} %)", figures
+    on = f"on measured points, at {100 * measured.confidence:.4g} %"
+    if scope == "every plant":
+        rows = plant_requirements(controller, Spot(name), figures)
+    else:
+        rows = _judge(controller, controller.measure(name, figures), scope, Spot(name))
+    return [replace(row, text=f"{on}; {row.text}" if row.text else on) for row in rows]
 
 
-def _make_requirement(verdict: Verdict, remark: str) -> Requirement:
-    limit = verdict.limit
-    return Requirement(
-        name=limit.requirement or limit.name, limit=verdict.allowed, value=verdict.value, met=verdict.met,
-        where=f"{verdict.plant}{remark}", sense=limit.symbol, tolerance=max(limit.tolerance, KEPT_TO),
-    )  # fmt: skip
+def _judge(
+    controller: Controller, loop: MeasuredLoop, scope: Scope, spot: Spot, *, stuck: bool = False
+) -> list[Requirement]:
+    return [
+        Requirement(
+            name=verdict.limit.requirement or verdict.limit.name,
+            limit=verdict.allowed,
+            value=verdict.value,
+            met=verdict.met,
+            sense=verdict.limit.symbol,
+            tolerance=max(verdict.limit.tolerance, KEPT_TO),
+            unit=loop.unit(verdict.limit),
+            **spot._asdict(),
+        )
+        for verdict in judge(controller.spec, loop, scope, stuck=stuck)
+    ]
 
 
-def _place_passive(verdict: Verdict, port: PortFigures | None, band: tuple[float, float] | None) -> str:
-    """Return where in the passive band its port is least passive, and what to do where it is not."""
-    if verdict.limit.name != "passive_band_hz" or port is None or band is None:
-        return ""
-    where = f", Re Z/|Z| at {port.at_hz:.4g} Hz, of {band[0]:g} to {band[1]:g} Hz"
-    if verdict.met:
-        return where
-    return where + (f"; {verdict.limit.remedy}" if port.held_stable else "; the loop grows with its link held")
+def _place_passive(row: Requirement, port: PortFigures, band: tuple[float, float]) -> Requirement:
+    """Return the row with where in the passive band the port is least passive, and what to do where it is not."""
+    text = f"Re Z/|Z| at {port.at_hz:.4g} Hz, of {band[0]:g} to {band[1]:g} Hz"
+    if row.met:
+        return replace(row, text=text)
+    remedy = BY_NAME[PASSIVE].remedy if port.held_stable else "the loop grows with its link held"
+    return replace(row, text=text, remedy=remedy)
 
 
 def draw_requirements(
-    result: MonteCarlo, worst: Mapping[str, Worst], max_failure_probability: float | None = None
+    result: MonteCarlo, worst: Mapping[Spot, Worst], max_failure_probability: float | None = None
 ) -> list[Requirement]:
     """Return what the draws require; where none fails, that the worst case found by search does not either."""
     bound = _require_bound(result, max_failure_probability)
     if not result.samples:
         return bound
-    name = max(worst, key=lambda key: worst[key].severity)
-    case = worst[name]
-    where = format_values(case.parameters, missing="")
+    spot, case = max(worst.items(), key=lambda found: found[1].severity)
     size = f"has Ms {case.witness.ms:.4g}, Mt {case.witness.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
-    witness = f"{name}: worst case {size}" + (f" at {where}" if where else "")
     rows = [
         Requirement(
-            name="monte_carlo_failures", limit=0.0, value=float(result.failures), met=result.failures == 0,
-            where=witness + (WITNESS_REMEDY if result.failures else ""),
+            name="monte_carlo_failures",
+            limit=0.0,
+            value=float(result.failures),
+            met=result.failures == 0,
+            draw=DrawnAt(parameters=case.parameters),
+            text=f"the worst case {size}",
+            remedy=WITNESS_REMEDY if result.failures else "",
+            **spot._asdict(),
         )
-    ]  # fmt: skip
+    ]
     if not result.failures:
-        rows += [row for key, case in worst.items() for row in _require_worst(key, case)]
+        rows += [row for key, one in worst.items() for row in _require_worst(key, one)]
     return rows + bound
 
 
 def friction_requirements(
-    margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None
+    margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None, unit: str
 ) -> list[Requirement]:
     """Return that stability is shown for friction as steep as asked, at the nominal values and over draws.
 
@@ -138,20 +156,21 @@ def friction_requirements(
     """
     if least is None:
         return []
-    if not margins and not draws:
-        return [Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=np.inf, met=True, where=NO_FRICTION)]
+
+    def require(value: float, **found: Any) -> Requirement:
+        met = bool(value >= least * (1.0 - LIMIT_ROUNDING))
+        return Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=value, met=met, sense="≥", unit=unit, **found)
+
     rows: list[Requirement] = []
     for name in dict.fromkeys((*margins, *draws)):
         margin, drawn = margins.get(name), draws.get(name)
-        if margin is None:
-            value, where = np.inf, f"{name}: {NO_FRICTION}"
+        nominal = np.inf if margin is None else margin.least_slope
+        if drawn is not None and drawn.least_slope < nominal:
+            rows.append(require(drawn.least_slope, plant=name, draw=DrawnAt(parameters=drawn.parameters)))
         else:
-            value, where = margin.least_slope, f"{name}: {margin.multiplier} at {margin.frequency_hz:.4g} Hz"
-        if drawn is not None and drawn.least_slope < value:
-            value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
-        met = bool(value >= least * (1.0 - LIMIT_ROUNDING))
-        rows.append(Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=value, met=met, where=where))
-    return rows
+            text = NO_FRICTION if margin is None else f"{margin.multiplier} at {margin.frequency_hz:.4g} Hz"
+            rows.append(require(nominal, plant=name, text=text))
+    return rows or [require(np.inf, text=NO_FRICTION)]
 
 
 def compensation_requirements(
@@ -161,48 +180,65 @@ def compensation_requirements(
 
     Where it is, or is not, says the largest fraction of Coulomb friction that is shown at the compensation's speed.
     """
+    friction = None if controller.compensation is None else controller.compensation.friction
     rows: list[Requirement] = []
     for name, margin in margins.items():
-        value, where = margin.slope, f"{name}: {margin.multiplier}"
-        where += f" at {margin.frequency_hz:.4g} Hz" if margin.slope else ""
-        drawn = draws.get(name)
+        drawn, value, draw = draws.get(name), margin.slope, None
+        said = [f"{margin.multiplier}; {margin.shift} at {margin.frequency_hz:.4g} Hz" if value else margin.multiplier]
         if drawn is not None and drawn.least_slope < value:
-            value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
-        met = bool(value >= margin.asked * (1.0 - LIMIT_ROUNDING))
-        if controller.compensation is not None and controller.compensation.friction is not None and value:
-            where += (
-                f"; shown up to {value / margin.asked * controller.compensation.friction.fraction:.3g} of the friction"
+            value, draw, said = drawn.least_slope, DrawnAt(parameters=drawn.parameters), []
+        if friction is not None and value:
+            said.append(f"shown up to {value / margin.asked * friction.fraction:.3g} of the friction")
+        rows.append(
+            Requirement(
+                name=FRICTION_COMPENSATION,
+                limit=margin.asked,
+                value=value,
+                met=bool(value >= margin.asked * (1.0 - LIMIT_ROUNDING)),
+                sense="≥",
+                unit=controller.command.mechanics.damping,
+                plant=name,
+                draw=draw,
+                text="; ".join(said),
             )
-        rows.append(Requirement(name=FRICTION_COMPENSATION, limit=margin.asked, value=value, met=met, where=where))
+        )
     return rows
 
 
 def eigenvalue_requirements(
-    controller: Controller, models: Mapping[str, Plant], gravity: Mapping[str, GravityCase],
+    controller: Controller,
+    models: Mapping[str, Plant],
+    gravity: Mapping[str, GravityCase],
     ripple: Mapping[str, RippleCase],
-) -> list[Requirement]:  # fmt: skip
+) -> list[Requirement]:
     """Return that neither a weight nor a ripple compensated makes a loop grow, at nominal values and over draws."""
-    terms = controller.compensation
-    found: list[tuple[str, str, GravityCase | RippleCase, str, str]] = []
-    if terms is not None and terms.gravity is not None:
-        looked = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
-        for name, case in gravity.items():
-            port = models[name].port
-            unit = "" if port is None else models[name].states[str(port.coordinate)]
-            found.append((GRAVITY_COMPENSATION, name, case, f"{case.angle:.3g} {unit}", looked))
-    if terms is not None and terms.ripple is not None:
-        unit = f"{controller.command.effort_unit}/{terms.ripple.unit}"
-        for name, case in ripple.items():
-            found.append((RIPPLE_COMPENSATION, name, case, f"{case.slope:.3g} {unit}", "over the slopes"))
     limit = 1.0 + NEUTRAL
-    return [
-        Requirement(
-            name=requirement, limit=limit, value=case.radius, met=case.radius <= limit,
-            where=f"{name} at {at}{f' and {format_values(case.parameters)}' if case.parameters else ''}: the largest "
-            f"eigenvalue {looked}",
+
+    def require(name: str, plant: str, case: GravityCase | RippleCase, text: str) -> Requirement:
+        return Requirement(
+            name=name,
+            limit=limit,
+            value=case.radius,
+            met=case.radius <= limit,
+            plant=plant,
+            draw=DrawnAt(parameters=case.parameters),
+            text=f"the largest eigenvalue, {text}",
         )
-        for requirement, name, case, at, looked in found
-    ]  # fmt: skip
+
+    def list_rows() -> Iterator[Requirement]:
+        terms = controller.compensation
+        if terms is not None and terms.gravity is not None:
+            looked = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
+            for name, case in gravity.items():
+                port = models[name].port
+                unit = "" if port is None else models[name].states[str(port.coordinate)]
+                yield require(GRAVITY_COMPENSATION, name, case, f"{looked}, at {case.angle:.3g} {unit}".rstrip())
+        if terms is not None and terms.ripple is not None:
+            unit = f"{controller.command.effort_unit}/{terms.ripple.unit}"
+            for name, case in ripple.items():
+                yield require(RIPPLE_COMPENSATION, name, case, f"over the slopes, at {case.slope:.3g} {unit}")
+
+    return list(list_rows())
 
 
 def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
@@ -212,41 +248,59 @@ def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Require
     """
     if impedance is None:
         return []
-    called, unit = impedance.rendering.called, impedance.rendering.outer.place_unit
-    link = f"{impedance.plant}: link"
+    called, unit, plant = impedance.rendering.called, impedance.rendering.outer.place_unit, impedance.plant
     rows: list[Requirement] = []
-    for state, rendered in (("", impedance.rendering), (", friction stuck", impedance.stuck)):
+    for state, rendered in (("", impedance.rendering), ("stuck", impedance.stuck)):
         if rendered is None:
             continue
         breaking = "" if rendered.breaking is None else f"; {rendered.breaking.describe(called)}"
         rows += [
             Requirement(
-                name="impedance_stable", limit=1.0, value=rendered.spectral_radius, met=rendered.stable,
-                where=f"{link} with nothing on it{state}",
+                name="impedance_stable",
+                limit=1.0,
+                value=rendered.spectral_radius,
+                met=rendered.stable,
+                plant=plant,
+                state=state,
+                text="the link with nothing on it",
             ),
             Requirement(
-                name="impedance_damper", limit=rendered.link_damping, value=rendered.needed_damper,
+                name="impedance_damper",
+                limit=rendered.link_damping,
+                value=rendered.needed_damper,
                 met=rendered.passive,
-                where=f"{link}, {called.damping} that make it passive, and its own{state}{breaking}",
+                unit=called.damping,
+                plant=plant,
+                state=state,
+                text=f"{called.damping} at the link that make it passive, and its own{breaking}",
             ),
-        ]  # fmt: skip
-    if impedance.draws is not None:
-        drawn = impedance.draws
+        ]
+    drawn = impedance.draws
+    if drawn is not None:
         failed = drawn.samples - min(drawn.stable, drawn.passive)
         rows.append(
             Requirement(
-                name="impedance_draws", limit=0.0, value=float(failed), met=not failed,
-                where=f"{link}: {drawn}",
+                name="impedance_draws",
+                limit=0.0,
+                value=float(failed),
+                met=not failed,
+                plant=plant,
+                draw=DrawnAt(parameters=drawn.parameters),
+                text=f"stable in {drawn.stable} of {drawn.samples} draws and passive in {drawn.passive}",
             )
-        )  # fmt: skip
-    for step in impedance.steps:
-        rows.append(
-            Requirement(
-                name="impedance_rest", limit=AT_REST, value=step.moving, met=step.rests,
-                where=f"{link}: {step.describe(unit)}",
-            )
-        )  # fmt: skip
-    return rows
+        )
+    return rows + [
+        Requirement(
+            name="impedance_rest",
+            limit=AT_REST,
+            value=step.moving,
+            met=step.rests,
+            plant=plant,
+            scenario=f"step of x_0 by {step.size:.3g} {unit}",
+            text=step.describe(unit),
+        )
+        for step in impedance.steps
+    ]
 
 
 def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
@@ -255,30 +309,29 @@ def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]
         return []
     value = result.failure_probability_bound if result.samples else 1.0
     fewest = int(np.ceil(np.log(1.0 - result.confidence) / np.log1p(-limit))) if limit < 1.0 else 1
-    where = f"{result.failures} failures in {result.samples} draws"
+    text, remedy = f"{result.failures} failures in {result.samples} draws", ""
     if not result.samples:
-        where = "nothing is uncertain, so that nothing was drawn; give a fit, prior_std or ranges"
+        text, remedy = "nothing is uncertain, so that nothing was drawn", "give a fit, prior_std or ranges"
     elif value > limit:
-        where += f"; {fewest} draws without a failure would do"
-    return [
-        Requirement(name="max_failure_probability", limit=limit, value=value, met=bool(value <= limit), where=where)
-    ]
+        remedy = f"{fewest} draws without a failure would do"
+    met = bool(value <= limit)
+    return [Requirement(name="max_failure_probability", limit=limit, value=value, met=met, text=text, remedy=remedy)]
 
 
-def _require_worst(name: str, case: Worst) -> list[Requirement]:
+def _require_worst(spot: Spot, case: Worst) -> list[Requirement]:
     """Return how much of the limits the worst case uses: 1 is all of it."""
     if not case.limited and case.severity < UNSTABLE:
         return []
-    where = format_values(case.parameters, missing="")
     met = case.severity <= 1.0 + LIMIT_ROUNDING
-    used = case.severity if case.severity < UNSTABLE else np.inf
     return [
         Requirement(
             name="worst_case",
             limit=1.0,
-            value=used,
+            value=case.severity if case.severity < UNSTABLE else np.inf,
             met=met,
-            where=f"{name}{'' if case.severity < UNSTABLE else ', UNSTABLE,'} at {where}"
-            + ("" if met else WITNESS_REMEDY),
+            draw=DrawnAt(parameters=case.parameters),
+            text="" if case.severity < UNSTABLE else UNSTABLE_LOOP,
+            remedy="" if met else WITNESS_REMEDY,
+            **spot._asdict(),
         )
     ]

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from itertools import pairwise
@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
+from seaopt.codec import to_content
 from seaopt.control import Controller, LoopFigures, ScheduledController
 from seaopt.control.laws.delay import split_delayed
 from seaopt.control.loops.sampled_plant import conditions
@@ -35,17 +36,18 @@ from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, pl
 from seaopt.errors import ControlError, require_number, require_seed, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor, map_ordered
-from seaopt.formatting import format_count, html_text, join_words
+from seaopt.formatting import format_count, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction
+from seaopt.plants.friction import name_states, split_friction
 from seaopt.progress import Progress, count_off, divide, ignore
-from seaopt.records import Result, record
+from seaopt.records import Result, Worded, record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
-from seaopt.robustness.certificate.certificate import DESIGN_PLANT, MIN_FRICTION_MARGIN, Certificate, Requirement
+from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import CONFIDENCE, add_design, certify, failure_bound, find_own_drive
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.measured_draws import Failures, Loops
+from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, Requirement, Spot
 from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
@@ -67,7 +69,7 @@ POINT, BOUND, SWEEP = 4.0, 0.2, 5.0  # seconds that a part takes as a rule: of a
 
 
 @record(eq=False)
-class PlaceCertificate:
+class PlaceCertificate(Result):
     """What was found with the variable standing at one value.
 
     Parameters
@@ -100,6 +102,11 @@ class PlaceCertificate:
     requirements: tuple[Requirement, ...]
     simulated: Certificate | None = None
 
+    @property
+    def met(self) -> bool:
+        """Whether every requirement there is met."""
+        return all(row.met for row in self.requirements)
+
     def on(self, plants: Mapping[str, Plant]) -> PlaceCertificate:
         """Return the same of plants that equal its own (`Worst.on`)."""
         return replace(self, worst={name: case.on(plants[name]) for name, case in self.worst.items()})
@@ -116,7 +123,7 @@ class PlaceCertificate:
 
 
 @record(eq=False, repr=False)
-class ScheduleCertificate(Result):
+class ScheduleCertificate(Result, Worded):
     """What `certify_schedule` returns.
 
     Parameters
@@ -148,11 +155,6 @@ class ScheduleCertificate(Result):
 
     @property
     def met(self) -> bool:
-        """Whether every requirement is met."""
-        return self.passed
-
-    @property
-    def passed(self) -> bool:
         """Whether every requirement is met."""
         return all(row.met for row in self.requirements)
 
@@ -200,38 +202,23 @@ class ScheduleCertificate(Result):
     @property
     def notes(self) -> tuple[str, ...]:
         """What is proved, assumed and simulated, one sentence each."""
-        swept = (describe_sweeps(sweeps, self.schedule.unit) for sweeps in self.sweeps.values())
-        moved = (describe_motion(motion, self.schedule.over, self.schedule.unit) for motion in self.motions.values())
+        unit, over = self.rate_unit, self.schedule.over
+        swept = (f"{name}: {describe_sweeps(sweeps, unit)}" for name, sweeps in self.sweeps.items())
+        moved = (f"{name}: {describe_motion(motion, over, unit)}" for name, motion in self.motions.items())
         return (self.proof, self.assumption, *swept, *moved)
-
-    def list_rows(self) -> list[tuple[str, ...]]:
-        """Return the points as text: value, largest Ms and Mt nominal, worst Ms found, draws that fail."""
-        rows: list[tuple[str, ...]] = []
-        for place in self.places:
-            failed = place.unstable + place.over_ms + place.over_mt
-            rows.append((
-                f"{place.value:.4g}", "point" if place.point else "between",
-                f"{place.ms:.3f}", f"{max(one.mt for one in place.plants.values()):.3f}",
-                "" if place.worst_ms is None else f"{place.worst_ms:.3f}", f"{failed} of {place.draws}",
-            ))  # fmt: skip
-        return rows
-
-    @property
-    def row_heads(self) -> tuple[str, ...]:
-        """What stands above the columns of `list_rows`."""
-        return (f"{self.schedule.over}{unit_after(self.schedule.unit)}", "", "Ms", "Mt", "worst Ms", "draws that fail")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of schedule_robustness.json (schema seaopt/schedule_robustness/1)."""
         return {
             "schema": SCHEDULE_ROBUSTNESS_SCHEMA,
             "met": self.met,
-            "passed": self.passed,
+            "passed": self.met,
             "over": self.schedule.over,
             "unit": self.schedule.unit,
-            "requirements": [_list_fields(row) for row in self.requirements],
+            "requirements": [row.to_dict() for row in self.requirements],
             "places": [
                 {
+                    "met": place.met,
                     "value": place.value,
                     "point": place.point,
                     "plants": {
@@ -239,42 +226,60 @@ class ScheduleCertificate(Result):
                         for name, one in place.plants.items()
                     },
                     "worst": {
-                        name: {"parameters": one.parameters, "ms": one.ms, "mt": one.mt}
+                        name: {
+                            "parameters": one.parameters,
+                            "ms": one.ms,
+                            "mt": one.mt,
+                            "largest": {
+                                figure: at.parameters for figure, at in zip(("ms", "mt"), one.largest, strict=True)
+                            },
+                        }
                         for name, one in place.worst.items()
                     },
-                    "draws": place.draws, "unstable": place.unstable, "over_ms": place.over_ms,
+                    "draws": place.draws,
+                    "unstable": place.unstable,
+                    "over_ms": place.over_ms,
                     "over_mt": place.over_mt,
                     "simulated": None if place.simulated is None else place.simulated.to_dict(),
                 }
                 for place in self.places
             ],
-            "monte_carlo": _list_fields(self.monte_carlo),
-            "stretches": [_list_fields(one) for one in self.stretches],
-            "sweeps": {name: [_list_fields(one) for one in sweeps] for name, sweeps in self.sweeps.items()},
-            "motions": {name: _list_fields(one) for name, one in self.motions.items()},
+            "monte_carlo": to_content(self.monte_carlo),
+            "stretches": to_content(self.stretches),
+            "sweeps": to_content(self.sweeps),
+            "motions": to_content(self.motions),
             "fastest_rate": self.fastest,
             "rate_unit": self.rate_unit,
             "proof": self.proof,
             "assumption": self.assumption,
             "notes": list(self.notes),
-        }  # fmt: skip
+        }
 
-    def __repr__(self) -> str:
-        broken = [row for row in self.requirements if not row.met]
-        verdict = "passed" if self.passed else f"FAILED, {len(broken)} of {len(self.requirements)} requirements not met"
-        rows = [self.row_heads, *self.list_rows()]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        return "\n".join(
-            [
-                f"ScheduleCertificate over {self.schedule.over}: {verdict}",
-                *("  " + "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows),
-                f"  {self.monte_carlo}",
-                *(f"  {note}" for note in self.notes),
-                *(f"  not met: {row.name} {row.value:.4g} of {row.limit:.4g}: {row.where}" for row in broken),
-            ]
-        )
+    @classmethod
+    def from_dict(
+        cls,
+        content: Mapping[str, Any],
+        schedule: ScheduledController,
+        plants: Mapping[str, Plant],
+        parameters: Fit | ParameterSet,
+        *,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        others: ParameterSet | None = None,
+    ) -> ScheduleCertificate:
+        """Return the certificate of a schedule_robustness.json; nothing is simulated.
 
-    _repr_html_ = html_text
+        Linear figures are computed again. Arguments are those of `certify_schedule`.
+
+        Raises
+        ------
+        FileError
+            A field is missing or malformed, it was edited or written by hand, or nothing is required in it.
+
+        """
+        from seaopt.robustness.certificate.stored import build_schedule_certificate  # deferred: pydantic
+
+        given = find_standing(schedule, plants, parameters, dict(ranges or {}), others or ParameterSet())
+        return build_schedule_certificate(content, schedule, given)
 
 
 def certify_schedule(
@@ -342,30 +347,34 @@ def certify_schedule(
         raise ControlError(f"min_rate = {min_rate:g} is not positive; give a rate in {schedule.unit}/s")
     ranges, others = dict(ranges or {}), others or ParameterSet()
     _check_variable(schedule, parameters, ranges)
-    models = add_design(schedule.design[0], plants)
-    models = split_delayed(schedule.spec, schedule.design[0], models, parameters)
-    values = sorted({*schedule.points, *list_inner(schedule.points, PARTS)})
+    given = find_standing(schedule, plants, parameters, ranges, others)
+    models, values, unknowns, sources = given.models, given.values, given.unknowns, given.sources
     standing, proving, sweeping = divide(
         progress, POINT * len(schedule.points), BOUND * len(values) * len(models), SWEEP * len(models) * simulations
     )
     count = -(-samples // len(values))
     rng = np.random.default_rng([require_seed(seed, ControlError), *_digest(schedule)])
-    sources = [_place_source(schedule, parameters, others, value) for value in values]
-    drive = find_own_drive(schedule.controllers[0], parameters)
-    unknowns = [combine_uncertainty(source, rest, ranges, models, drive) for source, rest in sources]
     drawn = [unknown.draw(count if unknown.size else 0, rng) for unknown in unknowns]
     shared, nominal = Shared((schedule, models)), unknowns[-1].nominal
     parts = zip(values, unknowns, drawn, rng.spawn(len(values)), strict=True)
     standing_at = map_ordered(partial(_certify_place, shared), parts, executor)
     places: list[PlaceCertificate] = []
     for number, value in enumerate(count_off(values, f"value of {schedule.over}", standing)):
-        place, (source, rest) = next(standing_at).on(_split(models, unknowns[number])), sources[number]
-        if held := _list_held(schedule, models, value):
+        place, (source, rest) = next(standing_at).on(split_states(models, unknowns[number])), sources[number]
+        if held := list_held(schedule, models, value):
             simulated = certify(
-                schedule.at(value), held, source, ranges=_choose_ranges(ranges, held), others=rest, samples=count,
-                seed=seed, simulations=simulations, sensors=sensors if simulations else None,
-                current_step_A=current_step_A if simulations else 0.0, executor=executor,
-            )  # fmt: skip
+                schedule.at(value),
+                held,
+                source,
+                ranges=_choose_ranges(ranges, held),
+                others=rest,
+                samples=count,
+                seed=seed,
+                simulations=simulations,
+                sensors=sensors if simulations else None,
+                current_step_A=current_step_A if simulations else 0.0,
+                executor=executor,
+            )
             place = _add_simulations(schedule, place, simulated)
         places.append(place)
     pairs = list(pairwise(values))
@@ -376,26 +385,66 @@ def certify_schedule(
         found = sweep_schedule(schedule, name, models[name], nominal, executor=executor)
         sweeps |= {name: found} if found else {}
     draws = _count_draws(places, seed, confidence)
+    spots = {
+        value: {
+            label: spot._replace(place=(schedule.over, value)) for label, spot in _name_spots(models, unknown).items()
+        }
+        for value, unknown in zip(values, unknowns, strict=True)
+    }
     certificate = ScheduleCertificate(
-        schedule=schedule, places=tuple(places), monte_carlo=draws, stretches=tuple(stretches), sweeps=sweeps,
+        schedule=schedule,
+        places=tuple(places),
+        monte_carlo=draws,
+        stretches=tuple(stretches),
+        sweeps=sweeps,
         motions={},
         requirements=(
             *(row for place in places for row in place.requirements),
-            *_require_limits_between(schedule), *_require_draws(places, draws, max_failure_probability),
+            *_require_limits_between(schedule),
+            *_require_draws(places, spots, draws, max_failure_probability),
         ),
-    )  # fmt: skip
+    )
     progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
     if not sweeps:
         return certificate
     slowest = min(found[0].rate for found in sweeps.values())
     motions = move_plants(schedule, models, nominal, min_rate or certificate.fastest or slowest)
     return replace(
-        certificate, motions=motions,
+        certificate,
+        motions=motions,
         requirements=(
-            *certificate.requirements, *_require_rate(certificate, min_rate),
-            *(_require_motion(motion, schedule, min_rate) for motion in motions.values()),
+            *certificate.requirements,
+            *_require_rate(certificate, min_rate),
+            *(_require_motion(motion, schedule.over, certificate.rate_unit, min_rate) for motion in motions.values()),
         ),
-    )  # fmt: skip
+    )
+
+
+@record(eq=False)
+class Standing:
+    """What a schedule is certified at: plants, values of its variable, and at each what is known and uncertain."""
+
+    models: dict[str, Plant]
+    values: tuple[float, ...]
+    sources: tuple[tuple[Fit | ParameterSet, ParameterSet], ...]  # and others
+    unknowns: tuple[Uncertainty, ...]
+
+
+def find_standing(
+    schedule: ScheduledController,
+    plants: Mapping[str, Plant],
+    parameters: Fit | ParameterSet,
+    ranges: Mapping[str, tuple[float, float]],
+    others: ParameterSet,
+) -> Standing:
+    """Return what a schedule is certified at: its points and the values between them, with the design plant."""
+    models = add_design(schedule.design[0], plants)
+    models = split_delayed(schedule.spec, schedule.design[0], models, parameters)
+    values = tuple(sorted({*schedule.points, *list_inner(schedule.points, PARTS)}))
+    sources = tuple(_place_source(schedule, parameters, others, value) for value in values)
+    drive = find_own_drive(schedule.controllers[0], parameters)
+    unknowns = tuple(combine_uncertainty(source, rest, ranges, models, drive) for source, rest in sources)
+    return Standing(models=models, values=values, sources=sources, unknowns=unknowns)
 
 
 def _check_variable(
@@ -425,9 +474,15 @@ def _place_source(
 _Scheduled = tuple[ScheduledController, dict[str, Plant]]
 
 
-def _split(models: Mapping[str, Plant], unknown: Uncertainty) -> dict[str, Plant]:
+def split_states(models: Mapping[str, Plant], unknown: Uncertainty) -> dict[str, Plant]:
     """Return the plants whose loops are measured: one with friction is there sliding and stuck."""
     return split_friction(models, unknown.nominal, [row.name for row in unknown.varied()])
+
+
+def _name_spots(models: Mapping[str, Plant], unknown: Uncertainty) -> dict[str, Spot]:
+    """Return plant and state behind each name of `split_states`."""
+    states = name_states(models, unknown.nominal, [row.name for row in unknown.varied()])
+    return {label: Spot(*state) for label, state in states.items()}
 
 
 def _certify_place(
@@ -435,25 +490,29 @@ def _certify_place(
 ) -> PlaceCertificate:
     """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case."""
     (schedule, models), (value, unknown, points, rng) = shared.value, part
-    controller, point, plants = schedule.at(value), value in schedule.points, _split(models, unknown)
+    controller, point, plants = schedule.at(value), value in schedule.points, split_states(models, unknown)
     figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
     failures = _count_failures(controller, plants, unknown, points)
-    rows = [row for name in plants for row in plant_requirements(controller, name, figures[name])]
+    spots = _name_spots(models, unknown)
+    rows = [row for name, spot in spots.items() for row in plant_requirements(controller, spot, figures[name])]
     rows += _require_friction(schedule, models, value, unknown, len(points), rng)
     if point:
         design, _ = schedule.design
-        rows += design_requirements(
-            controller, split_friction({DESIGN_PLANT: design}, unknown.nominal), unknown.nominal
-        )
+        rows += design_requirements(controller, design, unknown.nominal)
     return PlaceCertificate(
-        value=value, point=point, plants=figures,
+        value=value,
+        point=point,
+        plants=figures,
         worst={name: find_worst(controller, plant, unknown, points) for name, plant in plants.items()} if point else {},
-        draws=len(points), unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
-        requirements=_name_place(schedule, value, rows),
-    )  # fmt: skip
+        draws=len(points),
+        unstable=failures.unstable,
+        over_ms=failures.over_ms,
+        over_mt=failures.over_mt,
+        requirements=_place(schedule, value, rows),
+    )
 
 
-def _list_held(schedule: ScheduledController, models: Mapping[str, Plant], value: float) -> dict[str, Plant]:
+def list_held(schedule: ScheduledController, models: Mapping[str, Plant], value: float) -> dict[str, Plant]:
     """Return the plants that `certify` takes: at a point those that hold the variable, if the design plant does.
 
     Where a plant moves the variable, a law that is frozen there is not what runs.
@@ -464,11 +523,15 @@ def _list_held(schedule: ScheduledController, models: Mapping[str, Plant], value
 
 
 def _require_friction(
-    schedule: ScheduledController, models: Mapping[str, Plant], value: float, unknown: Uncertainty, samples: int,
+    schedule: ScheduledController,
+    models: Mapping[str, Plant],
+    value: float,
+    unknown: Uncertainty,
+    samples: int,
     rng: np.random.Generator,
-) -> list[Requirement]:  # fmt: skip
+) -> list[Requirement]:
     """Return the friction margins asked at a value, of the plants that `certify` does not take there."""
-    controller, held = schedule.at(value), _list_held(schedule, models, value)
+    controller, held = schedule.at(value), list_held(schedule, models, value)
     least = controller.spec.level(MIN_FRICTION_MARGIN)
     apart = {name: plant for name, plant in models.items() if name not in held}
     if least is None or not apart:
@@ -476,7 +539,7 @@ def _require_friction(
     margins = find_nominal_margins(controller, apart, unknown.nominal)
     loops = Loops(controller=controller, models=apart, plants=apart, unknown=unknown, bounds=None)
     draws = find_margins_at_draws(Shared(loops), margins, samples, rng, least)
-    return friction_requirements(margins, draws, least)
+    return friction_requirements(margins, draws, least, controller.command.mechanics.damping)
 
 
 def _count_failures(
@@ -491,8 +554,8 @@ def _count_failures(
     return failures
 
 
-def _name_place(schedule: ScheduledController, value: float, rows: Sequence[Requirement]) -> tuple[Requirement, ...]:
-    return tuple(replace(row, where=f"{schedule.over} = {value:.4g}, {row.where}") for row in rows)
+def _place(schedule: ScheduledController, value: float, rows: Sequence[Requirement]) -> tuple[Requirement, ...]:
+    return tuple(replace(row, place=(schedule.over, value)) for row in rows)
 
 
 def _choose_ranges(
@@ -509,9 +572,9 @@ def _add_simulations(
     schedule: ScheduledController, place: PlaceCertificate, certificate: Certificate
 ) -> PlaceCertificate:
     """Return a point with the certificate of the plants that hold the variable there."""
-    known = {(row.name, row.where) for row in place.requirements}
-    rows = _name_place(schedule, place.value, certificate.requirements)
-    new = tuple(row for row in rows if (row.name, row.where) not in known)
+    known = {(row.name, row.plant, row.state) for row in place.requirements}
+    rows = _place(schedule, place.value, certificate.requirements)
+    new = tuple(row for row in rows if (row.name, row.plant, row.state) not in known)
     return replace(place, simulated=certificate, requirements=(*place.requirements, *new))
 
 
@@ -534,18 +597,25 @@ def _count_draws(places: Sequence[PlaceCertificate], seed: int, confidence: floa
     )
     failures = unstable + over_ms + over_mt
     return MonteCarlo(
-        samples=samples, failures=failures, seed=seed, confidence=confidence, unstable=unstable, over_ms=over_ms,
-        over_mt=over_mt, failure_probability_bound=failure_bound(samples, failures, confidence),
-    )  # fmt: skip
+        samples=samples,
+        failures=failures,
+        seed=seed,
+        confidence=confidence,
+        unstable=unstable,
+        over_ms=over_ms,
+        over_mt=over_mt,
+        failure_probability_bound=failure_bound(samples, failures, confidence),
+    )
 
 
 def _require_draws(
-    places: Sequence[PlaceCertificate], draws: MonteCarlo, max_failure_probability: float | None
+    places: Sequence[PlaceCertificate],
+    spots: Mapping[float, Mapping[str, Spot]],
+    draws: MonteCarlo,
+    max_failure_probability: float | None,
 ) -> list[Requirement]:
     """Return what the draws require, the worst case found at a point beside them."""
-    worst = {
-        f"{name} at {place.value:.4g}": case for place in places for name, case in place.worst.items()
-    }  # fmt: skip
+    worst = {spots[place.value][name]: case for place in places for name, case in place.worst.items()}
     return draw_requirements(draws, worst, max_failure_probability)
 
 
@@ -553,12 +623,16 @@ def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
     """Return that the design plant's limits hold between the points, 0.9 of the bandwidth asked among them."""
     return [
         Requirement(
-            name="limits_between_points", limit=0.0, value=float(len(place.broken)), met=not place.broken,
-            where=f"{schedule.over} = {place.value:.4g}"
-            + (f": {', '.join(place.broken)}; {schedule.remedy}" if place.broken else ""),
+            name="limits_between_points",
+            limit=0.0,
+            value=float(len(place.broken)),
+            met=not place.broken,
+            place=(schedule.over, place.value),
+            text=", ".join(place.broken),
+            remedy=schedule.remedy if place.broken else "",
         )
         for place in schedule.between
-    ]  # fmt: skip
+    ]
 
 
 def _require_rate(certificate: ScheduleCertificate, least: float | None) -> list[Requirement]:
@@ -567,39 +641,47 @@ def _require_rate(certificate: ScheduleCertificate, least: float | None) -> list
     for sweeps in certificate.sweeps.values():
         fastest, faults = find_fastest(sweeps), [sweep.fault for sweep in sweeps if sweep.fault]
         asked = sweeps[0].rate if least is None else least
-        short = f", the fastest tried is {sweeps[-1].rate:.3g}" if not faults else f": {faults[0]}"
+        text = faults[0] if faults else f"the fastest tried is {sweeps[-1].rate:.3g} {certificate.rate_unit}"
         rows.append(
             Requirement(
-                name="min_schedule_rate", limit=asked, value=fastest, met=fastest >= asked,
-                where=f"{sweeps[0].plant}, {certificate.rate_unit} in a sweep{short}",
+                name="min_schedule_rate",
+                limit=asked,
+                value=fastest,
+                met=fastest >= asked,
+                sense="≥",
+                unit=certificate.rate_unit,
+                plant=sweeps[0].plant,
+                scenario="sweep",
+                text=text,
             )
-        )  # fmt: skip
+        )
     return rows
 
 
-def _require_motion(motion: Motion, schedule: ScheduledController, least: float | None) -> Requirement:
+def _require_motion(motion: Motion, over: str, unit: str, least: float | None) -> Requirement:
     """Return that a plant that moves the variable keeps its judgement: at the rate reached at all, or as asked.
 
     What keeps its judgement at less than was asked is not met: nothing is known of the rate that was.
     """
     asked = motion.rate if least is None else least
     short = not motion.fault and motion.rate < asked
-    remedy = "; ask a smaller min_rate, or give the command a higher limit" if short else ""
     return Requirement(
-        name=MOTION_RATE, limit=asked, value=0.0 if motion.fault else motion.rate,
+        name=MOTION_RATE,
+        limit=asked,
+        value=0.0 if motion.fault else motion.rate,
         met=not motion.fault and not short,
-        where=f"{describe_motion(motion, schedule.over, schedule.unit)}{remedy}",
-    )  # fmt: skip
+        sense="≥",
+        unit=unit,
+        plant=motion.plant,
+        text=describe_motion(motion, over, unit),
+        remedy="ask a smaller min_rate, or give the command a higher limit" if short else "",
+    )
 
 
 def _digest(schedule: ScheduledController) -> tuple[int, ...]:
     """Return numbers of the law's own, so that another law meets other draws at the same seed."""
     text = " ".join(f"{value:.6g}" for row in schedule.table.gains.values() for value in row)
     return tuple(int(word) for word in np.frombuffer(sha256(text.encode()).digest()[:16], dtype=np.uint32))
-
-
-def _list_fields(row: Any) -> dict[str, Any]:
-    return {field.name: getattr(row, field.name) for field in fields(row)}
 
 
 def _round_up(value: float) -> str:

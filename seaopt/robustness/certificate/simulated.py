@@ -15,12 +15,13 @@ from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
 from seaopt.executors import Shared, map_ordered
-from seaopt.formatting import format_band, html_text
+from seaopt.formatting import format_band, format_count, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
 from seaopt.progress import Progress, divide, ignore
 from seaopt.records import Result, record
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
@@ -29,7 +30,6 @@ from seaopt.robustness.verification.verification import (
     Verification,
     check_plants,
     check_sensors,
-    describe_witness,
     verify,
 )
 
@@ -42,17 +42,6 @@ NAMED_FAULTS = {
     "overshoot": STEP_OVERSHOOT, "settling": STEP_SETTLING, "steady error": "steady_error",
     "oscillation": "sustained_oscillation",
 }  # fmt: skip
-
-
-@record
-class SimulationRequirement:
-    """What runs of one plant require, in the fields of a certificate's requirement."""
-
-    name: str
-    limit: float
-    value: float
-    met: bool
-    where: str
 
 
 @record(eq=False)
@@ -84,24 +73,23 @@ class Simulated(Result):
 
     @property
     def met(self) -> bool:
-        """Whether every scenario passed."""
-        return self.passed
-
-    @property
-    def passed(self) -> bool:
-        """Every scenario passed; large signals and passivity are findings."""
-        return self.verification is not None and self.verification.passed
+        """Whether every scenario passed; large signals and passivity are findings."""
+        return self.verification is not None and self.verification.met
 
     def simulation_dict(self) -> dict[str, Any]:
         """Return what goes into robustness.json under "simulation"."""
         played = {} if self.verification is None else self.verification.to_dict()
-        return {"passed": self.passed} | played | {
-            "large_signal": [sweep.to_dict() for sweep in self.large_signal],
-            "sensors": asdict(self.sensors),
-            "current_step_A": self.current_step_A,
-            "seed": self.seed,
-            "left_out": dict(self.left_out),
-        }  # fmt: skip
+        return (
+            {"met": self.met, "passed": self.met}
+            | played
+            | {
+                "large_signal": [sweep.to_dict() for sweep in self.large_signal],
+                "sensors": asdict(self.sensors),
+                "current_step_A": self.current_step_A,
+                "seed": self.seed,
+                "left_out": dict(self.left_out),
+            }
+        )
 
     def passivity_dict(self) -> dict[str, Any] | None:
         """Return what goes into robustness.json under "passivity"; None for a plant without a port."""
@@ -174,14 +162,10 @@ def run_simulations(
         )
     check_plants(plants, draws or {}, {})
     check_sensors(sensors, controller, plants)
-    plant, values = controller.design
     device = sensors or Sensors()
     swept = _list_sweeps(controller, plants, parameters)
     jobs: dict[str, Callable[[], Any]] = {what: partial(_sweep, controller, name, *on) for name, on, what in swept}
-    jobs |= {
-        "passivity": partial(passivity, controller, plant, values),
-        "environments": partial(coupled_stability, controller, plant, values),
-    }
+    jobs |= _list_port_jobs(controller)
     sweeping, playing = divide(progress, SWEEP * len(swept) + PORT, SCENARIOS * len(plants))
     attempts = map_ordered(partial(_attempt_job, Shared(tuple(jobs.values()))), range(len(jobs)), executor)
     done: dict[str, tuple[Any, str]] = {}
@@ -203,11 +187,26 @@ def run_simulations(
         )
     )
     return Simulated(
-        verification=verification, large_signal=tuple(done[what][0] for _, _, what in swept if not done[what][1]),
-        passivity=done["passivity"][0], environments=done["environments"][0],
+        verification=verification,
+        large_signal=tuple(done[what][0] for _, _, what in swept if not done[what][1]),
+        passivity=done["passivity"][0],
+        environments=done["environments"][0],
         left_out={what: reason for what, (_, reason) in done.items() if reason},
-        sensors=device, current_step_A=current_step_A, seed=seed,
-    )  # fmt: skip
+        sensors=device,
+        current_step_A=current_step_A,
+        seed=seed,
+    )
+
+
+def find_port_figures(controller: Controller) -> dict[str, Any]:
+    """Return what the linear loop does at the design plant's port; None what cannot be had."""
+    return {what: _attempt(job)[0] for what, job in _list_port_jobs(controller).items()}
+
+
+def _list_port_jobs(controller: Controller) -> dict[str, Callable[[], Any]]:
+    assert controller.design is not None
+    verbs = {"passivity": passivity, "environments": coupled_stability}
+    return {what: partial(measure, controller, *controller.design) for what, measure in verbs.items()}
 
 
 def _attempt_job(jobs: Shared[tuple[Callable[[], Any], ...]], number: int) -> tuple[Any, str]:
@@ -239,58 +238,71 @@ def simulate_steps(
     """Play the steps of `step_scenarios` on every plant; return why not where that cannot be done."""
     try:
         return verify(
-            controller, plants, parameters, scenarios=step_scenarios, draws=draws, executor=executor,
-            progress=progress, sensors=sensors, current_step_A=current_step_A, seed=seed,
-        )  # fmt: skip
+            controller,
+            plants,
+            parameters,
+            scenarios=step_scenarios,
+            draws=draws,
+            executor=executor,
+            progress=progress,
+            sensors=sensors,
+            current_step_A=current_step_A,
+            seed=seed,
+        )
     except SeaoptError as error:
         return str(error)
 
 
-def require_runs(runs: Verification | str) -> list[SimulationRequirement]:
+def require_runs(runs: Verification | str) -> list[Requirement]:
     """Return what the runs require: the same fault in many runs of a plant is one requirement, with the worst of them.
 
-    Parameters
-    ----------
-    runs : Verification or str
-        What was played, or why nothing could be.
-
+    A text says why nothing could be played.
     """
     if isinstance(runs, str):
-        return [SimulationRequirement(name=SIMULATION_FAILURES, limit=0.0, value=np.inf, met=False, where=runs)]
-    requirements: list[SimulationRequirement] = []
+        return [Requirement(name=SIMULATION_FAILURES, limit=0.0, value=np.inf, met=False, text=runs)]
+    requirements: list[Requirement] = []
     for plant in runs.stages:
         rows = [row for row in runs.rows if row.plant == plant]
         requirements += [*_list_failures(runs, rows), *_list_kept(runs, plant, rows)]
     return requirements
 
 
-def _list_failures(runs: Verification, rows: Sequence[Outcome]) -> list[SimulationRequirement]:
+def _list_failures(runs: Verification, rows: Sequence[Outcome]) -> list[Requirement]:
     faults: dict[str, list[tuple[Fault, Outcome]]] = {}
     for row in rows:
         decisive = [fault for fault in row.faults if fault.kind in LOST][:1] or row.faults
         for fault in decisive:
             faults.setdefault(fault.kind, []).append((fault, row))
-    requirements: list[SimulationRequirement] = []
+    requirements: list[Requirement] = []
     for kind, cases in faults.items():
         fault, row = max(cases, key=lambda case: case[0].value / (case[0].limit or 1.0))
-        name = NAMED_FAULTS.get(kind, SIMULATION_FAILURES)
-        where = f"{row.plant}, {row.scenario}, draw {row.draw}, seed {runs.seed}: {fault.text}{describe_witness(row)}"
-        requirements.append(SimulationRequirement(
-            name=name, met=False, limit=fault.limit,
-            value=float(len(cases)) if name == SIMULATION_FAILURES else fault.value,
-            where=where + (f"; the worst of {len(cases)} such runs" if len(cases) > 1 else ""),
-        ))  # fmt: skip
+        counted = kind not in NAMED_FAULTS
+        requirements.append(
+            Requirement(
+                name=NAMED_FAULTS.get(kind, SIMULATION_FAILURES),
+                met=False,
+                limit=fault.limit,
+                value=float(len(cases)) if counted else fault.value,
+                unit="" if counted else fault.unit,
+                plant=row.plant,
+                scenario=row.scenario,
+                draw=DrawnAt(parameters=row.parameters, number=row.draw, seed=runs.seed),
+                text=fault.text,
+                remedy=fault.remedy,
+                count=len(cases),
+            )
+        )
     return requirements
 
 
-def _list_kept(runs: Verification, plant: str, rows: Sequence[Outcome]) -> list[SimulationRequirement]:
+def _list_kept(runs: Verification, plant: str, rows: Sequence[Outcome]) -> list[Requirement]:
     """Return the requirements on a plant that every run meets, the figures of steps with the worst of them."""
     if not rows:
         return []
-    kept: list[SimulationRequirement] = []
-    if all(row.passed for row in rows):
-        where = f"{plant}: {len(rows)} runs"
-        kept.append(SimulationRequirement(name=SIMULATION_FAILURES, limit=0.0, value=0.0, met=True, where=where))
+    kept: list[Requirement] = []
+    if all(row.met for row in rows):
+        text = format_count(len(rows), "run")
+        kept.append(Requirement(name=SIMULATION_FAILURES, limit=0.0, value=0.0, met=True, plant=plant, text=text))
     steps = [(row, runs.scenario(row)) for row in rows if row.overshoot is not None and row.settling_s is not None]
     peaks = [
         (1.0 + (row.overshoot or 0.0), scenario.max_overshoot, row)
@@ -298,11 +310,21 @@ def _list_kept(runs: Verification, plant: str, rows: Sequence[Outcome]) -> list[
         if scenario.max_overshoot is not None and not row.overshoot_by_limit
     ]
     times = [(row.settling_s or 0.0, scenario.settling_s or 0.0, row) for row, scenario in steps]
-    for name, figures in ((STEP_OVERSHOOT, peaks), (STEP_SETTLING, times)):
+    for name, unit, figures in ((STEP_OVERSHOOT, "", peaks), (STEP_SETTLING, "s", times)):
         if figures and all(value <= limit for value, limit, _ in figures):
             value, limit, row = max(figures, key=lambda figure: figure[0])
-            where = f"{plant}, {row.scenario}, draw {row.draw}"
-            kept.append(SimulationRequirement(name=name, limit=limit, value=value, met=True, where=where))
+            kept.append(
+                Requirement(
+                    name=name,
+                    limit=limit,
+                    value=value,
+                    met=True,
+                    unit=unit,
+                    plant=plant,
+                    scenario=row.scenario,
+                    draw=DrawnAt(parameters=row.parameters, number=row.draw, seed=runs.seed),
+                )
+            )
     return kept
 
 

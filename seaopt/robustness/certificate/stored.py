@@ -1,4 +1,4 @@
-"""What a certificate needs of its robustness.json, as pydantic models; all other figures are computed again.
+"""What a certificate needs of its robustness.json; all other figures are computed again.
 
 Null stands for what is infinite: the value of a requirement that an unstable plant breaks, a bound that there is not.
 """
@@ -7,25 +7,68 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from seaopt.bench import Sensors
-from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
-from seaopt.errors import FileError
+from seaopt.codec import from_content
+from seaopt.control import Controller, ScheduledController
+from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.documents import Flag, NullIsInfinite, Number, ResultTable, Whole, check_table
+from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_seal, plain
-from seaopt.robustness.certificate.certificate import Requirement, find_sense
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import split_friction
+from seaopt.records import record
+from seaopt.robustness.bounds.bracket import Bracket
+from seaopt.robustness.bounds.stretch import StretchBound
+from seaopt.robustness.certificate.certificate import DESIGN_NAMES, NO_MODEL, Certificate
+from seaopt.robustness.certificate.compensation import (
+    FRICTION_COMPENSATION,
+    CompensationDraws,
+    find_nominal_compensation,
+)
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
-from seaopt.units import LINEAR
+from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
+from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
+from seaopt.robustness.certificate.scheduled import (
+    PlaceCertificate,
+    ScheduleCertificate,
+    Standing,
+    list_held,
+    split_states,
+)
+from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
+from seaopt.robustness.uncertainty.draws import Uncertainty, Varied
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
+from seaopt.robustness.uncertainty.plant_margins import plant_margins
+from seaopt.robustness.uncertainty.worst import combine_worst, measure_worst
+from seaopt.robustness.verification.impedance_steps import ImpedanceStep
+from seaopt.robustness.verification.large_signal import LargeSignal
+from seaopt.robustness.verification.limit_cycles import FoundCycle
+from seaopt.robustness.verification.schedule_motion import Motion
+from seaopt.robustness.verification.schedule_sweep import Sweep
+from seaopt.robustness.verification.verification import Verification, make_stages
 
-CERTIFY_AGAIN = "certify again"
+FILE, SCHEDULE_FILE, CERTIFY_AGAIN = "robustness.json", "schedule_robustness.json", "certify again"
+OF_ALL_PLACES = ("monte_carlo_failures", "worst_case", "limits_between_points")  # not of a place's own
 OLDER_TOLERANCE = 0.5  # of a bandwidth, of which older files do not say whether a law was tuned for it
 
 
+class StoredDraw(ResultTable):
+    """The parameters that decide a requirement, and what its run needs besides."""
+
+    parameters: dict[str, Number] = {}
+    number: str = ""
+    seed: Whole | None = None
+
+
 class StoredRequirement(ResultTable):
-    """A figure against its limit."""
+    """A figure against its limit; `where`, in words, is all that older files have of what follows it."""
 
     name: str
     limit: NullIsInfinite
@@ -34,11 +77,35 @@ class StoredRequirement(ResultTable):
     where: str
     sense: Literal["≤", "≥", "="] | None = None
     tolerance: Annotated[Number, Field(ge=0.0, le=0.5)] | None = None
+    unit: str = ""
+    plant: str | None = None
+    state: str = ""
+    place: Annotated[dict[str, Number], Field(min_length=1, max_length=1)] | None = None
+    scenario: str = ""
+    draw: StoredDraw | None = None
+    text: str = ""
+    remedy: str = ""
+    count: Annotated[Whole, Field(ge=1)] = 1
 
     def build(self) -> Requirement:
         """Return the row; of an older file, which does not say it, one that is to be equal may be off by a half."""
-        row = Requirement(**self.model_dump(exclude_none=True))
+        row = Requirement(
+            **self.model_dump(exclude_none=True, exclude={"where", "place", "draw"}),
+            place=None if self.place is None else next(iter(self.place.items())),
+            draw=None if self.draw is None else DrawnAt(**self.draw.model_dump()),
+        )
+        if self.plant is None:
+            row = replace(row, text=self.where)
+        if self.sense is None:
+            row = replace(row, sense=find_sense(row.name))
         return replace(row, tolerance=OLDER_TOLERANCE) if self.tolerance is None and row.sense == "=" else row
+
+
+def find_sense(name: str) -> str:
+    """Return what a requirement's value must be to its limit, as a sign, of a law that was tuned."""
+    if name in BY_REQUIREMENT:
+        return BY_REQUIREMENT[name].symbol
+    return "≥" if name == FRICTION_COMPENSATION or name.startswith("min_") else "≤"
 
 
 class StoredLargest(ResultTable):
@@ -77,140 +144,55 @@ class StoredPlant(ResultTable):
     worst: StoredWorst
 
 
-class StoredMonteCarlo(ResultTable):
-    """Draws and failures."""
+@record
+class StoredSimulation:
+    """What the scenarios were played with, sweeps of amplitudes, and why something is missing."""
 
-    samples: Whole
-    failures: Whole
-    seed: Whole
-    failure_probability_bound: Number
-    confidence: Number
-    unstable: Whole = 0
-    over_ms: Whole = 0
-    over_mt: Whole = 0
+    sensors: Sensors
+    current_step_A: float
+    seed: int
+    large_signal: tuple[Mapping[str, Any], ...]
+    left_out: Mapping[str, str]
 
 
-class StoredVaried(ResultTable):
-    """A quantity that was drawn."""
+@record
+class StoredFriction:
+    """The margin of a plant with friction, of which all but draws and limit cycles is found again."""
 
-    name: str
-    unit: str
-    value: Number | None
-    std: Number | None
-    low: NullIsMinusInfinite
-    high: NullIsInfinite
+    draws: FrictionDraws | None = None
+    limit_cycles: tuple[Mapping[str, Any], ...] = ()
 
 
-class StoredSensors(ResultTable):
-    """What the simulations read the measured output with."""
+@record
+class StoredImpedance:
+    """What is rendered at the link, of which all but draws and simulated steps is found again."""
 
-    noise_std: dict[str, Number] = {}
-    offset: dict[str, Number] = {}
-    quantisation: dict[str, Number] = {}
-    saturation: dict[str, Number] = {}
-
-
-class StoredSimulation(ResultTable):
-    """What the scenarios were played with."""
-
-    sensors: StoredSensors
-    current_step_A: Number
-    seed: Whole
+    draws: ImpedanceDraws | None = None
+    steps: tuple[ImpedanceStep, ...] = ()
 
 
-class StoredFrictionDraws(ResultTable):
-    """For how many draws stability is shown with friction, and the least margin."""
-
-    samples: Whole
-    shown: Whole
-    least_slope: NullIsInfinite
-    factor: NullIsInfinite
-    parameters: dict[str, Number]
-
-
-class StoredFriction(ResultTable):
-    """The margin of a plant with friction, of which all but the draws is found again."""
-
-    draws: StoredFrictionDraws | None = None
-
-
-class StoredImpedanceDraws(ResultTable):
-    """For how many draws an impedance is stable and passive, and where it is least so."""
-
-    samples: Whole
-    stable: Whole
-    passive: Whole
-    margin: NullIsMinusInfinite
-    parameters: dict[str, Number]
-
-
-class StoredImpedance(ResultTable):
-    """What is rendered at the link, of which all but the draws is found again."""
-
-    draws: StoredImpedanceDraws | None = None
-
-
-class StoredCompensationDraws(ResultTable):
-    """For how many draws stability is shown with friction compensated, and the least slope for which it is."""
-
-    samples: Whole
-    shown: Whole
-    least_slope: NullIsInfinite
-    parameters: dict[str, Number]
-
-
-class StoredCompensation(ResultTable):
+@record
+class StoredCompensation:
     """The margin of a plant whose friction is compensated from the speed, of which all but the draws is found again."""
 
-    draws: StoredCompensationDraws | None = None
+    draws: CompensationDraws | None = None
 
 
-class StoredConstrained(ResultTable):
-    """Runs of predictive control with its limits active, the fields of `ConstrainedRuns`."""
-
-    runs: Whole
-    failures: Whole
-    seed: Whole
-    diverged: Whole
-    over_bound: Whole
-    not_settled: Whole
-    confidence: Number
-    failure_probability_bound: Number
-    bound_tolerance: Number
-    largest_violation: Number
-    at_limit: Number
-    fallback: Number
-    iterations: Whole
-    ringing: Whole = 0
-    largest_ring: Number = 0.0
-    sensors: StoredSensors = StoredSensors()
-    current_step_A: Number = 0.0
-    unit: str = LINEAR.unit
-    where: str
-    remedy: str = ""
-    left_out: tuple[str, ...]
-
-
-class StoredCertificate(ResultTable):
+@record(eq=False)
+class StoredCertificate:
     """A robustness.json."""
 
     requirements: list[StoredRequirement]
     plants: dict[str, StoredPlant]
-    monte_carlo: StoredMonteCarlo
-    varied: list[StoredVaried] = []
+    monte_carlo: MonteCarlo
+    varied: tuple[Varied, ...] = ()
+    steps: Mapping[str, Any] = field(default_factory=dict[str, Any])
     simulation: StoredSimulation | None = None
-    remarks: list[str] = []
-    friction: dict[str, StoredFriction] = {}
+    remarks: tuple[str, ...] = ()
+    friction: dict[str, StoredFriction] = field(default_factory=dict[str, StoredFriction])
     impedance: StoredImpedance | None = None
-    compensation: dict[str, StoredCompensation] = {}
-    constrained: StoredConstrained | None = None
-
-    def read_constrained(self) -> ConstrainedRuns | None:
-        """Return the runs with limits active, of a certificate of predictive control."""
-        if self.constrained is None:
-            return None
-        sensors = Sensors(**self.constrained.sensors.model_dump())
-        return ConstrainedRuns(**self.constrained.model_dump(exclude={"sensors"}), sensors=sensors)
+    compensation: dict[str, StoredCompensation] = field(default_factory=dict[str, StoredCompensation])
+    constrained: ConstrainedRuns | None = None
 
 
 class StoredRequirements(ResultTable):
@@ -228,8 +210,182 @@ def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
         A field is missing or malformed, or it was edited or written by hand.
 
     """
-    check_seal(content, "robustness.json", CERTIFY_AGAIN)
-    return check_table(StoredCertificate, plain(content), "robustness.json", remedy=CERTIFY_AGAIN)
+    check_seal(content, FILE, CERTIFY_AGAIN)
+    return from_content(StoredCertificate, content, FILE, remedy=CERTIFY_AGAIN)
+
+
+def build_certificate(
+    content: Mapping[str, Any], controller: Controller, models: Mapping[str, Plant], parameters: ParameterSet
+) -> Certificate:
+    """Return the certificate of a robustness.json, as `Certificate.from_dict` does."""
+    stored = read_certificate(content)
+    requirements = read_requirements(stored.requirements)
+    if controller.design is not None:  # certified too where nobody listed it
+        models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
+    varied, names = stored.varied, [row.name for row in stored.varied]
+    states = {name: split_friction({name: plant}, parameters, names) for name, plant in models.items()}
+    models = {name: plant for name, plant in models.items() if any(state in stored.plants for state in states[name])}
+    known = {state: plant for name in models for state, plant in states[name].items()}
+    for name in stored.plants:
+        if name not in known:
+            raise FileError(f'{FILE}: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
+    impedance = stored.impedance or StoredImpedance()
+    try:
+        linear = {name: known[name] for name in stored.plants}
+        bounds = {name: plant.worst.bounds for name, plant in stored.plants.items()}
+        certificate = Certificate(
+            requirements=requirements,
+            plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
+            margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
+            worst={
+                name: combine_worst(
+                    [measure_worst(controller, plant, parameters, at) for at in stored.plants[name].worst.cases]
+                )
+                for name, plant in linear.items()
+            },
+            monte_carlo=stored.monte_carlo,
+            controller=controller,
+            models=models,
+            parameters=parameters,
+            varied=varied,
+            brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
+            friction=find_nominal_margins(controller, models, parameters),
+            friction_draws={name: one.draws for name, one in stored.friction.items() if one.draws is not None},
+            compensation=find_nominal_compensation(controller, models, parameters),
+            compensation_draws={name: one.draws for name, one in stored.compensation.items() if one.draws is not None},
+            impedance=certify_impedance(controller, models, parameters, impedance.draws, impedance.steps),
+            constrained=stored.constrained,
+            remarks=stored.remarks,
+        )
+        return _restore_runs(certificate, stored, plain(content))
+    except FileError:
+        raise
+    except SeaoptError as error:
+        raise FileError(f"{FILE}: {error}; {CERTIFY_AGAIN}") from error
+
+
+def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: Mapping[str, Any]) -> Certificate:
+    """Return a certificate with what its file says of steps, limit cycles and scenarios."""
+    if not certificate.models:
+        return replace(certificate, steps=NO_MODEL)
+    runs, played = certificate.constrained, stored.simulation
+    draws = {name: (certificate.parameters, *drawn) for name, drawn in certificate.list_draws().items()}
+
+    def restore(rows: Mapping[str, Any], sensors: Sensors | None, current_step_A: float) -> Verification:
+        stages = make_stages(certificate.controller, certificate.models, sensors, current_step_A)
+        return Verification.from_dict(rows, stages, draws, FILE, CERTIFY_AGAIN)
+
+    if "rows" in stored.steps:
+        devices = (None, 0.0) if runs is None else (runs.sensors, runs.current_step_A)
+        steps = restore(stored.steps, *devices)
+    else:
+        steps = str(stored.steps.get("left_out", ""))
+    cycles = {
+        name: tuple(FoundCycle.from_dict(row, FILE, CERTIFY_AGAIN) for row in friction.limit_cycles)
+        for name, friction in stored.friction.items()
+        if friction.limit_cycles or not certificate.shows_friction_harmless(name)
+    }
+    certificate = replace(certificate, steps=steps, cycles=cycles)
+    if played is None:
+        return certificate
+    simulated = Simulated(
+        verification=restore(content["simulation"], played.sensors, played.current_step_A)
+        if "rows" in content["simulation"]
+        else None,
+        large_signal=tuple(LargeSignal.from_dict(row, FILE, CERTIFY_AGAIN) for row in played.large_signal),
+        **find_port_figures(certificate.controller),
+        left_out=played.left_out,
+        sensors=played.sensors,
+        current_step_A=played.current_step_A,
+        seed=played.seed,
+    )
+    return replace(certificate, simulated=simulated)
+
+
+@record(eq=False)
+class _StoredPlace:
+    """What a file has of the variable standing at one value."""
+
+    value: float
+    point: bool
+    worst: Mapping[str, Mapping[str, Any]]
+    draws: int
+    unstable: int
+    over_ms: int
+    over_mt: int
+    simulated: Mapping[str, Any] | None
+
+
+@record(eq=False)
+class _StoredSchedule:
+    """A schedule_robustness.json."""
+
+    requirements: tuple[Mapping[str, Any], ...]
+    places: tuple[_StoredPlace, ...]
+    monte_carlo: MonteCarlo
+    stretches: tuple[StretchBound, ...]
+    sweeps: Mapping[str, tuple[Sweep, ...]]
+    motions: Mapping[str, Motion]
+
+
+def build_schedule_certificate(
+    content: Mapping[str, Any], schedule: ScheduledController, given: Standing
+) -> ScheduleCertificate:
+    """Return the certificate of a schedule_robustness.json, as `ScheduleCertificate.from_dict` does."""
+    stored = from_content(_StoredSchedule, content, SCHEDULE_FILE, remedy=CERTIFY_AGAIN)
+    rows = list_requirements(content, SCHEDULE_FILE)
+    if tuple(place.value for place in stored.places) != given.values:
+        raise FileError(f"{SCHEDULE_FILE}: places are at other values than the schedule's; {CERTIFY_AGAIN}")
+    try:
+        return ScheduleCertificate(
+            schedule=schedule,
+            places=tuple(
+                _build_place(place, schedule, given.models, unknown, rows)
+                for place, unknown in zip(stored.places, given.unknowns, strict=True)
+            ),
+            monte_carlo=stored.monte_carlo,
+            stretches=stored.stretches,
+            sweeps=stored.sweeps,
+            motions=stored.motions,
+            requirements=rows,
+        )
+    except (KeyError, TypeError) as error:  # of what the model leaves open: the parameters of worst cases
+        raise FileError(f"{SCHEDULE_FILE}: a worst case has no {error}; {CERTIFY_AGAIN}") from error
+
+
+def _build_place(
+    stored: _StoredPlace,
+    schedule: ScheduledController,
+    models: Mapping[str, Plant],
+    unknown: Uncertainty,
+    rows: Sequence[Requirement],
+) -> PlaceCertificate:
+    controller, plants = schedule.at(stored.value), split_states(models, unknown)
+    held = list_held(schedule, models, stored.value)
+    figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
+    worst = {
+        name: combine_worst(
+            [
+                measure_worst(controller, plants[name], unknown.nominal, at)
+                for at in (case["parameters"], *case["largest"].values())
+            ]
+        )
+        for name, case in stored.worst.items()
+    }
+    return PlaceCertificate(
+        value=stored.value,
+        point=stored.point,
+        plants=figures,
+        worst=worst,
+        draws=stored.draws,
+        unstable=stored.unstable,
+        over_ms=stored.over_ms,
+        over_mt=stored.over_mt,
+        requirements=tuple(
+            row for row in rows if row.place == (schedule.over, stored.value) and row.name not in OF_ALL_PLACES
+        ),
+        simulated=build_certificate(stored.simulated, controller, held, unknown.nominal) if stored.simulated else None,
+    )
 
 
 def list_requirements(content: Mapping[str, Any], source: str) -> tuple[Requirement, ...]:
@@ -238,7 +394,7 @@ def list_requirements(content: Mapping[str, Any], source: str) -> tuple[Requirem
     return read_requirements(stored.requirements, source)
 
 
-def read_requirements(stored: Sequence[StoredRequirement], source: str = "robustness.json") -> tuple[Requirement, ...]:
+def read_requirements(stored: Sequence[StoredRequirement], source: str = FILE) -> tuple[Requirement, ...]:
     """Return the rows of a certificate.
 
     Raises

@@ -61,14 +61,20 @@ def join_figures(parts: Sequence[BatchFigures]) -> BatchFigures:
     """Return the figures of draws that were measured in parts."""
     return BatchFigures(
         spectral_radius=np.concatenate([part.spectral_radius for part in parts]),
-        ms=np.concatenate([part.ms for part in parts]), mt=np.concatenate([part.mt for part in parts]),
-    )  # fmt: skip
+        ms=np.concatenate([part.ms for part in parts]),
+        mt=np.concatenate([part.mt for part in parts]),
+    )
 
 
 def batch_figures(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]],
-    progress: Progress = ignore, threads: int = 2, peaks: bool = True,
-) -> BatchFigures:  # fmt: skip
+    controller: Controller,
+    plant: Plant,
+    nominal: ParameterSet,
+    draws: Mapping[str, Float[np.ndarray, " n"]],
+    progress: Progress = ignore,
+    threads: int = 2,
+    peaks: bool = True,
+) -> BatchFigures:
     """Close `controller` around `plant` at every draw.
 
     Parameters
@@ -96,9 +102,10 @@ def batch_figures(
         single = batch_figures(controller, plant, nominal, one, ignore, threads, peaks)
         progress(f"{count} of {count} draws", 1.0)
         return BatchFigures(
-            spectral_radius=np.repeat(single.spectral_radius, count), ms=np.repeat(single.ms, count),
+            spectral_radius=np.repeat(single.spectral_radius, count),
+            ms=np.repeat(single.ms, count),
             mt=np.repeat(single.mt, count),
-        )  # fmt: skip
+        )
     parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
     with ThreadPoolExecutor(threads) as pool:
         for start in range(0, count, DRAW_BLOCK):
@@ -187,9 +194,12 @@ def _close_piece(
 
 
 def compute_products(
-    controller: Controller, a: Float[np.ndarray, "n x x"], b: Float[np.ndarray, "n x"], c: Float[np.ndarray, "n y x"],
+    controller: Controller,
+    a: Float[np.ndarray, "n x x"],
+    b: Float[np.ndarray, "n x"],
+    c: Float[np.ndarray, "n y x"],
     d: Float[np.ndarray, "n y"],
-) -> Products:  # fmt: skip
+) -> Products:
     """Return S of every plant behind its hold, from the eigenvalues of the open and of the closed loop."""
     law = controller.law
     ac, bc, cc, dc = law.a, -law.b[:, 1:], law.c, -law.d[1:]
@@ -264,9 +274,12 @@ def _find_neighbours(
 
 
 def _refine_peaks(
-    loop: Products, low: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"],
+    loop: Products,
+    low: Float[np.ndarray, " n"],
+    x: Float[np.ndarray, " n"],
+    high: Float[np.ndarray, " n"],
     complement: bool,
-) -> Peaks:  # fmt: skip
+) -> Peaks:
     """Return the curve's value at its maximum between `low` and `high`, and the angle."""
     best, where = np.zeros(x.size), x.copy()
     live = np.arange(x.size)

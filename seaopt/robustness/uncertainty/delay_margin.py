@@ -150,9 +150,12 @@ def _measure_delayed(loop: Loop, part: float) -> _DelayedLoop:
     angles, phases = find_crossovers(system)
     nyquist = system.curves(np.array([np.pi]))[0, 0]
     return _DelayedLoop(
-        part=part, angles=angles, phases=np.mod(phases, FULL_TURN), loud=bool(nyquist.real < 0.5),
+        part=part,
+        angles=angles,
+        phases=np.mod(phases, FULL_TURN),
+        loud=bool(nyquist.real < 0.5),
         outside=int(np.sum(~(np.abs(system.poles) < STABLE))),
-    )  # fmt: skip
+    )
 
 
 def _build_grid(delay_loop: Callable[[float], _DelayedLoop]) -> list[_DelayedLoop]:

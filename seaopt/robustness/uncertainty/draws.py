@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.codec import OrInfinite, OrMinusInfinite
 from seaopt.control.laws.delay import Drive
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY, conditions
 from seaopt.errors import ControlError, suggestion
@@ -48,8 +49,8 @@ class Varied:
     unit: str
     value: float | None
     std: float | None
-    low: float
-    high: float
+    low: OrMinusInfinite
+    high: OrInfinite
 
     @property
     def outside(self) -> bool:
@@ -276,11 +277,14 @@ def combine_uncertainty(
     ranged = {name: plant for name, plant in find_modes(plants).items() if name in ranges}
     modes = {name: _tabulate_mode(plant, nominal, ranges[name]) for name, plant in ranged.items()}
     return Uncertainty(
-        nominal=nominal, names=tuple(uncertain[i] for i in used), covariance=whole[used][:, used],
-        ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()}, modes=modes,
+        nominal=nominal,
+        names=tuple(uncertain[i] for i in used),
+        covariance=whole[used][:, used],
+        ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()},
+        modes=modes,
         absent={name: default for plant in plants.values() for name, default in plant.defaults.items()}
         | conditions(tuple(plants.values())),
-    )  # fmt: skip
+    )
 
 
 def _in_plant_units(nominal: ParameterSet, plants: Mapping[str, Plant]) -> tuple[ParameterSet, dict[str, float]]:

@@ -25,16 +25,23 @@ class MonteCarlo:
     over_ms: int = 0
     over_mt: int = 0
 
-    def __str__(self) -> str:
+    @property
+    def count_text(self) -> str:
+        """How many draws fail, and by what."""
         if not self.samples:
-            return "no draws: nothing is uncertain; give a fit, prior_std or ranges for a statement on robustness"
+            return "no draws"
         counts = ((self.unstable, "unstable"), (self.over_ms, "over Ms"), (self.over_mt, "over Mt"))
         kinds = ", ".join(f"{count} {kind}" for count, kind in counts if count)
-        head = f"{self.failures} failures in {self.samples} draws" + (f" ({kinds})" if kinds else "")
+        return f"{self.failures} failures in {self.samples} draws" + (f" ({kinds})" if kinds else "")
+
+    def __str__(self) -> str:
+        if not self.samples:
+            remedy = "give a fit, prior_std or ranges for a statement on robustness"
+            return f"{self.count_text}: nothing is uncertain; {remedy}"
         if self.failures == self.samples:
-            return head
+            return self.count_text
         return (
-            f"{head}: failure probability below {self.failure_probability_bound:.3g} at a confidence of "
+            f"{self.count_text}: failure probability below {self.failure_probability_bound:.3g} at a confidence of "
             f"{_format_confidence(self.confidence)}"
         )
 

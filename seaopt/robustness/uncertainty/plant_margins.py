@@ -48,14 +48,16 @@ class PlantMargins:
             "sampled_delay_margin_s": self.sampled_delay_s,
             "disk_margins": {
                 kind: {
-                    "alpha": disk.alpha, "frequency_hz": disk.frequency_hz,
+                    "alpha": disk.alpha,
+                    "frequency_hz": disk.frequency_hz,
                     "perturbation": [disk.perturbation.real, disk.perturbation.imag],
-                    "gain_range": list(disk.gain_range), "phase_deg": disk.phase_deg,
+                    "gain_range": list(disk.gain_range),
+                    "phase_deg": disk.phase_deg,
                 }
                 for kind, disk in self.margins.disks.items()
             },
             "nu_gap": self.nu_gap,
-        }  # fmt: skip
+        }
 
 
 def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) -> PlantMargins:

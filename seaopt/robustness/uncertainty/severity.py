@@ -54,9 +54,7 @@ class _SampledPlants:
         return _SampledPlants(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
 
-def severities(
-    controller: Controller, figures: BatchFigures, by: Levels | None = None
-) -> Float[np.ndarray, " n"]:  # fmt: skip
+def severities(controller: Controller, figures: BatchFigures, by: Levels | None = None) -> Float[np.ndarray, " n"]:
     """Return the severity of every draw: instability first, then the fraction of the limits that it uses.
 
     With `by`, levels of Ms and Mt for all draws or for each, that is the fraction of these.
@@ -86,9 +84,12 @@ def levels(controller: Controller) -> Levels:
 
 
 def severity_slopes(
-    controller: Controller, plant: Plant, unknown: Uncertainty, points: Float[np.ndarray, "n k"],
+    controller: Controller,
+    plant: Plant,
+    unknown: Uncertainty,
+    points: Float[np.ndarray, "n k"],
     by: Levels | None = None,
-) -> SeveritySlopes:  # fmt: skip
+) -> SeveritySlopes:
     """Return the derivatives of each point's severity with respect to its coordinates.
 
     These are derivatives of the spectral radius where the loop is unstable, else of the larger of Ms and Mt as
@@ -142,9 +143,8 @@ def _sample_plants(
     a, b, c, d = (matrix.reshape(count, width, *matrix.shape[1:]) for matrix in stepped)
     da, db, dc, dd = (np.imag(matrix) / COMPLEX_STEP for matrix in (a, b, c, d))
     return _SampledPlants(
-        a=np.real(a[:, 0]), b=np.real(b[:, 0]), c=np.real(c[:, 0]), d=np.real(d[:, 0]),
-        da=da, db=db, dc=dc, dd=dd,
-    )  # fmt: skip
+        a=np.real(a[:, 0]), b=np.real(b[:, 0]), c=np.real(c[:, 0]), d=np.real(d[:, 0]), da=da, db=db, dc=dc, dd=dd
+    )
 
 
 def _radius_slopes(controller: Controller, loop: Products, sampled: _SampledPlants) -> SeveritySlopes:
@@ -158,9 +158,7 @@ def _radius_slopes(controller: Controller, loop: Products, sampled: _SampledPlan
     return np.real(np.conj(pole)[:, None] * moved) / np.abs(pole)[:, None]
 
 
-def _peak_slopes(
-    controller: Controller, loop: Products, sampled: _SampledPlants, by: Levels
-) -> SeveritySlopes:  # fmt: skip
+def _peak_slopes(controller: Controller, loop: Products, sampled: _SampledPlants, by: Levels) -> SeveritySlopes:
     (ms, ms_at), (mt, mt_at) = find_peaks(loop)
     ms_limit, mt_limit = by.T
     of_t = mt / mt_limit > ms / ms_limit

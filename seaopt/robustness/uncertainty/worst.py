@@ -78,9 +78,14 @@ class Worst(tuple[Plant, ParameterSet]):
     limited: bool
 
     def __new__(
-        cls, plant: Plant, values: ParameterSet, witness: Witness, *, limited: bool,
+        cls,
+        plant: Plant,
+        values: ParameterSet,
+        witness: Witness,
+        *,
+        limited: bool,
         largest: tuple[Witness, Witness] | None = None,
-    ) -> Worst:  # fmt: skip
+    ) -> Worst:
         """Return the pair with its figures; `limited` if the specification limits Ms or Mt.
 
         `largest` are the witnesses of the largest Ms and Mt found; the pair's own where they are left out.
@@ -212,9 +217,12 @@ def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, a
     )
     witness = Witness(
         parameters={name: value for name, value in at.items() if name in values},
-        ms=figures.ms, mt=figures.mt, ms_hz=figures.ms_hz,
-        spectral_radius=figures.spectral_radius, severity=float(severities(controller, single)[0]),
-    )  # fmt: skip
+        ms=figures.ms,
+        mt=figures.mt,
+        ms_hz=figures.ms_hz,
+        spectral_radius=figures.spectral_radius,
+        severity=float(severities(controller, single)[0]),
+    )
     return Worst(plant, values, witness, limited=bool(np.isfinite(min(limits(controller)))))
 
 

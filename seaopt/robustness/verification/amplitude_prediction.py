@@ -30,9 +30,12 @@ SATURATION_GAINS = np.geomspace(1.0, 1e-2, 80)
 
 
 def predict_gain(
-    controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"],
+    controller: Controller,
+    plant: Plant,
+    params: ParameterSet,
+    f: Float[np.ndarray, " f"],
     amplitude: Float[np.ndarray, " a"],
-) -> Complex[np.ndarray, "a f"]:  # fmt: skip
+) -> Complex[np.ndarray, "a f"]:
     """Return force over reference at amplitudes (N) and frequencies (Hz), the fundamental alone.
 
     Where several frictions change with the velocity, each is taken for sliding.
@@ -72,9 +75,12 @@ class _Friction:
     """The friction of a plant as a port of its loop, at frequencies; none where nothing changes with the velocity."""
 
     def __init__(
-        self, on_outputs: Complex[np.ndarray, "y f"], mobility: Complex[np.ndarray, " f"],
-        by_motor: Complex[np.ndarray, " f"], gains: Float[np.ndarray, " v"],
-    ) -> None:  # fmt: skip
+        self,
+        on_outputs: Complex[np.ndarray, "y f"],
+        mobility: Complex[np.ndarray, " f"],
+        by_motor: Complex[np.ndarray, " f"],
+        gains: Float[np.ndarray, " v"],
+    ) -> None:
         self.on_outputs, self.mobility, self.by_motor, self.gains = on_outputs, mobility, by_motor, gains
 
     @classmethod
@@ -88,15 +94,20 @@ class _Friction:
         opened = loop.respond(2 * np.pi * f * loop.plant.sample_time_s, FUNDAMENTAL, seen)
         mobility, *on_outputs = opened.by_friction[:, 0, :, port].T
         return cls(
-            on_outputs=np.array(on_outputs) + through[:, port, None], mobility=mobility,
+            on_outputs=np.array(on_outputs) + through[:, port, None],
+            mobility=mobility,
             by_motor=opened.by_motor[:, 0, 0],
             gains=describe_friction(plant, params, list(plant.friction)[port], AMPLITUDES),
-        )  # fmt: skip
+        )
 
     def effort(
-        self, sigma: Float[np.ndarray, "s 1 1"], closed: Complex[np.ndarray, "s 1 f"], c_r: Complex[np.ndarray, " f"],
-        fed_back: Complex[np.ndarray, " f"], amplitude: Float[np.ndarray, "1 a 1"],
-    ) -> Complex[np.ndarray, "s a f"]:  # fmt: skip
+        self,
+        sigma: Float[np.ndarray, "s 1 1"],
+        closed: Complex[np.ndarray, "s 1 f"],
+        c_r: Complex[np.ndarray, " f"],
+        fed_back: Complex[np.ndarray, " f"],
+        amplitude: Float[np.ndarray, "1 a 1"],
+    ) -> Complex[np.ndarray, "s a f"]:
         """Return the fundamental of the friction's effort on the plant; `fed_back` is the law's of a unit of it."""
         h = self.mobility - self.by_motor * sigma * closed * fed_back
         t = self.by_motor * sigma * closed * c_r

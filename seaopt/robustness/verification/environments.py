@@ -252,14 +252,18 @@ def coupled_stability(
     radius = _compute_radii(controller, coupled, values, m.ravel(), k.ravel(), d.ravel()).reshape(d.shape)
     at = np.unravel_index(int(np.argmax(radius)), radius.shape)
     return StabilityMap(
-        mass=mass, stiffness=stiffness, damping=damping, spectral_radius=radius,
+        mass=mass,
+        stiffness=stiffness,
+        damping=damping,
+        spectral_radius=radius,
         boundary=tuple(
             _find_boundary(controller, coupled, values, mass, stiffness, float(value), stable)
             for value, stable in zip(damping, radius <= GROWING, strict=True)
         ),
         worst=close_on_environment(controller, coupled, values, float(m[at]), float(k[at]), float(d[at])),
-        fixed_stable=_is_stable_fixed(controller, coupled, values), called=called,
-    )  # fmt: skip
+        fixed_stable=_is_stable_fixed(controller, coupled, values),
+        called=called,
+    )
 
 
 def _take_bare(coupled: Plant, parameters: ParameterSet) -> CompletedParameters:
@@ -279,10 +283,13 @@ def close_on_environment(
     largest = poles[int(np.argmax(np.abs(poles)))]
     radius, period = float(abs(largest)), controller.sample_time_s
     return Environment(
-        m_2=m_2, k_e=k_e, d_e=d_e, spectral_radius=radius,
+        m_2=m_2,
+        k_e=k_e,
+        d_e=d_e,
+        spectral_radius=radius,
         frequency_hz=float(abs(np.angle(largest)) / (2 * np.pi * period)),
         doubling_s=math.log(2.0) * period / math.log(radius) if radius > GROWING else None,
-    )  # fmt: skip
+    )
 
 
 def _check_grid(
@@ -304,9 +311,13 @@ def _name_values(coupled: Plant, mass: Value, stiffness: Value, damping: Value) 
 
 
 def _compute_radii(
-    controller: Controller, coupled: Plant, parameters: CompletedParameters, m: Float[np.ndarray, " n"],
-    k: Float[np.ndarray, " n"], d: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:  # fmt: skip
+    controller: Controller,
+    coupled: Plant,
+    parameters: CompletedParameters,
+    m: Float[np.ndarray, " n"],
+    k: Float[np.ndarray, " n"],
+    d: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
     """Return the spectral radii against n environments."""
     draws = _name_values(coupled, m, k, d)
     return batch_figures(controller, coupled, parameters, draws, peaks=False).spectral_radius
@@ -319,9 +330,14 @@ def _is_stable_fixed(controller: Controller, coupled: Plant, parameters: Complet
 
 
 def _find_boundary(
-    controller: Controller, coupled: Plant, parameters: CompletedParameters, mass: Float[np.ndarray, " m"],
-    stiffness: Float[np.ndarray, " k"], damping: float, stable: Bool[np.ndarray, "m k"],
-) -> Float[np.ndarray, "_ 2"]:  # fmt: skip
+    controller: Controller,
+    coupled: Plant,
+    parameters: CompletedParameters,
+    mass: Float[np.ndarray, " m"],
+    stiffness: Float[np.ndarray, " k"],
+    damping: float,
+    stable: Bool[np.ndarray, "m k"],
+) -> Float[np.ndarray, "_ 2"]:
     """Return points of the edge between neighbours of the grid, one of them stable, by bisection in logarithms."""
     grid = np.stack(np.meshgrid(np.log(mass), np.log(stiffness), indexing="ij"), axis=-1)
     ends: list[tuple[Any, Any]] = []

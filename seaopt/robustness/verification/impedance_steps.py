@@ -12,6 +12,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import OrInfinite, OrNaN
 from seaopt.control import Controller
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
@@ -51,9 +52,9 @@ class ImpedanceStep:
     """
 
     size: float
-    moving: float
-    end: float
-    overshoot: float
+    moving: OrInfinite
+    end: OrNaN
+    overshoot: OrNaN
     saturated: bool
 
     @property
@@ -67,9 +68,10 @@ class ImpedanceStep:
             return f"a simulated step of {self.size:.3g} {unit} runs away"
         limit = ", at the command's limit" if self.saturated else ""
         what = (
-            f"ends at {100 * self.end:.3g} % of it and overshoots by {100 * self.overshoot:.3g} %" if self.rests
+            f"ends at {100 * self.end:.3g} % of it and overshoots by {100 * self.overshoot:.3g} %"
+            if self.rests
             else f"goes on moving by {100 * self.moving:.3g} % of it, peak to peak"
-        )  # fmt: skip
+        )
         return f"a simulated step of {self.size:.3g} {unit} {what}{limit}"
 
 
@@ -92,9 +94,13 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
     law, measured = enclose_controller(controller, motion)
     params = controller.delay(params)
     loop = SampledLoop(
-        plant=plant, law=law, measured=measured, delay_samples=controller.compute_delay_samples,
-        longest_delay_s=find_longest_delay(plant, [params]), sticks=can_stick(plant),
-    )  # fmt: skip
+        plant=plant,
+        law=law,
+        measured=measured,
+        delay_samples=controller.compute_delay_samples,
+        longest_delay_s=find_longest_delay(plant, [params]),
+        sticks=can_stick(plant),
+    )
     samples = _count_samples(controller, plant, completed)
     steps: list[ImpedanceStep] = []
     for effort in _size_efforts(controller, find_dry_friction(plant, completed)):
@@ -111,9 +117,12 @@ def _judge(path: Float[np.ndarray, " n"], size: float, saturated: bool) -> Imped
     last = path[int((1.0 - LAST_SHARE) * path.size) :]
     end = float(np.mean(last))
     return ImpedanceStep(
-        size=size, moving=float(np.ptp(last)) / size, end=end / size,
-        overshoot=max(float(np.max(path)) - end, 0.0) / size, saturated=saturated,
-    )  # fmt: skip
+        size=size,
+        moving=float(np.ptp(last)) / size,
+        end=end / size,
+        overshoot=max(float(np.max(path)) - end, 0.0) / size,
+        saturated=saturated,
+    )
 
 
 def _size_efforts(controller: Controller, friction: dict[str, float]) -> list[float]:

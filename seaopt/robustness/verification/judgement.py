@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import Key, OrInfinite, OrNaN
 from seaopt.control.running.closed_loop import ENERGY
 from seaopt.control.running.sampled_loop import largest_current
 from seaopt.formatting import format_values
@@ -58,6 +59,8 @@ LINE_PERIODS = 8.0  # of the slowest oscillation, in the window
 SHORTER = 4.0  # times shorter: the second window
 STILL_PERIODS = 4.0  # where no link moves: of the slowest oscillation that is distinct from a drift
 SAME_FREQUENCY = 0.02  # by which a line in a spectrum may be off from a mode that it is of
+# With friction that sticks the integral grows until the joint lets go.
+SLOWER_INTEGRAL = 'tune with reference_weights = "measurement" or objective = "noise", whose integral is slower'
 VISIBLE = 0.01  # of a step: a smaller oscillation about it is none
 NOMINAL = "nominal"
 LOST = ("overflow", "unstable")  # kinds of fault that explain every other of the same run
@@ -71,17 +74,23 @@ class Fault:
     ----------
     kind : str
         "overshoot", "settling", "steady error", "oscillation", "growth", ...: faults of one kind are one failure.
-    text : str
-        What happened, with figures.
+    text, remedy : str
+        What happened, with figures, and what to do about it where that is particular.
     value, limit : float
-        The figure and what is allowed, in the same unit.
+        The figure and what is allowed, in `unit`.
+    unit : str
 
     """
 
     kind: str
     text: str
-    value: float = 1.0
-    limit: float = 0.0
+    value: OrInfinite = 1.0
+    limit: OrInfinite = 0.0
+    unit: str = ""
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text}; {self.remedy}" if self.remedy else self.text
 
 
 @record
@@ -92,11 +101,8 @@ class Outcome(Result):
     ----------
     scenario, plant, draw : str
         `draw` is "nominal" or the number of a draw, from 1.
-    passed : bool
-    reason : str
-        What failed; empty if nothing did.
     faults : tuple of Fault
-        The same, one by one.
+        What failed.
     parameters : mapping of name to float
         Where the draw differs from nominal: with scenario, plant and seed, the witness.
     peak_force_N, peak_current_A : float
@@ -120,16 +126,21 @@ class Outcome(Result):
 
     """
 
+    json_keys = (
+        "met", "passed", "reason", "scenario", "plant", "draw", Key(field="kinds", name="faults"),
+        Key(field="faults", name="findings"), "parameters", "peak_force_N", "peak_current_A", "saturated",
+        "peak_angle_rad", "peak_energy_J", "energy_growth", "final_error_N", "limit_cycle_N", "limit_cycle_hz",
+        "overshoot", "settling_s", "overshoot_by_limit", "contact_impulse", "contact_loss_J",
+    )  # fmt: skip
+
     scenario: str
     plant: str
     draw: str
-    passed: bool
-    reason: str
     faults: tuple[Fault, ...]
     parameters: Mapping[str, float]
-    peak_force_N: float
-    peak_current_A: float
-    saturated: float
+    peak_force_N: OrInfinite
+    peak_current_A: OrInfinite
+    saturated: OrNaN
     peak_angle_rad: float | None = None
     peak_energy_J: float | None = None
     energy_growth: float | None = None
@@ -144,8 +155,18 @@ class Outcome(Result):
 
     @property
     def met(self) -> bool:
-        """Whether the run passed."""
-        return self.passed
+        """Whether nothing is wrong with the run."""
+        return not self.faults
+
+    @property
+    def reason(self) -> str:
+        """What failed; empty if nothing did."""
+        return "; ".join(map(str, self.faults))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of its faults."""
+        return tuple(fault.kind for fault in self.faults)
 
 
 @record
@@ -155,14 +176,21 @@ class _Findings:
     figures: dict[str, Any] = field(default_factory=dict[str, Any])
     faults: list[Fault] = field(default_factory=list[Fault])
 
-    def add(self, kind: str, text: str, value: float = 1.0, limit: float = 0.0) -> None:
-        self.faults.append(Fault(kind=kind, text=text, value=value, limit=limit))
+    def add(self, kind: str, text: str, **figure: Any) -> None:
+        """Add a fault, its figure as the fields of a `Fault`."""
+        self.faults.append(Fault(kind=kind, text=text, **figure))
 
 
 def judge_run(
-    stage: Stage, name: str, scenario: Scenario, trace: Playback, run: int, sets: Sequence[ParameterSet],
-    ideal: Playback | None = None, unlimited: Playback | None = None,
-) -> Outcome:  # fmt: skip
+    stage: Stage,
+    name: str,
+    scenario: Scenario,
+    trace: Playback,
+    run: int,
+    sets: Sequence[ParameterSet],
+    ideal: Playback | None = None,
+    unlimited: Playback | None = None,
+) -> Outcome:
     """Return the outcome of one run of a trace, played on the plant `name` with `sets`, nominal first.
 
     `ideal` is the same scenario on `stage.ideal`; the trace itself where the stage is ideal. `unlimited` is that one
@@ -187,11 +215,13 @@ def judge_run(
     else:
         findings.faults.insert(0, Fault(kind="overflow", text="its numbers overflow"))
     return Outcome(
-        scenario=scenario.name, plant=name, draw=NOMINAL if run == 0 else str(run), passed=not findings.faults,
-        reason="; ".join(fault.text for fault in findings.faults), faults=tuple(findings.faults),
+        scenario=scenario.name,
+        plant=name,
+        draw=NOMINAL if run == 0 else str(run),
+        faults=tuple(findings.faults),
         parameters=_find_differences(sets[0], sets[run]),
         **findings.figures,
-    )  # fmt: skip
+    )
 
 
 def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings) -> None:
@@ -236,8 +266,8 @@ def _judge_rest(stage: Stage, trace: Playback, run: int, drawn: ParameterSet, fi
     where = format_values({name: drawn[name].value for name in stage.plant.states if name in drawn}, missing="")
     findings.add(
         "rest",
-        f"to rest at {where} takes {show(trace.rest.current_A[run])}, above the limit of {show(limit)}; narrow its "
-        "range",
+        f"to rest at {where} takes {show(trace.rest.current_A[run])}, above the limit of {show(limit)}",
+        remedy="narrow its range",
     )
 
 
@@ -277,9 +307,14 @@ def _judge_outbreak(
 
 
 def _judge_oscillation(
-    stage: Stage, scenario: Scenario, trace: Playback, run: int, drawn: ParameterSet, view: LinearView,
+    stage: Stage,
+    scenario: Scenario,
+    trace: Playback,
+    run: int,
+    drawn: ParameterSet,
+    view: LinearView,
     findings: _Findings,
-) -> None:  # fmt: skip
+) -> None:
     """Check that no oscillation lasts: a slow one in a long window, one whose phase noise moves in a short one."""
     spec, period = stage.controller.spec, stage.controller.sample_time_s
     if not scenario.quiet:
@@ -301,7 +336,7 @@ def _judge_oscillation(
             what = "sustains itself" if line.sustained else f"grows {line.growth:.3g} times"
             unit = stage.controller.command.reference_unit
             text = f"an oscillation of {line.amplitude:.3g} {unit} at {line.frequency_hz:.4g} Hz {what}"
-            findings.add("oscillation", text, line.amplitude)
+            findings.add("oscillation", text, value=line.amplitude, unit=unit)
             return
 
 
@@ -377,13 +412,12 @@ def _judge_step(
         if not by_limit:
             over, most = (f"{100.0 * (share - 1.0):.3g} %" for share in (largest, allowed))
             text = f"a step of {step:.3g} {unit} overshoots by {over}, {most} are allowed"
-            if scenario.friction == "sticking":  # with the integral that has grown until friction lets go
-                text += '; tune with reference_weights = "measurement" or objective = "noise", whose integral is slower'
-            findings.add("overshoot", text, largest, allowed)
+            remedy = SLOWER_INTEGRAL if scenario.friction == "sticking" else ""
+            findings.add("overshoot", text, value=largest, limit=allowed, remedy=remedy)
     if settling_s > scenario.settling_s:
         when = f"after {settling_s:.4g} s" if settled else "not at all"
         text = f"a step of {step:.3g} {unit} settles {when}, {scenario.settling_s:.4g} s are allowed"
-        findings.add("settling", text, settling_s, scenario.settling_s)
+        findings.add("settling", text, value=settling_s, limit=scenario.settling_s, unit="s")
 
 
 def _judge_final_error(
@@ -403,7 +437,7 @@ def _judge_final_error(
             text = (
                 f"the {word} ends {abs(value):.4g} {unit} {side} its reference{what}, {allowed:.4g} {unit} are allowed"
             )
-            findings.add("steady error", text, abs(value), allowed)
+            findings.add("steady error", text, value=abs(value), limit=allowed, unit=unit)
             return
 
 

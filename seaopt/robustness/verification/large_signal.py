@@ -14,11 +14,13 @@ The same gains are predicted by describing functions (`amplitude_prediction`).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from seaopt.codec import OrInfinite, OrNaN, from_content
 from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.loops.loop import Loop
@@ -42,6 +44,21 @@ STATIC_HZ = 1e-3  # stands for 0 Hz
 LEAST_FRICTION, MOST_FRICTION, FRICTION_AMPLITUDES = 0.1, 50.0, 9  # times the dry friction: from stuck to sliding
 SLOWEST_STUCK = 15.0  # times slower than the bandwidth: where sweeps begin on a plant with friction
 PREDICTED_POINTS = 80
+
+
+@record(eq=False)
+class _StoredSweep:
+    """What a file has of a sweep of amplitudes."""
+
+    plant: str
+    unit: str
+    amplitude_N: tuple[float, ...]
+    bandwidth_hz: tuple[float | None, ...]
+    predicted_hz: tuple[float | None, ...]
+    friction_N: float
+    saturation_map: Mapping[str, tuple[OrInfinite, ...]]
+    gain: Mapping[str, tuple[tuple[OrNaN, ...], ...]]
+    saturated: tuple[tuple[bool, ...], ...]
 
 
 @record(eq=False)
@@ -96,7 +113,26 @@ class LargeSignal:
             "predicted_hz": list(self.predicted_hz),
             "friction_N": self.friction_N,
             "saturation_map": {"frequency_hz": self.frequency_hz.tolist(), "amplitude_N": self.onset_N.tolist()},
+            "gain": {"re": np.real(self.gain).tolist(), "im": np.imag(self.gain).tolist()},
+            "saturated": self.saturated.tolist(),
         }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], source: str, remedy: str) -> LargeSignal:
+        """Return what `to_dict` gave; nothing is simulated."""
+        stored = from_content(_StoredSweep, content, source, remedy=remedy)
+        return cls(
+            plant=stored.plant,
+            unit=stored.unit,
+            frequency_hz=np.array(stored.saturation_map["frequency_hz"]),
+            amplitude_N=np.array(stored.amplitude_N),
+            gain=np.array(stored.gain["re"]) + 1j * np.array(stored.gain["im"]),
+            saturated=np.array(stored.saturated, dtype=bool),
+            onset_N=np.array(stored.saturation_map["amplitude_N"]),
+            bandwidth_hz=stored.bandwidth_hz,
+            predicted_hz=stored.predicted_hz,
+            friction_N=stored.friction_N,
+        )
 
     def __repr__(self) -> str:
         dry = f", dry friction {self.friction_N:.4g} {self.unit}" if self.friction_N else ""
@@ -168,9 +204,12 @@ def large_signal(
     if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
     loop = SampledLoop(
-        plant=plant, law=runnable(controller), measured=controller.signals,
-        delay_samples=controller.compute_delay_samples, longest_delay_s=find_longest_delay(plant, [parameters]),
-    )  # fmt: skip
+        plant=plant,
+        law=runnable(controller),
+        measured=controller.signals,
+        delay_samples=controller.compute_delay_samples,
+        longest_delay_s=find_longest_delay(plant, [parameters]),
+    )
     if frequencies_hz is None:
         wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)
     else:
@@ -199,11 +238,17 @@ def large_signal(
     dense = np.geomspace(f[0], f[-1], PREDICTED_POINTS)
     predicted = np.abs(predict_gain(controller, plant, values, dense, amplitude))
     return LargeSignal(
-        plant=plant.name, frequency_hz=f, amplitude_N=amplitude, gain=gain, saturated=saturated, onset_N=onset,
+        plant=plant.name,
+        frequency_hz=f,
+        amplitude_N=amplitude,
+        gain=gain,
+        saturated=saturated,
+        onset_N=onset,
         bandwidth_hz=tuple(_find_bandwidth(f, np.abs(row), static, plant.moves) for row in gain),
         predicted_hz=tuple(_find_bandwidth(dense, row, static, plant.moves) for row in predicted),
-        friction_N=friction, unit=controller.command.reference_unit,
-    )  # fmt: skip
+        friction_N=friction,
+        unit=controller.command.reference_unit,
+    )
 
 
 def predict_bandwidths(

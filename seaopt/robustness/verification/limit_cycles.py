@@ -7,11 +7,13 @@ and commands at rest, a reference of zero. What is left after many periods has f
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
+from seaopt.codec import from_content
 from seaopt.control import Controller
 from seaopt.control.laws.limit_cycles import LimitCycle, predict_limit_cycles
 from seaopt.control.laws.realisation import runnable
@@ -31,6 +33,18 @@ PUSH = 1.5  # times the predicted cycle, where a run starts
 PERIODS, LEAST_S, LONGEST_S = 60.0, 1.0, 30.0  # of the predicted cycle, that a run lasts
 JUDGED = 0.4  # of a run, at its end
 FLOOR = 0.05  # of the predicted force: a smaller oscillation is one that dies out
+
+
+@record
+class _StoredCycle:
+    """What a file has of a limit cycle."""
+
+    predicted: LimitCycle | None
+    simulated: Mapping[str, float] | None
+    runs_away: bool
+    found_by: str
+    not_simulated: str | None
+    unit: str = LINEAR.unit
 
 
 @record
@@ -84,7 +98,23 @@ class FoundCycle:
             "runs_away": self.runs_away,
             "found_by": self.found_by,
             "not_simulated": self.not_simulated or None,
+            "unit": self.unit,
         }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], source: str, remedy: str) -> FoundCycle:
+        """Return what `to_dict` gave."""
+        stored = from_content(_StoredCycle, content, source, remedy=remedy)
+        simulated = stored.simulated or {}
+        return cls(
+            predicted=stored.predicted,
+            simulated_N=simulated.get("force_N"),
+            simulated_hz=simulated.get("frequency_hz"),
+            runs_away=stored.runs_away,
+            found_by=stored.found_by,
+            not_simulated=stored.not_simulated or "",
+            unit=stored.unit,
+        )
 
     def __str__(self) -> str:
         parts: list[str] = []
@@ -141,9 +171,12 @@ def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle:
     measured, delay = controller.signals, controller.compute_delay_samples
     try:
         loop = SampledLoop(
-            plant=plant, law=runnable(controller), measured=measured, delay_samples=delay,
+            plant=plant,
+            law=runnable(controller),
+            measured=measured,
+            delay_samples=delay,
             longest_delay_s=find_longest_delay(plant, [values]),
-        )  # fmt: skip
+        )
         start = at_rest(loop, 1, PUSH * np.array(cycle.state))
         run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
     except SimulationError as error:
@@ -156,6 +189,8 @@ def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle:
     if line is None or not (line.sustained or line.growing):
         return FoundCycle(predicted=cycle, simulated_N=None, simulated_hz=None)
     return FoundCycle(
-        predicted=cycle, simulated_N=None if line.growing else line.amplitude,
-        simulated_hz=None if line.growing else line.frequency_hz, runs_away=line.growing,
-    )  # fmt: skip
+        predicted=cycle,
+        simulated_N=None if line.growing else line.amplitude,
+        simulated_hz=None if line.growing else line.frequency_hz,
+        runs_away=line.growing,
+    )

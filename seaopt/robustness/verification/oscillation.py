@@ -91,9 +91,11 @@ def find_oscillation(
     if last <= floor / size or last**2 < LINE_SHARE * power:
         return None
     return Oscillation(
-        frequency_hz=f, amplitude=size * last, growth=last / max(first, 1e-300),
+        frequency_hz=f,
+        amplitude=size * last,
+        growth=last / max(first, 1e-300),
         peak=size * float(np.max(np.abs(fast[halves[1]]))),
-    )  # fmt: skip
+    )
 
 
 def measure_swing(signal: Float[np.ndarray, " n"], sample_time_s: float, *, lowest_hz: float) -> Oscillation:
@@ -120,9 +122,11 @@ def measure_swing(signal: Float[np.ndarray, " n"], sample_time_s: float, *, lowe
     halves = np.array_split(fast, 2)
     first, last = (math.sqrt(2.0 * float(np.mean(half**2))) for half in halves)
     return Oscillation(
-        frequency_hz=_find_frequency(fast, sample_time_s) if last else 0.0, amplitude=last,
-        growth=last / max(first, 1e-300), peak=float(np.max(np.abs(halves[1]))),
-    )  # fmt: skip
+        frequency_hz=_find_frequency(fast, sample_time_s) if last else 0.0,
+        amplitude=last,
+        growth=last / max(first, 1e-300),
+        peak=float(np.max(np.abs(halves[1]))),
+    )
 
 
 def _remove_slow(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: float) -> Float[np.ndarray, " n"]:

@@ -122,11 +122,13 @@ def _predict(controller: Controller, loop: Loop, play: _Play) -> list[LimitCycle
         regulated = play.mix(low)[2][0]
         cycles.append(
             LimitCycle(
-                frequency_hz=float(speed / (2 * np.pi)), force_N=float(abs(regulated[play.state]) * deflection),
-                velocity=float(speed * deflection), stable=bool(growth[i] > 0.0),
+                frequency_hz=float(speed / (2 * np.pi)),
+                force_N=float(abs(regulated[play.state]) * deflection),
+                velocity=float(speed * deflection),
+                stable=bool(growth[i] > 0.0),
                 state=tuple(float(value) for value in deflection * np.eye(loop.plant.b.size)[play.state]),
             )
-        )  # fmt: skip
+        )
     return cycles
 
 

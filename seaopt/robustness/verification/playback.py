@@ -223,9 +223,14 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             phase, loop.law.sample_time_s, np.random.default_rng([require_seed(seed, ControlError), number])
         )
         run = run_loop(
-            loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s,
+            loop,
+            values,
+            reference,
+            start=now,
+            seed=seed + 7919 * number,
+            start_s=begin_s,
             standing=0.0 if grip is None else _read_standing(stage, values, grip, loop.standing),
-        )  # fmt: skip
+        )
         now, begin_s = run.end, begin_s + reference.shape[1] * loop.law.sample_time_s
         runs.append(run)
     return _join_phases(stage, runs, rest, tuple(contacts))
@@ -286,9 +291,9 @@ def _read_standing(
     plant = stage.plant
     observe, rows, still = output_function(plant), find_rows(plant, names), np.zeros(len(plant.inputs))
     places = [fill_vector("state", plant.states, at) for at in grip]
-    return np.array([
-        np.array(observe(0.0, x, still, each.vector)).ravel()[rows] for x, each in zip(places, values, strict=True)
-    ])  # fmt: skip
+    return np.array(
+        [np.array(observe(0.0, x, still, each.vector)).ravel()[rows] for x, each in zip(places, values, strict=True)]
+    )
 
 
 def _let_go(
@@ -313,10 +318,7 @@ def _join_phases(
         reference=np.hstack([run.reference for run in runs]),
         current=np.hstack([run.current for run in runs]),
         outputs={name: np.hstack([column(run, name) for run in runs]) for name in names},
-        peaks={
-            name: np.max([run.peaks[name] for run in runs if name in run.peaks], axis=0)
-            for name in names
-        },
+        peaks={name: np.max([run.peaks[name] for run in runs if name in run.peaks], axis=0) for name in names},
         rest=rest,
         edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
         contacts=contacts,
@@ -324,4 +326,4 @@ def _join_phases(
         command=runs[0].command,
         substeps=max(run.substeps for run in runs),
         wall_s=sum(run.wall_s for run in runs),
-    )  # fmt: skip
+    )

@@ -183,9 +183,7 @@ def _struck(plant: Plant) -> str | None:
     return plant.port.motion if plant.port is not None else None
 
 
-def default_scenarios(
-    controller: Controller, plant: Plant, sets: Sequence[ParameterSet] = ()
-) -> tuple[Scenario, ...]:  # fmt: skip
+def default_scenarios(controller: Controller, plant: Plant, sets: Sequence[ParameterSet] = ()) -> tuple[Scenario, ...]:
     """Return the scenarios for a plant, sized by the controller's own limits.
 
     Forces are multiples of two: that of the step that just reaches the current limit (at its first samples, where the
@@ -311,9 +309,11 @@ def _stick(controller: Controller, step: Scenario, friction: float) -> Scenario:
     settling_s = step.settling_s + WAITING_PERIODS / controller.spec.bandwidth_hz * friction / force
     last = replace(step.phases[-1], duration_s=max(step.phases[-1].duration_s, 1.25 * settling_s))
     return replace(
-        sticking, phases=(*step.phases[:-1], last), settling_s=settling_s,
+        sticking,
+        phases=(*step.phases[:-1], last),
+        settling_s=settling_s,
         final_error=min(SETTLED * force, (step.final_error or 0.0) + 0.02 * friction),
-    )  # fmt: skip
+    )
 
 
 def _size_steps(controller: Controller) -> dict[str, float]:
@@ -388,9 +388,12 @@ def _size_blow(controller: Controller, plant: Plant, force: float) -> float:
     assert link is not None
     params = plant.complete(_require_design(controller)[1]).drop_conditions()
     loop = SampledLoop(
-        plant=plant, law=runnable(controller), measured=controller.signals,
-        delay_samples=controller.compute_delay_samples, longest_delay_s=find_longest_delay(plant, [params]),
-    )  # fmt: skip
+        plant=plant,
+        law=runnable(controller),
+        measured=controller.signals,
+        delay_samples=controller.compute_delay_samples,
+        longest_delay_s=find_longest_delay(plant, [params]),
+    )
 
     def measure_peak(blow: float) -> float:
         state = strike(plant, params, np.zeros(len(plant.states)), link, blow)

@@ -28,6 +28,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import OrInfinite
 from seaopt.control.running.force_run import ForceRun, close_loop
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, SimulationError
@@ -36,7 +37,6 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.verification.scenarios import SETTLED
 from seaopt.robustness.verification.schedule_sweep import RestStart, find_least_effort
-from seaopt.units import unit_after
 
 PUSHES, ROUNDS = (1.0, -1.0, -1.0, 1.0), 3
 LEAST_PERIODS, MOST_PERIODS, JUDGED_PERIODS = 5, 20, 2  # of the least bandwidth: of a push, and of its end
@@ -72,8 +72,8 @@ class Motion:
     low: float
     high: float
     size: float
-    left: float
-    ringing: float
+    left: OrInfinite
+    ringing: OrInfinite
     fault: str
 
 
@@ -105,11 +105,18 @@ class _Pushing:
         """Return the loop under pushes of a size."""
         law, start, spec = self.schedule.runnable(), self.start, self.schedule.spec
         return close_loop(
-            law.step, law.reset(start.output, start.output, self.middle, start.command), self.plant, start.params,
-            start.output + size * self.pushes, measured=spec.regulated, sample_time_s=spec.sample_time_s,
-            delay_samples=spec.loop_delay_samples, start_state=start.take(self.plant), start_command=start.command,
+            law.step,
+            law.reset(start.output, start.output, self.middle, start.command),
+            self.plant,
+            start.params,
+            start.output + size * self.pushes,
+            measured=spec.regulated,
+            sample_time_s=spec.sample_time_s,
+            delay_samples=spec.loop_delay_samples,
+            start_state=start.take(self.plant),
+            start_command=start.command,
             place=self.schedule.over,
-        )  # fmt: skip
+        )
 
     def follow(self, run: ForceRun) -> Float[np.ndarray, " n"]:
         """Return the variable at each sample."""
@@ -123,10 +130,12 @@ class _Pushing:
                 run = self.run(size)
                 place = self.follow(run)
                 push = _Push(
-                    size=size, run=run, rate=float(np.max(np.abs(np.diff(place)))) / self.schedule.spec.sample_time_s,
+                    size=size,
+                    run=run,
+                    rate=float(np.max(np.abs(np.diff(place)))) / self.schedule.spec.sample_time_s,
                     room=float(np.max(np.abs(place - self.middle))) / self.room,
                     command=float(np.max(np.abs(run.current))) / limit,
-                )  # fmt: skip
+                )
                 share = max(NEAR * push.rate / rate, push.room, push.command)
                 kept = push if share <= 1.0 else kept
             except (ControlError, SimulationError):
@@ -173,9 +182,16 @@ def move_schedule(
     push = pushing.find_push(rate, FIRST_SHARE * find_least_effort(schedule))
     if push is None:
         return Motion(
-            plant=name, asked=rate, rate=0.0, low=pushing.middle, high=pushing.middle, size=0.0, left=math.inf,
-            ringing=math.inf, fault="is lost under any push, small ones too",
-        )  # fmt: skip
+            plant=name,
+            asked=rate,
+            rate=0.0,
+            low=pushing.middle,
+            high=pushing.middle,
+            size=0.0,
+            left=math.inf,
+            ringing=math.inf,
+            fault="is lost under any push, small ones too",
+        )
     if push.rate < rate:
         pushing, push = _change_length(pushing, push, rate)
     place, size = pushing.follow(push.run), push.size
@@ -191,9 +207,16 @@ def move_schedule(
     elif not left <= most:
         fault = f"departs: a push is still {100 * left:.3g} % off at its end, {100 * most:.3g} % allowed"
     return Motion(
-        plant=name, asked=rate, rate=push.rate, low=float(np.min(place)), high=float(np.max(place)), size=size,
-        left=left, ringing=ringing, fault=fault,
-    )  # fmt: skip
+        plant=name,
+        asked=rate,
+        rate=push.rate,
+        low=float(np.min(place)),
+        high=float(np.max(place)),
+        size=size,
+        left=left,
+        ringing=ringing,
+        fault=fault,
+    )
 
 
 def _change_length(pushing: _Pushing, push: _Push, rate: float) -> tuple[_Pushing, _Push]:
@@ -213,9 +236,15 @@ def _make_pushing(schedule: ScheduledController, plant: Plant, params: Parameter
     period = math.ceil(1.0 / min(schedule.bandwidths_hz) / ts)
     lasting = _limit_length(room / rate / ts, period)
     return _Pushing(
-        schedule=schedule, plant=plant, start=RestStart.at_rest(schedule, plant, params, middle), middle=middle,
-        room=room, pushes=_make_pushes(lasting, period), lasting=lasting, period=period,
-    )  # fmt: skip
+        schedule=schedule,
+        plant=plant,
+        start=RestStart.at_rest(schedule, plant, params, middle),
+        middle=middle,
+        room=room,
+        pushes=_make_pushes(lasting, period),
+        lasting=lasting,
+        period=period,
+    )
 
 
 def _limit_length(samples: float, period: int) -> int:
@@ -238,10 +267,10 @@ def move_plants(
 
 
 def describe_motion(motion: Motion, over: str, unit: str) -> str:
-    """Return what was found where a plant moves the variable, in one line."""
-    per, ends = f"{unit_after(unit).strip()}/s", f"{motion.low:.3g} and {motion.high:.3g}"
-    head = f"{motion.plant} moves {over} by itself between {ends} at up to {motion.rate:.3g} {per}"
+    """Return what was found where a plant moves the variable `over`, in one line; rates are in `unit`."""
+    ends = f"{motion.low:.3g} and {motion.high:.3g}"
+    head = f"moves {over} by itself between {ends} at up to {motion.rate:.3g} {unit}"
     found = f"{head}, pushed to and fro, and {motion.fault or 'neither rings nor departs'}"
     if motion.rate >= motion.asked:
         return found
-    return f"{found}; {motion.asked:.3g} {per} is not reached within the table and the command's limit"
+    return f"{found}; {motion.asked:.3g} {unit} is not reached within the table and the command's limit"

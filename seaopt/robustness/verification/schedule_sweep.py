@@ -30,6 +30,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import OrInfinite
 from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.running.force_run import close_loop
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
@@ -43,7 +44,6 @@ from seaopt.plants.plant import output_function
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
 from seaopt.robustness.verification.scenarios import PEAK_GRACE, SETTLED
-from seaopt.units import unit_after
 
 SLOWEST, FASTEST = 1.0 / 128.0, 0.5  # of the least bandwidth: frequencies of the sweeps
 PULSE_PERIODS = 10.0  # of the least bandwidth, that a pulse lasts, and a pause
@@ -78,8 +78,8 @@ class Sweep:
     plant: str
     rate: float
     frequency_hz: float
-    peak: float
-    left: float
+    peak: OrInfinite
+    left: OrInfinite
     fault: str
 
 
@@ -94,9 +94,13 @@ class _Pulses:
 
 
 def sweep_schedule(
-    schedule: ScheduledController, name: str, plant: Plant, params: ParameterSet, progress: Progress = ignore,
+    schedule: ScheduledController,
+    name: str,
+    plant: Plant,
+    params: ParameterSet,
+    progress: Progress = ignore,
     executor: Executor | None = None,
-) -> tuple[Sweep, ...]:  # fmt: skip
+) -> tuple[Sweep, ...]:
     """Sweep a plant's scheduling variable at growing rates, up to the first that does not keep the judgement.
 
     Parameters
@@ -151,11 +155,9 @@ def find_fastest(sweeps: Sequence[Sweep]) -> float:
 
 
 def describe_sweeps(sweeps: Sequence[Sweep], unit: str) -> str:
-    """Return what the sweeps of one plant found, in one line."""
-    rate, per = find_fastest(sweeps), f"{unit_after(unit).strip()}/s"
-    head = f"{sweeps[0].plant}: keeps its judgement in sweeps of up to {rate:.3g} {per}"
-    last = sweeps[-1]
-    return f"{head}, the fastest tried" if not last.fault else f"{head}; at {last.rate:.3g} {per} {last.fault}"
+    """Return what the sweeps of one plant found, in one line; rates are in `unit`."""
+    head, last = f"keeps its judgement in sweeps of up to {find_fastest(sweeps):.3g} {unit}", sweeps[-1]
+    return f"{head}, the fastest tried" if not last.fault else f"{head}; at {last.rate:.3g} {unit} {last.fault}"
 
 
 def _choose_pulses(schedule: ScheduledController, plant: Plant, params: ParameterSet) -> _Pulses:
@@ -167,10 +169,11 @@ def _choose_pulses(schedule: ScheduledController, plant: Plant, params: Paramete
         for loop in schedule.close_points(plant, params)
     )
     return _Pulses(
-        size=STEP_SHARE * find_least_effort(schedule), samples=samples,
+        size=STEP_SHARE * find_least_effort(schedule),
+        samples=samples,
         allowed_peak=PEAK_GRACE * (spec.level("max_reference_peak") or DEFAULT_PEAK),
         allowed_left=max(SETTLED, 2.0 * left),
-    )  # fmt: skip
+    )
 
 
 def find_least_effort(schedule: ScheduledController) -> float:
@@ -194,17 +197,25 @@ def _run_sweep(
     start = RestStart.at_rest(schedule, plant, params, low)
     swept = make_swept_plant(plant, schedule.over)
     values = start.params.with_parameters(
-        *(Parameter(name=key, value=value, unit=unit) for key, value, unit in zip(
-            SWEEP, (low, high, omega), (schedule.unit, schedule.unit, "rad/s"), strict=True
-        ))
-    )  # fmt: skip
+        *(
+            Parameter(name=key, value=value, unit=unit)
+            for key, value, unit in zip(SWEEP, (low, high, omega), (schedule.unit, schedule.unit, "rad/s"), strict=True)
+        )
+    )
 
     def run(size: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         out = close_loop(
-            _follow(law, place), (0, law.reset(start.output, start.output, low, start.command)), swept, values,
-            start.output + size * pulse, measured=schedule.spec.regulated, sample_time_s=ts,
-            delay_samples=schedule.spec.loop_delay_samples, start_state=start.take(swept), start_command=start.command,
-        )  # fmt: skip
+            _follow(law, place),
+            (0, law.reset(start.output, start.output, low, start.command)),
+            swept,
+            values,
+            start.output + size * pulse,
+            measured=schedule.spec.regulated,
+            sample_time_s=ts,
+            delay_samples=schedule.spec.loop_delay_samples,
+            start_state=start.take(swept),
+            start_command=start.command,
+        )
         return out.force, out.current
 
     rate = 0.5 * (high - low) * omega
@@ -263,9 +274,11 @@ class RestStart:
         row = list(plant.outputs).index(schedule.spec.regulated)
         output = float(output_function(plant)(0.0, x, u, placed.vector)[row])
         return cls(
-            params=placed.drop_conditions(), states=dict(zip(plant.states, x.tolist(), strict=True)), output=output,
+            params=placed.drop_conditions(),
+            states=dict(zip(plant.states, x.tolist(), strict=True)),
+            output=output,
             command=float(u[0]),
-        )  # fmt: skip
+        )
 
     def take(self, plant: Plant) -> Float[np.ndarray, " nx"]:
         """Return the states that a plant still has."""
@@ -296,9 +309,11 @@ def make_swept_plant(plant: Plant, over: str) -> Plant:
         moved |= {rate: half * p.sweep_rad_s * ca.sin(phase)} if rate else {}
         states, values = ({**vars(space), **moved} for space in (x, p))
         slopes, outputs = equations(
-            t, ca.vertcat(*(states[name] for name in plant.states)), ca.vertcat(*(getattr(u, n) for n in plant.inputs)),
+            t,
+            ca.vertcat(*(states[name] for name in plant.states)),
+            ca.vertcat(*(getattr(u, n) for n in plant.inputs)),
             ca.vertcat(*(values[name] for name in plant.parameters)),
-        )  # fmt: skip
+        )
         return (
             dict(zip(plant.states, ca.vertsplit(slopes), strict=True)),
             dict(zip(plant.outputs, ca.vertsplit(outputs), strict=True)),
@@ -311,10 +326,15 @@ def make_swept_plant(plant: Plant, over: str) -> Plant:
         return evaluate(t, x, u, p)[1]
 
     return Plant(
-        name=f"{plant.name}, {over} swept", states=kept, inputs=plant.inputs, outputs=plant.outputs,
-        parameters={**plant.parameters, **dict(zip(SWEEP, (unit, unit, "rad/s"), strict=True))}, f=f, h=h,
+        name=f"{plant.name}, {over} swept",
+        states=kept,
+        inputs=plant.inputs,
+        outputs=plant.outputs,
+        parameters={**plant.parameters, **dict(zip(SWEEP, (unit, unit, "rad/s"), strict=True))},
+        f=f,
+        h=h,
         drive_offset_s=plant.drive_offset_s,
-    )  # fmt: skip
+    )
 
 
 def _find_rate(plant: Plant, over: str) -> str:

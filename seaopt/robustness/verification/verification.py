@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import fields
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from seaopt.bench import Sensors
+from seaopt.codec import OrInfinite, from_content, to_content
 from seaopt.control import Controller
 from seaopt.control.laws.command import Command
 from seaopt.errors import ControlError, StepSizeError, suggestion
@@ -29,6 +30,7 @@ from seaopt.robustness.verification.scenarios import Scenario, default_scenarios
 from seaopt.units import LINEAR, Mechanics, unit_after
 
 ChooseScenarios = Callable[[Controller, Plant, Sequence[ParameterSet]], Sequence[Scenario]]
+SKIPPED_KEYS = ("scenario", "plant", "reason")
 TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it is played as friction that sticks"
 
 
@@ -38,8 +40,6 @@ class Verification(Result):
 
     Parameters
     ----------
-    passed : bool
-        Whether every row passed, and there is at least one.
     rows : tuple of Outcome
     skipped : tuple of (scenario, plant, reason)
         Requested runs that cannot be simulated.
@@ -61,7 +61,6 @@ class Verification(Result):
 
     plot = PlotAccessor("seaopt.reporting.plots:VerificationPlots")
 
-    passed: bool
     rows: tuple[Outcome, ...]
     skipped: tuple[tuple[str, str, str], ...]
     real_time_factor: Mapping[str, float]
@@ -75,7 +74,7 @@ class Verification(Result):
     @property
     def met(self) -> bool:
         """Whether every run passed, and there is one."""
-        return self.passed
+        return bool(self.rows) and all(row.met for row in self.rows)
 
     @property
     def mechanics(self) -> Mechanics:
@@ -117,14 +116,14 @@ class Verification(Result):
     @property
     def failures(self) -> tuple[Outcome, ...]:
         """The rows that did not pass."""
-        return tuple(row for row in self.rows if not row.passed)
+        return tuple(row for row in self.rows if not row.met)
 
     def worst(self) -> tuple[Outcome, ...]:
         """Return one row per scenario and plant: one that failed, else the one with the largest force."""
         best: dict[tuple[str, str], Outcome] = {}
         for row in self.rows:
             key = (row.plant, row.scenario)
-            if key not in best or (not row.passed, row.peak_force_N) > (not best[key].passed, best[key].peak_force_N):
+            if key not in best or (not row.met, row.peak_force_N) > (not best[key].met, best[key].peak_force_N):
                 best[key] = row
         return tuple(best.values())
 
@@ -173,17 +172,49 @@ class Verification(Result):
     def to_dict(self) -> dict[str, Any]:
         """Return what goes into robustness.json under "simulation"."""
         return {
-            "passed": self.passed,
+            "met": self.met,
+            "passed": self.met,
             "seed": self.seed,
             "integration_error": self.error,
             "follows_hz": {name: None if band is None else list(band) for name, band in self.follows_hz.items()},
-            "rows": [{f.name: _to_plain(getattr(row, f.name)) for f in fields(Outcome)} for row in self.rows],
-            "skipped": [dict(zip(("scenario", "plant", "reason"), row, strict=True)) for row in self.skipped],
+            "rows": to_content(self.rows),
+            "skipped": [dict(zip(SKIPPED_KEYS, row, strict=True)) for row in self.skipped],
+            "scenarios": to_content(self.scenarios),
         }
+
+    @classmethod
+    def from_dict(
+        cls,
+        content: Mapping[str, Any],
+        stages: Mapping[str, Stage],
+        draws: Mapping[str, tuple[ParameterSet, ...]],
+        source: str,
+        remedy: str,
+    ) -> Verification:
+        """Return what `to_dict` gave, of the same stages and draws; nothing is simulated.
+
+        Raises
+        ------
+        FileError
+            A key is missing or a value of the wrong kind.
+
+        """
+        stored = from_content(_StoredRuns, content, source, remedy=remedy)
+        return cls(
+            rows=tuple(map(_restore_settling, stored.rows)),
+            skipped=tuple((row["scenario"], row["plant"], row["reason"]) for row in stored.skipped),
+            real_time_factor={},
+            error=stored.integration_error,
+            seed=stored.seed,
+            stages=stages,
+            scenarios=stored.scenarios,
+            draws=draws,
+            follows_hz=stored.follows_hz,
+        )
 
     def __repr__(self) -> str:
         failed = len(self.failures)
-        verdict = "passed" if self.passed else (f"FAILED in {failed} of {len(self.rows)} runs" if failed else "EMPTY")
+        verdict = "passed" if self.met else (f"FAILED in {failed} of {len(self.rows)} runs" if failed else "EMPTY")
         lines = [f"Verification by simulation: {verdict}"]
         lines += [f"  {line}" for line in (*_format_worst(self), *self.describe_draws(), *self.describe_tracking())]
         lines += [
@@ -192,10 +223,50 @@ class Verification(Result):
         ]
         lines += [f"  not played: {scenario} on {plant}, {reason}" for scenario, plant, reason in self.skipped]
         speed = ", ".join(f"{name} {value:.0f}" for name, value in self.real_time_factor.items())
-        return "\n".join([*lines, f"  simulated seconds per second: {speed}; seed {self.seed}"])
+        speed = f"simulated seconds per second: {speed}; " if speed else ""  # a file does not keep it
+        return "\n".join([*lines, f"  {speed}seed {self.seed}"])
 
     def _repr_html_(self) -> str:
         return html_text(self) + self.plot.to_html()
+
+
+@record(eq=False)
+class _StoredRuns:
+    """What a file has of a verification."""
+
+    rows: tuple[Outcome, ...]
+    seed: int
+    integration_error: OrInfinite
+    follows_hz: Mapping[str, tuple[float, float] | None]
+    skipped: tuple[Mapping[str, str], ...]
+    scenarios: Mapping[str, tuple[Scenario, ...]]
+
+
+def _restore_settling(row: Outcome) -> Outcome:
+    """Return a step that never settles with the infinite time that JSON cannot hold."""
+    never = row.settling_s is None and row.overshoot is not None
+    return replace(row, settling_s=math.inf) if never else row
+
+
+def make_stages(
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    sensors: Sensors | None,
+    current_step_A: float,
+    partners: Mapping[str, Plant] | None = None,
+) -> dict[str, Stage]:
+    """Return where a controller is played: on plants as it sees them, with what holds their links."""
+    seen = {name: controller.see(plant) for name, plant in plants.items()}
+    return {
+        name: Stage(
+            controller=controller,
+            plant=plant,
+            partner=_partner(plant, (partners or {}).get(name)),
+            sensors=sensors or Sensors(),
+            current_step_A=current_step_A,
+        )
+        for name, plant in seen.items()
+    }
 
 
 def verify(
@@ -269,14 +340,7 @@ def verify(
     """
     check_plants(plants, draws or {}, partners or {})
     check_sensors(sensors, controller, plants)
-    plants = {name: controller.see(plant) for name, plant in plants.items()}
-    stages = {
-        name: Stage(
-            controller=controller, plant=plant, partner=_partner(plant, (partners or {}).get(name)),
-            sensors=sensors or Sensors(), current_step_A=current_step_A,
-        )
-        for name, plant in plants.items()
-    }  # fmt: skip
+    stages = make_stages(controller, plants, sensors, current_step_A, partners)
     played: dict[str, tuple[Scenario, ...]] = {}
     skipped: list[tuple[str, str, str]] = []
     sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
@@ -321,13 +385,19 @@ def verify(
         played[name] = tuple(done)
         speeds[name] = simulated / wall if wall else math.nan
     return Verification(
-        passed=bool(rows) and all(row.passed for row in rows), rows=tuple(rows), skipped=tuple(skipped),
-        real_time_factor=speeds, error=error, seed=seed, stages=stages, scenarios=played, draws=sets,
+        rows=tuple(rows),
+        skipped=tuple(skipped),
+        real_time_factor=speeds,
+        error=error,
+        seed=seed,
+        stages=stages,
+        scenarios=played,
+        draws=sets,
         follows_hz={
             name: controller.close(take_sliding(plant, parameters), parameters).figures().tracking_band_hz
-            for name, plant in plants.items()
+            for name, plant in ((name, stage.plant) for name, stage in stages.items())
         },
-    )  # fmt: skip
+    )
 
 
 @record
@@ -372,8 +442,9 @@ def _run_scenario(stage: Stage, name: str, scenario: Scenario, sets: Sequence[Pa
         actual=scenario,
         outcomes=[judge_run(stage, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))],
         simulated_s=sum(len(sets) * one.time.size * stage.controller.sample_time_s for one in traces),
-        wall_s=sum(one.wall_s for one in traces), error=max(one.error for one in traces),
-    )  # fmt: skip
+        wall_s=sum(one.wall_s for one in traces),
+        error=max(one.error for one in traces),
+    )
 
 
 def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:
@@ -428,14 +499,6 @@ def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
     return share_drive(plant.port.held(), plant)
 
 
-def _to_plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return dict(value)
-    if isinstance(value, tuple):
-        return [fault.kind for fault in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def describe_witness(row: Outcome) -> str:
     """Return where a row's draw differs from nominal, as text that follows its reason."""
     return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
@@ -445,20 +508,39 @@ def _format_worst(verification: Verification) -> list[str]:
     called = verification.mechanics
     unit = called.unit
     head = (
-        "plant", "scenario", "size", "", f"{called.word} {unit}", "overshoot", "settles s",
-        f"{verification.command.word}{unit_after(verification.command.unit)}", "angle deg",
-        "energy J", "at limit", f"ends off {unit}", f"allowed {unit}", "draw",
-    )  # fmt: skip
+        "plant",
+        "scenario",
+        "size",
+        "",
+        f"{called.word} {unit}",
+        "overshoot",
+        "settles s",
+        f"{verification.command.word}{unit_after(verification.command.unit)}",
+        "angle deg",
+        "energy J",
+        "at limit",
+        f"ends off {unit}",
+        f"allowed {unit}",
+        "draw",
+    )
     cells: list[tuple[str, ...]] = []
     for row in verification.worst():
         angle = None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad)
         scenario = verification.scenario(row)
-        cells.append((
-            row.plant, row.scenario, scenario.describe_size(called), "passed" if row.passed else "FAILED",
-            f"{row.peak_force_N:.4g}",
-            "" if row.overshoot is None else f"{100 * row.overshoot:.3g} %", format_number(row.settling_s, 3, ""),
-            *(format_number(value, 3, "") for value in (row.peak_current_A, angle, row.peak_energy_J)),
-            f"{100 * row.saturated:.3g} %", format_number(row.final_error_N, 3, ""),
-            format_number(scenario.final_error, 3, ""), row.draw,
-        ))  # fmt: skip
+        cells.append(
+            (
+                row.plant,
+                row.scenario,
+                scenario.describe_size(called),
+                "passed" if row.met else "FAILED",
+                f"{row.peak_force_N:.4g}",
+                "" if row.overshoot is None else f"{100 * row.overshoot:.3g} %",
+                format_number(row.settling_s, 3, ""),
+                *(format_number(value, 3, "") for value in (row.peak_current_A, angle, row.peak_energy_J)),
+                f"{100 * row.saturated:.3g} %",
+                format_number(row.final_error_N, 3, ""),
+                format_number(scenario.final_error, 3, ""),
+                row.draw,
+            )
+        )
     return format_table(cells, head)

@@ -244,7 +244,7 @@ def test_a_gate_answers_by_status_and_begins_at_zero_where_a_reset_cannot_be_bel
 
 
 def test_an_infeasible_controller_is_refused_unless_asked(tuned, tmp_path):
-    missed = replace(tuned, feasible=False, active_constraints=("max_noise_gain",))
+    missed = replace(tuned, met=False, active_constraints=("max_noise_gain",))
     with pytest.raises(ControlError, match="misses max_noise_gain"):
         export(missed, tmp_path)
     assert not list(tmp_path.iterdir())

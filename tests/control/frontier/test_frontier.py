@@ -60,7 +60,7 @@ def test_a_row_says_what_friction_costs(stand, thor):
     assert row.without_sticking.disturbance == pytest.approx(free.disturbance, rel=1e-2)
     assert row.without_sticking.disturbance <= row.disturbance * 1.001
     table = repr(sweep(stand, thor.update(f_c=50.0), spec, [40]))
-    assert "cost of friction" in table and "%" in table
+    assert "friction: by how much it raises the integral" in table and "%" in table
 
 
 def test_the_command_writes_table_json_and_figure(tmp_path, monkeypatch, capsys):

@@ -32,6 +32,7 @@ from seaopt.robustness.verification.environments import attach_environment
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario
+from tests.words import flatten
 
 DELAY_S = 2.04e-3
 SUBSTEPS, STEPS_LATE = 25, 51  # of 1 ms: 2.04 ms are 51 steps of 40 us
@@ -91,7 +92,7 @@ def test_a_fitted_delay_is_the_drives_and_the_program_that_logged_waits_for_noth
     assert controller.feasible
     assert _true_ms(controller, stand, fit.parameters, DELAY_S) == pytest.approx(controller.achieved.ms, rel=2e-3)
     assert _true_ms(controller, stand, fit.parameters, DELAY_S + 1e-3) > 1.02 * controller.achieved.ms
-    assert "compute delay 0 samples + drive delay 2.0" in repr(controller)
+    assert "compute delay 0 samples + drive delay 2.0" in flatten(repr(controller))
 
 
 def test_a_command_that_is_measured_says_nothing_of_the_program(fit, stand):
@@ -141,7 +142,7 @@ def test_the_older_key_is_refused_beside_a_new_one(make, other):
 
 @pytest.mark.parametrize("value", [-1e-3, 2.0, np.nan, True])
 def test_a_drives_delay_is_in_seconds(value):
-    with pytest.raises(ControlError, match=r"drive_delay_s = .* is in seconds"):
+    with pytest.raises(ControlError, match=r"drive_delay_s = .* (is in seconds|is not a finite number)"):
         so.ControllerSpec(drive_delay_s=value)
 
 
@@ -152,7 +153,7 @@ def test_predictive_control_has_the_fits_delay(fit, stand, thor):
     given = MPCSpec(current_limit_A=9.0, bandwidth_hz=15, compute_delay_samples=1, drive_delay_s=0.0)
     short = force_mpc(stand, fit, given)
     assert short.delay_samples == 1 and "drive_delay_s = 0, but" in short.warnings[0]
-    assert short.warnings[0] in repr(short)
+    assert short.warnings[0] in flatten(repr(short))
     assert force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=15)).delay_samples == 1
 
 
@@ -395,7 +396,9 @@ def test_under_the_older_key_no_drive_of_the_values_is_added(stand, thor):
     plan = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=15, delay_samples=3))
     assert plan.close(stand, late).figures().ms == pytest.approx(plan.achieved.ms, rel=1e-9)
     assert "delay_samples = 3 is an older key, the whole loop" in plan.warnings[0]
-    assert plan.warnings[0] in repr(plan) and "delay 3 samples in all, the drive's among them" in repr(plan)
+    assert plan.warnings[0] in flatten(repr(plan)) and "delay 3 samples in all, the drive's among them" in flatten(
+        repr(plan)
+    )
 
 
 def test_completed_values_keep_a_drive_of_their_own(stand, thor):

@@ -270,13 +270,13 @@ def test_knots_reach_from_end_to_end(samples, moves):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"current_limit_A": 0.0}, "current_limit_A = 0.0 is not a number above zero"),
+        ({"current_limit_A": 0.0}, "current_limit_A = 0 is not above 0"),
         ({"current_slew_A_per_s": -1.0}, "current_slew_A_per_s"),
         ({"bandwidth_hz": 300.0}, "sample more than four times as fast"),
         ({"compute_delay_samples": -1}, "compute_delay_samples = -1"),
         ({"bandwidth_hz": 1e-3}, "slower than any weight makes it"),
         ({"bandwidth_hz": 240.0}, "beyond what any weight gives"),
-        ({"decay": 1.0}, "decay = 1.0 is not from 0 to below 1"),
+        ({"decay": 1.0}, "decay = 1 is not from 0 to below 1"),
         ({"moves": 60}, "horizon_s = 0.05 is 50 samples"),
         ({"measured": "F9"}, "not an output of high_impedance"),
         ({"measured": "F2"}, "follows the current at once"),

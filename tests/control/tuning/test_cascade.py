@@ -24,6 +24,7 @@ from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.running.outer_run import enclose_law
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
+from seaopt.reporting.sections.kinds.controller import list_achieved
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, step_scenarios
 
@@ -126,7 +127,7 @@ def test_the_encoders_noise_gain_is_a_limit(tuned: Controller) -> None:
     assert quieter.feasible
     assert quieter.achieved.other_noise_gains[0] <= asked
     assert quieter.gains["k_v"] < tuned.gains["k_v"]
-    assert f"{asked:g} N m/rad" in {row[0]: row[2] for row in quieter.list_achieved()}["other signals' noise gain"]
+    assert f"{asked:g} N m/rad" in {row[0]: row[2] for row in list_achieved(quieter)}["other signals' noise gain"]
 
 
 def test_its_p_form_is_the_drives(tuned: Controller) -> None:

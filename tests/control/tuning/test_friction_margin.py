@@ -13,6 +13,7 @@ from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from tests.control.loops import test_absolute_stability as lifted
+from tests.words import flatten
 
 # The actuator of the lifted discretisation: 18.9 kg in all, 395 N s/m.
 RADIUS = 0.005 / (2 * np.pi)
@@ -99,7 +100,7 @@ def test_the_margin_is_shown_and_a_file_cannot_claim_another(stand, rubbing, des
     """In the text, the table and the JSON it is what the certificate's test finds; one that is edited is refused."""
     margin = find_friction_margin(designed, stand, rubbing)
     assert designed.friction == margin
-    assert f"friction margin {margin.least_slope:.4g} N s/m (asked {ASKED:g})" in repr(designed)
+    assert f"Friction margin {margin.least_slope:.4g} N s/m (asked {ASKED:g})" in flatten(repr(designed))
     assert f"{margin.least_slope:.4g} N s/m" in designed._repr_html_()
     content = json.loads(to_json(designed.to_dict()))
     assert content["achieved"]["friction_margin"] == pytest.approx(margin.least_slope, rel=1e-12)

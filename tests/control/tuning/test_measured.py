@@ -230,7 +230,7 @@ def test_beside_a_model_the_limits_hold_on_the_discs_too():
         for one in (both, alone)
     )
     assert passed.passed and not failed.passed
-    rows = [row for row in failed.requirements if row.where.startswith("frf:chirp")]
+    rows = [row for row in failed.requirements if row.plant == "frf:chirp"]
     assert {row.name for row in rows if not row.met} >= {"max_sensitivity"}
 
 

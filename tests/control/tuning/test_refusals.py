@@ -12,11 +12,13 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control import Notch
 from seaopt.control.laws.verdict import list_broken_limits
+from seaopt.control.tuning import interior_point
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.optimisation_problem import K_P
 from seaopt.control.tuning.solution import solve, tighten_limits
 from seaopt.control.tuning.tuner import make_task
+from tests.control.tuning.drawn_requests import draw_request
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
 REFUSALS = 4  # benchmarks/bench_tune.py --refusals 100 rechecks more
@@ -130,6 +132,22 @@ def test_the_same_request_has_the_same_answer():
     grid = task.grid(place_frequencies(task))
     one, other = (Evolution.of(task, grid).run(generations=5, members=10)[1] for _ in range(2))
     assert np.array_equal(one, other, equal_nan=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "most"), [(217, 80), (233, 75)])
+def test_a_refusal_takes_a_bounded_count_of_solutions(monkeypatch, seed, most):
+    """With every start at every fraction of the link's feedforward these took 115 and 278 of IPOPT's."""
+    solve_ipopt, count = interior_point.solve_ipopt, 0
+
+    def solve_and_count(solver, **given):
+        nonlocal count
+        count += 1
+        return solve_ipopt(solver, **given)
+
+    monkeypatch.setattr(interior_point, "solve_ipopt", solve_and_count)
+    assert not draw_request(np.random.default_rng(seed)).tune().feasible
+    assert count <= most
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, FileError
 from seaopt.plants.friction import take_sliding
 from tests.control.loops.test_loop import independent
+from tests.words import flatten
 
 LIMITS = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
 
@@ -158,7 +159,7 @@ def test_a_sensitivity_over_its_limit_is_stated_by_how_much(stand, thor):
         bandwidth_hz=30, max_sensitivity=1.2, min_sensitivity_bandwidth_hz=20, bandwidth_range_hz=(29, 31)
     )
     controller = so.tune(stand, thor, spec)
-    assert not controller.feasible and controller.active_constraints and "NOT FEASIBLE" in repr(controller)
+    assert not controller.feasible and controller.active_constraints and repr(controller).startswith("not met")
     loop = controller.close(stand, thor)
     reached = np.max(np.abs(loop.sensitivity(np.linspace(0.01, 20.0, 20000))))
     blocked = next(text for text in controller.blocked_by if text.startswith("min_sensitivity_bandwidth_hz"))
@@ -169,7 +170,7 @@ def test_a_sensitivity_over_its_limit_is_stated_by_how_much(stand, thor):
 @pytest.mark.parametrize(("depth", "noted"), [(0.4, False), (1.0, True)])
 def test_a_notch_without_effect_is_noted(depth, noted, controller):
     gains = {**controller.gains, "notch_frequency_hz": 100.0, "notch_width": 0.2, "notch_depth": depth}
-    assert ("tune without it" in repr(replace(controller, gains=gains))) is noted
+    assert ("tune without it" in flatten(repr(replace(controller, gains=gains)))) is noted
 
 
 def test_the_summary_says_where_friction_has_the_bandwidth_placed(stand, thor):
@@ -178,7 +179,7 @@ def test_the_summary_says_where_friction_has_the_bandwidth_placed(stand, thor):
     controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25))
     r = thor["l"].value / (2 * np.pi * thor["N_p"].value)
     stuck = controller.close(stand, thor.update(b_r=thor["b_r"].value + 50.0 / 1e-3 * r**2)).figures()
-    assert f"stuck: bandwidth {stuck.bandwidth_hz:.4g} Hz, Ms {stuck.ms:.4g}" in repr(controller)
+    assert f"stuck: bandwidth {stuck.bandwidth_hz:.4g} Hz, Ms {stuck.ms:.4g}" in flatten(repr(controller))
     assert "sliding" not in repr(so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=20)))
 
 
@@ -210,7 +211,7 @@ def test_json_round_trip(stand, swing, thor, tmp_path):
         ({"objective": "speed"}, "objective"),
         ({"compute_delay_samples": 100_000}, "delay_samples"),
         ({"sample_rate_hz": float("inf")}, "sample_rate_hz"),
-        ({"sample_rate_hz": 1e300}, "above 1e\\+06 Hz"),
+        ({"sample_rate_hz": 1e300}, "up to 1e\\+06"),
         ({"prefilter": Prefilter(corner_hz=1e-300)}, r"prefilter.corner_hz = 1e-300 is not 0.001 to 450"),
         ({"notch": Notch(frequency_hz=1e-300)}, r"notch.frequency_hz = 1e-300 is not 0.001 to 450"),
     ],
@@ -278,7 +279,7 @@ def test_a_derivative_that_nothing_filters_is_said(controller, stand, thor):
     assert "1 N of noise on F1 makes up to " in note and "give max_noise_gain" in note
     _, _, noise = independent(free.close(stand, thor), np.linspace(0.1, 499.9, 20_000))
     assert float(note.split("up to ")[1].split(" N")[0]) == pytest.approx(np.abs(noise).max(), rel=5e-3)
-    assert f"note: {note}" in repr(free)
+    assert note in flatten(repr(free))
     for spec in ({"max_noise_gain": 25}, {"objective": "noise"}):
         assert so.tune(stand, thor, so.ControllerSpec(**unfiltered, **spec)).notes == (lifted,)
     assert controller.notes == ()

@@ -16,7 +16,7 @@ from seaopt.errors import EstimationError, PlantError, SimulationError
 from seaopt.plants import Difference
 from seaopt.plants.sensors.difference import add_difference
 from seaopt.simulation import Clock, Point, Segment, make_model, run_passes
-from seaopt.simulation.interpreted import interpreted_passes
+from seaopt.simulation.interpreted import interpret_pass
 from seaopt.simulation.passes import Weights
 
 PERIOD, N = 4e-3, 4000
@@ -82,10 +82,10 @@ def test_simulated_differences_are_those_of_the_simulated_angle(friction, case):
     point = Point(
         theta=np.zeros(0), offset=np.zeros(2), gain=np.ones(2), clock=Clock(period=PERIOD, delay_s=1e-3), substeps=2
     )
-    x0 = np.zeros((1, len(observed.states)))
+    x0 = np.zeros(len(observed.states))
     for run in (
         run_passes(model, segment, point, x0, outputs=True),
-        interpreted_passes(model, segment, point, Weights.plain(2), np.array([0, 60]), x0, outputs=True),
+        interpret_pass(model, segment, point, Weights.plain(2), 60, x0, outputs=True),
     ):
         angle, speed = run.outputs.T
         np.testing.assert_allclose(speed, difference_by_hand(angle, CASES[case]), rtol=1e-9, atol=1e-9)
@@ -103,7 +103,7 @@ def test_derivatives_are_those_of_finite_differences(f_c):
             theta=theta, offset=np.zeros(1), gain=np.ones(1), substeps=2,
             clock=Clock(period=PERIOD, delay_s=1e-3, delay_free=True),
         )  # fmt: skip
-        return run_passes(model, segment, point, x0[None], **keep)
+        return run_passes(model, segment, point, x0, **keep)
 
     theta, x0 = np.array([2e-4, 300.0]), np.linspace(0.1, 0.4, model.nx)
     columns = run(theta, x0, columns=True).columns[:, 0, 1:]
@@ -179,7 +179,7 @@ def test_the_first_difference_of_a_stretch_tells_what_was_held(motion):
         one = so.Experiment(plant=plant, log=log, outputs=("speed",), differences={"speed": CASES["one sample"]},
                             sigma={"speed": 0.02})  # fmt: skip
         fits.append(so.fit([one], params, diagnostics=False))
-    assert len(one.stretches) == 2
+    assert len(one.log_segments) == 2
     for name in FREE:
         a, b = (fit.parameters[name] for fit in fits)
         assert abs(a.value - b.value) < 1e-3 * a.std

@@ -48,7 +48,7 @@ def test_another_log_is_predicted_from_its_own_start_and_offset(fitted):
     residual = score.model["x"] - log["x"]
     expected = 100 * (1 - np.linalg.norm(residual) / np.linalg.norm(log["x"] - log["x"].mean()))
     assert score.fit_percent["x"] == pytest.approx(expected)
-    assert "second" in repr(score) and f"{expected:.2f} %" in repr(score)
+    assert "second" in repr(score) and f"{expected:.2f}" in repr(score)
 
 
 def test_a_fit_with_nothing_free_scores_a_log(fitted):

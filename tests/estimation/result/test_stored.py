@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import json
 
 import numpy as np
 import pytest
 
 import seaopt as so
 from seaopt.errors import FileError
+from seaopt.files import to_json
 
 CONTENT = {
     "schema": "seaopt/fit/2", "met": True, "findings": [],
@@ -54,10 +56,13 @@ def test_null_is_infinite_where_json_has_no_infinity():
         (("parameters", "J", "free"), 1, "parameters.J.free = 1"),
         (("status",), "done", "status = 'done': should be 'converged', "),
         (("iterations",), 2.5, "iterations = 2.5"),
-        (("covariance", "matrix"), [[1.0]], "covariance.matrix is not 2 by 2"),
-        (("covariance", "matrix"), [[-1.0, 0.0], [0.0, 1.0]], "covariance has a negative variance"),
+        (("covariance", "matrix"), [[1.0]], "covariance: matrix is not 2 by 2"),
+        (("covariance", "matrix"), [[-1.0, 0.0], [0.0, 1.0]], "covariance: has a negative variance"),
         (("covariance", "names"), ["J", "k"], "covariance.names = J, k is not what parameters has free, J, eta"),
         (("outputs", "chirp"), [], "outputs.chirp = []"),
+        (("met",), 3, "met = 3"),
+        (("met",), False, "met is False, and the other keys make True"),
+        (("parameters", "J", "ci95"), [0.0, 1.0], "parameters.J.ci95 is [0.0, 1.0], and the other keys make [2.99"),
     ],
 )
 def test_a_mistake_is_one_line_with_place_value_and_remedy(keys, value, words):
@@ -74,3 +79,10 @@ def test_a_mistake_is_one_line_with_place_value_and_remedy(keys, value, words):
     message = str(raised.value)
     assert message.startswith("fit.json: ") and words in message
     assert message.endswith("; run the fit again") and "\n" not in message
+
+
+def test_a_fit_read_from_its_file_writes_the_same_bytes():
+    fit = so.Fit.from_dict(CONTENT)
+    written = to_json(fit.to_dict())
+    again = so.Fit.from_dict(json.loads(written))
+    assert to_json(again.to_dict()) == written and repr(again) == repr(fit)

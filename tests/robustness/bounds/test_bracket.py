@@ -17,6 +17,7 @@ from seaopt.robustness.bounds.region import build_region
 from seaopt.robustness.uncertainty.draws import LEVEL
 from seaopt.robustness.uncertainty.worst import find_worst, measure_worst
 from tests.laws import law_of
+from tests.words import flatten
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +222,7 @@ def test_the_certificate_states_and_keeps_the_bounds(controller, swing, thor, tm
     )
     bounds = certificate.brackets["swing"]
     assert certificate.worst["swing"].ms <= bounds.ms_upper < 1.011 * certificate.worst["swing"].ms
-    assert "bounded, rounding estimated: all stable, Ms below 1.5" in repr(certificate)
+    assert "bounded, rounding estimated: all stable, Ms below 1.5" in flatten(repr(certificate))
     content = json.loads(json.dumps(certificate.to_dict(), default=lambda array: array.tolist()))
     assert content["plants"]["swing"]["worst"]["bounded_stable"] is True
     again = so.robustness.Certificate.from_dict(content, controller, {"swing": swing}, thor)

@@ -137,7 +137,8 @@ def test_a_friction_margin_is_certified_and_the_draw_that_lacks_it_goes_back_to_
     assert row.met and row.limit == 4e4 and row.value >= 4e4
     draws = done.certificate.friction_draws["stand"]
     lacking = replace(draws, least_slope=3e4)
-    certificate = replace(done.certificate, passed=False, friction_draws={"stand": lacking})
+    unmet = (replace(row, met=False),)
+    certificate = replace(done.certificate, friction_draws={"stand": lacking}, requirements=unmet)
     ((plant, values),) = (
         pair for name, pair in _list_new_witnesses(certificate, [], 1).items() if name.startswith("stand's friction")
     )

@@ -13,7 +13,8 @@ import seaopt as so
 from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, runnable
 from seaopt.errors import ControlError
 from seaopt.files import to_json
-from seaopt.reporting.verdict import judge_certificate
+from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.data import Commands
 from seaopt.robustness import certify_mpc, linear_controller
 
 TS = 1e-3
@@ -87,8 +88,8 @@ def test_a_motor_much_stronger_than_its_model_fails_and_its_run_can_be_played_ag
     assert {"constrained_failures", "constrained_failure_probability"} <= broken
     assert runs.over_bound + runs.not_settled + runs.diverged == 1
     assert "fit K_tau or narrow" in runs.remedy and "qd" in runs.remedy and "max_iterations" not in runs.remedy
-    assert judge_certificate(failed, "seaopt certify", "seaopt tune").next[0].startswith(runs.remedy)
-    torque = float(runs.where.split("K_tau = ")[1])
+    assert judge(failed, Commands(certify="seaopt certify", tune="seaopt tune")).next[0].startswith(runs.remedy)
+    torque = runs.parameters["K_tau"]
     run = close_loop(mpc.command, mpc.start, stand, thor.update(K_tau=torque), np.full(100, 2000.0))
     assert np.max(np.abs(run.state[:, 1])) > 1.05 * SPEED_LIMIT["qd"][1]
 
@@ -103,7 +104,7 @@ def test_a_drives_delay_is_in_the_linear_region_in_the_runs_and_in_the_draws(sta
     assert near.plants["stand"].ms == pytest.approx(mpc.achieved.ms, rel=1e-9)
     assert not any("drive_delay_s is not drawn" in note for note in near.constrained.left_out)
     far = certify_mpc(mpc, {"stand": stand}, thor, ranges={"drive_delay_s": (0.01, 0.011)}, samples=1, runs=1)
-    assert far.constrained.failures == 1 and "drive_delay_s" in far.constrained.where
+    assert far.constrained.failures == 1 and "drive_delay_s" in far.constrained.parameters
 
 
 def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, stand, thor):
@@ -167,7 +168,7 @@ def test_a_law_whose_estimate_trusts_a_coarse_reading_rings_and_is_not_met(stand
     runs = found.constrained
     assert not found.passed and 0 < runs.ringing <= runs.failures
     assert runs.largest_ring > 7.5 and f"{runs.largest_ring:.3g} N" in str(runs)
-    assert runs.remedy.startswith("finer sensors") and "does not die out" in runs.where
+    assert runs.remedy.startswith("finer sensors") and "does not die out" in runs.text
     again = so.Certificate.from_dict(json.loads(to_json(found.to_dict())), found.controller, {"stand": stand}, thor)
     assert again.constrained == runs and again.runs.rows == found.runs.rows
     ideal = certify_mpc(mpc, {"stand": stand}, thor, **options)

@@ -10,11 +10,12 @@ import pytest
 import seaopt as so
 from seaopt.control import tune_schedule
 from seaopt.control.laws.friction_margin import find_friction_margin
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, FileError
 from seaopt.executors import Shared
 from seaopt.files import to_json
 from seaopt.parameters import ParameterSet
-from seaopt.robustness import certify_schedule
+from seaopt.robustness import ScheduleCertificate, certify_schedule
+from seaopt.robustness.certificate import scheduled
 from seaopt.robustness.certificate.certify import add_design, find_own_drive
 from seaopt.robustness.certificate.measured_draws import Loops, measure_draws
 from seaopt.robustness.certificate.scheduled import (
@@ -25,9 +26,11 @@ from seaopt.robustness.certificate.scheduled import (
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
+from seaopt.robustness.verification import limit_cycles, schedule_motion, schedule_sweep, verification
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
 from tests.schedules import POINTS, read_knee, tune_knee
+from tools.golden import compare
 
 RANGES = {"I_p": (0.33, 0.39), "k": (645e3, 665e3)}
 
@@ -163,18 +166,17 @@ def test_a_rate_is_required_where_it_is_asked_and_the_slowest_sweep_always(certi
 
 
 def test_a_motion_slower_than_the_rate_asked_is_not_met():
-    schedule = tune_knee()
     slow = Motion(
         plant="swing", asked=3.0, rate=1.5, low=0.1, high=0.5, size=4.5, left=0.3, ringing=0.01, fault="",
     )  # fmt: skip
-    short = _require_motion(slow, schedule, 3.0)
+    short = _require_motion(slow, "phi", "rad/s", 3.0)
     assert (short.met, short.limit, short.value, short.sense) == (False, 3.0, 1.5, "≥")
     assert "3 rad/s is not reached within the table and the command's limit; ask a smaller min_rate" in short.where
-    assert _require_motion(slow, schedule, 1.5).met
-    tried = _require_motion(slow, schedule, None)  # nothing was asked: what is shown is stated
+    assert _require_motion(slow, "phi", "rad/s", 1.5).met
+    tried = _require_motion(slow, "phi", "rad/s", None)  # nothing was asked: what is shown is stated
     assert tried.met and tried.limit == tried.value == 1.5 and "is not reached" in tried.where
     for least in (None, 1.0):
-        rings = _require_motion(replace(slow, fault="rings"), schedule, least)
+        rings = _require_motion(replace(slow, fault="rings"), "phi", "rad/s", least)
         assert not rings.met and rings.value == 0.0
 
 
@@ -182,6 +184,36 @@ def test_a_range_of_what_it_is_over_is_refused():
     stand, _, values = read_knee()
     with pytest.raises(ControlError, match="range of phi"):
         certify_schedule(tune_knee(), {"stand": stand}, values, ranges={"phi": (0.0, 1.0)})
+
+
+def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
+    stand, swing, values = read_knee()
+    found = replace(
+        certificate,
+        sweeps={"swing": (Sweep(plant="swing", rate=1.0, frequency_hz=1.0, peak=np.inf, left=0.1, fault="is lost"),)},
+        motions={"swing": Motion(plant="swing", asked=3.0, rate=1.5, low=0.1, high=0.5, size=4.5, left=0.3,
+                                 ringing=0.01, fault="")},
+    )  # fmt: skip
+    content = json.loads(to_json(found.to_dict()))
+
+    def refuse(*args, **keywords):
+        raise AssertionError("reading a result must not simulate")
+
+    for module, name in ((verification, "play"), (schedule_sweep, "close_loop"), (schedule_motion, "close_loop"),
+                         (limit_cycles, "run_loop"), (scheduled, "bound_stretch")):  # fmt: skip
+        monkeypatch.setattr(module, name, refuse)
+    plants = {"stand": stand, "swing": swing}
+    again = ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
+    own = json.loads(to_json(again.to_dict()))
+    for place in (*content["places"], *own["places"]):  # digests change with the last digit
+        place["simulated"] = {**(place["simulated"] or {}), "made_from": None}
+    assert not list(compare(content, own, "", sentences=True))
+    assert again.requirements == found.requirements
+    assert again.notes == found.notes
+    content = json.loads(to_json(found.to_dict()))
+    del content["places"][0]["worst"]["stand"]["largest"]
+    with pytest.raises(FileError, match="a worst case has no 'largest'; certify again"):
+        ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
 
 
 def test_what_is_written_is_json_with_its_verdict(certificate):

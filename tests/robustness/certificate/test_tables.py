@@ -35,8 +35,8 @@ def rows(shown):
 def test_a_controller_shows_gains_and_what_is_asked(certificate):
     controller = certificate.controller
     found = {row[0]: row[1:] for row in rows(controller._repr_html_())}
-    assert found["k_p"][0] == f"{controller.gains['k_p']:.5g} N/N"
-    assert found["k_p"][1] == f"{controller.gains['k_p'] * controller.command.per_effort:.5g} A/N"
+    gain = controller.gains["k_p"]
+    assert found["k_p"] == [f"{gain:.5g}", "N/N", f"{gain * controller.command.per_effort:.5g}", "A/N"]
     assert found["Ms"] == [f"{controller.achieved.ms:.4g}", "at most 1.6"]
     assert found["Mt"][1] == "at most 1.3"
     assert found["noise gain"][1] == ""
@@ -45,23 +45,23 @@ def test_a_controller_shows_gains_and_what_is_asked(certificate):
 
 def test_a_certificate_shows_plants_draws_and_requirements(certificate):
     shown = certificate._repr_html_()
-    assert "Certificate: passed" in shown and "<pre>" not in shown
+    assert "Certificate: passed" in shown and "<pre>" not in shown and "0 failures in 20 draws" in shown
     found = rows(shown)
-    assert "varied: " in shown and "I_p 0.3 to 0.5" in shown
-    (plant,) = [row for row in found if row[:2] == ["swing", "yes"]]
-    assert plant[2] == f"{certificate.plants['swing'].ms:.4g}"
-    assert plant[-1].startswith("I_p = ")
-    assert ["samples", "20"] in found and ["failures", "0"] in found
-    assert len([row for row in found if row[-1] in ("yes", "NO")]) == len(certificate.requirements)
+    (varied,) = [row for row in found if row[:2] == ["I_p", "uniform"]]
+    assert varied[3:5] == ["0.3", "0.5"]
+    plant, worst = [row for row in found if row[0] == "swing"][:2]
+    assert plant[1] == f"{certificate.plants['swing'].ms:.3f}"
+    assert worst[-1].startswith("I_p = ")
+    assert len([row for row in found if row[0] in ("met", "not met")]) == len(certificate.requirements)
 
 
 def test_what_is_not_met_comes_first_and_is_escaped(certificate):
-    broken = replace(certificate.requirements[-1], met=False, where="<b>swing</b>")
-    shown = replace(certificate, passed=False, requirements=(*certificate.requirements, broken))._repr_html_()
-    assert "FAILED" in shown and "&lt;b&gt;swing" in shown
+    broken = replace(certificate.requirements[-1], met=False, plant="<b>swing</b>")
+    shown = replace(certificate, requirements=(*certificate.requirements, broken))._repr_html_()
+    assert "not met" in shown and "&lt;b&gt;swing" in shown
     below = rows(shown)
-    place = next(i for i, row in enumerate(below) if row[0] == "requirement")
-    assert below[place + 1][1] == "<b>swing</b>"
+    place = next(i for i, row in enumerate(below) if row[0] == "verdict")
+    assert below[place + 1][0] == "not met" and below[place + 1][-1].startswith("<b>swing</b>")
 
 
 def test_worst_case_and_draws_show_themselves(certificate):

@@ -81,7 +81,7 @@ def test_a_loop_that_rings_while_it_moves_is_found(monkeypatch):
     schedule, (_, swing, values) = tune_knee(), read_knee()
     motion = move_schedule(schedule, "swing", swing, values.update(K_f=6 * FORCE), RATE)
     assert motion.fault.startswith("rings")
-    assert "rings" in describe_motion(motion, "phi", "rad")
+    assert "rings" in describe_motion(motion, "phi", "rad/s")
 
 
 @pytest.mark.slow
@@ -93,7 +93,7 @@ def test_a_link_too_heavy_for_the_rate_asked_shows_less():
     motion = move_schedule(schedule, "swing", swing, values.update(I_p=inertia), asked)
     assert bound < asked == motion.asked
     assert 0.5 < motion.rate < bound and not motion.fault
-    assert "8 rad/s is not reached within" in describe_motion(motion, "phi", "rad")
+    assert "8 rad/s is not reached within" in describe_motion(motion, "phi", "rad/s")
     assert schedule.points[0] < motion.low < motion.high < schedule.points[-1]
 
 

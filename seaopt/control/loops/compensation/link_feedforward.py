@@ -45,16 +45,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from seaopt.codec import Limits
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import linearise_sets
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
+from seaopt.options import option
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
@@ -71,32 +73,33 @@ OTHER_STATES = 1e-9  # of a signal's slopes: less is rounding
 
 @record
 class LinkFeedforward:
-    """Which motion of the link is fed forward, and how; what is None has its default.
+    """Which motion of the link is fed forward, and how; what is left out has its default."""
 
-    Parameters
-    ----------
-    measured : str, optional
-        The output that is the link's position or speed; the one that the plant states as its `link_position`.
-    fraction : float, optional
-        Of the effort that the model says; where it is left out, as much as the limits were found to leave.
-    corner_hz : float, optional
-        Of the low-pass; the bandwidth. Noise on the signal grows with its square and more.
-    high_pass_hz : float, optional
-        Of the high-pass; a tenth of the bandwidth. Zero for none.
-
-    """
-
-    measured: str | None = None
-    fraction: float | None = None
-    corner_hz: float | None = None
-    high_pass_hz: float | None = None
+    measured: str | None = option(
+        "The output that is the link's position or speed; where the plant says what that is, it may be left out.",
+        default=None,
+    )
+    fraction: float | None = option(
+        "Share of the effort that the model says; as much as the limits leave where left out.", default=None
+    )
+    corner_hz: float | None = option(
+        "Corner of the low-pass; the bandwidth where left out. Noise on the signal grows with its square and more.",
+        default=None,
+        unit="Hz",
+    )
+    high_pass_hz: float | None = option(
+        "Below which nothing is fed forward; a tenth of the bandwidth where left out, 0 for none.",
+        default=None,
+        unit="Hz",
+    )
 
     def place(self, path: LinkPath, bandwidth_hz: float) -> LinkPath:
         """Return a path with the corners asked, or their defaults at a bandwidth."""
         return replace(
-            path, corner_hz=self.corner_hz or bandwidth_hz,
+            path,
+            corner_hz=self.corner_hz or bandwidth_hz,
             high_pass_hz=0.1 * bandwidth_hz if self.high_pass_hz is None else self.high_pass_hz,
-        )  # fmt: skip
+        )
 
 
 @record
@@ -124,15 +127,15 @@ class LinkPath:
     damping: float
     is_speed: bool
     fraction: float
-    corner_hz: float
-    high_pass_hz: float
+    corner_hz: Annotated[float, Limits(gt=0.0)]
+    high_pass_hz: Annotated[float, Limits(ge=0.0)]
 
     def feedback(self, sample_time_s: float) -> TransferFunction:
         """Return C of u = - C x, in q = 1/z."""
         delta, double = np.array([1.0, -1.0]), np.array([1.0, 1.0])  # of s = (2/T_s) delta/double
         rate, w = 2.0 / sample_time_s, math.tan(math.pi * self.corner_hz * sample_time_s)
         pairs = ((delta, delta), (delta, double), (double, double))
-        squares = np.array([np.convolve(one, other) for one, other in pairs])
+        squares = np.array([np.convolve(first, second) for first, second in pairs])
         first = self.inertia * rate, self.damping
         numbers = (0.0, *first) if self.is_speed else (first[0] * rate, first[1] * rate, 0.0)
         num = w * w * (np.array(numbers) @ squares)
@@ -194,23 +197,26 @@ def _hold_output(plant: Plant, name: str, unit: str) -> Plant:
     return replace(plant, h=h, outputs={**plant.outputs, name: unit}, sensing=replace(sensing, still=still))
 
 
-def name_link_signal(asked: LinkFeedforward, plant: Plant) -> str | None:
+def name_link_signal(feedforward: LinkFeedforward, plant: Plant) -> str | None:
     """Return the output of a plant that is its link's motion; None where it holds its link, or has another."""
     sensing = plant.sensing
-    name = asked.measured or (None if sensing is None else sensing.link_position)
+    name = feedforward.measured or (None if sensing is None else sensing.link_position)
     moves = plant.port is not None and plant.port.motion is not None
     return name if moves and name in plant.outputs else None
 
 
 def model_link_path(
-    asked: LinkFeedforward, plant: Plant, params: ParameterSet, regulated: str, per_effort: float, bandwidth_hz: float
+    feedforward: LinkFeedforward,
+    plant: Plant,
+    params: ParameterSet,
+    regulated: str,
+    per_effort: float,
+    bandwidth_hz: float,
 ) -> LinkPath:
     """Return the path of a plant whose link moves, of a fraction of 1 where none is asked.
 
-    Raises
-    ------
-    ControlError
-        What is measured is not the link's position or speed, or the effort is not that of an inertia and a damper.
+    Raises ControlError: what is measured is not the link's position or speed, or the effort is not that of an inertia
+    and a damper.
 
     Examples
     --------
@@ -222,7 +228,7 @@ def model_link_path(
     x_2 -294.0 kg, -11636 N s/m
 
     """
-    name = name_link_signal(asked, plant)
+    name = name_link_signal(feedforward, plant)
     assert name is not None, "the plant has been asked"
     sliding = take_sliding(plant, params)
     values = sliding.complete(params)
@@ -231,11 +237,16 @@ def model_link_path(
     response = port_of(sliding, values, regulated, per_effort).response(f)
     inertia, damping = _fit(-response.motion_to_feedback / response.motor_to_feedback, f, plant.name)
     path = LinkPath(
-        measured=name, unit=plant.outputs[name], inertia=per_signal * inertia, damping=per_signal * damping,
-        is_speed=is_speed, fraction=1.0 if asked.fraction is None else asked.fraction, corner_hz=bandwidth_hz,
+        measured=name,
+        unit=plant.outputs[name],
+        inertia=per_signal * inertia,
+        damping=per_signal * damping,
+        is_speed=is_speed,
+        fraction=1.0 if feedforward.fraction is None else feedforward.fraction,
+        corner_hz=bandwidth_hz,
         high_pass_hz=0.0,
-    )  # fmt: skip
-    return asked.place(path, bandwidth_hz)
+    )
+    return feedforward.place(path, bandwidth_hz)
 
 
 def _relate(plant: Plant, params: ParameterSet, name: str, per_effort: float) -> tuple[float, bool]:
@@ -243,17 +254,17 @@ def _relate(plant: Plant, params: ParameterSet, name: str, per_effort: float) ->
     port = plant.port
     assert port is not None and port.motion is not None
     (_, _, c, _), _ = linearise_sets(plant, [plant.complete(params)], (port.motion, name), per_effort)
-    states, (place, signal) = list(plant.states), c[0]
-    own = [states.index(state) for state in (port.coordinate, port.rate) if state is not None]
-    others = np.delete(signal, own)
-    speed = signal[own[1]] if len(own) > 1 else 0.0
-    position = signal[own[0]]
-    if np.any(np.abs(others) > OTHER_STATES * np.max(np.abs(signal))) or (position != 0.0) == (speed != 0.0):
+    states, (motion, signal) = list(plant.states), c[0]
+    link_states = [states.index(state) for state in (port.coordinate, port.rate) if state is not None]
+    elsewhere = np.delete(signal, link_states)
+    speed = signal[link_states[1]] if len(link_states) > 1 else 0.0
+    position = signal[link_states[0]]
+    if np.any(np.abs(elsewhere) > OTHER_STATES * np.max(np.abs(signal))) or (position != 0.0) == (speed != 0.0):
         raise ControlError(
             f'link_feedforward: measured = "{name}" of {plant.name} is not its link\'s position or speed alone; '
             f'measure the link: link_feedforward = {{ measured = "{port.motion}" }}'
         )
-    return float(place[own[0]] / (position or speed)), bool(position == 0.0)
+    return float(motion[link_states[0]] / (position or speed)), bool(position == 0.0)
 
 
 def _fit(effort: Complex[np.ndarray, " m"], f: Float[np.ndarray, " m"], name: str) -> tuple[float, float]:
@@ -274,24 +285,17 @@ def _fit(effort: Complex[np.ndarray, " m"], f: Float[np.ndarray, " m"], name: st
 
 
 def limit_fraction(
-    path: LinkPath, motions: Complex[np.ndarray, "n m"], beyond: Bool[np.ndarray, "n m"], f: Float[np.ndarray, " m"],
-    sample_time_s: float, max_sensitivity: float,
-) -> float:  # fmt: skip
+    path: LinkPath,
+    motions: Complex[np.ndarray, "n m"],
+    beyond: Bool[np.ndarray, "n m"],
+    f: Float[np.ndarray, " m"],
+    sample_time_s: float,
+    max_sensitivity: float,
+) -> float:
     """Return the largest fraction, in hundredths, that leaves Ms where the loop has next to nothing but the path.
 
-    Parameters
-    ----------
-    path : LinkPath
-        Of any fraction.
-    motions : array, shape (n, m)
-        Responses of what is measured, from the command, of every plant.
-    beyond : array, shape (n, m)
-        Where the regulated force does not answer to the command, so that S is 1/B.
-    f
-        Frequencies in Hz.
-    sample_time_s, max_sensitivity
-        Of the loop.
-
+    `motions`: responses of what is measured, from the command, of every plant. `beyond`: where the regulated force does
+    not answer to the command, so that S is 1/B. `f`: frequencies in Hz.
     """
     whole = replace(path, fraction=1.0).feedback(sample_time_s).response(f, sample_time_s) * motions
     least = np.array([np.min(np.abs(1.0 + share * whole), where=beyond, initial=np.inf) for share in FRACTIONS])

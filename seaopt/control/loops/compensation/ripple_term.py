@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from seaopt.codec import Limits
 from seaopt.errors import ControlError, require_number
+from seaopt.options import check_options, option
 from seaopt.records import record
 
 MOST_CYCLES = 200  # per revolution
@@ -29,22 +31,12 @@ MOST_TURNS = 1e9  # which a C long holds
 SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(7, -1, -1))
 COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(8, -1, -1))
 POINTS_PER_CYCLE = 64
+Cycles = Annotated[int, Limits(ge=1, le=MOST_CYCLES)]
 
 
 @record
 class CompensateRipple:
     """What is asked of a compensation of torque ripple.
-
-    Parameters
-    ----------
-    cycles : tuple of int
-        Harmonics, in cycles per revolution.
-    cos, sin : tuple of float
-        Of each, the command that meets the ripple, in the command's unit (`identify_ripple` has them).
-    fraction : float
-        Of them, above 0 and up to 1.5.
-    period : float, optional
-        What the motor's position moves in one revolution; 2 pi of a position in rad where it is left out.
 
     Raises
     ------
@@ -59,13 +51,20 @@ class CompensateRipple:
 
     """
 
-    cycles: tuple[int, ...]
-    cos: tuple[float, ...]
-    sin: tuple[float, ...]
-    fraction: float = RIPPLE_FRACTION
-    period: float | None = None
+    cycles: tuple[int, ...] = option("Harmonics, in cycles per revolution.", least=1, most=MOST_CYCLES)
+    cos: tuple[float, ...] = option(
+        "The command that meets the ripple, for each harmonic, in the command's unit; `identify_ripple` has them."
+    )
+    sin: tuple[float, ...] = option("The same for the sine of each harmonic.")
+    fraction: float = option("Share of the series that is compensated.", default=RIPPLE_FRACTION, above=0.0, most=1.5)
+    period: float | None = option(
+        "What the motor's position moves in one revolution; 2 pi where it is in rad and this is left out.",
+        default=None,
+        above=0.0,
+    )
 
     def __post_init__(self) -> None:
+        check_options(self, ControlError, "compensate.ripple.")
         count = len(self.cycles)
         if not count or len(self.cos) != count or len(self.sin) != count:
             raise ControlError(
@@ -79,26 +78,10 @@ class CompensateRipple:
                     raise ControlError(f"compensate.ripple.{name} has {value:g}; give finite numbers")
         if not any((*self.cos, *self.sin)):
             raise ControlError("compensate.ripple: cos and sin are all zero; leave ripple out of compensate")
-        if not 0.0 < require_number(self.fraction, "compensate.ripple.fraction", ControlError) <= 1.5:
-            raise ControlError(
-                f"compensate.ripple.fraction = {self.fraction:g} is not above 0 and up to 1.5; give "
-                f"fraction = {RIPPLE_FRACTION}"
-            )
-        if self.period is not None and not 0.0 < require_number(
-            self.period, "compensate.ripple.period", ControlError
-        ) < float("inf"):
-            raise ControlError(f"compensate.ripple.period = {self.period:g} is not positive; leave it out, or give one")
 
 
 def check_cycles(cycles: Sequence[int], name: str) -> None:
-    """Refuse harmonics that are not whole numbers from 1 to 200, each once.
-
-    Raises
-    ------
-    ControlError
-        They are not.
-
-    """
+    """Refuse harmonics that are not whole numbers from 1 to 200, each once."""
     for value in cycles:
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_CYCLES:
             raise ControlError(
@@ -113,21 +96,6 @@ def check_cycles(cycles: Sequence[int], name: str) -> None:
 class RippleTerm:
     """Compensation of torque ripple as it runs.
 
-    Parameters
-    ----------
-    cycles : tuple of int
-        Harmonics, in cycles per revolution.
-    cos, sin : tuple of float
-        Of each, the fraction in them, in the command's unit of effort.
-    period : float
-        What the reading moves in one revolution, in its unit.
-    reads : str
-        The output that is the motor's position.
-    unit : str
-        Of it.
-    fraction : float
-        Of the ripple.
-
     Examples
     --------
     >>> term = RippleTerm(cycles=(2,), cos=(0.0,), sin=(3.0,), period=4.0, reads="q", unit="m", fraction=1.0)
@@ -136,13 +104,19 @@ class RippleTerm:
 
     """
 
-    cycles: tuple[int, ...]
-    cos: tuple[float, ...]
+    cycles: Annotated[
+        tuple[Cycles, ...], Limits(min_length=1, max_length=MOST_CYCLES)
+    ]  # harmonics, in cycles per revolution
+    cos: tuple[float, ...]  # cos, sin: of each, the fraction in them, in the command's unit of effort
     sin: tuple[float, ...]
-    period: float
-    reads: str
+    period: Annotated[float, Limits(gt=0.0)]  # what the reading moves in one revolution, in its unit
+    reads: Annotated[str, Limits(min_length=1)]  # the output that is the motor's position
     unit: str
-    fraction: float
+    fraction: Annotated[float, Limits(gt=0.0)]  # of the ripple
+
+    def __post_init__(self) -> None:
+        if not len(set(self.cycles)) == len(self.cycles) == len(self.cos) == len(self.sin):
+            raise ControlError("should have each of cycles once, and one cos and one sin for each")
 
     @property
     def numbers(self) -> list[float]:
@@ -183,17 +157,7 @@ class RippleTerm:
 def sum_ripple(cycles: Sequence[int], numbers: Sequence[Any], position: Any, operations: Any) -> Any:
     """Return the series at a position, of floats or expressions.
 
-    Parameters
-    ----------
-    cycles : sequence of int
-        Harmonics.
-    numbers : sequence
-        Of a `RippleTerm`.
-    position
-        The reading.
-    operations
-        What has fmin, fmax and floor for them: the modules numpy or casadi.
-
+    `operations`: what has fmin, fmax and floor for them: the modules numpy or casadi.
     """
     count = len(cycles)
     turns = operations.fmax(operations.fmin(numbers[0] * position, MOST_TURNS), -MOST_TURNS)

@@ -70,19 +70,10 @@ MARGIN_KEPT = 1.01  # what may lie between the angles that were looked at is not
 
 @record(eq=False)
 class SpeedReading:
-    """The friction's velocity as the controller has it.
+    """The friction's velocity as the controller has it."""
 
-    Parameters
-    ----------
-    velocity : array, shape (n,)
-        Its row of the states.
-    differenced : bool
-        It is the difference of two samples of a position, over the time between them.
-
-    """
-
-    velocity: Float[np.ndarray, " n"]
-    differenced: bool
+    velocity: Float[np.ndarray, " n"]  # its row of the states
+    differenced: bool  # it is the difference of two samples of a position, over the time between them
 
     def weigh(self, theta: Angles, s: Complex[np.ndarray, "m k"], period: float) -> Complex[np.ndarray, "m k"]:
         """Return what is read of a velocity at every alias."""
@@ -96,8 +87,8 @@ class SpeedReading:
         a, b = np.zeros((n + 1, n + 1)), np.append(loop.motor, 0.0)
         a[:n, :n], a[n, :n] = loop.a, self.velocity
         row = np.eye(1, n + 1, k=n)[0] if self.differenced else np.append(self.velocity, 0.0)
-        held = hold(a[None], b[None], row[None], np.zeros(1), period, np.array([loop.delay_s]))
-        a_d, b_d, c_d, _ = (block[0] for block in held)
+        sampled = hold(a[None], b[None], row[None], np.zeros(1), period, np.array([loop.delay_s]))
+        a_d, b_d, c_d, _ = (block[0] for block in sampled)
         z, size = np.exp(1j * theta), b_d.size
         inputs = np.broadcast_to(b_d.astype(complex)[:, None], (z.size, size, 1))
         response = np.linalg.solve(z[:, None, None] * np.eye(size) - a_d, inputs)[..., 0] @ c_d
@@ -107,29 +98,16 @@ class SpeedReading:
 
 @record
 class CompensationMargin:
-    """How steep a compensation from the motor's speed stability is shown for, with the plant's own friction and less.
+    """The steepest compensation from the motor's speed shown to be stable, with the plant's friction and less."""
 
-    Parameters
-    ----------
-    slope : float
-        The steepest, N s/m (N m s/rad) of effort over the friction's velocity: fraction times Coulomb friction over
-        the speed of the smoothing. Infinite where none is bounded, zero where nothing is shown.
-    asked : float
-        The compensation's own.
-    frequency_hz : float
-        Where the test fails first with a steeper one.
-    multiplier : str
-        With which it holds, of friction and of compensation; why not, where nothing is shown.
-    angles : int
-        At how many angles it was looked at; between them nothing is enclosed.
-
-    """
-
+    # the steepest, N s/m (N m s/rad) of effort over the friction's velocity: fraction times Coulomb friction over the
+    # speed of the smoothing. Infinite where none is bounded, zero where nothing is shown
     slope: float
-    asked: float
-    frequency_hz: float
-    multiplier: str
-    angles: int = 0
+    asked: float  # the compensation's own
+    frequency_hz: float  # where the test fails first with a steeper one
+    multiplier: str  # with which it holds, of friction; why not, where nothing is shown
+    shift: str = ""  # the compensation's part of it
+    angles: int = 0  # at how many angles it was looked at; between them nothing is enclosed
 
     @property
     def shown(self) -> bool:
@@ -155,19 +133,9 @@ def compensation_margin(
 ) -> CompensationMargin:
     """Return the steepest compensation for which the test of stability holds, the best over all multipliers.
 
-    Parameters
-    ----------
-    loop : FrictionLoop
-        The loop with its friction taken out and without compensation, which must be stable.
-    reading : SpeedReading
-        What the compensation reads.
-    asked : float
-        The compensation's own slope, N s/m (N m s/rad).
-    first : str, optional
-        The name of a multiplier that is tried first.
-    enough : float
-        A multiplier that shows a slope of so many times the one asked ends the search.
-
+    `loop`: the loop with its friction taken out and without compensation, which must be stable. `asked`: the
+    compensation's own slope, N s/m (N m s/rad). `first`: the name of a multiplier that is tried first. `enough`: a
+    multiplier that shows a slope of so many times the one asked ends the search.
     """
     obstacle = loop.obstacle
     if not obstacle and np.max(np.abs(Loop(plant=loop.plant, law=loop.law).eigenvalues())) >= STABLE:
@@ -178,14 +146,14 @@ def compensation_margin(
     best = CompensationMargin(
         slope=0.0, asked=asked, frequency_hz=0.0, multiplier="it is not without compensation either"
     )
-    for name, multiplier in sorted(list_multipliers(loop), key=lambda named: named[0] != first.split("; ")[0]):
+    for name, multiplier in sorted(list_multipliers(loop), key=lambda named: named[0] != first):
         form = _Form.of(search.base, multiplier)
         if form is None:
             continue
         for shift in SHIFTS:
             margin = search.measure(form, multiplier, shift, best.slope)
             if margin is not None and margin.slope > best.slope:
-                best = replace(margin, multiplier=f"{name}; {shift}")
+                best = replace(margin, multiplier=name, shift=shift)
             if best.slope >= enough * asked:
                 return best
     return best
@@ -209,9 +177,11 @@ class _Readings:
         f = theta / (2 * np.pi * period)
         around = np.sum(loop.plant.responses(f) * loop.law.feedback_responses(f), axis=0)
         return cls(
-            friction=friction, speed=rows * reading.weigh(theta, friction.s, period)[..., None],
-            through=reading.respond(loop, theta), sensitivity=1.0 / (1.0 + around),
-        )  # fmt: skip
+            friction=friction,
+            speed=rows * reading.weigh(theta, friction.s, period)[..., None],
+            through=reading.respond(loop, theta),
+            sensitivity=1.0 / (1.0 + around),
+        )
 
 
 @record(eq=False)
@@ -249,9 +219,11 @@ class _Form:
 
         middle, reach = 0.5 * np.log(np.max(q_0) / np.max(q_2)), 0.5 * RATIOS * np.log(10.0)
         best = minimize_scalar(
-            lambda log: float(np.max(inverse_at(np.exp(log)))), bounds=(middle - reach, middle + reach),
-            method="bounded", options={"xatol": 1e-3},
-        )  # fmt: skip
+            lambda log: float(np.max(inverse_at(np.exp(log)))),
+            bounds=(middle - reach, middle + reach),
+            method="bounded",
+            options={"xatol": 1e-3},
+        )
         ratio = float(np.exp(best.x))
         return _LeastInverse(theta=at.friction.theta, inverse=float(best.fun), ratio=ratio, at_ratio=inverse_at)
 
@@ -284,9 +256,12 @@ class _Search:
         needed = max(needed, found.inverse)
         slope = np.inf if needed <= 0.0 else 1.0 / (MARGIN_KEPT * needed)
         return CompensationMargin(
-            slope=float(slope), asked=self.asked, multiplier=shift, angles=count,
+            slope=float(slope),
+            asked=self.asked,
+            multiplier=shift,
+            angles=count,
             frequency_hz=float(worst / (2 * np.pi * self.loop.plant.sample_time_s)),
-        )  # fmt: skip
+        )
 
 
 @record(eq=False)

@@ -24,13 +24,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 from numpy.polynomial.chebyshev import chebder, chebval
 
+from seaopt.codec import Limits, to_content
 from seaopt.control.loops.compensation.ripple_term import RippleTerm, sum_ripple
-from seaopt.errors import ControlError, require_number
+from seaopt.errors import ControlError
+from seaopt.options import check_options, option
 from seaopt.records import record
 
 FrictionSource = Literal["reference", "speed"]
@@ -44,16 +46,6 @@ FORGOTTEN: Memory = (0.0, 0.0)
 class CompensateFriction:
     """What is asked of a compensation of friction.
 
-    Parameters
-    ----------
-    fraction : float
-        Of Coulomb friction, above 0 and up to 1.5; above 1 is more than there is.
-    source : {"reference", "speed"}
-        The velocity that the reference asks for, or the motor's as measured.
-    speed : float, optional
-        v_0, over which the compensation rises to its full size, m/s or rad/s at the friction. Left out: the plant's own
-        smoothing; of the measured speed at least twice what stability is shown for on the design plant.
-
     Raises
     ------
     ControlError
@@ -66,34 +58,31 @@ class CompensateFriction:
 
     """
 
-    fraction: float = DEFAULT_FRACTION
-    source: FrictionSource = "reference"
-    speed: float | None = None
+    fraction: float = option(
+        "Share of the design plant's Coulomb friction; above 1 is more than there is.",
+        default=DEFAULT_FRACTION,
+        above=0.0,
+        most=1.5,
+    )
+    source: FrictionSource = option(
+        'The motor speed that the "reference" asks for, outside the loop; or its measured "speed", inside.',
+        default="reference",
+        key="from",
+    )
+    speed: float | None = option(
+        "v_0, at which it has its full size, m/s or rad/s at the friction. Left out: the plant's own smoothing; of the "
+        "measured speed at least twice what stability is shown for on the design plant.",
+        default=None,
+        above=0.0,
+    )
 
     def __post_init__(self) -> None:
-        if not 0.0 < require_number(self.fraction, "compensate.friction.fraction", ControlError) <= 1.5:
-            raise ControlError(
-                f"compensate.friction.fraction = {self.fraction:g} is not above 0 and up to 1.5; give "
-                f"fraction = {DEFAULT_FRACTION}"
-            )
-        if self.source not in SOURCES:
-            raise ControlError(
-                f'compensate.friction: from = "{self.source}" is not known; give from = "reference" or from = "speed"'
-            )
-        if self.speed is not None and not 0.0 < require_number(
-            self.speed, "compensate.friction.speed", ControlError
-        ) < float("inf"):
-            raise ControlError(f"compensate.friction.speed = {self.speed:g} is not positive; leave it out, or give one")
+        check_options(self, ControlError, "compensate.friction.")
 
 
 @record
 class CompensateGravity:
     """What is asked of a compensation of gravity.
-
-    Parameters
-    ----------
-    fraction : float
-        Of what the spring carries at rest, above 0 and up to 1.5; above 1 a link falls upwards.
 
     Raises
     ------
@@ -102,31 +91,17 @@ class CompensateGravity:
 
     """
 
-    fraction: float = 1.0
+    fraction: float = option(
+        "Share of what the spring carries at rest; above 1 a link falls upwards.", default=1.0, above=0.0, most=1.5
+    )
 
     def __post_init__(self) -> None:
-        if not 0.0 < require_number(self.fraction, "compensate.gravity.fraction", ControlError) <= 1.5:
-            raise ControlError(
-                f"compensate.gravity.fraction = {self.fraction:g} is not above 0 and up to 1.5; give fraction = 1.0"
-            )
+        check_options(self, ControlError, "compensate.gravity.")
 
 
 @record
 class GravityTerm:
     """Compensation of gravity as it runs.
-
-    Parameters
-    ----------
-    coefficients : tuple of float
-        Of Chebyshev's polynomials, the fraction in them, in the unit of the reference.
-    low, high : float
-        The range of the link's position in which they hold, in its unit.
-    reads : str
-        The output that is the link's position.
-    unit : str
-        Of it.
-    fraction : float
-        Of what the spring carries at rest.
 
     Examples
     --------
@@ -136,12 +111,18 @@ class GravityTerm:
 
     """
 
-    coefficients: tuple[float, ...]
-    low: float
+    coefficients: Annotated[
+        tuple[float, ...], Limits(min_length=1, max_length=100)
+    ]  # of Chebyshev's polynomials, the fraction in them, in the unit of the reference
+    low: float  # low, high: the range of the link's position in which they hold, in its unit
     high: float
-    reads: str
+    reads: Annotated[str, Limits(min_length=1)]  # the output that is the link's position
     unit: str
-    fraction: float
+    fraction: Annotated[float, Limits(gt=0.0)]  # of what the spring carries at rest
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ControlError("should have low below high")
 
     @property
     def numbers(self) -> list[float]:
@@ -161,7 +142,7 @@ class GravityTerm:
 
     def scaled(self, factor: float) -> GravityTerm:
         """Return the term times a factor."""
-        return replace(self, coefficients=tuple(factor * one for one in self.coefficients))
+        return replace(self, coefficients=tuple(factor * coefficient for coefficient in self.coefficients))
 
     def describe(self, effort_unit: str) -> str:
         """Return what it does in words."""
@@ -174,34 +155,19 @@ class GravityTerm:
 
 @record
 class FrictionTerm:
-    """Compensation of friction as it runs.
+    """Compensation of friction as it runs."""
 
-    Parameters
-    ----------
-    effort : float
-        Its full size, fraction times Coulomb friction, in the command's unit of effort.
-    speed : float
-        v_0, at the friction.
-    speed_unit : str
-        m/s or rad/s.
-    fraction : float
-        Of the Coulomb friction of the design plant.
-    source : {"reference", "speed"}
-        Where the velocity is from.
-    reads : str
-        The output that is differenced, a position of the motor; empty where it is the reference.
-    velocity_per_rate : float
-        g, the velocity at the friction per rate of what is differenced.
+    effort: Annotated[float, Limits(gt=0.0)]  # full size, fraction times Coulomb friction, in the command's unit
+    speed: Annotated[float, Limits(gt=0.0)]  # v_0, at the friction
+    speed_unit: str  # m/s or rad/s
+    fraction: Annotated[float, Limits(gt=0.0)]  # of the Coulomb friction of the design plant
+    source: FrictionSource  # where the velocity is from
+    reads: str  # the output that is differenced, a position of the motor; empty where it is the reference
+    velocity_per_rate: float  # g, the velocity at the friction per rate of what is differenced
 
-    """
-
-    effort: float
-    speed: float
-    speed_unit: str
-    fraction: float
-    source: FrictionSource
-    reads: str
-    velocity_per_rate: float
+    def __post_init__(self) -> None:
+        if bool(self.reads) != (self.source == "speed"):
+            raise ControlError('should have reads where source is "speed", and only there')
 
     @property
     def slope(self) -> float:
@@ -245,6 +211,8 @@ class Compensation:
 
     """
 
+    json_keys = ("friction", "gravity", "ripple")
+
     sample_time_s: float
     friction: FrictionTerm | None = None
     gravity: GravityTerm | None = None
@@ -268,12 +236,13 @@ class Compensation:
     def shape(self) -> CompensationShape:
         """What of it is no number."""
         return CompensationShape(
-            friction=None if self.friction is None else self.friction.source, reads=self.reads,
+            friction=None if self.friction is None else self.friction.source,
+            reads=self.reads,
             gravity=0 if self.gravity is None else len(self.gravity.numbers),
             link=0 if self.gravity is None else self.reads.index(self.gravity.reads),
             ripple=() if self.ripple is None else self.ripple.cycles,
             motor=0 if self.ripple is None else self.reads.index(self.ripple.reads),
-        )  # fmt: skip
+        )
 
     def step(self, memory: Memory, reference: float, readings: Sequence[float]) -> tuple[float, float, Memory]:
         """Return the reference that the law gets, the effort that is added to its own, and the next memory.
@@ -298,13 +267,12 @@ class Compensation:
                 f"readings: the compensation reads {', '.join(self.reads) or 'nothing'}, and got {len(readings)}; give "
                 "one reading for each"
             )
-        asked, effort, kept = compensate(self.shape, self.numbers, memory, reference, readings, _Floats)
-        return asked, effort, (kept[0], kept[1]) if kept else FORGOTTEN
+        shaped, effort, kept = compensate(self.shape, self.numbers, memory, reference, readings, _Floats)
+        return shaped, effort, (kept[0], kept[1]) if kept else FORGOTTEN
 
     def to_dict(self) -> dict[str, Any]:
         """Return its terms, for controller.json."""
-        terms = {"friction": self.friction, "gravity": self.gravity, "ripple": self.ripple}
-        return {name: None if term is None else asdict(term) for name, term in terms.items()}
+        return to_content(self)
 
     def describe(self, effort_unit: str) -> list[str]:
         """Return what it does, one line for each term."""
@@ -351,34 +319,28 @@ class _Floats:
 
 
 def compensate(
-    shape: CompensationShape, numbers: Sequence[Any], memory: Sequence[Any], reference: Any, readings: Sequence[Any],
+    shape: CompensationShape,
+    numbers: Sequence[Any],
+    memory: Sequence[Any],
+    reference: Any,
+    readings: Sequence[Any],
     operations: Any,
-) -> tuple[Any, Any, list[Any]]:  # fmt: skip
+) -> tuple[Any, Any, list[Any]]:
     """Return the law's reference, the effort that is added, and the next memory, of floats or expressions.
 
-    Parameters
-    ----------
-    shape, numbers
-        Of a `Compensation`.
-    memory : sequence
-        As many as the shape remembers.
-    reference, readings
-        Of this sample.
-    operations
-        What has fmin, fmax and floor for them: the module casadi for expressions.
-
+    `operations`: what has fmin, fmax and floor for them: the module casadi for expressions.
     """
-    asked, added, rubs = reference, 0.0, 0 if shape.friction is None else 2
+    shaped, added, rubs = reference, 0.0, 0 if shape.friction is None else 2
     if shape.gravity:
-        asked = reference + _sum_series(numbers[rubs : rubs + shape.gravity], readings[shape.link], operations)
+        shaped = reference + _sum_series(numbers[rubs : rubs + shape.gravity], readings[shape.link], operations)
     if shape.ripple:
         added = sum_ripple(shape.ripple, numbers[rubs + shape.gravity :], readings[shape.motor], operations)
     if shape.friction is None:
-        return asked, added, []
+        return shaped, added, []
     effort, share_per_step = numbers[:2]
     now = reference if shape.friction == "reference" else readings[0]
     share = memory[0] * share_per_step * (now - memory[1])
-    return asked, added + effort * _limit(share, operations), [1.0, now]
+    return shaped, added + effort * _limit(share, operations), [1.0, now]
 
 
 def _limit(value: Any, operations: Any) -> Any:
@@ -388,8 +350,8 @@ def _limit(value: Any, operations: Any) -> Any:
 def _sum_series(numbers: Sequence[Any], position: Any, operations: Any) -> Any:
     """Return a series of Chebyshev's polynomials, by Clenshaw's recurrence; constant beyond its range."""
     middle, scale, *coefficients = numbers
-    place = _limit(scale * (position - middle), operations)
-    one, two = 0.0 * place, 0.0 * place
+    scaled = _limit(scale * (position - middle), operations)
+    last, before = 0.0 * scaled, 0.0 * scaled
     for coefficient in coefficients[:0:-1]:
-        one, two = 2.0 * place * one - two + coefficient, one
-    return place * one - two + coefficients[0]
+        last, before = 2.0 * scaled * last - before + coefficient, last
+    return scaled * last - before + coefficients[0]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
+from seaopt.codec import OrInfinite, OrNaN, to_content
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import ASSUMED, MeasuredPlant
@@ -15,43 +15,24 @@ from seaopt.records import record
 
 @record
 class MeasuredFigures:
-    """A law on one measured response; the figures are the worst of all responses in its discs, as in `LoopFigures`.
+    """A law on one measured response; the figures are the worst of all responses in its discs, as in `LoopFigures`."""
 
-    Parameters
-    ----------
-    name : str
-        Such as frf:chirp.
-    confidence : float
-        That the discs hold the truth, all of them.
-    points : int
-        Measured frequencies.
-    band_hz : (low, high)
-        Of them.
-    bandwidth_hz : (low or None, high or None)
-        Of the responses in the discs.
-    stable : bool
-        Shown to be stable, by the turns of 1 + L, under what is `assumed`.
-    ms, ms_hz, mt, disk_margin, noise_gain, reference_peak, droop_db : float
-        Infinite, and the disk margin zero, where it is not.
-    assumed : str
-        Of the plant, besides the points.
-
-    """
-
-    name: str
-    confidence: float
-    points: int
-    band_hz: tuple[float, float]
-    bandwidth_hz: tuple[float | None, float | None]
-    stable: bool
-    ms: float
-    ms_hz: float
-    mt: float
+    name: str  # such as frf:chirp
+    confidence: float  # that the discs hold the truth, all of them
+    points: int  # measured frequencies
+    band_hz: tuple[float, float]  # (low, high)
+    bandwidth_hz: tuple[float | None, float | None]  # (low or None, high or None); of the responses in the discs
+    stable: bool  # shown to be stable, by the turns of 1 + L, under what is `assumed`
+    # ms, ms_hz, mt, disk_margin, noise_gain, reference_peak, droop_db: infinite, and the disk margin zero, where it is
+    # not
+    ms: OrInfinite
+    ms_hz: OrNaN
+    mt: OrInfinite
     disk_margin: float
-    noise_gain: float
-    reference_peak: float
-    droop_db: float
-    assumed: str = ASSUMED
+    noise_gain: OrInfinite
+    reference_peak: OrInfinite
+    droop_db: OrInfinite
+    assumed: str = ASSUMED  # of the plant, besides the points
 
     def __str__(self) -> str:
         low, high = (format_number(f, 3) for f in self.band_hz)
@@ -68,7 +49,7 @@ class MeasuredFigures:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
-        return asdict(self)
+        return to_content(self)
 
 
 def measure_discs(plant: MeasuredPlant, law: Law, bandwidth_hz: float) -> MeasuredFigures:
@@ -77,11 +58,13 @@ def measure_discs(plant: MeasuredPlant, law: Law, bandwidth_hz: float) -> Measur
     figures = loop.figures(bandwidth_hz)
     taken = ("stable", "ms", "ms_hz", "mt", "disk_margin", "noise_gain", "reference_peak", "droop_db")
     return MeasuredFigures(
-        name=plant.name, confidence=plant.confidence, points=plant.f.size,
+        name=plant.name,
+        confidence=plant.confidence,
+        points=plant.f.size,
         band_hz=(float(plant.f[0]), float(plant.f[-1])),
         bandwidth_hz=loop.bandwidths_hz() if figures.stable else (None, None),
         **{name: getattr(figures, name) for name in taken},
-    )  # fmt: skip
+    )
 
 
 def measure_all_discs(plants: Sequence[object], law: Law, bandwidth_hz: float) -> tuple[MeasuredFigures, ...]:

@@ -84,8 +84,8 @@ class DiscLoop:
         at, nyquist = self.plant.f, self.plant.nyquist_hz
         steps = np.linspace(0.0, 1.0, POINTS_BETWEEN, endpoint=False)
         between = (at[:-1, None] + np.diff(at)[:, None] * steps).ravel()
-        own = np.abs(np.angle(self.law.poles)) / (2 * np.pi * self.plant.sample_time_s)
-        grid = np.concatenate([np.geomspace(GRID_LOWEST_HZ, nyquist, 1200), between, at[-1:], own])
+        law_hz = np.abs(np.angle(self.law.poles)) / (2 * np.pi * self.plant.sample_time_s)
+        grid = np.concatenate([np.geomspace(GRID_LOWEST_HZ, nyquist, 1200), between, at[-1:], law_hz])
         return np.unique(grid[(grid >= GRID_LOWEST_HZ) & (grid <= nyquist)])
 
     def is_stable(self) -> bool:
@@ -108,8 +108,8 @@ class DiscLoop:
 
     def _turns(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
         """Return by how much 1 + L of the centres turns from each frequency to the next (rad)."""
-        one = 1.0 + self.open_loop(f)
-        return np.angle(one[1:] / one[:-1])
+        distance = 1.0 + self.open_loop(f)
+        return np.angle(distance[1:] / distance[:-1])
 
     def _distance(self, f: Float[np.ndarray, " m"]) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return 1 + L of the centres, and how far the discs reach from it."""
@@ -126,17 +126,28 @@ class DiscLoop:
         """
         if not self.is_stable():
             return LoopFigures(
-                stable=False, spectral_radius=np.inf, bandwidth_hz=None, tracking_band_hz=None, crossover_hz=None,
-                sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
-                droop_db=np.inf, return_hz=None, gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0,
-                disk_margin=0.0, noise_gain=np.inf,
-            )  # fmt: skip
+                stable=False,
+                spectral_radius=np.inf,
+                bandwidth_hz=None,
+                tracking_band_hz=None,
+                crossover_hz=None,
+                sensitivity_bandwidth_hz=0.0,
+                ms=np.inf,
+                mt=np.inf,
+                ms_hz=np.nan,
+                reference_peak=np.inf,
+                droop_db=np.inf,
+                return_hz=None,
+                gain_margin_db=0.0,
+                phase_margin_deg=0.0,
+                delay_margin_s=0.0,
+                disk_margin=0.0,
+                noise_gain=np.inf,
+            )
         f = self.grid()
         p, r = self.plant.response(f), self.plant.discs(f)
         reference, negative = self.law.responses(f)[:2]
-        sizes = {
-            name: bound_disc(name, p, r, -negative, reference) for name in ("1", "L", "1 - L", "C_y", "P C_r")
-        }  # fmt: skip
+        sizes = {name: bound_disc(name, p, r, -negative, reference) for name in ("1", "L", "1 - L", "C_y", "P C_r")}
         (least, most), s, crossovers = sizes["P C_r"], sizes["1"][1], self._find_crossovers(f)
         ms, static = float(np.max(s)), 1.0 if self.law.integrators else float(least[0])
         down, top = (_first(f, HALF_POWER * static - size) for size in (least, most))
@@ -148,17 +159,24 @@ class DiscLoop:
         large = sizes["L"][1] > 0.5
         late = np.arcsin(0.5 / sizes["L"][1][large]) / (np.pi * f[large])
         return LoopFigures(
-            stable=True, spectral_radius=0.0, bandwidth_hz=down, tracking_band_hz=_band(f, least, most),
+            stable=True,
+            spectral_radius=0.0,
+            bandwidth_hz=down,
+            tracking_band_hz=_band(f, least, most),
             crossover_hz=crossovers[-1] if crossovers else None,
-            sensitivity_bandwidth_hz=_first(f, s - HALF_POWER) or float(f[-1]), ms=ms, mt=mt,
-            ms_hz=float(f[np.argmax(s)]), reference_peak=max(float(np.max(most)) / static, 1.0),
+            sensitivity_bandwidth_hz=_first(f, s - HALF_POWER) or float(f[-1]),
+            ms=ms,
+            mt=mt,
+            ms_hz=float(f[np.argmax(s)]),
+            reference_peak=max(float(np.max(most)) / static, 1.0),
             droop_db=max(0.0, -20.0 * float(np.log10(max(droop, 1e-300) / static))),
             return_hz=None if down is None else self._find_return(f, most, down, static),
             gain_margin_db=float(-20.0 * np.log10(1.0 - 1.0 / ms)) if ms > 1.0 else None,
             phase_margin_deg=float(np.degrees(phase)),
             delay_margin_s=float(np.min(late)) if late.size else None,
-            disk_margin=2.0 / float(np.max(sizes["1 - L"][1])), noise_gain=float(np.max(sizes["C_y"][1])),
-        )  # fmt: skip
+            disk_margin=2.0 / float(np.max(sizes["1 - L"][1])),
+            noise_gain=float(np.max(sizes["C_y"][1])),
+        )
 
     def bandwidths_hz(self) -> tuple[float | None, float | None]:
         """Return the least and the largest bandwidth of the responses in the discs."""
@@ -182,13 +200,13 @@ class DiscLoop:
 
 
 def bound_disc(
-    of: str, p: Any, r: Any, c_y: Any, c_r: Any, rest: Any = 1.0
+    of: str, p: Any, r: Any, c_y: Any, c_r: Any, constant: Any = 1.0
 ) -> tuple[Float[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
     """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table.
 
     1 + L is `rest` + P C_y: of a model, without a disc, what the law reads besides is in the rest.
     """
-    open_loop = rest - 1.0 + p * c_y
+    open_loop = constant - 1.0 + p * c_y
     a, reach = 1.0 + open_loop, r * np.abs(c_y)
     size = np.abs(a) ** 2
     room = size * leave_positive(1.0 - reach**2 / np.maximum(size, 1e-300))

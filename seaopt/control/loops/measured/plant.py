@@ -38,35 +38,16 @@ ASSUMED = (
 
 @record(eq=False)
 class MeasuredPlant:
-    """Discs over frequency, from effort to what is measured, with hold and delay of the controller.
+    """Discs over frequency, from effort to what is measured, with hold and delay of the controller."""
 
-    Parameters
-    ----------
-    name : str
-        Of the experiment.
-    f : array, shape (m,)
-        The measured frequencies (Hz).
-    centre, radius : arrays, shape (m,)
-        At them.
-    sample_time_s : float
-        Seconds.
-    end : float
-        abs(P) at the end of the band at most, without folding.
-    folded : float
-        What folding adds to that above the band, at most.
-    confidence : float
-        Of all discs.
-
-    """
-
-    name: str
-    f: Float[np.ndarray, " m"]
+    name: str  # of the experiment
+    f: Float[np.ndarray, " m"]  # the measured frequencies (Hz)
     centre: Complex[np.ndarray, " m"]
     radius: Float[np.ndarray, " m"]
-    sample_time_s: float
-    end: float
-    folded: float
-    confidence: float
+    sample_time_s: float  # seconds
+    end: float  # abs(P) at the end of the band at most, without folding
+    folded: float  # what folding adds to that above the band, at most
+    confidence: float  # of all discs
 
     @property
     def nyquist_hz(self) -> float:
@@ -98,23 +79,10 @@ def sample_measured(
 ) -> MeasuredPlant:
     """Return what a controller sees of a measured response.
 
-    Parameters
-    ----------
-    measured : MeasuredResponse
-        Of a log.
-    gain : float
-        The input for one unit of what the controller gives.
-    sample_time_s : float
-        Of the controller.
-    delay_samples : float
-        Samples from a reading to the command being put out, besides the hold. What is between a command and its effect
-        is in the log.
+    `gain`: the input for one unit of what the controller gives. `delay_samples`: samples from a reading to the command
+    being put out, besides the hold. What is between a command and its effect is in the log.
 
-    Raises
-    ------
-    ControlError
-        Its band ends beyond the controller's Nyquist frequency, or its lowest point is not at rest.
-
+    Raises ControlError: its band ends beyond the controller's Nyquist frequency, or its lowest point is not at rest.
     """
     clock, f = measured.clock, measured.frequency_hz
     late = delay_samples * sample_time_s
@@ -139,9 +107,15 @@ def sample_measured(
         turned, end, folded = turned * ratio, plain, _fold_most(Clock(period=sample_time_s), plain, f[-1])
     _check_rest(measured, f, turned, late + clock.delay_s + 0.5 * sample_time_s)
     return MeasuredPlant(
-        name=f"frf:{measured.name}", f=f, centre=turned, radius=radius, sample_time_s=sample_time_s, end=end,
-        folded=folded, confidence=measured.confidence,
-    )  # fmt: skip
+        name=f"frf:{measured.name}",
+        f=f,
+        centre=turned,
+        radius=radius,
+        sample_time_s=sample_time_s,
+        end=end,
+        folded=folded,
+        confidence=measured.confidence,
+    )
 
 
 def _check_rest(

@@ -1,4 +1,4 @@
-"""Frequency responses of a problem's experiments, as the command shows and writes them."""
+"""Frequency responses of a problem's experiments, measured and modelled."""
 
 from __future__ import annotations
 
@@ -7,25 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from seaopt.cli.terminal import Terminal
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.fit_result import Nuisance
-from seaopt.formatting import MISSING, format_number
-from seaopt.frequency import DriveEstimate, Pair, SecondOrder, Survey
+from seaopt.frequency import Pair, SecondOrder, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
 from seaopt.progress import Progress, count_off
 from seaopt.records import record
-from seaopt.reporting import experiment_survey, write_frequency_figure
-
-TITLES = ("response", "coherent", "peak", "gain", "f_n", "zeta", "form", "file")
-
-RESPONSES_NOTE = (
-    "coherent: band of coherence above 0.8; peak and natural frequency f_n in Hz; gain, f_n and damping ratio zeta: "
-    "of the second-order form K/(s² + a s + b), fitted; form, file, fit: how far that form and the model with the "
-    "file's and the fitted values lie from H1, in its standard deviations"
-)
+from seaopt.reporting.comparison import experiment_survey
+from seaopt.reporting.files import write_frequency_figure
 
 
 @record(eq=False)
@@ -42,7 +33,7 @@ class Responses:
         for name, survey in self.surveys.items():
             content[name] = survey.to_dict(self.guess)
             for row, pair in zip(content[name]["pairs"], survey.pairs, strict=True):
-                row["fitted_misfit"] = self._fitted_misfit(name, pair)
+                row["fitted_misfit"] = self.fitted_misfit(name, pair)
         return {"experiments": content}
 
     def draw(self, path: Path) -> list[Path]:
@@ -63,34 +54,8 @@ class Responses:
         pairs = (pair for survey in self.surveys.values() for pair in survey.pairs)
         return [pair.second_order for pair in pairs if pair.second_order is not None]
 
-    def show(self, console: Terminal) -> None:
-        """Print a row per response of each experiment, and what those of second order say of the actuator."""
-        titles = (*TITLES, "fit") if self.fitted else TITLES
-        for name, survey in self.surveys.items():
-            console.say(f"\n{name}", style="bold")
-            rows = [self._format_cells(name, survey, pair) for pair in survey.pairs]
-            console.tabulate(rows, titles, "<<".ljust(len(titles), ">"))
-            for pair in survey.pairs:
-                drive = survey.drive(pair, self.guess)
-                for line in _describe_drive(survey, pair, drive) if drive is not None else ():
-                    console.wrap(line, indent=2)
-        console.wrap(RESPONSES_NOTE, indent=2, style="dim")
-
-    def _format_cells(self, name: str, survey: Survey, pair: Pair) -> list[str]:
-        band, peak, form = pair.good_band_hz, pair.peak, pair.second_order
-        figures = (form.static_gain, form.natural_frequency_hz, form.damping_ratio) if form is not None else ()
-        misfits = [form.misfit if form is not None else None, pair.misfit(survey.model(pair, self.guess))]
-        misfits += [self._fitted_misfit(name, pair)] if self.fitted else []
-        return [
-            pair.name,
-            f"{band[0]:.2g}–{band[1]:.3g}" if band is not None else "none",
-            format_number(None if peak is None else peak.frequency_hz, 3),
-            *(format_number(figure.value, 3) for figure in figures),
-            *([MISSING] * (3 - len(figures))),
-            *(format_number(misfit, 3) for misfit in misfits),
-        ]
-
-    def _fitted_misfit(self, name: str, pair: Pair) -> float | None:
+    def fitted_misfit(self, name: str, pair: Pair) -> float | None:
+        """Return how far the model with the fitted values is from a response; None without a fit."""
         if name not in self.fitted:
             return None
         survey, fit = self.fitted[name]
@@ -124,15 +89,3 @@ def estimate_responses(
 def _adopt_fit(survey: Survey, nuisance: Nuisance) -> Survey:
     """Return a survey whose models have a fit's delay and gains."""
     return replace(survey, clock=replace(survey.clock, delay_s=nuisance.delay_s, delay_free=False), gain=nuisance.gain)
-
-
-def _describe_drive(survey: Survey, pair: Pair, drive: DriveEstimate) -> tuple[str, ...]:
-    form, spring = pair.second_order, survey.plant.spring
-    assert form is not None and spring is not None
-    m_k, b_m = spring.mass, spring.damping
-    return (
-        f"{pair.name} in second order, per unit of what the motor gives: "
-        f"{drive.K.value:.5g}/(s² + {form.a.value:.4g} s + {form.b.value:.5g})",
-        f"with k known: {m_k} = {drive.m_k}, {b_m} = {drive.b_m}, efficiency {drive.efficiency}",
-        f"K and b averaged, as the paper does: {m_k} = {drive.m_k_averaged}, {b_m} = {drive.b_m_averaged}",
-    )

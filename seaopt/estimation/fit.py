@@ -1,4 +1,10 @@
-"""Fit plants to logs: one call from experiments to parameters with their uncertainty."""
+"""Fit plants to logs: one call from experiments to parameters with their uncertainty.
+
+`fit` is the door of this package, and its body the way through it: experiments are checked and become a least-squares
+problem (`seaopt.estimation.problem`), a method finds a start and the minimum (`solver`), the minimum becomes a result
+with covariance and identifiability (`result`), and the result is judged: does it explain its logs, and what would
+explain them better (`judgement`)?
+"""
 
 from __future__ import annotations
 
@@ -111,9 +117,13 @@ def fit(
     _check_differences(named, chosen)
     _check_motion(named)
     problem = pose_problem(
-        named, complete_parameters(named, params), loss=loss if loss is not None else Squares(), band_hz=band,
-        holdout=holdout, noise=chosen.models_noise,
-    )  # fmt: skip
+        named,
+        complete_parameters(named, params),
+        loss=loss if loss is not None else Squares(),
+        band_hz=band,
+        holdout=holdout,
+        noise=chosen.models_noise,
+    )
     _check_samples(problem)
     _check_stiffness(problem)
     for advice in _advise_sticking(problem):
@@ -184,9 +194,9 @@ def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     if not experiments:
         raise EstimationError("no experiment is given; give at least one Experiment(plant=..., log=...)")
     require_type(experiments, Sequence, "experiments", "give a list of Experiment", EstimationError)
-    for place, experiment in enumerate(experiments):
-        require_type(experiment, Experiment, f"experiments[{place}]", "give an Experiment", EstimationError)
-        require_plant(experiment.plant, f"experiments[{place}]", EstimationError)
+    for index, experiment in enumerate(experiments):
+        require_type(experiment, Experiment, f"experiments[{index}]", "give an Experiment", EstimationError)
+        require_plant(experiment.plant, f"experiments[{index}]", EstimationError)
     seen: set[str] = set()
     out: list[Experiment] = []
     for experiment in experiments:
@@ -229,8 +239,8 @@ def complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSe
     for experiment in experiments:
         for name, parameter in experiment.plant.complete(experiment.apply_own(params)).items():
             parameters.setdefault(name, params.get(name, parameter) if name in experiment.parameters else parameter)
-        for own in experiment.list_own().values():
-            parameters.setdefault(own.name, params.get(own.name, own))
+        for local in experiment.list_own().values():
+            parameters.setdefault(local.name, params.get(local.name, local))
     for name in params.free_names:
         parameters.setdefault(name, params[name])
     return ParameterSet(parameters.values())
@@ -280,7 +290,7 @@ def _check_samples(problem: FitProblem) -> None:
                     f"experiment {experiment.name}: output {name} has no sample that counts; "
                     "leave it out of outputs, or keep back less (holdout)"
                 )
-        whole = max(stretch.stop - stretch.start for stretch in data.stretches)
+        whole = max(rows.stop - rows.start for rows in data.log_segments)
         check_shots(data, whole, data.shots, f"shots = {data.shots}")
         if experiment.longest <= settle + 2:
             raise EstimationError(

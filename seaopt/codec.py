@@ -1,0 +1,315 @@
+"""Records to what JSON holds and back, by their annotations.
+
+A record has in its file the keys that its class lists in `json_keys`, names of fields and properties in the order of
+the file; without such a list, all its fields. Reading makes a pydantic model of the annotations, which checks a file
+and makes the records of it. What is a property is computed again: `check_agrees` compares it with the file's.
+
+- a float is a number; `OrInfinite`, `OrMinusInfinite` and `OrNaN` are null in the file where they are not finite
+- a tuple of any length is a list, a tuple of two a range, a Mapping a table, a jaxtyping array lists of numbers
+- `Limits` beside a type in `Annotated` is what its values keep to
+- a class whose instances are not made of their own keys alone has a class method `_from_json`, whose argument's
+  annotation says what the file holds: Mapping[str, Any] is its own fields, `Fields` those of another record
+"""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+from jaxtyping import AbstractArray
+
+from seaopt.errors import FileError, SeaoptError
+from seaopt.files import check_seal, plain
+from seaopt.records import record
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+T = TypeVar("T")
+EXACT = 1e-9  # between what a file says and what is made of it: the rounding of another machine
+
+
+@record
+class Key:
+    """A key of a file, where it is not a field's name alone."""
+
+    field: str
+    name: str  # in the file
+    omit_none: bool = False  # leave it out where the field is None
+
+
+@record
+class NullIs:
+    """What null in a file stands for."""
+
+    value: float
+
+
+@record
+class Limits:
+    """What a number, text or list of a file keeps to, in pydantic's words."""
+
+    gt: float | None = None
+    ge: float | None = None
+    le: float | None = None
+    min_length: int | None = None
+    max_length: int | None = None
+    pattern: str | None = None
+
+
+@record
+class Fields:
+    """Asks for a record's fields in place of the record, beside Mapping[str, Any]."""
+
+    of: type[Any]
+
+
+OrInfinite = Annotated[float, NullIs(value=math.inf)]
+OrMinusInfinite = Annotated[float, NullIs(value=-math.inf)]
+OrNaN = Annotated[float, NullIs(value=math.nan)]
+
+
+def to_content(value: Any) -> Any:
+    """Return a record as what its file holds; `files.plain` makes lists of the arrays in it.
+
+    Examples
+    --------
+    >>> @record
+    ... class Band:
+    ...     json_keys = ("low_hz", "centre_hz")
+    ...     low_hz: float
+    ...     high_hz: float = 20.0
+    ...     @property
+    ...     def centre_hz(self):
+    ...         return (self.low_hz + self.high_hz) / 2.0
+    >>> to_content(Band(low_hz=10.0))
+    {'low_hz': 10.0, 'centre_hz': 15.0}
+
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        pairs = [(key, to_content(getattr(value, key.field))) for key in list_keys(type(value))]
+        return {key.name: item for key, item in pairs if item is not None or not key.omit_none}
+    if isinstance(value, Mapping):
+        return {key: to_content(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_content(item) for item in cast(Sequence[Any], value)]
+    return value
+
+
+def from_content(cls: type[T], content: Any, source: str, *, remedy: str) -> T:
+    """Return the record of a file's content, as `read_fields` reads it.
+
+    Examples
+    --------
+    >>> @record
+    ... class Band:
+    ...     low_hz: float
+    ...     high_hz: OrInfinite = 20.0
+    >>> from_content(Band, {"low_hz": 10.0, "high_hz": None}, "band.json", remedy="tune again")
+    Band(low_hz=10.0, high_hz=inf)
+    >>> from_content(Band, {"low_hz": "low"}, "band.json", remedy="tune again")
+    Traceback (most recent call last):
+    ...
+    seaopt.errors.FileError: band.json: low_hz = 'low': should be a valid number; tune again
+
+    """
+    try:
+        return cls(**read_fields(cls, content, source, remedy=remedy))
+    except FileError:
+        raise
+    except SeaoptError as error:
+        raise FileError(f"{source}: {error}; {remedy}") from error
+
+
+def read_fields(cls: type[Any], content: Any, source: str, *, remedy: str) -> dict[str, Any]:
+    """Return the fields of a record that a file holds.
+
+    Raises
+    ------
+    FileError
+        A key is missing, a value is of the wrong kind, or the file has a digest that is not that of its content.
+
+    """
+    from seaopt.documents import check_table
+
+    if isinstance(content, Mapping) and "made_from" in content:
+        check_seal(cast(Mapping[str, Any], content), source, remedy)
+    return _take_fields(cls, check_table(make_model(cls), plain(content), source, remedy=remedy))
+
+
+def check_agrees(content: Any, own: Any, source: str, *, remedy: str, place: str = "", rtol: float = EXACT) -> None:
+    """Refuse a file of which a key is not what the record that was made of it writes.
+
+    Parameters
+    ----------
+    content : mapping
+        Of the file. Keys that it has not are not asked for: an older file may have fewer.
+    own : mapping
+        What `to_content` makes of the record.
+    source, remedy : str
+        For messages.
+    place : str
+        Where in the file both stand.
+    rtol : float
+        Relative difference that two numbers may have.
+
+    Raises
+    ------
+    FileError
+        Names the first key that differs.
+
+    """
+    from seaopt.documents import shorten
+
+    if isinstance(own, Mapping) and isinstance(content, Mapping):
+        for key in own:
+            if key in content:
+                inner = f"{place}.{key}".lstrip(".")
+                check_agrees(content[key], own[key], source, remedy=remedy, place=inner, rtol=rtol)
+        return
+    content, own = plain(content), plain(own)
+    if not _agree(content, own, rtol):
+        found, made = shorten(content), shorten(own)
+        raise FileError(f"{source}: {place} is {found}, and the other keys make {made}; {remedy}")
+
+
+def _agree(one: Any, other: Any, rtol: float) -> bool:
+    if isinstance(one, list) and isinstance(other, list):
+        pairs = list(zip(cast(list[Any], one), cast(list[Any], other), strict=False))
+        return len(one) == len(other) and all(_agree(a, b, rtol) for a, b in pairs)
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_agree(one[key], other[key], rtol) for key in one)
+    if isinstance(one, float | int) and isinstance(other, float | int) and bool not in (type(one), type(other)):
+        return math.isclose(one, other, rel_tol=rtol)
+    return type(cast(Any, one)) is type(cast(Any, other)) and one == other
+
+
+def list_keys(cls: type[Any]) -> Iterator[Key]:
+    """Yield the keys that a record has in its file."""
+    for each in getattr(cls, "json_keys", ()) or [field.name for field in fields(cls)]:
+        yield each if isinstance(each, Key) else Key(field=each, name=each)
+
+
+def json_schema(cls: type[Any]) -> dict[str, Any]:
+    """Return the JSON Schema of a record's file."""
+    return make_model(cls).model_json_schema(by_alias=True)
+
+
+@cache
+def make_model(cls: type[Any]) -> type[BaseModel]:
+    """Return the pydantic model of a record's file; what is a property may be left out, and is not read."""
+    from pydantic import Field as ModelField
+    from pydantic import create_model
+
+    from seaopt.documents import ResultTable
+
+    hints, known = get_type_hints(cls, include_extras=True), {field.name: field for field in fields(cls)}
+    definitions: dict[str, Any] = {}
+    for key in list_keys(cls):
+        if key.field in known:
+            default = _state_default(known[key.field])
+            definitions[key.field] = (_translate(hints[key.field]), ModelField(alias=key.name, **default))
+        else:
+            held = get_type_hints(getattr(cls, key.field).fget, include_extras=True)["return"]
+            definitions[key.field] = (_translate(held), ModelField(alias=key.name, default=None))
+    summary = (cls.__doc__ or cls.__name__).strip().split("\n\n")[0].replace("\n", " ")
+    return create_model(f"Stored{cls.__name__}", __base__=ResultTable, __doc__=summary, **definitions)
+
+
+def _state_default(field: Field[Any]) -> dict[str, Any]:
+    if field.default is not MISSING:
+        return {"default": field.default}
+    return {} if field.default_factory is MISSING else {"default_factory": field.default_factory}
+
+
+def _take_fields(cls: type[Any], model: BaseModel) -> dict[str, Any]:
+    known = {field.name for field in fields(cls)}
+    return {key.field: getattr(model, key.field) for key in list_keys(cls) if key.field in known}
+
+
+def _translate(hint: Any) -> Any:
+    """Return the annotation with which pydantic reads what a record's annotation says."""
+    from pydantic import AfterValidator
+
+    from seaopt.documents import Flag, Number, Whole
+
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _translate_marked(arguments[0], arguments[1:])
+    if origin in (Union, types.UnionType):
+        return Union[tuple(_translate(each) for each in arguments)]  # noqa: UP007  # of a tuple
+    if origin is tuple and arguments[-1] is not ...:
+        return tuple[tuple(_translate(each) for each in arguments)]  # pyright: ignore[reportInvalidTypeArguments]
+    if origin is tuple:
+        return Annotated[list[_translate(arguments[0])], AfterValidator(tuple)]
+    if origin is list:
+        return list[_translate(arguments[0])]
+    if origin in (dict, Mapping):
+        return dict[_translate(arguments[0]), _translate(arguments[1])]
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        return _translate_array(hint, Number)
+    if hasattr(hint, "_from_json"):
+        held = get_type_hints(hint._from_json, include_extras=True)["content"]
+        held = Annotated[held, Fields(of=hint)] if held == Mapping[str, Any] else held
+        return Annotated[_translate(held), AfterValidator(_explain(hint._from_json))]
+    if is_dataclass(hint):
+        cls = cast(type[Any], hint)
+        return Annotated[make_model(cls), AfterValidator(_explain(lambda model: cls(**_take_fields(cls, model))))]
+    return {float: Number, int: Whole, bool: Flag}.get(hint, hint)
+
+
+def _translate_marked(hint: Any, marks: Sequence[Any]) -> Any:
+    """Return the annotation of a hint with marks of this module, or with pydantic's own."""
+    from pydantic import AfterValidator, BeforeValidator, WithJsonSchema
+    from pydantic import Field as ModelField
+
+    from seaopt.documents import Number
+
+    mark, *further = marks
+    if further:
+        return Annotated[_translate_marked(hint, [mark]), *further]
+    if isinstance(mark, Fields):
+        return Annotated[make_model(mark.of), AfterValidator(lambda model: _take_fields(mark.of, model))]
+    if isinstance(mark, Limits):
+        limits = {key.name: value for key in list_keys(Limits) if (value := getattr(mark, key.name)) is not None}
+        return Annotated[_translate(hint), ModelField(**limits)]
+    if not isinstance(mark, NullIs):
+        return _translate(hint)
+    either = WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "null"}]})
+    number = Annotated[Number, BeforeValidator(lambda value: mark.value if value is None else value), either]
+    return number if hint is float else _translate_array(hint, number)
+
+
+def _translate_array(hint: type[AbstractArray], number: Any) -> Any:
+    from pydantic import AfterValidator
+
+    def convert(rows: Any) -> np.ndarray:
+        try:
+            array = np.array(rows, dtype=float)
+        except ValueError:
+            raise ValueError("should have rows of one length") from None
+        return array if free else array.reshape(array.shape + (0,) * (len(hint.dims) - array.ndim))  # [] has no columns
+
+    free, rows = "..." in hint.dim_str, list[number]
+    if free:
+        return Annotated[rows | list[rows], AfterValidator(convert)]
+    for _ in hint.dims[1:]:
+        rows = list[rows]
+    return Annotated[rows, AfterValidator(convert)]
+
+
+def _explain(build: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Let pydantic say where in the file stands what a record refuses."""
+
+    def checked(value: Any) -> Any:
+        try:
+            return build(value)
+        except SeaoptError as error:
+            raise ValueError(str(error)) from error
+
+    return checked

@@ -1,0 +1,211 @@
+"""What a declared plant is checked for when it is made: names and units, equations, roles, bristles, structure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from seaopt.errors import PlantError, suggestion
+from seaopt.parameters import Parameter
+from seaopt.plants.roles import Friction
+from seaopt.units import DIMENSIONLESS, si_unit
+
+if TYPE_CHECKING:
+    from seaopt.plants.plant import Plant
+
+ENERGY = "energy"  # among the outputs of a simulation, what the plant stores (J)
+# Units that need no look-up: asking pint costs 0.2 s the first time.
+COMMON_UNITS = frozenset(
+    "m,s,kg,N,A,rad,V,m/s,rad/s,N/m,kg m^2,N m,N m/A,N s/m,N m s,m/s^2,K,degC,ohm,K/W,J/K,1/K".split(",")  # noqa: SIM905
+)
+
+
+def evaluate_equations(
+    plant: Plant, what: str, equations: Callable[..., Mapping[str, Any]], *arguments: Any
+) -> Mapping[str, Any]:
+    """Return what f or h gives; a name that it uses and that is not there is a PlantError."""
+    try:
+        return equations(*arguments)
+    except AttributeError as error:
+        if not isinstance(error.obj, SimpleNamespace):
+            raise
+        raise PlantError(
+            f'plant {plant.name}: {what} uses "{error.name}"; {suggestion(str(error.name), vars(error.obj))}'
+        ) from error
+    except (TypeError, RuntimeError, NotImplementedError) as error:
+        reason = str(error).strip().splitlines()[-1][:160]
+        raise PlantError(
+            f"plant {plant.name}: {what} cannot be made symbolic ({reason}); "
+            "use CasADi's functions, and ca.if_else for a branch"
+        ) from error
+
+
+def check_names(plant: Plant) -> None:
+    """Refuse names that are no identifiers or are used twice, and units that are missing or unknown."""
+    for group in ("states", "inputs", "outputs", "parameters"):
+        if not isinstance(getattr(plant, group), Mapping):
+            raise PlantError(f"plant {plant.name}: {group} is no mapping; give {{name: unit}}")
+        for name, declared in getattr(plant, group).items():
+            if not isinstance(declared, str | Parameter):
+                raise PlantError(
+                    f'plant {plant.name}: "{name}" in {group} has no unit; give one, "-" for a pure number'
+                )
+    seen: dict[str, str] = {}
+    for group in ("states", "inputs", "parameters", "friction"):
+        for name in getattr(plant, group):
+            if not name.isidentifier():
+                raise PlantError(f'plant {plant.name}: "{name}" in {group} is not a name; use letters, digits and _')
+            if name in seen:
+                raise PlantError(f'plant {plant.name}: "{name}" is in {seen[name]} and in {group}; rename one')
+            seen[name] = group
+    if ENERGY in plant.outputs:
+        raise PlantError(
+            f'plant {plant.name}: the output "{ENERGY}" has the name of the simulated energy (J); rename the output, '
+            "and give energy=lambda x, p: ... where it is what the plant stores"
+        )
+    for name, declared in plant.parameters.items():
+        unit = declared.unit if isinstance(declared, Parameter) else declared
+        if not unit.strip():
+            raise PlantError(f'plant {plant.name}: parameter "{name}" has no unit; give one, "-" for a pure number')
+    for group in ("states", "inputs", "outputs", "parameters"):
+        for declared in getattr(plant, group).values():
+            unit = declared.unit if isinstance(declared, Parameter) else declared
+            if unit.strip() not in DIMENSIONLESS and unit not in COMMON_UNITS:
+                si_unit(unit)
+    unknown = sorted(plant.optional_inputs - set(plant.inputs))
+    if unknown:
+        raise PlantError(f"plant {plant.name}: optional input {unknown[0]} is not an input; add it to inputs")
+
+
+def check_loads(plant: Plant, name: str, friction: Friction, spaces: list[SimpleNamespace]) -> None:
+    """Refuse loads of a friction that are not rated, or that have a parameter's name."""
+    loads = list(friction.loads(*spaces)) if friction.loads is not None else []
+    if sorted(loads) != sorted(friction.rated):
+        given = ", ".join(friction.rated) or "none"
+        raise PlantError(
+            f"plant {plant.name}: friction {name} has the loads {', '.join(loads) or 'none'}, and rated has {given}; "
+            "give the largest size of each load in rated"
+        )
+    taken = [load for load in loads if load in plant.parameters]
+    if taken:
+        raise PlantError(f'plant {plant.name}: load "{taken[0]}" of friction {name} is a parameter; name it otherwise')
+
+
+def check_roles(plant: Plant) -> None:
+    """Refuse a role that names what the plant does not have."""
+    signals = {**plant.outputs, **plant.states}
+    named: list[tuple[str, str | None, Mapping[str, Any]]] = []
+    if plant.actuation is not None:
+        named += [
+            ("actuation.input", plant.actuation.input, plant.inputs),
+            ("actuation.efficiency", plant.actuation.efficiency, plant.parameters),
+        ]
+    if plant.sensing is not None:
+        named += [("sensing.regulated", name, plant.outputs) for name in plant.sensing.regulated]
+        named += [("sensing.from_encoders", name, plant.outputs) for name in plant.sensing.from_encoders]
+        fields = ("motor_position", "motor_speed", "link_position")
+        named += [(f"sensing.{name}", getattr(plant.sensing, name), signals) for name in fields]
+    if plant.spring is not None:
+        named.append(("spring.stiffness", plant.spring.stiffness, plant.parameters))
+        named.append(("spring.play", plant.spring.play, plant.parameters))
+        named += [
+            (f"spring.{name}", getattr(plant.spring, name), plant.derived_values()) for name in ("mass", "damping")
+        ]
+    for port in plant.ports:
+        named += [("port.motion", port.motion, plant.outputs), ("port.effort", port.effort, plant.inputs)]
+        fields = ("coordinate", "rate", "drive")
+        named += [(f"port.{name}", getattr(port, name), plant.states) for name in fields]
+        named += [("port.payload", name, plant.parameters) for name in port.payload]
+    named += [
+        (f"friction.{name}.smoothing", friction.smoothing, plant.parameters)
+        for name, friction in plant.friction.items()
+    ]
+    bristled = {name: friction.bristles for name, friction in plant.friction.items() if friction.bristles is not None}
+    named += [(f"friction.{name}.bristles.state", bristles.state, plant.states) for name, bristles in bristled.items()]
+    if plant.mode is not None:
+        named += [("mode.parameter", plant.mode.parameter, plant.parameters)]
+        named += [("mode.state", plant.mode.state, plant.states)]
+    if plant.winding is not None:
+        named += [("winding.rises", name, plant.states) for name in plant.winding.rises]
+        named += [("winding.temperatures", name, plant.outputs) for name in plant.winding.temperatures]
+    for role, name, names in named:
+        if name is not None and name not in names:
+            raise PlantError(f'plant {plant.name}: {role} = "{name}" is not one of its own; {suggestion(name, names)}')
+    if plant.actuation is not None and plant.actuation.input != next(iter(plant.inputs)):
+        raise PlantError(
+            f'plant {plant.name}: actuation.input = "{plant.actuation.input}" is not the first input; put it first'
+        )
+
+
+def check_bristles(plant: Plant, spaces: list[SimpleNamespace]) -> None:
+    """Refuse bristles that `f` contradicts, at one point: in their rate, or in that of their coordinate."""
+    x, u, p = spaces
+    for name, friction in plant.friction.items():
+        bristles = friction.bristles
+        if bristles is None:
+            continue
+        slip, speed = ca.SX(friction.find_rate(x, u, p)), ca.SX(friction.velocity(x, p))
+        moves = ca.jtimes(ca.SX(bristles.coordinate(x, p)), plant.x, plant.dynamics)
+        stated = plant.dynamics[list(plant.states).index(bristles.state)]
+        symbols = [plant.t, plant.x, plant.u, plant.p]
+        rng = np.random.default_rng(0)
+        values = [rng.uniform(0.5, 1.5, symbol.shape[0]) for symbol in symbols]
+        found = [
+            float(number) for number in ca.Function("bristles", symbols, [slip, stated, moves, speed]).call(values)
+        ]
+        for given, expected, message in (
+            (found[1], found[0], f'f gives "{bristles.state}" another rate than bristles.rate; use the same in both'),
+            (
+                found[2],
+                found[3],
+                "the rate of bristles.coordinate is not the velocity; give the coordinate it belongs to",
+            ),
+        ):
+            if abs(given - expected) > 1e-6 * max(abs(given), abs(expected)):  # what is not finite there is not judged
+                raise PlantError(f"plant {plant.name}: friction {name}: {message} ({given:.6g} against {expected:.6g})")
+
+
+def stack_rows(plant: Plant, what: str, equations: Mapping[str, Any], names: Mapping[str, str]) -> Any:
+    """Return the expressions in the order of `names`, refusing missing and unknown ones."""
+    if not isinstance(equations, Mapping):
+        raise PlantError(f"plant {plant.name}: {what} returns a {type(equations).__name__}; give {{name: expression}}")
+    for name in equations:
+        if name not in names:
+            raise PlantError(f'plant {plant.name}: {what} returns "{name}"; {suggestion(name, names)}')
+    for name in names:
+        if name not in equations:
+            raise PlantError(f'plant {plant.name}: {what} returns nothing for "{name}"; add its equation')
+    rows: list[Any] = []
+    for name in names:
+        try:
+            row = ca.SX(equations[name])
+        except (TypeError, NotImplementedError) as error:
+            raise PlantError(f'plant {plant.name}: {what} gives no expression for "{name}"') from error
+        if not row.is_scalar():
+            raise PlantError(f'plant {plant.name}: {what} gives "{name}" the shape {row.shape}; give one expression')
+        rows.append(row)
+    return ca.vertcat(*rows) if rows else ca.SX(0, 1)
+
+
+def check_structure(plant: Plant) -> None:
+    """Refuse what can only be a mistake: an output of nothing, a state that neither moves nor is driven."""
+    moved_by = ca.vertcat(plant.t, plant.x, plant.u)
+    still = () if plant.sensing is None else plant.sensing.still
+    for index, name in enumerate(plant.outputs):
+        if name not in still and not ca.depends_on(plant.output[index], moved_by):
+            raise PlantError(f'plant {plant.name}: output "{name}" depends on no state and no input; check h')
+    sampled = plant.sampling.sets if plant.sampling is not None else {}
+    for index, name in enumerate(plant.states):
+        if name in sampled:
+            continue
+        movers = ca.vertcat(plant.t, *(x for k, x in enumerate(ca.vertsplit(plant.x)) if k != index), plant.u)
+        free = not plant.inputs  # a plant without inputs may decay by itself
+        if not ca.depends_on(plant.dynamics[index], moved_by if free else movers):
+            raise PlantError(
+                f'plant {plant.name}: state "{name}" is driven by nothing, no input, no other state; '
+                "check f, or make it a parameter"
+            )

@@ -1,0 +1,69 @@
+"""The one place where results become words and tables.
+
+Each kind of result has a module in `kinds` that gives its sections and, where it has one, its verdict. `repr`, the
+terminal, notebooks, the report and comments in C render what it gives, so that a new row appears in all of them.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from seaopt.reporting.sections import html, text
+from seaopt.reporting.sections.data import Commands, Section, Verdict
+
+# The module of each kind: found by name, so that a text of one result loads nothing of the others.
+KINDS = {
+    "Fit": "fit",
+    "ModelledOutputs": "prediction",
+    "Quality": "quality",
+    "Responses": "responses",
+    "Frontier": "frontier",
+    "Controller": "controller",
+    "ScheduledController": "schedule",
+    "ForceMPC": "mpc",
+    "Certificate": "certificate",
+    "ScheduleCertificate": "schedule_certificate",
+    "Verification": "verification",
+}
+
+
+def _find_module(result: object) -> Any:
+    name = next((KINDS[kind.__name__] for kind in type(result).__mro__ if kind.__name__ in KINDS), None)
+    return None if name is None else import_module(f"seaopt.reporting.sections.kinds.{name}")
+
+
+def describe(result: object) -> list[Section]:
+    """Return the sections of a result, in the order of a terminal."""
+    return _find_module(result).describe(result)
+
+
+def judge(result: object, commands: Commands | None = None) -> Verdict | None:
+    """Return the verdict on a result; None on those that have none.
+
+    Parameters
+    ----------
+    result : Fit, Controller, Certificate, ...
+        What a stage returned.
+    commands : Commands, optional
+        What to type next, where the result was made on the command line.
+
+    """
+    judged = getattr(_find_module(result), "judge", None)
+    return None if judged is None else judged(result, commands or Commands())
+
+
+def write_text(result: object) -> str:
+    """Return a result as text of 80 columns: verdict, then all sections but details."""
+    verdict = judge(result)
+    lines = [] if verdict is None else text.render_verdict(verdict)
+    lines += text.render_sections(describe(result))
+    return text.join(lines).removeprefix("\n")
+
+
+def write_html(result: object) -> str:
+    """Return a result as HTML, with its main figures where it draws itself."""
+    verdict, plot = judge(result), getattr(result, "plot", None)
+    parts = [] if verdict is None else [html.render_verdict(verdict)]
+    parts += [html.render_section(section) for section in describe(result)]
+    return "".join(parts) + ("" if plot is None else plot.to_html())

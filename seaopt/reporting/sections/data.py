@@ -1,0 +1,121 @@
+"""What results are said with: sections of tables, sentences and figures, and verdicts; no renderer is known here."""
+
+from __future__ import annotations
+
+from dataclasses import field, replace
+from typing import Literal
+
+from seaopt.formatting import MISSING
+from seaopt.records import record
+
+Style = Literal["good", "bad", "error", "warning", "note"]
+
+
+@record
+class Mark:
+    """A word that stands out: a verdict, or how severe a finding is."""
+
+    text: str
+    style: Style
+
+
+Cell = str | Mark
+
+
+def mark_met(met: bool, yes: str = "met", no: str = "not met") -> Mark:
+    """Return a verdict as a cell."""
+    return Mark(text=yes, style="good") if met else Mark(text=no, style="bad")
+
+
+@record
+class Table:
+    """Rows under their heads; `align` has "<" or ">" for each column.
+
+    Where the width lacks, `optional` columns are left out, the last first; a column without any entry always is.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    align: str = ""
+    label: str = ""  # what a screen reader says of it; the section's title, where left out
+    optional: tuple[str, ...] = ()
+
+    def drop_empty(self) -> Table:
+        """Return the table without columns that have no entry."""
+        empty = [
+            head
+            for at, head in enumerate(self.head)
+            if self.rows and all(row[at] in ("", MISSING) for row in self.rows)
+        ]
+        return self.drop(*empty)
+
+    def drop(self, *heads: str) -> Table:
+        """Return the table without these columns."""
+        kept = [at for at, head in enumerate(self.head) if head not in heads]
+        return replace(
+            self,
+            head=tuple(self.head[at] for at in kept),
+            rows=tuple(tuple(row[at] for at in kept) for row in self.rows),
+            align="".join(self.align[at : at + 1] or "<" for at in kept),
+        )
+
+
+@record
+class Item:
+    """A line of a list, with how severe it is."""
+
+    severity: Style
+    text: str
+
+
+@record
+class Section:
+    """One subject of a result: a title, key figures beside it, sentences, tables, remarks on them, a list, figures."""
+
+    title: str
+    aside: str = ""
+    sentences: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    remarks: tuple[str, ...] = ()  # what the columns mean, below the tables
+    items: tuple[Item, ...] = ()
+    part: str = ""  # of the page
+    screen: bool = True  # whether it stands on one screen of a terminal, or with --verbose
+    folded: bool = False  # detail: on a terminal with --verbose, on a page when opened
+
+
+@record
+class Reason:
+    """One thing that is not met; of `count` places it is in, `where` is the worst."""
+
+    what: str
+    where: str = ""
+    count: int = 1
+
+    def __str__(self) -> str:
+        more = f" (and {self.count - 1} more)" if self.count > 1 else ""
+        return f"{self.what}{more}" + (f": {self.where}" if self.where else "")
+
+
+@record
+class Verdict:
+    """Whether a result is met, in one line; why not; and what comes next: a command, or lines of the problem file."""
+
+    met: bool
+    text: str
+    reasons: tuple[Reason, ...] = ()
+    next: tuple[str, ...] = ()
+    words: tuple[str, str] = field(default=("met", "not met"))
+
+
+@record
+class Commands:
+    """What to type, where a result was made on the command line; empty elsewhere."""
+
+    fit: str = ""
+    tune: str = ""
+    certify: str = ""
+
+    @property
+    def sweep(self) -> str:
+        """The command that tunes at a range of bandwidths, but for the range."""
+        return f"{self.tune} --sweep" if self.tune else ""

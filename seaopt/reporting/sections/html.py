@@ -1,0 +1,66 @@
+"""Sections as HTML, for notebooks and for the page of the report, whose style sheet knows the classes."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable
+
+from seaopt.formatting import printable
+from seaopt.reporting.sections.data import Cell, Mark, Section, Table, Verdict
+
+
+def render_section(section: Section, *, title: bool = True) -> str:
+    """Return a section; details are behind their title."""
+    body = "".join(
+        [
+            *(f"<p>{_escape(text)}</p>" for text in section.sentences),
+            *(
+                _render_table(table.drop_empty(), table.label or section.title)
+                for table in section.tables
+                if table.rows
+            ),
+            *(f'<p class="note">{_escape(text)}</p>' for text in section.remarks),
+            _render_list((Mark(text=item.severity, style=item.severity), item.text) for item in section.items),
+        ]
+    )
+    head = _escape(section.title)
+    if section.folded:
+        return f"<details><summary>{head}</summary>{body}</details>"
+    aside = f' <span class="aside">{_escape(section.aside)}</span>' if section.aside else ""
+    return (f"<h3>{head}{aside}</h3>" if title else "") + body
+
+
+def render_verdict(verdict: Verdict) -> str:
+    """Return a verdict with its reasons and what comes next."""
+    yes, no = verdict.words
+    mark = Mark(text=yes, style="good") if verdict.met else Mark(text=no, style="bad")
+    lines = [*map(str, verdict.reasons), *(f"next: {text}" for text in verdict.next)]
+    reasons = "".join(f"<li>{_escape(line)}</li>" for line in lines)
+    return f"<p>{_render_cell(mark)} {_escape(verdict.text)}</p>" + (f"<ul>{reasons}</ul>" if reasons else "")
+
+
+def _render_list(items: Iterable[tuple[Mark, str]]) -> str:
+    lines = "".join(f"<li>{_render_cell(mark)} {_escape(text)}</li>" for mark, text in items)
+    return f'<ul class="findings">{lines}</ul>' if lines else ""
+
+
+def _render_table(table: Table, label: str) -> str:
+    sides = [' class="n"' if side == ">" else "" for side in table.align.ljust(len(table.head), "<")]
+    head = "".join(f'<th scope="col"{side}>{_escape(text)}</th>' for text, side in zip(table.head, sides, strict=True))
+    rows = "".join(
+        "<tr>"
+        + "".join(f"<td{side}>{_render_cell(cell)}</td>" for cell, side in zip(row, sides, strict=True))
+        + "</tr>"
+        for row in table.rows
+    )
+    top = f"<thead><tr>{head}</tr></thead>" if any(table.head) else ""
+    opening = f'<div class="wide" role="region" aria-label="{_escape(label)}" tabindex="0">'
+    return f"{opening}<table>{top}<tbody>{rows}</tbody></table></div>"
+
+
+def _render_cell(cell: Cell) -> str:
+    return f'<b class="{cell.style}">{_escape(cell.text)}</b>' if isinstance(cell, Mark) else _escape(cell)
+
+
+def _escape(text: str) -> str:
+    return html.escape(printable(text))

@@ -1,0 +1,286 @@
+"""A certificate in words: its verdict with remedies, margins, requirements, worst cases and draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.formatting import MISSING, format_band, format_count, format_number, format_values
+from seaopt.reporting.figures.certificate import label_requirement
+from seaopt.reporting.sections.data import Cell, Commands, Item, Mark, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.kinds.controller import show_costs
+from seaopt.robustness import Certificate
+from seaopt.robustness.certificate.certificate import NO_MODEL
+from seaopt.robustness.certificate.requirement import Failure, group_failures
+from seaopt.units import unit_after
+
+FROM_DRAWS = ("monte_carlo_failures", "worst_case", "max_failure_probability")
+RETUNE = "retune = 4 in [robustness] tunes for the worst cases, too"
+REPLAN = "a lower bandwidth_hz in [controller], or narrower ranges in [robustness]"  # what plans is not tuned again
+REMEDIES = {
+    **dict.fromkeys(FROM_DRAWS, RETUNE),
+    "step_overshoot": "lower max_reference_peak in [controller]",
+    "step_settling_s": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
+    "steady_error": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
+    "sustained_oscillation": "a lower bandwidth_hz, or min_friction_margin in [controller]",
+    "impedance_stable": "less stiffness, or more damping, in [impedance]",
+    "impedance_rest": "less stiffness, or more damping, in [impedance]",
+    "impedance_draws": "less stiffness, or more damping, in [impedance]",
+    "impedance_damper": "other stiffness, damping or velocity_filter_s in [impedance], inside the region of the report",
+    "gravity_compensation": "a smaller fraction of gravity in compensate of [controller], or an [impedance]",
+    "ripple_compensation": "a smaller fraction of ripple, or fewer of its cycles, in compensate of [controller]",
+    "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
+    "constrained_failure_probability": "more constrained_runs in [robustness]",
+    "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
+}
+
+
+SWINGS = (
+    "A swinging output puts a zero of the plant near 1 Hz that no controller can fill, so that its −3 dB bandwidth is "
+    "no measure of tracking: read the tracking band."
+)
+
+
+def judge(certificate: Certificate, commands: Commands) -> Verdict:
+    """Return the verdict on a certificate."""
+    draws = certificate.monte_carlo
+    if certificate.met:
+        runs = "" if certificate.runs is None else f", {len(certificate.runs.rows)} simulated runs passed"
+        if not certificate.models:
+            return Verdict(met=True, text=f"Certificate: passed, {NO_MODEL}")
+        if not draws.samples:
+            text = f"Certificate: passed, nothing was uncertain, so that nothing was drawn{runs}"
+            return Verdict(met=True, text=text, next=_advise_ranges(certificate) if commands.certify else ())
+        bound = f", failure probability below {draws.failure_probability_bound:.2g}"
+        text = f"Certificate: passed, {format_count(draws.failures, 'failure')} in {draws.samples} draws{bound}{runs}"
+        return Verdict(met=True, text=text)
+    broken = [row for row in certificate.requirements if not row.met]
+    reasons = [explain_failure(one) for one in group_failures(broken)]
+    remedies = [_advise(row.name) for row in broken]
+    if certificate.constrained is not None:
+        remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
+    first = next((text for text in remedies if text), "")
+    again = f"type {commands.certify}" if commands.certify else "tune and certify again"
+    command = f"{first}; then {again}" if first else again
+    costs = show_costs(certificate.controller.spec.bandwidth_hz, commands)
+    return Verdict(
+        met=False,
+        text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
+        reasons=tuple(reasons),
+        next=(command, *([costs] if certificate.constrained is None else ())),
+    )
+
+
+def _advise_ranges(certificate: Certificate) -> tuple[str, ...]:
+    """Return the line of the file that makes something uncertain: a tenth about the first parameter that is not 0."""
+    for plant in certificate.linear_models.values():
+        for name in plant.parameters:
+            value = certificate.parameters[name].value if name in certificate.parameters else 0.0
+            if value:
+                low, high = sorted((0.9 * value, 1.1 * value))
+                return (
+                    f"to certify what is not known well add parameters = {{ {name} = [{low:.3g}, {high:.3g}] }} "
+                    "to [robustness]",
+                )
+    return ()
+
+
+def _advise(name: str) -> str:
+    return BY_REQUIREMENT[name].remedy if name in BY_REQUIREMENT else REMEDIES.get(name, "")
+
+
+def explain_failure(failure: Failure) -> Reason:
+    """Return what a certificate fails on, by its worst case."""
+    row = failure.worst
+    if failure.unstable:
+        what = f"unstable on {', '.join(failure.subjects)}"
+        return Reason(what=what, where=f"tune with that plant in robust_to{failure.consequence}")
+    value, limit = format_number(row.value, 4), format_number(row.limit, 4)
+    return Reason(what=f"{row.name} {value}, limit {row.sense} {limit}", where=row.where, count=failure.count)
+
+
+def describe(certificate: Certificate) -> list[Section]:
+    """Return the margins of every plant, the requirements, the worst cases, the draws, and the findings."""
+    findings = [Item(severity="note", text=note) for note in certificate.notes]
+    if certificate.simulated is not None:
+        for what, reason in certificate.simulated.left_out.items():
+            findings.append(Item(severity="note", text=f"no {what}: {reason}"))
+    return [
+        _list_requirements(certificate),
+        Section(
+            title="Margins on every plant",
+            aside=certificate.monte_carlo.count_text if certificate.models else "measured points alone",
+            part="certificate",
+            tables=(_tabulate_margins(certificate),),
+            remarks=(
+                "Stability by eigenvalues, peaks and crossings by level sets, not off a grid. Gain: how far it may rise"
+                "; the delay margin is that of the sampled loop with the delay in it; worst: of the worst case found.",
+                *([SWINGS] if _swings(certificate) else []),
+                *_describe_simulation(certificate),
+            ),
+        ),
+        *(_describe_uncertainty(certificate) if certificate.models else ()),
+        *([Section(title="Findings of the certificate", part="findings", items=tuple(findings))] if findings else []),
+    ]
+
+
+def _swings(certificate: Certificate) -> bool:
+    """Tell whether the -3 dB bandwidth of some plant says nothing: its tracking band does not start at 0 Hz."""
+    bands = (figures.tracking_band_hz for figures in certificate.plants.values())
+    return any(band is not None and band[0] > 1.0 for band in bands)
+
+
+def _tabulate_margins(certificate: Certificate) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for name, figures in certificate.plants.items():
+        worst, margins = certificate.worst[name], certificate.margins[name]
+        if not figures.stable:
+            rows.append((name, Mark(text="unstable", style="bad"), *[MISSING] * 10))
+            continue
+        late = margins.sampled_delay_s
+        rows.append(
+            (
+                name,
+                f"{figures.ms:.3f}",
+                f"{worst.ms:.3f}",
+                f"{figures.mt:.3f}",
+                f"{worst.mt:.3f}",
+                format_number(margins.margins.gain_up_db, 3),
+                format_number(figures.phase_margin_deg, 3),
+                f"{1e3 * late:.3g}" if late is not None else f"> {1e3 * margins.searched_delay_s:.2g}",
+                format_number(figures.disk_margin, 3),
+                format_band(figures.tracking_band_hz, missing=MISSING),
+                format_number(figures.bandwidth_hz),
+                format_number(margins.margins.gain_down_db, 3),
+            )
+        )
+    head = ("plant", "Ms", "worst Ms", "Mt", "worst Mt", "gain dB", "phase °", "delay ms", "disk")
+    more = ("tracking band Hz", "bandwidth Hz", "gain down dB")
+    return Table(head=(*head, *more), rows=tuple(rows), align="<".ljust(12, ">"), optional=more)
+
+
+def _describe_simulation(certificate: Certificate) -> Iterator[str]:
+    """Yield what was found in simulation, and at the link."""
+    if certificate.runs is not None:
+        yield from certificate.runs.describe_steps()
+    if certificate.simulated is not None:
+        left_out = len(certificate.simulated.left_out)
+        lines = certificate.simulated.lines()
+        yield from lines[: len(lines) - left_out]
+    if certificate.impedance is not None:
+        yield from (f"impedance: {line}" for line in certificate.impedance.lines())
+
+
+def _list_requirements(certificate: Certificate) -> Section:
+    """Return what is missed, each kind once with its count, and then what is met."""
+    groups = [(failure.worst, failure.count) for failure in group_failures(certificate.requirements)]
+    groups += [(row, 1) for row in certificate.requirements if row.met]
+    rows = tuple(
+        (
+            mark_met(row.met),
+            label_requirement(row),
+            format_number(row.value),
+            f"{row.sense} {format_number(row.limit)}",
+            unit_after(row.unit).strip(),
+            f"{row.where} (the worst of {count} such failures)" if count > 1 else row.where,
+        )
+        for row, count in groups
+    )
+    head = ("verdict", "requirement", "value", "limit", "unit", "where")
+    remark = (
+        "Worst case, of its limits: the largest share of a limit that the worst parameters found use; 1 is all of it."
+        if certificate.models
+        else f"{certificate.draws[:1].upper()}{certificate.draws[1:]}. Every response in the discs about the points "
+        "keeps the limits above."
+    )
+    return Section(
+        title="Requirements",
+        part="certificate",
+        screen=False,
+        tables=(Table(head=head, rows=rows, align="<<>><<"),),
+        remarks=(remark,),
+    )
+
+
+def _describe_uncertainty(certificate: Certificate) -> Iterator[Section]:
+    """Yield the worst cases, what was drawn, and the perturbations that each loop survives."""
+    rows = tuple(
+        (
+            name,
+            format_number(worst.ms),
+            format_number(worst.witness.ms_hz),
+            format_number(worst.mt),
+            format_number(worst.witness.spectral_radius, 6),
+            format_values(worst.parameters, 5, "nominal")
+            + "".join(
+                f"; largest {figure} at {format_values(at.parameters)}" for figure, at in worst.elsewhere.items()
+            ),
+        )
+        for name, worst in certificate.worst.items()
+    )
+    limits = tuple(f"{name}: {bracket.statement}" for name, bracket in certificate.brackets.items())
+    yield Section(
+        title="Worst case found",
+        part="certificate",
+        screen=False,
+        tables=(Table(head=("plant", "Ms", "at Hz", "Mt", "radius", "parameters"), rows=rows, align="<>>>><"),),
+        remarks=(
+            *limits,
+            "Found among the draws and by a search from the worst of them and from vertices of the ranges, over 99.9 % "
+            "of the fit's distribution and all of the ranges; there may be worse cases"
+            f"{', up to the bounds' if limits else ''}. certificate.worst[plant].verify(controller) checks each again.",
+        ),
+    )
+    draws = certificate.monte_carlo
+    varied = tuple(
+        (
+            each.name,
+            "uniform" if each.std is None else "Gaussian, correlated as fitted",
+            format_number(each.value),
+            format_number(each.std, 2),
+            format_number(each.low),
+            format_number(each.high),
+            each.unit,
+        )
+        for each in certificate.varied
+    )
+    yield Section(
+        title="Probability of failure",
+        part="certificate",
+        screen=False,
+        sentences=(f"{draws}, seed {draws.seed}." if draws.samples else f"{draws}.",),
+        tables=(
+            Table(
+                label="What is drawn",
+                head=("varied", "distribution", "nominal", "std", "from", "to", "unit"),
+                rows=varied,
+                align="<<>>>><",
+            ),
+        ),
+    )
+    disks = tuple(
+        (
+            name,
+            kind,
+            format_number(disk.alpha, 3),
+            format_number(disk.frequency_hz),
+            f"{disk.perturbation.real:.4g}{disk.perturbation.imag:+.4g} j",
+            f"{disk.gain_range[0]:.3g} to {format_number(disk.gain_range[1], 3)}",
+            f"± {disk.phase_deg:.3g}",
+        )
+        for name, margins in certificate.margins.items()
+        for kind, disk in margins.margins.disks.items()
+    )
+    yield Section(
+        title="Smallest destabilising perturbations",
+        part="certificate",
+        folded=True,
+        tables=(
+            Table(
+                head=("plant", "disk", "size", "at Hz", "factor on the loop", "gains inside", "phases inside °"),
+                rows=disks,
+                align="<<>>>>>",
+            ),
+        ),
+        remarks=("The loop survives every factor inside the disk; the factor named puts a pole on the unit circle.",),
+    )

@@ -1,0 +1,188 @@
+"""A controller in words: its verdict, the gains, what was asked and achieved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from seaopt.control import Controller
+from seaopt.control.laws.command import describe_cascade, name_gain_units
+from seaopt.control.laws.verdict import join_labels, list_design_figures
+from seaopt.control.loops.law import describe_integrators
+from seaopt.formatting import MISSING, format_band, format_count, format_figure, format_number
+from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict
+
+NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
+SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
+
+
+def judge(controller: Controller, commands: Commands) -> Verdict:
+    """Return the verdict on a controller; `sweep` is the command that tunes at a range of bandwidths, if there is."""
+    spec = controller.spec
+    name = f"Controller: {controller.structure} on {spec.regulated}, {spec.bandwidth_hz:g} Hz"
+    if controller.met:
+        on = " on measured points" if controller.design is None else ""
+        return Verdict(met=True, text=f"{name}, every limit met{on}")
+    blocked = controller.blocked_by or (join_labels(controller.active_constraints),)
+    reasons = [Reason(what=text) for text in blocked]
+    return Verdict(
+        met=False,
+        text=f"{name}, {format_count(len(reasons), 'limit')} not met",
+        reasons=tuple(reasons),
+        next=_advise_bandwidth(controller, commands),
+    )
+
+
+def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[str, ...]:
+    """Return the line of the file with a bandwidth that is possible, or how to look for what is."""
+    possible, asked = controller.possible, controller.spec.bandwidth_hz
+    look = show_costs(asked, commands)
+    if possible is None:
+        return (look,)
+    text = str(possible)
+    if possible.nearest_hz:
+        nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - asked))
+        return (text, f"bandwidth_hz = {nearest:.4g} in [controller], or {look}")
+    return (text, f"raise max_sensitivity, or max_noise_gain, in [controller]; {look}")
+
+
+def show_costs(asked: float, commands: Commands) -> str:
+    """Return how to see what bandwidths about one cost."""
+    how = f"type {commands.sweep} {_choose_range(asked)}" if commands.tune else "call seaopt.control.sweep"
+    return f"to see what other bandwidths cost {how}"
+
+
+def _choose_range(asked: float) -> str:
+    low, high = (factor * asked for factor in SWEEP_SPREAD)
+    step = max(float(f"{(high - low) / 6:.1g}"), 0.1)
+    return f"{step * math.floor(low / step):.4g}:{step * math.ceil(high / step):.4g}:{step:.4g}"
+
+
+def describe(controller: Controller) -> list[Section]:
+    """Return the gains, what was asked and achieved, what surrounds the law, and the findings."""
+    spec, command = controller.spec, controller.command
+    law = (
+        f"{command.mechanics.word.capitalize()} of the motor F_m = C_r F_ref − C_y {spec.regulated}; {command.input} = "
+        f"{command.per_effort:.6g} {command.per_effort_unit} × F_m."
+    )
+    findings = tuple(Item(severity="note", text=note) for note in controller.notes)
+    active = join_labels(controller.active_constraints) or "none"
+    return [
+        Section(
+            title="Controller",
+            aside=f"{controller.structure} on {spec.regulated} at {spec.sample_rate_hz:g} Hz, {controller.delays}",
+            part="controller",
+            sentences=(law, *_describe_parts(controller)),
+            tables=(_tabulate_gains(controller),),
+        ),
+        Section(
+            title="Asked and achieved",
+            part="controller",
+            tables=(
+                Table(
+                    head=(controller.judged_on, "achieved", "asked"), rows=tuple(list_achieved(controller)), align="<><"
+                ),
+            ),
+            remarks=(
+                f"Active limits: {active}." if controller.met else f"{controller.explanation}.",
+                *_describe_friction(controller),
+                *_describe_forces(controller),
+                *_describe_surroundings(controller),
+            ),
+        ),
+        *([Section(title="Findings of the controller", part="findings", items=findings)] if findings else []),
+    ]
+
+
+def list_achieved(controller: Controller) -> list[tuple[str, str, str]]:
+    """Return the figures of the design plant: what each is, what was achieved, what was asked."""
+    a = controller.achieved
+    rows = [
+        (row.limit.label, format_figure(row.value, row.unit), row.allowed_text)
+        for row in list_design_figures(controller.spec, controller.design_loop)
+    ]
+    if controller.prefilter is not None:
+        rows.append(("bandwidth without prefilter", format_figure(controller.bandwidth_without_prefilter_hz, "Hz"), ""))
+    return [
+        *rows,
+        ("tracking band", format_band(a.tracking_band_hz, "Hz", MISSING), ""),
+        ("gain margin", format_figure(a.gain_margin_db, "dB"), ""),
+        ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
+        ("delay margin", format_figure(a.delay_margin_ms, "ms"), ""),
+    ]
+
+
+def _tabulate_gains(controller: Controller) -> Table:
+    units, commanded = name_gain_units(controller.command), controller.engineering
+    rows: list[tuple[str, ...]] = []
+    for name, value in controller.gains.items():
+        as_command, unit = commanded.get(name, (None, ""))
+        figure = MISSING if as_command is None else f"{as_command:.5g}"
+        rows.append((name, f"{value:.5g}", units.get(name, ""), figure, unit))
+    head = ("gain", "value", "", f"as {controller.command.word}", "")
+    return Table(label="Gains", head=head, rows=tuple(rows), align="<><><")
+
+
+def _describe_parts(controller: Controller) -> Iterator[str]:
+    """Yield what the gains stand for, part by part of the law."""
+    gains = controller.gains
+    if not gains:
+        yield f"A law of order {controller.law.c.size} with {describe_integrators(controller.law)}."
+    if gains.get("k_v"):
+        yield f"{describe_cascade(gains, controller.command)}."
+    if controller.observer is not None:
+        yield f"Disturbance observer: Q is 3 dB down at {controller.observer.bandwidth_hz:.4g} Hz."
+    if "notch_depth" in gains:
+        f, width, depth = (gains[f"notch_{name}"] for name in ("frequency_hz", "width", "depth"))
+        use = "" if depth < NO_NOTCH else ": of no use, tune without it"
+        yield f"Notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}{use}."
+    low_pass = controller.prefilter
+    if low_pass is not None:
+        damping = "" if low_pass.damping is None else f", damping {low_pass.damping:.3g}"
+        bare = format_number(controller.bandwidth_without_prefilter_hz, missing="none")
+        yield (
+            f"Prefilter of {low_pass.order.replace('_', ' ')}: {low_pass.corner_hz:.4g} Hz{damping}; without it the "
+            f"bandwidth is {bare} Hz."
+        )
+
+
+def _describe_friction(controller: Controller) -> Iterator[str]:
+    """Yield the friction margin, and what the design plant achieves when it sticks; nothing without friction."""
+    if controller.design is None:
+        return
+    if controller.friction is not None:
+        loop, asked = controller.design_loop, controller.spec.level("min_friction_margin")
+        limit = "" if asked is None else f" (asked {asked:g})"
+        slope = f"{format_number(loop.friction_slope)} {loop.slope_unit}"
+        yield f"Friction margin {slope}{limit}: {controller.friction.describe()}."
+    _, *stuck = controller.measure_states().items()
+    for state, figures in stuck:
+        bandwidth = format_number(figures.bandwidth_hz, missing="none")
+        yield (
+            "These figures are of the sliding design plant, on which the bandwidth is placed;"
+            f"{state}: bandwidth {bandwidth} Hz, {figures.describe_peaks()}."
+        )
+
+
+def _describe_forces(controller: Controller) -> Iterator[str]:
+    """Yield what reference the limit of the command allows, and what the motor can do without overheating."""
+    slow, fast = controller.force_limit(0.0), controller.force_limit(controller.spec.bandwidth_hz)
+    if slow is not None and fast is not None and controller.command_limit is not None:
+        unit, band = controller.command.reference_unit, controller.spec.bandwidth_hz
+        yield (
+            f"The limit of {controller.command.show(controller.command_limit)} allows a reference of {slow:.4g} {unit} "
+            f"at rest and {fast:.4g} {unit} at {band:g} Hz, whatever the gains."
+        )
+    if controller.rating is not None:
+        yield from (f"Motor: {line}." for line in controller.rating.describe())
+
+
+def _describe_surroundings(controller: Controller) -> Iterator[str]:
+    """Yield what runs around the law: an outer loop, compensation, a gate."""
+    if controller.outer is not None:
+        yield f"{controller.outer.describe()}."
+    if controller.compensation is not None:
+        for line in controller.compensation.describe(controller.command.effort_unit):
+            yield f"Compensates {line}."
+    if controller.gate is not None:
+        yield f"{controller.gate.describe(controller.command.reference_unit)}."

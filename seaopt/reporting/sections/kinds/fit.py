@@ -1,0 +1,224 @@
+"""A fit in words: its verdict, the parameters with what follows from them, and how well each output is explained."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+from seaopt.estimation import Fit
+from seaopt.estimation.result.findings import DerivedFigure, FitFinding
+from seaopt.formatting import MISSING, format_count, format_number
+from seaopt.parameters import Parameter
+from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict
+from seaopt.units import unit_after
+
+RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be proposed
+DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
+MOST_PLACES = 3  # that a reason names
+EXPLAINED = (
+    "explained: share of the output's energy that the model accounts for; of at most: the share that any model of "
+    "these inputs could account for, estimated from the log alone"
+)
+
+
+def judge(fit: Fit, commands: Commands) -> Verdict:
+    """Return the verdict on a fit: what forbids its use, each reason once with its places."""
+    size = f"{fit.samples} samples"
+    percents = [one.fit_percent for row in fit.outputs.values() for one in row.values()]
+    if fit.met:
+        ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
+        outputs = f", outputs fit to {' to '.join(ends)} %" if ends else ""
+        return Verdict(met=True, text=f"Fit: converged, {size}{outputs}")
+    status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
+    errors = [(one.text, one.where) for one in fit.errors]
+    if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
+        errors.insert(0, (fit.message, ""))
+    reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit.errors))
+    again = f"correct the file, then type {commands.fit}" if commands.fit else ""
+    return Verdict(
+        met=False,
+        text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met",
+        reasons=reasons,
+        next=tuple(filter(None, (cures, again))),
+    )
+
+
+def describe(fit: Fit) -> list[Section]:
+    """Return the sections of a fit."""
+    size = f"{fit.samples} samples, {format_count(fit.iterations, 'iteration')}, {fit.wall_s:.1f} s"
+    items = tuple(_list_findings(fit))
+    return [
+        Section(
+            title="Parameters",
+            aside=size,
+            part="parameters",
+            sentences=tuple(_list_caveats(fit)),
+            tables=(_tabulate_parameters(fit),),
+        ),
+        Section(
+            title="Fit of every output",
+            part="fit",
+            tables=(_tabulate_outputs(fit),),
+            remarks=(EXPLAINED,) if fit.outputs else (),
+        ),
+        *([Section(title="Findings of the fit", part="findings", items=items)] if items else []),
+        *_describe_details(fit),
+    ]
+
+
+def _list_caveats(fit: Fit) -> Iterator[str]:
+    yield f"{fit.message[:1].upper()}{fit.message[1:]}."
+    if fit.caveat:
+        yield f"{fit.caveat[:1].upper()}{fit.caveat[1:]}."
+    for direction in fit.identifiability.unidentifiable:
+        yield f"Not identifiable: {' + '.join(f'{weight:.2g} {name}' for name, weight in direction.items())}."
+
+
+def _tabulate_parameters(fit: Fit) -> Table:
+    rows = [
+        (
+            one.name,
+            f"{one.value:.6g}",
+            _spread(one.std),
+            _interval(one.ci95),
+            _unit(one.unit),
+            _remark(one),
+            one.description,
+        )
+        for one in fit.parameters.values()
+        if one.free
+    ]
+    for remark, figures in (("of one log", fit.own_unknowns), ("derived", fit.derived)):
+        rows += [_tabulate_figure(name, figure, remark) for name, figure in figures.items()]
+    return Table(
+        label="Fitted parameters, and what follows from them",
+        head=("parameter", "value", "std", "95 % interval", "unit", "", "meaning"),
+        rows=tuple(rows),
+        align="<>>><<<",
+        optional=("95 % interval", "meaning"),
+    )
+
+
+def _tabulate_figure(name: str, figure: DerivedFigure, remark: str) -> tuple[str, ...]:
+    interval = _interval(figure.ci95) if figure.std else ""
+    return (name, f"{figure.value:.6g}", _spread(figure.std), interval, _unit(figure.unit), remark, "")
+
+
+def _tabulate_outputs(fit: Fit) -> Table:
+    rows = [
+        (
+            f"{name}.{output}",
+            f"{one.fit_percent:.2f}",
+            format_number(one.holdout_fit_percent),
+            format_number(one.one_step_fit_percent),
+            format_number(one.band_fit_percent),
+            _percent(one.explained),
+            _percent(one.explainable),
+            f"{one.rms_residual:.4g}",
+            _unit(one.unit),
+            format_number(one.sigma),
+            format_number(fit.nuisance[name].offset.get(output), 3) if name in fit.nuisance else MISSING,
+            format_number(one.whiteness_p, 2),
+        )
+        for name, row in fit.outputs.items()
+        for output, one in row.items()
+    ]
+    columns = ("fit %", "held out", "one step", "in the band", "explained", "of at most", "residual", "")
+    return Table(
+        label="Fit of every output",
+        head=("output", *columns, "sigma", "offset", "whiteness p"),
+        rows=tuple(rows),
+        align="<>>>>>>><>>>",
+        optional=("sigma", "offset", "whiteness p"),
+    )
+
+
+def _list_findings(fit: Fit) -> Iterator[Item]:
+    """Yield what whoever uses the fit should know; errors stand in the verdict."""
+    for one in fit.findings:
+        if one.severity != "error":
+            yield Item(severity=one.severity, text=f"{one.where}: {one.text}" if one.where else one.text)
+    for name, own in fit.nuisance.items():
+        if len(own.initial_state) > 1:
+            yield Item(severity="note", text=f"{name}: {len(own.initial_state)} segments, each with its initial state")
+    for note in fit.notes:
+        yield Item(severity="note", text=note)
+
+
+def _describe_details(fit: Fit) -> Iterator[Section]:
+    fixed = [one for one in fit.parameters.values() if not one.free]
+    if fixed:
+        rows = tuple((one.name, f"{one.value:.6g}", _unit(one.unit), one.description) for one in fixed)
+        yield Section(
+            title=f"{format_count(len(fixed), 'parameter')} not fitted",
+            part="parameters",
+            folded=True,
+            tables=(
+                Table(
+                    label="Fixed parameters", head=("parameter", "value", "unit", "meaning"), rows=rows, align="<><<"
+                ),
+            ),
+        )
+
+
+def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
+    """Yield each text once, with the places that it is said of."""
+    places: dict[str, list[str]] = {}
+    for text, where in pairs:
+        places.setdefault(text, []).append(where)
+    for text, where in places.items():
+        named = list(dict.fromkeys(filter(None, where)))
+        what = ", ".join(named[:MOST_PLACES]) or "the fit"
+        yield Reason(what=what, where=text, count=1 + len(named[MOST_PLACES:]))
+
+
+def _list_cures(errors: Sequence[FitFinding]) -> tuple[str, ...]:
+    """Return the lines to write for the likely cause that is named first.
+
+    What is not told from zero is not to be freed: a search for how sharp friction is takes long and ends nowhere.
+    """
+    cause = next((one for one in errors if one.kind == "cause" and one.preferred), None)
+    if cause is None:
+        return ()
+    apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
+    return tuple(filter(None, (spell_cure(name, value) for name, value in apart.items())))
+
+
+def spell_cure(name: str, value: float) -> str:
+    """Return the line of a problem file that frees what a log would have otherwise; "" where there is no such line.
+
+    Examples
+    --------
+    >>> spell_cure("chirp.delay_s", 0.004), spell_cure("f_c", 12.0)
+    ('delay_s = { value = 0.004, free = true, max = 0.02 } in the [[experiment]] chirp', 'f_c = { value = 12, free = true } in [parameters]')
+
+    """  # noqa: E501
+    *of, own = name.split(".")
+    if not of:
+        return f"{own} = {{ value = {value:.4g}, free = true }} in [parameters]"
+    if own == "delay_s" and value > 0.0:
+        longest = DELAY_ROOM * value
+        return f"delay_s = {{ value = {value:.4g}, free = true, max = {longest:.2g} }} in the [[experiment]] {of[0]}"
+    return ""
+
+
+def _remark(parameter: Parameter) -> str:
+    words = ["at its bound"] if parameter.at_bound else ["prior"] if parameter.prior_std is not None else []
+    return ", ".join([*words, *([] if parameter.identified else ["not identified"])])
+
+
+def _spread(std: float | None) -> str:
+    return f"± {std:.2g}" if std else MISSING  # what is fixed has none
+
+
+def _interval(ends: tuple[float, float] | None) -> str:
+    known = ends is not None and all(map(math.isfinite, ends))
+    return " to ".join(format_number(end, 6) for end in ends) if ends is not None and known else MISSING
+
+
+def _percent(share: float | None) -> str:
+    return MISSING if share is None else f"{100 * share:.1f} %"
+
+
+def _unit(unit: str) -> str:
+    return unit_after(unit).strip()

@@ -1,0 +1,78 @@
+"""Predictive control in words: its verdict, the limits it plans within, and its loop while no limit is active."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from seaopt.control import ForceMPC
+from seaopt.control.laws.verdict import join_labels
+from seaopt.formatting import format_count, format_number
+from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict, mark_met
+
+
+def judge(mpc: ForceMPC, commands: Commands) -> Verdict:
+    """Return the verdict on a predictive controller: the limits of its loop while no limit of its plan is active."""
+    name = f"Predictive control: {mpc.measured}, {mpc.spec.bandwidth_hz:g} Hz"
+    if mpc.met:
+        return Verdict(met=True, text=f"{name}, every limit met")
+    return Verdict(
+        met=False,
+        text=f"{name}, {format_count(len(mpc.broken), 'limit')} not met: {join_labels(mpc.broken)}",
+        reasons=(Reason(what=mpc.explanation),),
+    )
+
+
+def describe(mpc: ForceMPC) -> list[Section]:
+    """Return the limits of the plan, the loop's limits with what was achieved, and the findings."""
+    spec, unit = mpc.spec, mpc.design[0].outputs[mpc.spec.measured]
+    bounds = [
+        f"{name} within {low:g} and {high:g} {mpc.kalman.units[mpc.kalman.names.index(name)]}".rstrip()
+        for name, (low, high) in spec.bounds.items()
+    ]
+    rows = tuple(
+        (
+            verdict.plant,
+            verdict.limit.label,
+            format_number(verdict.value),
+            f"{verdict.limit.symbol} {format_number(verdict.allowed)}",
+            verdict.limit.unit,
+            mark_met(verdict.met),
+        )
+        for verdict in mpc.verdicts
+    )
+    findings = tuple(Item(severity="note", text=note) for note in mpc.notes)
+    return [
+        Section(
+            title="Predictive control",
+            aside=f"{spec.measured} of {mpc.design[0].name} at {spec.sample_rate_hz:g} Hz, {mpc.delays}",
+            part="mpc",
+            sentences=(
+                f"Plans within {mpc.describe_limits()}, enough to hold {mpc.static_gain * mpc.command_limit:.4g} {unit}"
+                f"; horizon {1e3 * spec.horizon_s:g} ms, {mpc.prediction.knots.size} moves.",
+                *bounds,
+            ),
+            tables=(
+                Table(
+                    label="Limits of predictive control",
+                    head=("plant", "limit", "achieved", "asked", "unit", ""),
+                    rows=rows,
+                    align="<<>><<",
+                ),
+            ),
+            remarks=(
+                f"The figures hold while no limit of the {mpc.actuation.word} is active.",
+                f"Bandwidth {format_number(mpc.achieved.bandwidth_hz, missing='none')} Hz, asked "
+                f"{spec.bandwidth_hz:g} Hz.",
+                *_describe_loops(mpc),
+            ),
+        ),
+        *([Section(title="Findings of predictive control", part="findings", items=findings)] if findings else []),
+    ]
+
+
+def _describe_loops(mpc: ForceMPC) -> Iterator[str]:
+    """Yield the margins of each loop of the design plant: with friction sliding and stuck."""
+    for loop in mpc.measured_loops:
+        figures = loop.figures
+        bandwidth = format_number(figures.bandwidth_hz, missing="none")
+        yield f"{loop.name}: bandwidth {bandwidth} Hz, {figures.describe_peaks()}; {figures.describe_margins()}."

@@ -1,0 +1,67 @@
+"""The certificate of a schedule in words: its verdict, and the figures at every value of the variable."""
+
+from __future__ import annotations
+
+from seaopt.formatting import format_count
+from seaopt.reporting.sections.data import Commands, Item, Section, Table, Verdict
+from seaopt.reporting.sections.kinds.certificate import explain_failure
+from seaopt.robustness import ScheduleCertificate
+from seaopt.robustness.certificate.requirement import group_failures
+from seaopt.robustness.certificate.scheduled import MOTION_RATE
+from seaopt.units import unit_after
+
+
+def judge(certificate: ScheduleCertificate, commands: Commands) -> Verdict:
+    """Return the verdict on a schedule's certificate, with its assumption."""
+    draws = certificate.monte_carlo
+    if certificate.met:
+        drawn = (
+            f"{format_count(draws.failures, 'failure')} in {draws.samples} draws"
+            if draws.samples
+            else "nothing was uncertain, so that nothing was drawn"
+        )
+        rate = f"{certificate.fastest:.3g} {certificate.rate_unit}"
+        swept = f"; {certificate.schedule.over} up to {rate} in sweeps" if certificate.sweeps else ""
+        still = f"{certificate.schedule.over} standing still"
+        return Verdict(met=True, text=f"Certificate: passed with {still}, {drawn}{swept}")
+    broken = [row for row in certificate.requirements if not row.met]
+    reasons = tuple(explain_failure(one) for one in group_failures(broken))
+    command = f"type {commands.certify}" if commands.certify else "tune again"
+    slow = all(row.name == MOTION_RATE and row.value > 0.0 for row in broken)  # 0 where it rings or departs
+    change = "ask a smaller min_rate, or allow more current" if slow else "raise reserve, or add points"
+    return Verdict(
+        met=False,
+        text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
+        reasons=reasons,
+        next=(certificate.schedule.remedy or f"{change}; then {command}",),
+    )
+
+
+def describe(certificate: ScheduleCertificate) -> list[Section]:
+    """Return the figures at every value of the schedule's variable, the draws, and the findings."""
+    rows: list[tuple[str, ...]] = []
+    for place in certificate.places:
+        failed = place.unstable + place.over_ms + place.over_mt
+        rows.append(
+            (
+                f"{place.value:.4g}",
+                "point" if place.point else "between",
+                f"{place.ms:.3f}",
+                f"{max(figures.mt for figures in place.plants.values()):.3f}",
+                "" if place.worst_ms is None else f"{place.worst_ms:.3f}",
+                f"{failed} of {place.draws}",
+            )
+        )
+    variable = f"{certificate.schedule.over}{unit_after(certificate.schedule.unit)}"
+    head = (variable, "", "Ms", "Mt", "worst Ms", "draws that fail")
+    notes = tuple(Item(severity="note", text=note) for note in certificate.notes)
+    return [
+        Section(
+            title="What is certified",
+            aside=certificate.monte_carlo.count_text,
+            part="schedule",
+            tables=(Table(head=head, rows=tuple(rows), align="><>>>>"),),
+            remarks=(f"{certificate.monte_carlo}.",),
+        ),
+        *([Section(title="Findings of the schedule's certificate", part="findings", items=notes)] if notes else []),
+    ]

@@ -1,0 +1,69 @@
+"""The verdicts on several results together: a design is no better than the fit, and the guesses, that it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from seaopt.control import Controller, ForceMPC, ScheduledController
+from seaopt.estimation import Fit
+from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.data import Reason, Verdict
+from seaopt.robustness import Certificate, ScheduleCertificate
+from seaopt.robustness.verification.verification import Verification
+
+UNMET = "on a fit that is not met"
+
+
+def judge_results(
+    *,
+    fit: Fit | None = None,
+    controller: Controller | ScheduledController | None = None,
+    mpc: ForceMPC | None = None,
+    certificate: Certificate | ScheduleCertificate | None = None,
+    verification: Verification | None = None,
+    expectations: Sequence[tuple[bool, str]] = (),
+) -> list[Verdict]:
+    """Return the verdict on each result that there is; a design on a fit that is not met is not met either.
+
+    Parameters
+    ----------
+    fit, controller, mpc, certificate, verification : optional
+        Results, the later ones made with the earlier ones.
+    expectations : sequence of (bool, str)
+        Of a problem file: whether each is met, and what to say of it.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), so.ControllerSpec(bandwidth_hz=30))
+    >>> [one.text for one in judge_results(controller=controller)]
+    ['Controller: pid on F1, 30 Hz, every limit met']
+
+    """
+    made = (controller, mpc, certificate, verification)
+    designs = [one for result in made if result is not None and (one := judge(result)) is not None]
+    verdict = None if fit is None else judge(fit)
+    sound = fit is None or fit.met
+    judged = [*([] if verdict is None else [verdict]), *(designs if sound else map(doubt_design, designs))]
+    guesses = "" if fit is None else fit.guesses
+    return [*(name_guesses(one, guesses) for one in judged), *judge_expectations(expectations)]
+
+
+def name_guesses(verdict: Verdict, guesses: str) -> Verdict:
+    """Return the verdict with the guesses that it rests on ("on 2 guesses: N_p, l"), where it is met."""
+    return replace(verdict, text=f"{verdict.text}, {guesses}") if verdict.met and guesses else verdict
+
+
+def doubt_design(verdict: Verdict) -> Verdict:
+    """Return the verdict on a design as it is where the fit that it was made with is not met."""
+    return replace(verdict, met=False, text=f"{verdict.text}, {UNMET}")
+
+
+def judge_expectations(outcomes: Sequence[tuple[bool, str]]) -> list[Verdict]:
+    """Return the verdict on what a problem file expects, in one line; none where it expects nothing."""
+    if not outcomes:
+        return []
+    unmet = [Reason(what=text) for met, text in outcomes if not met]
+    text = f"Expectations: {len(outcomes) - len(unmet)} of {len(outcomes)} met"
+    return [Verdict(met=not unmet, text=text, reasons=tuple(unmet))]

@@ -1,0 +1,65 @@
+"""Welch's averages: segments under Hann's window that overlap by half, without their means (Welch 1967).
+
+The window is the periodic one, whose transform is nothing but three lines, (-1/4, 1/2, -1/4): what reads spectra here
+counts on it (Parseval's 3/8, the mean of three lines that an H1 estimate is). Two channels' segments are cut alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+INDEPENDENT = 0.947  # averages that a segment counts as, half of which is the next one's (Welch 1967, Hann)
+MEAN_SQUARE = 0.375  # of the window
+Start = TypeVar("Start")
+
+
+def hann(length: int) -> Float[np.ndarray, " n"]:
+    """Return Hann's window of a period."""
+    return np.hanning(length + 1)[:length]
+
+
+def list_starts(runs: Iterable[slice], length: int) -> list[int]:
+    """Return the first rows of the segments that lie in runs of rows, each half a segment after the last."""
+    return [row for run in runs for row in range(run.start, run.stop - length + 1, max(length // 2, 1))]
+
+
+def thin(starts: Sequence[Start], most: int) -> list[Start]:
+    """Return at most so many of the segments, evenly spread over all of them."""
+    if len(starts) <= most:
+        return list(starts)
+    return [starts[i] for i in np.linspace(0, len(starts) - 1, most).astype(int)]
+
+
+def count_averages(segments: int) -> float:
+    """Return how many independent averages so many segments are worth."""
+    return max(1.0, INDEPENDENT * segments)
+
+
+def transform(
+    segments: Float[np.ndarray, "*shape n"], window: Float[np.ndarray, " n"]
+) -> Complex[np.ndarray, "*shape m"]:
+    """Return the spectra of windowed segments without their means, in their own precision; the segments are used up."""
+    segments -= segments.mean(axis=-1, keepdims=True)
+    segments *= window  # in place: fresh memory costs more than the transform
+    if segments.dtype == np.float64:
+        return np.fft.rfft(segments)
+    from scipy.fft import rfft  # deferred: scipy is slow to load, and of single precision twice as fast
+
+    spectra: Any = rfft(segments)
+    return spectra
+
+
+def square(values: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Return the squared magnitude; np.abs would take a root first."""
+    return np.real(values) ** 2 + np.imag(values) ** 2
+
+
+def coherence(
+    cross: Complex[np.ndarray, "*shape"], first: Float[np.ndarray, "*shape"], second: Float[np.ndarray, "*shape"]
+) -> Float[np.ndarray, "*shape"]:
+    """Return the squared coherence of each line, of the averaged cross-spectrum and powers."""
+    return square(cross) / np.maximum(first * second, 1e-300)

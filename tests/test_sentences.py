@@ -1,0 +1,75 @@
+"""Nobody takes what a result says apart: results have fields, and words are made of them in one place."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+SEAOPT = Path(__file__).resolve().parents[1] / "seaopt"
+# Names of what is said. A search of them, or a cut, is a sentence that is parsed.
+SAID = {"text", "where", "reason", "message", "sentence", "explanation", "verdict", "said", "remedy", "summary",
+        "label", "draws", "proof", "assumption", "statement", "what", "str"}  # fmt: skip
+CUTS = {"split", "rsplit", "partition", "rpartition", "startswith", "endswith", "find", "index", "removeprefix",
+        "removesuffix"}  # fmt: skip
+# What is read there, and why it is no sentence of a result, or what it waits for.
+READERS = {
+    "cli/frontier.py": "an argument of the command line",
+    "cli/inspect.py": "an argument of the command line",
+    "cli/main.py": "blanks of an error's text",
+    "control/laws/verdict.py": "active_constraints of controller.json are labels, NAME (PLANT)",
+    "control/tuning/tuner.py": "labels of limits that are broken, as active_constraints",
+    "errors.py": "blanks of an error's text",
+    "estimation/problem/experiment.py": "a note that is there already is not added again",
+    "estimation/result/identifiability.py": "EXPERIMENT.NAME of an unknown",
+    "logs": "columns and files",
+    "plants": "equations and files",
+    "problem/problem.py": "a remark of an experiment, found by its name",
+    "problem/proposal": "answers, and lines of the file that is written",
+    "problem/reading.py": "an error's text under another place",
+    "reporting/page/chart.py": "matplotlib's mark of a line without a label",
+    "reporting/sections/kinds/fit.py": "a message that an error repeats is not said twice",
+    "reporting/sections/text.py": "a command in a next step, set on a line of its own",
+    "robustness": "names of draws and conditions, and blanks of a wrong value",
+    "units.py": "a unit's own text",
+}
+CALLS_IN_ROBUSTNESS = {"str(name).removesuffix('_hz')", "name in draws"}
+
+
+def name_of(node):
+    """Return the last name of an expression."""
+    match node:
+        case ast.Call(func=ast.Name(id="str" | "repr")):
+            return "str"
+        case ast.Call(func=function):
+            return name_of(function)
+        case ast.Attribute(attr=name) | ast.Name(id=name):
+            return name
+        case ast.Subscript(value=value):
+            return name_of(value)
+    return ""
+
+
+def list_parsed(source):
+    """Yield what cuts or searches something that is said."""
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.Call(func=ast.Attribute(attr=verb, value=value)) if verb in CUTS and name_of(value) in SAID:
+                yield ast.unparse(node)
+            case ast.Compare(ops=[ast.In() | ast.NotIn()], comparators=[value]) if name_of(value) in SAID:
+                yield ast.unparse(node)
+
+
+def test_the_search_finds_what_was_parsed_before():
+    source = "plant = row.where.split(':')[0]\nhead = str(draws).partition(':')\nunstable = 'UNSTABLE' in row.text\n"
+    assert len(list(list_parsed(source))) == 3
+
+
+def test_no_sentence_of_a_result_is_parsed():
+    found = {
+        path.relative_to(SEAOPT).as_posix(): parsed
+        for path in SEAOPT.rglob("*.py")
+        if (parsed := list(list_parsed(path.read_text(encoding="utf-8"))))
+    }
+    assert [path for path in found if not any(path == known or path.startswith(f"{known}/") for known in READERS)] == []
+    in_robustness = {each for path, parsed in found.items() if path.startswith("robustness/") for each in parsed}
+    assert {each for each in in_robustness if "repr(value)" not in each} == CALLS_IN_ROBUSTNESS
