@@ -15,6 +15,7 @@ import io
 import re
 import sys
 import tempfile
+from difflib import unified_diff
 from pathlib import Path
 
 import matplotlib.image
@@ -109,7 +110,9 @@ def compare(path: Path, fresh: NotebookNode) -> list[str]:
     for number, (old, new) in enumerate(zip(stored.cells, fresh.cells, strict=True), start=1):
         before, after = describe(old), describe(new)
         if len(before) != len(after) or not all(map(agree, before, after)):
-            differences.append(f"{path.name}, cell {number}: stored {before}, fresh {after}")
+            lines = ("\n".join(shown).splitlines() for shown in (before, after))
+            changes = unified_diff(*lines, f"{path.name}, cell {number}, stored", "fresh", n=0, lineterm="")
+            differences.append("\n".join(changes))
     return differences
 
 
