@@ -4,12 +4,12 @@ A kernel is one C function ``int f(const jobs *, long count)`` that does indepen
 `load_kernel` compiles it once per user and source, in however many processes; `Kernel.run` shares the jobs among
 threads.
 
-The shared libraries live in a folder of the user's own (mode 0700, refused if anyone else can write to it, or if it is
-a link) under the hash of their source, flags and compiler. A file with the hash of the library itself stands beside
-each: Python would die of a library that was cut off, so one that does not match is compiled again. A new library is
-first loaded in a process apart, whatever the compiler's exit status says of it. A compiler that does not end within
-a minute is not asked again for an hour. Where one fails, a line is logged, and all is computed without it.
-``SEAOPT_COMPILER`` names a compiler, or "none" to use none; ``SEAOPT_CACHE_DIR`` names the folder.
+The shared libraries are in a folder of the user's own (mode 0700, refused if anyone else can write to it, or if it is
+a link). A library's name is the hash of its source, flags and compiler, and the hash of its content: Python would die
+of a library that was cut off, so one that does not match its name is compiled again. A new library is first loaded in
+a child process, even if the compiler's exit status is zero. A compiler that does not end within a minute is not asked
+again for an hour. Where one fails, a line is logged, and everything is computed without it. ``SEAOPT_COMPILER`` names
+a compiler, or "none" to use none; ``SEAOPT_CACHE_DIR`` names the folder.
 
 Threads write to arrays by address, which nothing but this module keeps alive. An interrupt (Ctrl-C) reaches the main
 thread alone, while the others still write: `Kernel.run` raises it when they have ended. Between two instructions of
@@ -25,7 +25,6 @@ import logging
 import os
 import platform
 import re
-import select
 import shutil
 import signal
 import stat
@@ -34,10 +33,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager, suppress
-from functools import lru_cache, partial
+from contextlib import ExitStack, suppress
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -49,18 +48,18 @@ from jaxtyping import Int, Shaped
 from seaopt.records import record
 
 THREAD_NAME = "seaopt-native"
-COMPILER_S = 60.0  # that a compiler gets for one library,
-PER_CHARACTER_S = 5e-4  # and for its source: ten times what an idle machine takes
-HUNG_S = 3_600.0  # for which one that took longer is not asked again
-ORPHAN_S = 3_600.0  # after which a folder of the compiler's has nobody who waits for it
-BUILD = "build-"  # begins the names of those folders
+COMPILER_S = 60.0  # time limit of a compiler for one library,
+PER_CHARACTER_S = 5e-4  # and for each character of its source: ten times what an idle machine takes
+HUNG_S = 3_600.0  # for which a compiler that took longer is not asked again
+ORPHAN_S = 3_600.0  # after which nobody waits for the compiler of a folder any more
+BUILD = "build-"  # prefix of those folders
 # Loops are unrolled as by -O3. What is left out of -O2 moves instructions about, after all sums are in their order: the
 # numbers are the same to the last bit, as quickly, and compile in nine tenths of the time.
 FLAGS = (
     *("-O2", "-fpeel-loops", "-fno-gcse", "-fno-schedule-insns2", "-fno-caller-saves"),
     *("-std=gnu99", "-fPIC", "-shared", "-fno-math-errno", "-fvisibility=hidden"),
 )
-CLONES = ("-fipa-cp-clone",)  # copies of a pass for constant arguments; clang and zig refuse what they do not know
+CLONES = ("-fipa-cp-clone",)  # copies of a pass for constant arguments; clang and zig refuse unknown options
 NATIVE = ("-march=native", "-mprefer-vector-width=256", "-mno-avx512f")
 LOAD = "import ctypes, sys; getattr(ctypes.CDLL(sys.argv[1]), sys.argv[2])"  # 15 ms, of the half second of a compiler
 
@@ -118,27 +117,25 @@ def load_library(source: str, name: str) -> ctypes.CDLL | None:
     if compiler is None or folder is None:
         return None
     content = (source, LOAD, *FLAGS, *CLONES, *NATIVE, *compiler, sys.platform, _processor())
-    key = hashlib.sha256("\0".join(content).encode()).hexdigest()
-    library = folder / f"{key}.so"
-    for ready in (_is_whole, partial(_compile_once, compiler, source, name)):
-        if ready(library) and _is_private(library):
-            try:
-                return ctypes.CDLL(str(library))
-            except OSError:  # built for another machine that shares this folder
-                continue
+    key = _digest("\0".join(content).encode())
+    library = _find_whole(folder, key) or _compile_once(compiler, source, name, folder, key)
+    if library is not None and _is_private(library):
+        with suppress(OSError):  # built for another machine that shares this folder
+            return ctypes.CDLL(str(library))
     return None
 
 
-def _is_whole(library: Path) -> bool:
-    """Tell whether a library is the one that was compiled: the hash beside it is its own."""
-    try:
-        return _hash_beside(library).read_text(encoding="ascii") == hashlib.sha256(library.read_bytes()).hexdigest()
-    except (OSError, ValueError):
-        return False
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
-def _hash_beside(library: Path) -> Path:
-    return library.with_suffix(".sha256")
+def _find_whole(folder: Path, key: str) -> Path | None:
+    """Return the library of a key whose content has the hash in its name."""
+    for library in folder.glob(f"{key}.*.so"):
+        with suppress(OSError):
+            if library.name == f"{key}.{_digest(library.read_bytes())}.so":
+                return library
+    return None
 
 
 @lru_cache(maxsize=1)
@@ -151,39 +148,35 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
 
 
-def _compile_once(compiler: list[str], source: str, name: str, library: Path) -> bool:
-    """Compile as `_compile` does; of several processes that want one library at a time, one does, and others wait."""
-    with _lock(library.with_suffix(".lock")):
-        return _is_whole(library) or _compile(compiler, source, name, library)
-
-
-@contextmanager
-def _lock(path: Path) -> Generator[None]:
-    """Hold a file's lock, which ends with the process; on a disk that has none everybody goes on at once."""
+def _compile_once(compiler: list[str], source: str, name: str, folder: Path, key: str) -> Path | None:
+    """Return the library of a source; of several processes that want it at a time one compiles, and others wait."""
     import fcntl  # not on Windows, where nothing is compiled
 
+    path = folder / f"{key}.lock"
     with ExitStack() as stack:
-        with suppress(OSError):
-            handle = stack.enter_context(path.open("w"))
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-        with suppress(OSError):  # whoever waits has it open still, and finds the library made
+        with suppress(OSError):  # a disk without locks: everybody compiles
+            fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)  # ends with the process
+        library = _find_whole(folder, key) or _compile(compiler, source, name, folder, key)
+        with suppress(OSError):  # whoever waits has it open still
             path.unlink()
+    return library
 
 
-def _compile(compiler: list[str], source: str, name: str, library: Path) -> bool:
-    """Compile a source to a library with its hash beside it; whatever goes wrong, there is none, and it is False."""
-    hung = _hung_marker(compiler, library.parent)
-    _sweep(library.parent)
+def _compile(compiler: list[str], source: str, name: str, folder: Path, key: str) -> Path | None:
+    """Return the library that a compiler makes of a source; None, and a line in the log, if anything goes wrong."""
+    hung = folder / f"{_digest(chr(0).join(compiler).encode())}.hung"
+    with suppress(OSError):
+        for orphan in folder.glob(f"{BUILD}*"):
+            if time.time() - orphan.lstat().st_mtime > ORPHAN_S:
+                shutil.rmtree(orphan, ignore_errors=True)
     try:
         if hung.exists() and abs(time.time() - hung.lstat().st_mtime) < HUNG_S:
             trouble = f"did not end less than {HUNG_S / 60:g} minutes ago, and is not asked again so soon"
-        elif any(
-            _run_compiler([*compiler, *FLAGS, *extra], source, name, library)
-            for extra in ((*CLONES, *NATIVE), NATIVE, CLONES, ())
-        ):
-            return True
         else:
+            for options in ((*CLONES, *NATIVE), NATIVE, CLONES, ()):
+                library = _run_compiler([*compiler, *FLAGS, *options], source, name, folder, key)
+                if library is not None:
+                    return library
             trouble = "fails, or makes nothing that can be loaded"
     except subprocess.TimeoutExpired as error:
         trouble = f"did not end within {error.timeout:.2g} s"
@@ -191,80 +184,54 @@ def _compile(compiler: list[str], source: str, name: str, library: Path) -> bool
             hung.touch()
     except OSError as error:  # no room on the disk, among others
         trouble = error.strerror or str(error)
-    _tell(f"C compiler {' '.join(compiler)}: {trouble}; slower without it; SEAOPT_COMPILER names another, or none")
-    return False
+    _warn_once(f"C compiler {' '.join(compiler)}: {trouble}; slower without it; SEAOPT_COMPILER names another, or none")
+    return None
 
 
 @lru_cache(maxsize=8)
-def _tell(text: str) -> None:
-    """Log a line, once per process."""
+def _warn_once(text: str) -> None:
     logging.getLogger("seaopt").warning("seaopt: %s", text)
 
 
-def _hung_marker(compiler: list[str], folder: Path) -> Path:
-    """Return the file that is there if a compiler hung; another build of the compiler has another one."""
-    try:
-        build = str(os.stat(compiler[0]).st_mtime_ns)  # noqa: PTH116
-    except OSError:
-        build = ""
-    return folder / f"{hashlib.sha256(chr(0).join((*compiler, build)).encode()).hexdigest()}.hung"
-
-
-def _sweep(folder: Path) -> None:
-    """Remove what compilers that were killed have left behind."""
-    with suppress(OSError):
-        for left in [*folder.glob(f"{BUILD}*"), *folder.glob("tmp*")]:
-            if time.time() - left.lstat().st_mtime > ORPHAN_S:
-                shutil.rmtree(left, ignore_errors=True)
-
-
-def _run_compiler(command: list[str], source: str, name: str, library: Path) -> bool:
-    """Compile a source, load what comes of it, and move it into its place once all of it is on the disk."""
-    with tempfile.TemporaryDirectory(dir=library.parent, prefix=BUILD, ignore_cleanup_errors=True) as folder:
-        code, built, beside = (Path(folder) / file for file in ("kernel.c", "kernel.so", "kernel.sha256"))
+def _run_compiler(command: list[str], source: str, name: str, folder: Path, key: str) -> Path | None:
+    """Compile a source, load the result in a child process, and give it its name in the folder."""
+    with tempfile.TemporaryDirectory(dir=folder, prefix=BUILD, ignore_cleanup_errors=True) as build:
+        code, built = Path(build) / "kernel.c", Path(build) / "kernel.so"
         code.write_text(source, encoding="utf-8")
-        compiling = [*command, str(code), "-o", str(built), "-lm"]
-        loading = [sys.executable, "-I", "-S", "-c", LOAD, str(built), name]  # may die of it: SIGBUS, SIGSEGV
         limit_s = COMPILER_S + PER_CHARACTER_S * len(source)
-        if not all(_succeeds(step, limit_s) for step in (compiling, loading)):
-            return False
-        beside.write_text(hashlib.sha256(built.read_bytes()).hexdigest(), encoding="ascii")
-        for file, target in ((built, library), (beside, _hash_beside(library))):
-            file.chmod(0o700)
-            with file.open("rb+") as stream:
-                os.fsync(stream.fileno())
-            file.replace(target)
-    return True
+        loading = [sys.executable, "-I", "-S", "-c", LOAD, str(built), name]  # may die of it: SIGBUS, SIGSEGV
+        if not (_succeeds([*command, str(code), "-o", str(built), "-lm"], limit_s) and _succeeds(loading, limit_s)):
+            return None
+        built.chmod(0o700)
+        return built.replace(folder / f"{key}.{_digest(built.read_bytes())}.so")
 
 
 def _succeeds(command: list[str], limit_s: float) -> bool:
-    """Run a command and tell whether it ends with status 0; one that does not end is killed with all it started."""
-    silent = subprocess.DEVNULL
+    """Run a command and tell whether it ends with status 0; one that does not end is killed with all it started.
+
+    Raises TimeoutExpired: it did not end in time. `Popen.wait` with a limit would look only every 50 ms.
+    """
+    silent, expired = subprocess.DEVNULL, threading.Event()
     process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)  # noqa: S603
-    try:
-        _await_end(process, limit_s)
-        return process.wait() == 0
-    except BaseException:
+
+    def kill() -> None:
+        expired.set()
         with suppress(OSError):
             os.killpg(process.pid, signal.SIGKILL)  # a compiler's driver starts others
+
+    timer = threading.Timer(limit_s, kill)
+    timer.start()
+    try:
+        status = process.wait()
+    except BaseException:
+        kill()
         process.wait()
         raise
-
-
-def _await_end(process: subprocess.Popen[bytes], limit_s: float) -> None:
-    """Wait until a process ends, at once where its end is an event: `wait` itself looks only every 50 ms."""
-    try:
-        handle = os.pidfd_open(process.pid)
-    except (AttributeError, OSError):  # not on Linux, or of an older kernel
-        process.wait(limit_s)
-        return
-    try:
-        ended = select.poll()
-        ended.register(handle, select.POLLIN)
-        if not ended.poll(1e3 * limit_s):
-            raise subprocess.TimeoutExpired(process.args, limit_s)
     finally:
-        os.close(handle)
+        timer.cancel()
+    if expired.is_set():
+        raise subprocess.TimeoutExpired(command, limit_s)
+    return status == 0
 
 
 def define_constants(constants: Mapping[str, float]) -> str:

@@ -63,10 +63,14 @@ def run_passes(
         return program.run(
             0, last, x0, sums=sums, outputs=outputs, output_rows=output_rows, columns=columns, states=states
         )
-    result = interpret_pass(model, segment, point, chosen, last, x0, outputs=outputs, columns=columns, states=states)
-    if output_rows is None or result.outputs is None:
-        return result
-    return replace(result, outputs=result.outputs[:output_rows].copy())
+    result = interpret_pass(model, segment, point, chosen, last, x0)
+    assert result.outputs is not None
+    return replace(
+        result,
+        outputs=result.outputs[:output_rows] if outputs else None,
+        columns=result.columns if columns else None,
+        states=result.states if states else None,
+    )
 
 
 def stream(
@@ -86,10 +90,12 @@ def stream(
     chosen = weights if weights is not None else Weights.plain(model.ny)
     program = Program.make(model, segment, point, chosen)
     if program is None:
-        yield from _split_into_chunks(
-            interpret_pass(model, segment, point, chosen, segment.n, x0, outputs=True, columns=columns),
-            chunk,
-        )
+        whole = interpret_pass(model, segment, point, chosen, segment.n, x0)
+        assert whole.outputs is not None
+        for start in range(0, segment.n, chunk):
+            rows = slice(start, start + chunk)
+            v = whole.columns[rows] if columns and whole.columns is not None else None
+            yield replace(whole, outputs=whole.outputs[rows], columns=v, states=None)
         return
     carry, part = program.carry(), None
     for start in range(0, segment.n, chunk):
@@ -123,11 +129,3 @@ def double_sum(
     """
     program = Program.make(model, segment, point, weights)
     return None if program is None else program.double_sum(x0, into, r)
-
-
-def _split_into_chunks(whole: Pass, chunk: int) -> Iterator[Pass]:
-    assert whole.outputs is not None
-    for start in range(0, len(whole.outputs), chunk):
-        rows = slice(start, start + chunk)
-        columns = None if whole.columns is None else whole.columns[rows]
-        yield replace(whole, outputs=whole.outputs[rows], columns=columns)

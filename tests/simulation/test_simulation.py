@@ -218,7 +218,7 @@ def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
     model, segment, point, weights, x0 = passes(case, thor, n=140, **options)
     for stop, start in ((140, x0), (60, 2 * x0)):
         fast = Program.make(model, segment, point, weights).run(0, stop, start, **keep)
-        slow = interpret_pass(model, segment, point, weights, stop, start, **keep)
+        slow = interpret_pass(model, segment, point, weights, stop, start)
         for name in ("gram", "loss", "count", "outputs", "columns", "states"):
             a, b = getattr(fast, name), getattr(slow, name)
             scale = np.max(np.abs(b), axis=0, keepdims=True)

@@ -67,9 +67,13 @@ def test_compiled_and_interpreted_passes_agree_and_their_derivatives_are_those_o
 
     here = run(theta, delay)
     there = interpret_pass(
-        model, segment, make_point(theta, hold, free=free, delay_s=delay), plain, drive.size, start,
-        outputs=True, columns=True,
-    )  # fmt: skip
+        model,
+        segment,
+        make_point(theta, hold, free=free, delay_s=delay),
+        plain,
+        drive.size,
+        start,
+    )
     assert np.allclose(here.outputs, there.outputs, rtol=1e-10, atol=1e-13)
     assert np.allclose(here.gram, there.gram, rtol=1e-8, atol=1e-8 * np.max(np.abs(there.gram)))
     places = [

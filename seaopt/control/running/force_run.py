@@ -30,6 +30,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.plant import name_input, output_function
 from seaopt.plants.sensors.deflection import evaluate_weights
 from seaopt.records import record
+from seaopt.simulation.direct_call import DirectCall
 from seaopt.units import LINEAR, mechanics_of, name_command, unit_after
 
 State = TypeVar("State")
@@ -175,7 +176,7 @@ def close_loop(
     if isinstance(preview_samples, bool) or not isinstance(preview_samples, int) or preview_samples < 0:
         raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, values.vector
-    output, integrator = _Call(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
+    output, integrator = DirectCall(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
     idle = [0.0] * (len(plant.inputs) - 1)
     reading = _place_sensor(sensors or Sensors(), plant, values, measured)
     noise = reading.noise_std * np.random.default_rng(require_seed(seed, ControlError)).normal(size=n)
@@ -200,7 +201,7 @@ def close_loop(
 
     for k in range(n):
         older = k - newer - (rest_s > 0.0)
-        (outputs,) = output(time_s[k], x, inputs(k, min(older, k - 1)), p)
+        outputs = output(time_s[k], x, inputs(k, min(older, k - 1)), p)[0][:, 0]
         force[k] = outputs[reading.row]
         call_start_s = time.perf_counter()
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
@@ -295,15 +296,15 @@ class _Integrator:
     substeps: int = FIRST_SUBSTEPS
     error: float = 0.0
     size: Any = 0.0
-    ends: _Call | None = None
+    ends: DirectCall | None = None
 
     def advance(
         self, t: float, x: Float[np.ndarray, " nx"], u: list[float], p: Float[np.ndarray, " np"], lasting: float
     ) -> Any:
         """Return the state after a time `lasting`, the inputs held."""
         while True:
-            self.ends = self.ends or _Call(_ends(self.plant, self.substeps))
-            coarse, fine = self.ends(t, x, u, p, lasting)
+            self.ends = self.ends or DirectCall(_ends(self.plant, self.substeps))
+            coarse, fine = (end[:, 0] for end in self.ends(t, x, u, p, lasting))
             size = np.maximum(self.size, np.maximum(np.abs(x), np.abs(fine)))
             scale = np.maximum(size, RESTS * np.max(size))
             with np.errstate(invalid="ignore"):
@@ -336,25 +337,3 @@ def _ends(plant: Plant, substeps: int) -> Any:
         ends.append(ca.densify(at))
     whole = ca.Function("held", [t, x, u, p, lasting], ends)
     return whole.expand() if substeps <= MAX_EXPANDED_STEPS else whole
-
-
-class _Call:
-    """A CasADi function of dense results with its numbers in memory of its own.
-
-    A call takes a tenth of the time of one that is given arrays, which CasADi makes into matrices of its own.
-    """
-
-    def __init__(self, function: Any) -> None:
-        self.buffer, self.run = function.buffer()  # `run` alone does not keep the memory that it works in
-        self.given = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
-        self.found = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
-        for set_pointer, arrays in ((self.buffer.set_arg, self.given), (self.buffer.set_res, self.found)):
-            for i, numbers in enumerate(arrays):
-                if numbers.size:  # nothing has no address
-                    set_pointer(i, numbers.data)
-
-    def __call__(self, *arguments: Any) -> list[Float[np.ndarray, " n"]]:
-        for numbers, argument in zip(self.given, arguments, strict=True):
-            numbers[:] = argument
-        self.run()
-        return [numbers.copy() for numbers in self.found]

@@ -85,7 +85,7 @@ def test_simulated_differences_are_those_of_the_simulated_angle(friction, case):
     x0 = np.zeros(len(observed.states))
     for run in (
         run_passes(model, segment, point, x0, outputs=True),
-        interpret_pass(model, segment, point, Weights.plain(2), 60, x0, outputs=True),
+        interpret_pass(model, segment, point, Weights.plain(2), 60, x0),
     ):
         angle, speed = run.outputs.T
         np.testing.assert_allclose(speed, difference_by_hand(angle, CASES[case]), rtol=1e-9, atol=1e-9)
