@@ -12,7 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
@@ -27,61 +27,25 @@ FORGOTTEN = 1e-24  # of a state, in any units: far below rounding
 LOSSES = ("square", "huber", "soft_l1")
 
 
+_LONGS = (
+    *("from", "to", "length", "lead", "shared", "drift_terms", "v_columns", "lag_a", "lag_b", "lag_c"),
+    *("settle", "start", "output_rows", "sections", "loss", "warm"),
+)
+_DOUBLES = ("t0", "tau0", "dtau")
+_POINTERS = (
+    *("model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count"),
+    *("outputs", "columns", "states", "carry"),
+)
+_INFLUENCES = ("lags", "parts", "outputs_of", "columns_in"), ("into", "correlation", "ring", "form")
+
+
 @lru_cache(maxsize=32)
 def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     """Return seaopt_pass_args of pass.c, field by field; pointers are whole numbers."""
-    pointer, whole, real = np.uint64, np.int64, np.float64
-    return np.dtype(
-        [
-            ("from", whole),
-            ("to", whole),
-            ("length", whole),
-            ("lead", whole),
-            ("u", pointer, (nu,)),
-            ("y", pointer, (ny,)),
-            ("keep", pointer, (ny,)),
-            ("shared", whole),
-            ("drift_terms", whole),
-            ("z_columns", whole),
-            ("v_columns", whole),
-            ("lag_a", whole),
-            ("lag_b", whole),
-            ("lag_c", whole),
-            ("settle", whole),
-            ("start", whole),
-            ("output_rows", whole),
-            ("t0", real),
-            ("tau0", real),
-            ("dtau", real),
-            ("model", pointer),
-            ("correction", pointer),
-            ("x0", pointer),
-            ("offset", pointer),
-            ("gain", pointer),
-            ("drift", pointer),
-            ("sos", pointer),
-            ("sections", whole),
-            ("loss", whole),
-            ("knee", pointer),
-            ("gram", pointer),
-            ("rho", pointer),
-            ("count", pointer),
-            ("outputs", pointer),
-            ("columns", pointer),
-            ("states", pointer),
-            ("last", pointer),
-            ("carry", pointer),
-            ("lags", whole),
-            ("parts", whole),
-            ("outputs_of", whole),
-            ("columns_in", whole),
-            ("into", pointer),
-            ("correlation", pointer),
-            ("ring", pointer),
-            ("form", pointer),
-            ("warm", whole),
-        ]
-    )
+    channels = [("u", np.uint64, (nu,)), ("y", np.uint64, (ny,)), ("keep", np.uint64, (ny,))]
+    kinds = (np.int64, _LONGS), (float, _DOUBLES), (np.uint64, _POINTERS), (np.int64, _INFLUENCES[0])
+    fields = [(name, kind) for kind, names in (*kinds, (np.uint64, _INFLUENCES[1])) for name in names]
+    return np.dtype([*channels, *fields])
 
 
 @memo
@@ -102,12 +66,15 @@ def _count_delayed(model: Model, point: Point) -> int:
 def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
     """Return the C source of the passes of a model, over data with measured outputs or of simulations alone."""
     constants = {
-        "NX": model.nx, "NU": model.nu, "NY": model.ny, "NJP": _pad_to_vectors(layout.states),
-        "NCP": _pad_to_vectors(layout.columns), "LINEAR": int(model.linear), "STEPPED": int(model.sticks),
-        "CORRECT": int(layout.corrected), "DELAYED": delayed, "MEASURED": int(measured),
-    }  # fmt: skip
+        **{"NX": model.nx, "NU": model.nu, "NY": model.ny, "DELAYED": delayed, "MEASURED": int(measured)},
+        **{"NJP": _pad_to_vectors(layout.states), "NCP": _pad_to_vectors(layout.columns)},
+        **{"LINEAR": int(model.linear), "STEPPED": int(model.sticks), "CORRECT": int(layout.corrected)},
+    }
     generated = _write_sampling(model)
-    constants |= {"NI": model.nu * (1 + delayed) + _has_constant(model)} if model.linear else {"NQ": model.np}
+    if model.linear:
+        constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
+    else:
+        constants["NQ"] = model.np
     if model.sticks:
         step, output = step_function(model), output_function(model)
         plain = [_drop_derivatives(step, "seaopt_plain_step"), _drop_derivatives(output, "seaopt_plain_output")]
@@ -116,14 +83,11 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
         rates = rate_functions(model, moving=delayed == 2)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
         constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
-        chains = (
-            _chain_code("rate", rates.rate_pattern, model.nx),
-            _chain_code("output", rates.output_pattern, model.ny),
-        )
-        generated += "\n".join((generate_code(rates.rate, rates.output), *chains))
-    return "\n".join(
-        (define_constants(constants), *map(_text, ("sums.h", "stack.h", "layout.h")), generated, _text("pass.c"))
-    )
+        generated += generate_code(rates.rate, rates.output)
+        generated += _chain_code("rate", rates.rate_pattern, model.nx)
+        generated += _chain_code("output", rates.output_pattern, model.ny)
+    headers = map(_text, ("sums.h", "stack.h", "layout.h"))
+    return "\n".join((define_constants(constants), *headers, generated, _text("pass.c")))
 
 
 def _write_sampling(model: Model) -> str:
@@ -162,7 +126,7 @@ def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int,
         terms = " + ".join(f"a[{k}] * ((const vec *)z[{j}])[j]" for k, (i, j) in enumerate(a) if i == row)
         lines.append(f"    for (int j = 0; j < NJP / 4; j++) ((vec *)out[{row}])[j] = {terms or 'zero'};")
         lines += [f"    out[{row}][{1 + j}] += b[{k}];" for k, (i, j) in enumerate(b) if i == row]
-    return "\n".join([*lines, "}"])
+    return "\n".join([*lines, "}\n"])
 
 
 @memo
@@ -200,7 +164,7 @@ def _linear_data(model: Model, point: Point, layout: Layout) -> Float[np.ndarray
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _memory_of(a: Float[np.ndarray, "nx nx"], limit: int) -> int:
+def _count_memory(a: Float[np.ndarray, "nx nx"], limit: int) -> int:
     """Return the power of two of samples after which nothing is left of a state; 0 if that is more than a limit."""
     samples = 1
     while samples <= limit:
@@ -225,22 +189,6 @@ def _reuse_or_make(room: Any, shape: tuple[int, ...]) -> Any:
     return np.empty(shape) if room is None or len(room) < shape[0] else room[: shape[0]]
 
 
-class _Memory:
-    """Keeps arrays alive while their addresses are in use."""
-
-    def __init__(self) -> None:
-        self.arrays: list[Any] = []
-
-    def address(self, array: Any) -> int:
-        if array is None:
-            return 0
-        self.arrays.append(array)
-        return int(array.ctypes.data)
-
-    def constant(self, array: Any) -> int:
-        return self.address(np.ascontiguousarray(array, dtype=float))
-
-
 class Program:
     """The passes of one segment at one point, ready to run."""
 
@@ -248,32 +196,37 @@ class Program:
         self, model: Model, segment: Segment, point: Point, weights: Weights, layout: Layout, kernel: Kernel
     ) -> None:
         self.model, self.segment, self.layout, self.kernel = model, segment, layout, kernel
-        self.memory = memory = _Memory()
-        data = _linear_data(model, point, layout) if model.linear else _settings(model, point)
-        ny = model.ny
+        self.memory: list[Any] = []  # arrays that stay alive while their addresses are in use
+        data, ny = _linear_data(model, point, layout) if model.linear else _settings(model, point), model.ny
         base = np.zeros(1, dtype=_arguments(model.nu, ny))
-        base["length"] = segment.n
-        base["lead"] = segment.lead
-        base["u"] = [memory.constant(channel) + 8 * segment.lead for channel in segment.u]
-        base["y"] = [memory.constant(channel) for channel in segment.y] if segment.y else 0
-        base["keep"] = [memory.address(np.ascontiguousarray(mask)) for mask in segment.keep] if segment.keep else 0
-        base["shared"], base["drift_terms"] = layout.shared, layout.drift_terms
-        base["z_columns"], base["v_columns"] = layout.states, layout.columns
+        base["length"], base["lead"], base["settle"], base["t0"] = (
+            segment.n,
+            segment.lead,
+            weights.settle,
+            segment.start_s,
+        )
+        base["u"] = [self._address(channel) + 8 * segment.lead for channel in segment.u]
+        base["y"] = [self._address(channel) for channel in segment.y] or 0
+        base["keep"] = [self._address(mask, np.uint8) for mask in segment.keep] or 0
+        base["shared"], base["drift_terms"], base["v_columns"] = layout.shared, layout.drift_terms, layout.columns
         base["lag_a"], base["lag_b"], base["lag_c"] = (*point.clock.lags, 0)[:3]
-        base["settle"], base["t0"] = weights.settle, segment.start_s
         base["tau0"], base["dtau"] = segment.drift_span
-        base["model"] = memory.constant(data)
-        base["correction"] = self._correction(point)
-        base["offset"], base["gain"] = memory.constant(point.offset), memory.constant(point.gain)
-        base["drift"] = memory.constant(point.drift)
-        base["sos"], base["sections"] = memory.constant(weights.sections), len(weights.sections)
-        base["loss"], base["knee"] = LOSSES.index(weights.loss), memory.constant(weights.knee)
+        base["settle"], base["sections"] = weights.settle, len(weights.sections)
+        base["loss"] = LOSSES.index(weights.loss)
+        pointed = {
+            **{"model": data, "offset": point.offset, "gain": point.gain, "drift": point.drift},
+            **{"sos": weights.sections, "knee": weights.knee},
+        }
+        if point.correction is not None:
+            pointed["correction"] = np.zeros((model.nx, ny, _pad_to_vectors(layout.states)))
+            pointed["correction"][:, :, : len(point.correction)] = point.correction.transpose(1, 2, 0)
+        for name, array in pointed.items():
+            base[name] = self._address(array)
         self.base = base
         self.run_up = 0  # samples in which all of a state is forgotten, so that two halves may run at once; 0: serially
         if model.linear and segment.n >= PARALLEL and not (layout.corrected or weights.settle or len(weights.sections)):
-            self.run_up = _memory_of(
-                data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx], segment.n // 8
-            )
+            a = data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx]
+            self.run_up = _count_memory(a, segment.n // 8)
 
     @classmethod
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
@@ -282,12 +235,10 @@ class Program:
         kernel = load_passes(model, layout, _count_delayed(model, point), measured=bool(segment.y))
         return None if kernel is None else cls(model, segment, point, weights, layout, kernel)
 
-    def _correction(self, point: Point) -> int:
-        if point.correction is None:
-            return 0
-        padded = np.zeros((self.model.nx, self.model.ny, _pad_to_vectors(self.layout.states)))
-        padded[:, :, : point.correction.shape[0]] = point.correction.transpose(1, 2, 0)
-        return self.memory.constant(padded)
+    def _address(self, array: Any, kind: Any = float) -> int:
+        """Return the address of an array's numbers, side by side."""
+        self.memory.append(np.ascontiguousarray(array, dtype=kind))
+        return int(self.memory[-1].ctypes.data)
 
     def run(
         self,
@@ -318,25 +269,20 @@ class Program:
         edges, starts, warm = self._split(first, last, x0, halve=sums_alone and n >= max(PARALLEL, 4 * self.run_up))
         parts = len(warm)
         gram, loss, count = np.zeros((parts, ny, nc, nc)), np.zeros((parts, ny)), np.zeros((parts, ny))
-        kept = {
-            "outputs": _reuse_or_make(room.outputs if room else None, (rows, ny)) if outputs else None,
-            "columns": _reuse_or_make(room.columns if room else None, (n, ny, nc))
-            if columns and self.segment.y
-            else None,
-            "states": np.empty((n, nx)) if states else None,
-        }
-        arguments = np.repeat(self.base, parts)
-        arguments["from"], arguments["to"], arguments["output_rows"] = edges[:-1] - warm, edges[1:], rows
-        arguments["start"], arguments["warm"] = edges[:-1] - warm if resume is None else 0, warm
-        for name, array in {"x0": starts, "rho": loss, "count": count}.items():
-            arguments[name] = row_addresses(array)
-        if sums:
-            arguments["gram"] = row_addresses(gram)
+        kept: dict[str, Any] = dict.fromkeys(("outputs", "columns", "states"))
+        if outputs:
+            kept["outputs"] = _reuse_or_make(room.outputs if room else None, (rows, ny))
+        if columns and self.segment.y:
+            kept["columns"] = _reuse_or_make(room.columns if room else None, (n, ny, nc))
+        if states:
+            kept["states"] = np.empty((n, nx))
+        arguments = self._place(edges, warm, x0=starts, rho=loss, count=count, **{"gram": gram} if sums else {})
+        arguments["output_rows"] = rows
+        if resume is not None:
+            arguments["start"], arguments["carry"] = 0, resume.ctypes.data
         for name, array in kept.items():
             if array is not None:
                 arguments[name] = array.ctypes.data
-        if resume is not None:
-            arguments["carry"] = resume.ctypes.data
         buffers = (self.memory, gram, loss, count, kept, starts, resume)
         self.kernel.run(arguments, buffers, parallel=n >= PARALLEL)
         return Pass(gram=np.sum(gram, axis=0), loss=np.sum(loss, axis=0), count=np.sum(count, axis=0), **kept)
@@ -356,17 +302,23 @@ class Program:
         edges, starts, warm = self._split(0, self.segment.n, x0, halve=True)
         warm[1:] += len(r)  # influences reach so far back
         ring, form = np.zeros((len(warm), 2 * len(r), ny, width)), np.zeros((len(warm), 2, width, width))
-        arguments = np.repeat(self.base, len(warm))
-        arguments["from"], arguments["start"], arguments["to"] = edges[:-1] - warm, edges[:-1] - warm, edges[1:]
-        arguments["warm"], arguments["lags"], arguments["parts"] = warm, len(r) - 1, width // 4
+        arguments = self._place(edges, warm, x0=starts, ring=ring, form=form)
+        arguments["lags"], arguments["parts"] = len(r) - 1, width // 4
         arguments["outputs_of"], arguments["columns_in"] = ny, nc
         arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
-        for name, array in {"x0": starts, "ring": ring, "form": form}.items():
-            arguments[name] = row_addresses(array)
         buffers = (self.memory, padded, halved, starts, ring, form)
         self.kernel.run(arguments, buffers, parallel=self.segment.n >= PARALLEL)
         total = np.sum(form, axis=0)
         return (total + total.transpose(0, 2, 1))[:, :p, :p]
+
+    def _place(self, edges: Any, warm: Any, **rows: Any) -> Shaped[np.ndarray, " parts"]:
+        """Return the arguments of parts between edges, each with its own row of the arrays."""
+        arguments = np.repeat(self.base, len(warm))
+        arguments["from"] = arguments["start"] = edges[:-1] - warm
+        arguments["to"], arguments["warm"] = edges[1:], warm
+        for name, array in rows.items():
+            arguments[name] = row_addresses(array)
+        return arguments
 
     def _split(self, first: int, last: int, x0: Float[np.ndarray, " nx"], *, halve: bool) -> tuple[Any, Any, Any]:
         """Return edges, starts and run-up of what runs at once: two halves where the state is soon forgotten, or one.

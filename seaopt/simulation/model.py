@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import lru_cache
 from typing import Any
@@ -45,10 +46,7 @@ class Model:
     plant: Plant
     free: tuple[str, ...]
     outputs: tuple[str, ...]
-    t: Any
-    x: Any
     u: Any
-    theta: Any
     p: Any
     constants: Float[np.ndarray, " nc"]
     f: Any
@@ -56,6 +54,21 @@ class Model:
     linear: bool
     sticks: bool = False
     memory: dict[Any, Any] = field(default_factory=dict, repr=False)  # of `memo`: what is made of the expressions
+
+    @property
+    def t(self) -> Any:
+        """The time."""
+        return self.plant.t
+
+    @property
+    def x(self) -> Any:
+        """The state."""
+        return self.plant.x
+
+    @property
+    def theta(self) -> Any:
+        """The free parameters."""
+        return self.p[: self.np]
 
     @property
     def order(self) -> int:
@@ -84,9 +97,9 @@ class Model:
 
     def __reduce__(self) -> tuple[Any, ...]:
         names = [str(symbol) for symbol in ca.vertsplit(self.p)]
-        stored = ca.Function("model", [self.t, self.x, self.u, self.p], [self.f, self.h])
-        content = (self.plant, self.free, self.outputs, names, self.constants, stored, self.linear, self.sticks)
-        return _restore_model, content
+        equations = ca.Function("model", [self.t, self.x, self.u, self.p], [self.f, self.h])
+        others = ("plant", "free", "outputs", "constants", "linear", "sticks")
+        return _restore_model, (names, equations, {name: getattr(self, name) for name in others})
 
     def __copy__(self) -> Model:
         return self  # nothing of a model changes
@@ -155,9 +168,8 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
 @lru_cache(maxsize=64)
 def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], zero: tuple[str, ...]) -> Model:
     """Return a model without its constants; models that differ in those alone share what is made of it."""
-    symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if plant.parameters else {}
-    theta = ca.vertcat(*(symbols[name] for name in names)) if names else ca.SX(0, 1)
-    fixed = [symbol for name, symbol in symbols.items() if name not in names and name not in zero]
+    fixed = [name for name in plant.parameters if name not in names and name not in zero]
+    u, p = _choose_symbols(plant, (*names, *fixed))
     rows = [list(plant.outputs).index(name) for name in outputs]
     f, h, levels = plant.dynamics, plant.output[rows], ca.SX(0)
     if plant.sticks and can_stick(plant):
@@ -165,18 +177,14 @@ def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], z
         h = h[rows]
     if zero:
         none = [ca.DM.zeros(len(zero))]
-        f, h, levels = ca.substitute([f, h, levels], [ca.vertcat(*(symbols[name] for name in zero))], none)
+        f, h, levels = ca.substitute([f, h, levels], [_choose_symbols(plant, zero)[1]], none)
     sticks = not ca.simplify(levels).is_zero()
-    u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
     return Model(
         plant=plant,
         free=names,
         outputs=outputs,
-        t=plant.t,
-        x=plant.x,
         u=u,
-        theta=theta,
-        p=ca.vertcat(theta, *fixed),
+        p=p,
         constants=np.zeros(len(fixed)),
         f=f,
         h=h,
@@ -185,37 +193,19 @@ def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], z
     )
 
 
-def _restore_model(
-    plant: Plant,
-    free: tuple[str, ...],
-    outputs: tuple[str, ...],
-    fixed: list[str],
-    constants: Float[np.ndarray, " nc"],
-    stored: Any,
-    linear: bool,
-    sticks: bool,
-) -> Model:
-    """Return a pickled model, in its plant's symbols."""
+def _choose_symbols(plant: Plant, names: Sequence[str]) -> tuple[Any, Any]:
+    """Return the input's symbol, which may be one that does nothing, and those of parameters."""
     symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if plant.parameters else {}
-    theta = ca.vertcat(*(symbols[name] for name in free)) if free else ca.SX(0, 1)
     u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
-    p = ca.vertcat(theta, *(symbols[name] for name in fixed[len(free) :]))
-    f, h = stored(plant.t, plant.x, u, p)
-    return Model(
-        plant=plant,
-        free=free,
-        outputs=outputs,
-        t=plant.t,
-        x=plant.x,
-        u=u,
-        theta=theta,
-        p=p,
-        constants=constants,
-        f=f,
-        h=h,
-        linear=linear,
-        sticks=sticks,
-    )
+    return u, ca.vertcat(ca.SX(0, 1), *(symbols[name] for name in names))
+
+
+def _restore_model(names: list[str], equations: Any, others: dict[str, Any]) -> Model:
+    """Return a pickled model, in its plant's symbols."""
+    plant = others["plant"]
+    u, p = _choose_symbols(plant, names)
+    f, h = equations(plant.t, plant.x, u, p)
+    return Model(u=u, p=p, f=f, h=h, **others)
 
 
 def fill_parameters(model: Model, p: Any) -> Any:

@@ -13,20 +13,23 @@
 #endif
 
 typedef struct {
-    long from, to;                 /* rows of the log: first, and one past the last */
-    long length;                   /* rows: inputs are clamped to them */
-    long lead;                     /* rows of inputs that go before row 0 */
     const double *u[NU];
     const double *y[NY];           /* of MEASURED */
     const unsigned char *keep[NY]; /* NULL: all kept */
+    long from, to;                 /* rows of the log: first, and one past the last */
+    long length;                   /* rows: inputs are clamped to them */
+    long lead;                     /* rows of inputs that go before row 0 */
     long shared;                   /* derivatives that all outputs share: parameters (NQ), then a free delay, then what only
                                       the correction gain depends on */
     long drift_terms;              /* per output */
-    long z_columns, v_columns;     /* of Z and v; NJP and NCP are the room for them */
+    long v_columns;                /* of v; NCP is the room for them, as NJP is for those of Z */
     long lag_a, lag_b, lag_c;      /* rows of u in force: u[k - lag_a], and so on; clamped to the log */
     long settle;                   /* rows from `start` that are left out while the filter settles */
     long start;                    /* first row of the stretch; later than `from` is not allowed */
     long output_rows;              /* rows from `from` whose outputs are kept */
+    long sections;                 /* of sos */
+    long loss;                     /* 0 squares, 1 Huber, 2 soft l1 */
+    long warm;                     /* rows from `from` that bring the state about, and are in no sum */
     double t0;                     /* time of row 0 */
     double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
     const double *model;           /* LINEAR: D (NX + NY)(NX + NI)(NJP), A (NX + NY)(NX); else the step's settings, then c */
@@ -35,20 +38,16 @@ typedef struct {
     const double *offset, *gain;   /* NY */
     const double *drift;           /* NY x drift_terms */
     const double *sos;             /* sections x 5: b0 b1 b2 a1 a2 */
-    long sections;
-    long loss;                     /* 0 squares, 1 Huber, 2 soft l1 */
     const double *knee;            /* NY: where a robust loss leaves the square */
-    double *gram;                  /* NY x v_columns x v_columns, added to, or NULL: no sums are made */
+    double *gram;                  /* NY x v_columns x v_columns, added to, or NULL: no sums are made; without sums, columns
+                                      and influences there are no derivatives */
     double *rho;                   /* NY: sum of losses, added to; unless gram is NULL */
     double *count;                 /* NY: samples counted, added to; unless gram is NULL */
     double *outputs;               /* output_rows x NY or NULL */
     double *columns;               /* (to - from) x NY x v_columns or NULL */
     double *states;                /* (to - from) x NX or NULL */
-    double *last;                  /* NX x z_columns: Z one step after the last row, or NULL; without sums, columns and influences
-                                      its derivatives are not made */
     double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
     influences into;               /* of estimates, into.into NULL: none */
-    long warm;                     /* rows from `from` that bring the state about, and are in no sum */
 } seaopt_pass_args;
 
 EXPORTED const column_sums *sums; /* of sums.c, set by who loads this */
@@ -427,8 +426,6 @@ ONCE void deliver(hot *q, const seaopt_pass_args *a) {
         memcpy(after->z, q->z, sizeof q->z);
         memcpy(after->filter, q->filter, sizeof q->filter);
     }
-    if (a->last)
-        for (int i = 0; i < NX; i++) memcpy(a->last + i * a->z_columns, q->z[i], a->z_columns * sizeof(double));
     for (int o = 0; a->gram && o < NY; o++) {
         a->rho[o] += q->rho[o];
         a->count[o] += q->count[o];
