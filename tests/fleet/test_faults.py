@@ -218,14 +218,14 @@ def fill_up(path):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """Return the folder of a disk of 64 kB, or skip."""
+    """Return the folder of a disk of 128 kB, or skip: half of it for parts that are not merged yet."""
     place = tmp_path / "disk"
     place.mkdir()
     mount = shutil.which("mount")
     if (
         mount is None
         or subprocess.run(
-            [mount, "-t", "tmpfs", "-o", "size=64k", "tmpfs", place], capture_output=True, check=False
+            [mount, "-t", "tmpfs", "-o", "size=128k", "tmpfs", place], capture_output=True, check=False
         ).returncode
     ):
         pytest.skip("no disk of its own can be mounted here")
