@@ -84,6 +84,7 @@ def _explain_keywords(cls: type[Any]) -> type[Any]:
 
 
 WORDS = "seaopt.reporting.sections"  # found by its name when a result is printed, as what draws is
+PLOTS = "seaopt.reporting.plots"
 
 
 class Worded:
@@ -135,21 +136,9 @@ class Result:
 class PlotAccessor:
     """The attribute `plot` of a result: all figures of it when called, each by itself by name, listed by `dir`.
 
-    What draws lies above the results in the layers. It is found by its name when `plot` is read, so that nothing below
-    imports it, and a plotting library is loaded when something is drawn.
-
-    Parameters
-    ----------
-    home : str
-        MODULE:CLASS of what draws; it is made with the result.
-
+    What draws lies above the results in the layers. It is imported by its name when `plot` is read, so that nothing
+    below imports it, and a plotting library is loaded when something is drawn.
     """
 
-    def __init__(self, home: str) -> None:
-        self._home = home
-
     def __get__(self, result: object, owner: type | None = None) -> Any:
-        if result is None:
-            return self
-        module, _, name = self._home.partition(":")
-        return getattr(import_module(module), name)(result)
+        return self if result is None else import_module(PLOTS).Plots(result)

@@ -1,33 +1,36 @@
 """The attribute `plot` of results: all figures of a result when called, each by itself by name.
 
+`KINDS` lists the figures of each kind of result: functions of the result and options that return a panel or several.
 A single figure takes `ax` and returns the Axes it is drawn on; what needs several axes takes a sequence of them and
 returns the Figure. Nothing is registered with pyplot: a figure that is not used any more is gone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import partial, wraps
+from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any
 
-from seaopt.control import Controller, Frontier, Impedance, ImpedanceRegion
-from seaopt.errors import ControlError, LogError, SeaoptError, suggestion
+from seaopt.control import Frontier
+from seaopt.errors import ControlError, EstimationError, LogError, SeaoptError, UnknownAttributeError, suggestion
 from seaopt.estimation import Diagnostics, Experiment, Fit, ModelledOutputs, Ranking, diagnose
 from seaopt.logs import Log
+from seaopt.records import record
 from seaopt.reporting.comparison import experiment_survey, fit_surveys, response_panels
 from seaopt.reporting.figures import certificate as certificates
 from seaopt.reporting.figures import fit as fits
 from seaopt.reporting.figures import log as logs
 from seaopt.reporting.figures import loop as loops
 from seaopt.reporting.figures import simulation as simulations
-from seaopt.reporting.figures.frontier import frontier_panel, frontier_panels
+from seaopt.reporting.figures.frontier import FIGURES as FRONTIER_FIGURES
+from seaopt.reporting.figures.frontier import frontier_panel
 from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.panel import Panel, compose_sheet, draw_panel
 from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
 from seaopt.robustness import Certificate
-from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.verification import Verification
 
@@ -36,20 +39,41 @@ if TYPE_CHECKING:
 
     from seaopt.reporting.figures.canvas import PlainFigure
 
-Place = Any  # Axes, a sequence of Axes, or None
-Make = Callable[[], Panel | Iterable[Panel]]
+Panels = Panel | Sequence[Panel]
+Make = Callable[..., Panels]
+
+
+@record
+class Kind:
+    """The figures of a kind of result by name, those on its sheet, and why there may be none."""
+
+    figures: Mapping[str, Make]
+    sheet: Sequence[str] | Callable[[Any], Iterable[Callable[[], Panels]]] = ()  # all figures, if left out
+    missing: str = "the result is empty"
 
 
 class Plots:
-    """Figures of one result: call it for a sheet of the main ones, or one of its methods for a figure by itself."""
+    """Figures of one result: call it for a sheet of the main ones, or one of its methods for a figure by itself.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    >>> dir(controller.plot)
+    ['bode', 'complementary', 'impedance', 'noise', 'nyquist', 'sensitivity', 'step', 'tracking']
+    >>> axis = controller.plot.sensitivity(plants={"stand": (stand, thor), "swing": (so.plants.moving_output(), thor)})
+    >>> axis.get_ylabel(), [line.get_label() for line in axis.lines][:2]
+    ('|S| [dB]', ['stand', 'swing'])
+
+    """
+
+    def __init__(self, result: object) -> None:
+        self._result = result
+        self._kind = KINDS[type(result).__name__]
 
     def __call__(self, *, columns: int = 2) -> PlainFigure:
-        """Draw the main figures on one sheet.
-
-        Parameters
-        ----------
-        columns : int
-            Of the sheet.
+        """Draw the main figures on one sheet of so many columns.
 
         Returns
         -------
@@ -59,48 +83,61 @@ class Plots:
         Raises
         ------
         SeaoptError
-            The result has not what a figure needs.
+            The result lacks what a figure needs.
 
         """
-        panels = self.panels()
+        panels = self._list_panels()
         if not panels:
-            raise SeaoptError(f"there is nothing to draw: {self._explain()}")
+            raise SeaoptError(f"there is nothing to draw: {self._kind.missing}")
         return compose_sheet(panels, columns)
 
-    def panels(self) -> list[Panel]:
-        """Return the main figures that the result allows."""
+    def _list_panels(self) -> list[Panel]:
+        sheet, figures = self._kind.sheet, self._kind.figures
+        makers = (
+            sheet(self._result) if callable(sheet) else [partial(figures[n], self._result) for n in sheet or figures]
+        )
         panels: list[Panel] = []
-        for make in self._main():
+        for make in makers:
             with suppress(SeaoptError):
-                made = make()
-                panels += [made] if isinstance(made, Panel) else made
+                panels += _as_list(make())
         return panels
-
-    def _main(self) -> Iterable[Make]:
-        """Return what makes the panels of the sheet."""
-        raise NotImplementedError
-
-    def _explain(self) -> str:
-        """Return why there may be nothing to draw."""
-        return "the result is empty"
 
     def to_html(self) -> str:
         """Return the sheet for a notebook; nothing where nothing can be drawn."""
-        panels = self.panels()
+        panels = self._list_panels()
         return compose_sheet(panels)._repr_html_() if panels else ""
+
+    def __getattr__(self, name: str) -> Callable[..., Axes | PlainFigure]:
+        if name.startswith("_"):  # before `_kind` is there, too
+            raise AttributeError(name)
+        make = self._kind.figures.get(name)
+        if make is None:
+            raise UnknownAttributeError(f"plot has no figure {name}; {suggestion(name, self._kind.figures)}")
+
+        @wraps(make)
+        def draw(*args: Any, ax: Any = None, **options: Any) -> Any:
+            return _draw(_as_list(make(self._result, *args, **options)), ax)
+
+        form = signature(make)
+        ax = Parameter("ax", Parameter.KEYWORD_ONLY, default=None)
+        parameters = sorted([*list(form.parameters.values())[1:], ax], key=lambda each: each.kind)
+        vars(draw)["__signature__"] = form.replace(parameters=parameters)
+        return draw
 
     def __dir__(self) -> list[str]:
         """List the figures by name."""
-        return sorted(name for name in vars(type(self)) if not name.startswith("_"))
+        return sorted(self._kind.figures)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}: call it, or one of {', '.join(dir(self))}"
+        return f"plot of {type(self._result).__name__}: call it, or one of {', '.join(dir(self))}"
 
 
-def _draw(panels: Panel | Sequence[Panel], ax: Place) -> Any:
-    """Draw one panel, where it is told to; several on a sheet."""
-    if isinstance(panels, Panel):
-        return draw_panel(panels, ax)
+def _as_list(panels: Panels) -> list[Panel]:
+    return [panels] if isinstance(panels, Panel) else list(panels)
+
+
+def _draw(panels: list[Panel], ax: Any) -> Any:
+    """Draw one panel, on given axes or its own; several on a sheet."""
     if len(panels) == 1:
         return draw_panel(panels[0], ax)
     if ax is not None:
@@ -109,512 +146,247 @@ def _draw(panels: Panel | Sequence[Panel], ax: Place) -> Any:
     return compose_sheet(panels)
 
 
-class FitPlots(Plots):
-    """Figures of a fit.
+def _choose(name: str | None, names: Iterable[str], argument: str, where: str) -> list[str]:
+    """Return the one that an argument names, or all."""
+    names = list(names)
+    if name is None or name in names:
+        return [each for each in names if name in (None, each)]
+    raise SeaoptError(f'{argument} = "{name}" is not in {where}; {suggestion(name, names)}')
 
-    Those of experiments need their logs: a fit that was read from a file has none, unless `Fit.from_dict` was given the
-    experiments.
 
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> from seaopt.bench import PAPER_STAND
-    >>> stand, thor, noise = so.plants.high_impedance(), so.plants.thor(), so.Sensors(noise_std={"F1": 2.0})
-    >>> log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=10, rate_hz=400, seed=1, sensors=noise)
-    >>> fit = so.fit([so.Experiment(plant=stand, log=log, outputs=("F1",))], thor.free("J", "b_r"))
-    >>> dir(fit.plot)
-    ['autocorrelation', 'correlation', 'inputs', 'outputs', 'parameters', 'residuals', 'response', 'spectrum']
-    >>> fit.plot.residuals().get_ylabel()
-    'F1 [N]'
+def _choose_experiments(fit: Fit, experiment: str | None) -> list[Experiment]:
+    if not fit.experiments:
+        raise EstimationError("this fit was read from a file without its logs; Fit.from_dict(content, experiments)")
+    by_name = {each.name: each for each in fit.experiments}
+    return [by_name[name] for name in _choose(experiment, by_name, "experiment", "the fit")]
 
+
+def _draw_prediction(panel: Callable[..., Panel]) -> Callable[..., Panel]:
+    """Return what draws a panel of a prediction, of all outputs or one."""
+
+    def make(prediction: ModelledOutputs, output: str | None = None, **options: Any) -> Panel:
+        names = _choose(output, prediction.measured, "output", "the log")
+        chosen = {field: {name: getattr(prediction, field)[name] for name in names} for field in ("measured", "model")}
+        return panel(replace(prediction, **chosen), **options)
+
+    make.__doc__ = panel.__doc__
+    return make
+
+
+def _draw_predictions(panel: Callable[..., Panel]) -> Make:
+    """Return what draws a panel of each of a fit's predictions, or of one experiment."""
+    draw = _draw_prediction(panel)
+
+    def make(fit: Fit, experiment: str | None = None, output: str | None = None, **options: Any) -> list[Panel]:
+        return [draw(fit.predict(each), output, **options) for each in _choose_experiments(fit, experiment)]
+
+    make.__doc__ = panel.__doc__
+    return make
+
+
+def _draw_diagnostics(panel: Callable[[Diagnostics, str], Panel]) -> Make:
+    """Return what draws a panel of each experiment's diagnostics, or of one."""
+
+    def make(result: Diagnostics | Fit, experiment: str | None = None) -> list[Panel]:
+        diagnostics = diagnose(result) if isinstance(result, Fit) else result
+        names = _choose(experiment, diagnostics.outputs, "experiment", "the fit")
+        return [panel(diagnostics, name) for name in names]
+
+    make.__doc__ = panel.__doc__
+    return make
+
+
+def _draw_responses(fit: Fit, experiment: str | None = None, pair: str | None = None) -> list[Panel]:
+    """Draw measured frequency responses (H1) and the fitted model: magnitude, phase and coherence.
+
+    `pair`: by its name, such as F1/I; all if left out. `ax`: a sequence of three Axes, for one pair.
     """
-
-    def __init__(self, fit: Fit) -> None:
-        self._fit = fit
-
-    def _main(self) -> Iterable[Make]:
-        for experiment in self._fit.experiments:
-            prediction = self._fit.predict(experiment)
-            yield lambda one=prediction: fits.outputs_panel(one)
-            yield lambda one=prediction: fits.residuals_panel(one)
-            yield lambda one=experiment: self._responses(one, None)[:1]
-            yield lambda one=prediction: fits.spectrum_panel(one)
-        yield lambda: fits.parameters_panel(self._fit)
-        yield lambda: fits.correlation_panel(self._fit)
-
-    def _explain(self) -> str:
-        return "no parameter was free, and the fit has no logs"
-
-    def _predict(self, experiment: str | None, output: str | None) -> list[ModelledOutputs]:
-        chosen = fits.choose_experiments(self._fit, experiment)
-        return [_select(self._fit.predict(one), output) for one in chosen]
-
-    def outputs(
-        self,
-        experiment: str | None = None,
-        output: str | None = None,
-        *,
-        span_s: tuple[float, float] | None = None,
-        ax: Place = None,
-    ) -> Axes | PlainFigure:
-        """Draw measured and model outputs.
-
-        Parameters
-        ----------
-        experiment, output : str, optional
-            All if left out.
-        span_s : (float, float), optional
-            From when to when, seconds after the first sample; the second with the largest motion if left out.
-        ax : Axes, or a sequence of them, optional
-            To draw on, one per output.
-
-        """
-        return _draw([fits.outputs_panel(one, span_s) for one in self._predict(experiment, output)], ax)
-
-    def residuals(
-        self, experiment: str | None = None, output: str | None = None, *, ax: Place = None
-    ) -> Axes | PlainFigure:
-        """Draw measured minus model over the whole log."""
-        return _draw([fits.residuals_panel(one) for one in self._predict(experiment, output)], ax)
-
-    def spectrum(
-        self, experiment: str | None = None, output: str | None = None, *, ax: Place = None
-    ) -> Axes | PlainFigure:
-        """Draw the spectral density of what was measured and of the residual."""
-        return _draw([fits.spectrum_panel(one) for one in self._predict(experiment, output)], ax)
-
-    def response(self, experiment: str | None = None, pair: str | None = None, *, ax: Place = None) -> PlainFigure:
-        """Draw measured frequency responses (H1) and the fitted model: magnitude, phase and coherence.
-
-        Parameters
-        ----------
-        experiment, pair : str, optional
-            The pair by its name, such as F1/I; all if left out.
-        ax : sequence of three Axes, optional
-            To draw on.
-
-        """
-        chosen = fits.choose_experiments(self._fit, experiment)
-        panels = [panel for one in chosen for panel in self._responses(one, pair)]
-        if not panels:
-            raise LogError(f"no frequency response of {pair or 'the logs'} can be estimated; look at fit.experiments")
-        return _draw(panels, ax)
-
-    def _responses(self, experiment: Experiment, pair: str | None) -> list[Panel]:
-        survey = experiment_survey(experiment, self._fit)
-        return response_panels(experiment, survey, {"model, fitted": self._fit}, pair=pair)
-
-    def parameters(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the 95 % interval of each free parameter in percent of its value, and what was known before."""
-        return _draw(fits.parameters_panel(self._fit), ax)
-
-    def correlation(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the correlation of the free parameters' errors."""
-        return _draw(fits.correlation_panel(self._fit), ax)
-
-    @cached_property
-    def _diagnostics(self) -> Diagnostics:
-        return diagnose(self._fit)
-
-    def autocorrelation(self, experiment: str | None = None, *, ax: Place = None) -> Axes | PlainFigure:
-        """Draw the correlation of each output's weighted residual with itself."""
-        return DiagnosticsPlots(self._diagnostics).autocorrelation(experiment, ax=ax)
-
-    def inputs(self, experiment: str | None = None, *, ax: Place = None) -> Axes | PlainFigure:
-        """Draw the correlation of each output's weighted residual with each input."""
-        return DiagnosticsPlots(self._diagnostics).inputs(experiment, ax=ax)
-
-
-def _select(prediction: ModelledOutputs, output: str | None) -> ModelledOutputs:
-    """Return a prediction of one output alone."""
-    if output is None:
-        return prediction
-    if output not in prediction.measured:
-        raise SeaoptError(f'output = "{output}" was not measured; {suggestion(output, prediction.measured)}')
-    return replace(prediction, measured={output: prediction.measured[output]}, model={output: prediction.model[output]})
-
-
-class DiagnosticsPlots(Plots):
-    """Figures of diagnostics."""
-
-    def __init__(self, diagnostics: Diagnostics) -> None:
-        self._diagnostics = diagnostics
-
-    def _main(self) -> Iterable[Make]:
-        for name in self._diagnostics.outputs:
-            yield lambda one=name: fits.autocorrelation_panel(self._diagnostics, one)
-            yield lambda one=name: fits.input_correlation_panel(self._diagnostics, one)
-
-    def _choose(self, experiment: str | None) -> list[str]:
-        known = list(self._diagnostics.outputs)
-        if experiment is not None and experiment not in known:
-            raise SeaoptError(f'experiment = "{experiment}" is none of the fit\'s; {suggestion(experiment, known)}')
-        return [name for name in known if experiment in (None, name)]
-
-    def autocorrelation(self, experiment: str | None = None, *, ax: Place = None) -> Axes | PlainFigure:
-        """Draw the correlation of each output's weighted residual with itself."""
-        return _draw([fits.autocorrelation_panel(self._diagnostics, name) for name in self._choose(experiment)], ax)
-
-    def inputs(self, experiment: str | None = None, *, ax: Place = None) -> Axes | PlainFigure:
-        """Draw the correlation of each output's weighted residual with each input."""
-        return _draw([fits.input_correlation_panel(self._diagnostics, name) for name in self._choose(experiment)], ax)
-
-
-class PredictionPlots(Plots):
-    """Figures of measured and model outputs of one log."""
-
-    def __init__(self, prediction: ModelledOutputs) -> None:
-        self._prediction = prediction
-
-    def _main(self) -> Iterable[Make]:
-        yield lambda: fits.outputs_panel(self._prediction)
-        yield lambda: fits.residuals_panel(self._prediction)
-        yield lambda: fits.spectrum_panel(self._prediction)
-
-    def outputs(
-        self, output: str | None = None, *, span_s: tuple[float, float] | None = None, ax: Place = None
-    ) -> Axes | PlainFigure:
-        """Draw measured and model outputs; over the second with the largest motion if `span_s` is left out."""
-        return _draw(fits.outputs_panel(_select(self._prediction, output), span_s), ax)
-
-    def residuals(self, output: str | None = None, *, ax: Place = None) -> Axes | PlainFigure:
-        """Draw measured minus model over the whole log."""
-        return _draw(fits.residuals_panel(_select(self._prediction, output)), ax)
-
-    def spectrum(self, output: str | None = None, *, ax: Place = None) -> Axes | PlainFigure:
-        """Draw the spectral density of what was measured and of the residual."""
-        return _draw(fits.spectrum_panel(_select(self._prediction, output)), ax)
-
-
-class LogPlots(Plots):
-    """Figures of a log: its clock, what its inputs excite, each channel in time and in frequency, faults marked."""
-
-    def __init__(self, log: Log) -> None:
-        self._log = log
-
-    def _main(self) -> Iterable[Make]:
-        yield lambda: logs.log_panels(self._log, self._quality)
-
-    @cached_property
-    def _quality(self) -> Any:
-        return self._log.quality
-
-    def _choose(self, channel: str | None) -> list[str]:
-        known = list(self._quality.channels)
-        if channel is not None and channel not in known:
-            raise LogError(f'channel = "{channel}" is not in {self._log.source}; {suggestion(channel, known)}')
-        return [name for name in known if channel in (None, name)]
-
-    def clock(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the steps of time between samples."""
-        return _draw(logs.clock_panel(self._log, self._quality), ax)
-
-    def excitation(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the coherence of the best output with each input, band by band."""
-        return _draw(logs.excitation_panel(self._quality), ax)
-
-    def channels(self, channel: str | None = None, *, ax: Axes | None = None) -> Axes | PlainFigure:
-        """Draw a channel over time, all of them on a sheet if left out."""
-        return _draw([logs.channel_panel(self._log, self._quality, name) for name in self._choose(channel)], ax)
-
-    def spectrum(self, channel: str | None = None, *, ax: Axes | None = None) -> Axes | PlainFigure:
-        """Draw the spectral density of a channel, of all of them on a sheet if left out."""
-        return _draw([logs.density_panel(self._quality, name) for name in self._choose(channel)], ax)
-
-
-class ControllerPlots(Plots):
-    """Figures of a controller, on its design plant or on `plants`, a mapping of name to (plant, parameters).
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
-    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    >>> axis = controller.plot.sensitivity(plants={"stand": (stand, thor), "swing": (so.plants.moving_output(), thor)})
-    >>> axis.get_ylabel(), [line.get_label() for line in axis.lines][:2]
-    ('|S| [dB]', ['stand', 'swing'])
-
-    """
-
-    def __init__(self, controller: Controller) -> None:
-        self._controller = controller
-
-    def _main(self) -> Iterable[Make]:
-        for name in ("step", "bode", "sensitivity", "tracking", "nyquist", "noise"):
-            yield lambda panel=loops.LOOP_PANELS[name]: panel(self._controller, None)
-
-    def _explain(self) -> str:
-        return "the controller does not know its design plant; read it with Controller.from_dict"
-
-    def step(
-        self,
-        *,
-        plants: loops.Plants | None = None,
-        size: float = 1.0,
-        duration_s: float | None = None,
-        ax: Place = None,
-    ) -> PlainFigure:
-        """Draw what is measured, and what is commanded, after a step of the reference.
-
-        Parameters
-        ----------
-        plants : mapping of name to (Plant, ParameterSet), optional
-            The design plant if left out.
-        size : float
-            Of the step, in the reference's unit.
-        duration_s : float, optional
-            Until it has settled if left out.
-        ax : sequence of two Axes, optional
-            To draw on.
-
-        """
-        return _draw(loops.step_panel(self._controller, plants, size=size, duration_s=duration_s), ax)
-
-    def bode(self, *, plants: loops.Plants | None = None, ax: Place = None) -> PlainFigure:
-        """Draw magnitude and phase of the open loop; `ax` is a sequence of two Axes."""
-        return _draw(loops.bode_panel(self._controller, plants), ax)
-
-    def nyquist(self, *, plants: loops.Plants | None = None, ax: Axes | None = None) -> Axes:
-        """Draw the open loop in the complex plane, with the disk that it must not enter."""
-        return _draw(loops.nyquist_panel(self._controller, plants), ax)
-
-    def sensitivity(self, *, plants: loops.Plants | None = None, ax: Axes | None = None) -> Axes:
-        """Draw abs(S), with its limits."""
-        return _draw(loops.sensitivity_panel(self._controller, plants), ax)
-
-    def complementary(self, *, plants: loops.Plants | None = None, ax: Axes | None = None) -> Axes:
-        """Draw abs(T), with its limit."""
-        return _draw(loops.complementary_panel(self._controller, plants), ax)
-
-    def tracking(self, *, plants: loops.Plants | None = None, ax: Axes | None = None) -> Axes:
-        """Draw what is measured over its reference, with the bandwidth that was asked for."""
-        return _draw(loops.tracking_panel(self._controller, plants), ax)
-
-    def noise(self, *, plants: loops.Plants | None = None, ax: Axes | None = None) -> Axes:
-        """Draw the effort per noise on what is measured, with its limit."""
-        return _draw(loops.noise_panel(self._controller, plants), ax)
-
-    def impedance(self, *, ax: Place = None) -> PlainFigure:
-        """Draw the impedance at link 2 of the design plant, where it has a port; `ax` is a sequence of two Axes."""
-        return _draw(certificates.impedance_panel(self._controller), ax)
-
-
-class CertificatePlots(Plots):
-    """Figures of a certificate; those of simulations need `with_simulation`."""
-
-    def __init__(self, certificate: Certificate) -> None:
-        self._certificate = certificate
-
-    def _main(self) -> Iterable[Make]:
-        certificate = self._certificate
-        yield lambda: certificates.requirements_panel(certificate)
-        yield lambda: certificates.worst_panel(certificate)
-        yield lambda: certificates.draws_panel(certificate)
-        yield lambda: loops.step_panel(certificate.controller, certificates.plants_of(certificate))
-        yield lambda: certificates.friction_panel(certificate)
-        yield lambda: simulations.bandwidth_panel(self._sweeps())
-
-    def _sweeps(self) -> tuple[LargeSignal, ...]:
-        simulated = self._certificate.simulated
-        sweeps = () if simulated is None else simulated.large_signal
-        if not sweeps:
-            raise ControlError(
-                "this certificate has no large signals: call with_simulation(); they need a limit of the command, or "
-                "friction"
-            )
-        return sweeps
-
-    def requirements(self, *, ax: Axes | None = None) -> Axes:
-        """Draw how much of its limit each kind of requirement uses."""
-        return _draw(certificates.requirements_panel(self._certificate), ax)
-
-    def sensitivity(self, *, ax: Axes | None = None) -> Axes:
-        """Draw abs(S) of every plant, nominal and at the worst parameters found."""
-        return _draw(certificates.worst_panel(self._certificate), ax)
-
-    def draws(self, *, ax: Axes | None = None) -> Axes:
-        """Draw which share of the draws has at most a given Ms."""
-        return _draw(certificates.draws_panel(self._certificate), ax)
-
-    def step(self, *, size: float = 1.0, duration_s: float | None = None, ax: Place = None) -> PlainFigure:
-        """Draw the step response of every plant, linear; `ax` is a sequence of two Axes."""
-        certificate = self._certificate
-        panel = loops.step_panel(
-            certificate.controller, certificates.plants_of(certificate), size=size, duration_s=duration_s
+    experiments = _choose_experiments(fit, experiment)
+    surveys = {each.name: experiment_survey(each, fit) for each in experiments}
+    return _list_responses(experiments, surveys, {"model, fitted": fit}, pair)
+
+
+def _compare_responses(ranking: Ranking, experiment: str | None = None, pair: str | None = None) -> list[Panel]:
+    """Draw measured frequency responses and the model of every fit; `ax` is a sequence of three Axes."""
+    models = {row.name: ranking.fits[row.name] for row in ranking.rows}
+    best = next(iter(models.values()))
+    return _list_responses(_choose_experiments(best, experiment), fit_surveys(best), models, pair)
+
+
+def _list_responses(
+    experiments: Iterable[Experiment], surveys: Mapping[str, Any], models: Mapping[str, Fit], pair: str | None
+) -> list[Panel]:
+    panels = [
+        panel
+        for each in experiments
+        if each.name in surveys
+        for panel in response_panels(each, surveys[each.name], models, pair=pair)
+    ]
+    if not panels:
+        raise LogError(f"no frequency response of {pair or 'the logs'} can be estimated; look at fit.experiments")
+    return panels
+
+
+def _list_fit(fit: Fit) -> Iterator[Callable[[], Panels]]:
+    for experiment in fit.experiments:
+        prediction = fit.predict(experiment)
+        yield partial(fits.outputs_panel, prediction)
+        yield partial(fits.residuals_panel, prediction)
+        yield lambda name=experiment.name: _draw_responses(fit, name)[:1]
+        yield partial(fits.spectrum_panel, prediction)
+    yield partial(fits.parameters_panel, fit)
+    yield partial(fits.correlation_panel, fit)
+
+
+def _list_diagnostics(diagnostics: Diagnostics) -> Iterator[Callable[[], Panels]]:
+    for name in diagnostics.outputs:
+        yield partial(fits.autocorrelation_panel, diagnostics, name)
+        yield partial(fits.input_correlation_panel, diagnostics, name)
+
+
+def _draw_channels(log: Log, channel: str | None = None) -> list[Panel]:
+    """Draw a channel over time with its faults, all of them on a sheet if left out."""
+    quality = log.quality
+    names = _choose(channel, quality.channels, "channel", log.source)
+    return [logs.channel_panel(log, quality, name) for name in names]
+
+
+def _draw_densities(log: Log, channel: str | None = None) -> list[Panel]:
+    """Draw the spectral density of a channel, of all of them on a sheet if left out."""
+    quality = log.quality
+    return [logs.density_panel(quality, name) for name in _choose(channel, quality.channels, "channel", log.source)]
+
+
+def _list_sweeps(certificate: Certificate) -> tuple[LargeSignal, ...]:
+    sweeps = () if certificate.simulated is None else certificate.simulated.large_signal
+    if not sweeps:
+        raise ControlError(
+            "this certificate has no large signals: call with_simulation(); they need a limit of the command, or "
+            "friction"
         )
-        return _draw(panel, ax)
-
-    def friction(self, *, ax: Axes | None = None) -> Axes:
-        """Draw how much steeper than its own each plant's friction may be for stability to be shown."""
-        return _draw(certificates.friction_panel(self._certificate), ax)
-
-    def bandwidth(self, *, ax: Axes | None = None) -> Axes:
-        """Draw bandwidth against amplitude, simulated and predicted."""
-        return _draw(simulations.bandwidth_panel(self._sweeps()), ax)
-
-    def amplitude(self, plant: str | None = None, *, ax: Axes | None = None) -> Axes | PlainFigure:
-        """Draw the gain against frequency at several amplitudes."""
-        return _draw([simulations.amplitude_panel(one) for one in self._sweeps() if plant in (None, one.plant)], ax)
-
-    def simulations(self, plant: str | None = None, scenario: str | None = None, *, ax: Place = None) -> PlainFigure:
-        """Draw the worst run of each scenario, simulated again; of one plant, or one scenario, if named."""
-        if self._certificate.runs is None:
-            raise ControlError("nothing was simulated for this certificate; call with_simulation()")
-        return VerificationPlots(self._certificate.runs).runs(plant, scenario, ax=ax)
-
-    def environments(self, *, ax: Axes | None = None) -> Axes | PlainFigure:
-        """Draw where the loop is stable against a mass on a spring and a damper, a figure per damper."""
-        simulated = self._certificate.simulated
-        if simulated is None or simulated.environments is None:
-            reason = "call with_simulation()" if simulated is None else simulated.left_out.get("environments", "")
-            raise ControlError(f"this certificate has no environments: {reason}")
-        return _draw(simulations.environment_panels(simulated.environments), ax)
-
-    def impedance(self, *, ax: Place = None) -> PlainFigure:
-        """Draw the impedance at link 2 of the design plant; `ax` is a sequence of two Axes."""
-        return _draw(certificates.impedance_panel(self._certificate.controller), ax)
+    return sweeps
 
 
-class VerificationPlots(Plots):
-    """Figures of simulated runs."""
-
-    def __init__(self, verification: Verification) -> None:
-        self._verification = verification
-
-    def _main(self) -> Iterable[Make]:
-        yield lambda: self._choose(None, None)
-
-    def _choose(self, plant: str | None, scenario: str | None) -> list[Panel]:
-        rows = [row for row in self._verification.worst() if plant in (None, row.plant)]
-        rows = [row for row in rows if scenario in (None, row.scenario)]
-        if not rows:
-            played = ", ".join(f"{row.scenario} on {row.plant}" for row in self._verification.worst())
-            raise ControlError(
-                f"{scenario or 'no scenario'} on {plant or 'any plant'} was not played; these were: {played}"
-            )
-        return [simulations.simulation_panel(self._verification, row) for row in rows]
-
-    def runs(self, plant: str | None = None, scenario: str | None = None, *, ax: Place = None) -> PlainFigure:
-        """Draw the worst run of each scenario, simulated again; `ax` of one of them is a sequence of two Axes."""
-        return _draw(self._choose(plant, scenario), ax)
+def _draw_steps(certificate: Certificate, *, size: float = 1.0, duration_s: float | None = None) -> Panel:
+    """Draw the step response of every plant, linear; `ax` is a sequence of two Axes."""
+    plants = certificates.plants_of(certificate)
+    return loops.step_panel(certificate.controller, plants, size=size, duration_s=duration_s)
 
 
-class LargeSignalPlots(Plots):
-    """Figures of a sweep over amplitudes."""
-
-    def __init__(self, sweep: LargeSignal) -> None:
-        self._sweep = sweep
-
-    def _main(self) -> Iterable[Make]:
-        yield lambda: simulations.bandwidth_panel([self._sweep])
-        yield lambda: simulations.amplitude_panel(self._sweep)
-        yield lambda: simulations.saturation_panel(self._sweep)
-
-    def bandwidth(self, *, ax: Axes | None = None) -> Axes:
-        """Draw bandwidth against amplitude."""
-        return _draw(simulations.bandwidth_panel([self._sweep]), ax)
-
-    def amplitude(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the gain against frequency at each amplitude."""
-        return _draw(simulations.amplitude_panel(self._sweep), ax)
-
-    def saturation(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the amplitude at which the command of the linear loop saturates."""
-        return _draw(simulations.saturation_panel(self._sweep), ax)
+def _draw_amplitudes(certificate: Certificate, plant: str | None = None) -> list[Panel]:
+    """Draw the gain against frequency at several amplitudes."""
+    return [simulations.amplitude_panel(sweep) for sweep in _list_sweeps(certificate) if plant in (None, sweep.plant)]
 
 
-class StabilityPlots(Plots):
-    """Figures of stability against environments."""
-
-    def __init__(self, stability: StabilityMap) -> None:
-        self._stability = stability
-
-    def _main(self) -> Iterable[Make]:
-        yield lambda: simulations.environment_panels(self._stability)
-
-    def environments(self, *, ax: Axes | None = None) -> Axes | PlainFigure:
-        """Draw where the loop is stable, a figure per damper."""
-        return _draw(simulations.environment_panels(self._stability), ax)
+def _draw_bandwidths(certificate: Certificate) -> Panel:
+    """Draw bandwidth against amplitude, simulated and predicted."""
+    return simulations.bandwidth_panel(_list_sweeps(certificate))
 
 
-class ImpedancePlots(Plots):
-    """Figures of what may be rendered at the link."""
-
-    def __init__(self, region: ImpedanceRegion) -> None:
-        self._region = region
-
-    def _main(self) -> Iterable[Make]:
-        yield lambda: region_panel(self._region)
-
-    def region(self, asked: Impedance | None = None, *, ax: Axes | None = None) -> Axes:
-        """Draw where stiffness and damping are passive, and what is asked for."""
-        return _draw(region_panel(self._region, asked), ax)
+def _draw_simulations(certificate: Certificate, plant: str | None = None, scenario: str | None = None) -> list[Panel]:
+    """Draw the worst run of each scenario, simulated again; of one plant, or one scenario, if named."""
+    if certificate.runs is None:
+        raise ControlError("nothing was simulated for this certificate; call with_simulation()")
+    return _draw_runs(certificate.runs, plant, scenario)
 
 
-class FrontierPlots(Plots):
-    """Figures of a sweep of bandwidths."""
-
-    def __init__(self, frontier: Frontier) -> None:
-        self._frontier = frontier
-
-    def _main(self) -> Iterable[Make]:
-        yield lambda: frontier_panels(self._frontier)
-
-    def noise_gain(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the noise gain against bandwidth."""
-        return _draw(frontier_panel(self._frontier, "noise_gain"), ax)
-
-    def ms(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the largest Ms of all plants against bandwidth."""
-        return _draw(frontier_panel(self._frontier, "ms"), ax)
-
-    def disturbance(self, *, ax: Axes | None = None) -> Axes:
-        """Draw what is left of disturbances against bandwidth."""
-        return _draw(frontier_panel(self._frontier, "disturbance"), ax)
-
-    def phase_margin(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the phase margin against bandwidth."""
-        return _draw(frontier_panel(self._frontier, "phase_margin_deg"), ax)
-
-    def disk_margin(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the disk margin against bandwidth."""
-        return _draw(frontier_panel(self._frontier, "disk_margin"), ax)
-
-    def force_limit(self, *, ax: Axes | None = None) -> Axes:
-        """Draw the largest reference at the bandwidth that the command's limit allows."""
-        return _draw(frontier_panel(self._frontier, "force_limit_N"), ax)
+def _draw_environments(certificate: Certificate) -> list[Panel]:
+    """Draw where the loop is stable against a mass on a spring and a damper, a figure per damper."""
+    simulated = certificate.simulated
+    if simulated is None or simulated.environments is None:
+        reason = "call with_simulation()" if simulated is None else simulated.left_out.get("environments", "")
+        raise ControlError(f"this certificate has no environments: {reason}")
+    return simulations.environment_panels(simulated.environments)
 
 
-class RankingPlots(Plots):
-    """Figures of fits that are compared."""
+def _draw_impedance(certificate: Certificate) -> Panel:
+    """Draw the impedance at link 2 of the design plant; `ax` is a sequence of two Axes."""
+    return certificates.impedance_panel(certificate.controller)
 
-    def __init__(self, ranking: Ranking) -> None:
-        self._ranking = ranking
 
-    def _main(self) -> Iterable[Make]:
-        yield lambda: evidence_panel(self._ranking)
-        yield lambda: octave_panels(self._ranking)
+def _draw_runs(verification: Verification, plant: str | None = None, scenario: str | None = None) -> list[Panel]:
+    """Draw the worst run of each scenario, simulated again; `ax` of one of them is a sequence of two Axes."""
+    worst = verification.worst()
+    rows = [row for row in worst if plant in (None, row.plant) and scenario in (None, row.scenario)]
+    if not rows:
+        played = ", ".join(f"{row.scenario} on {row.plant}" for row in worst)
+        raise ControlError(f"{scenario or 'no scenario'} on {plant or 'any plant'} was not played, only: {played}")
+    return [simulations.simulation_panel(verification, row) for row in rows]
 
-    def evidence(self, *, ax: Axes | None = None) -> Axes:
-        """Draw how far each fit's effective BIC lies above the best one's."""
-        return _draw(evidence_panel(self._ranking), ax)
 
-    def octaves(self, *, ax: Axes | None = None) -> Axes | PlainFigure:
-        """Draw the residual of every fit per octave, a figure per output."""
-        return _draw(octave_panels(self._ranking), ax)
+def _draw_figure(figure: str) -> Make:
+    """Return what draws a figure of a sweep against bandwidth."""
 
-    def response(self, experiment: str | None = None, pair: str | None = None, *, ax: Place = None) -> PlainFigure:
-        """Draw measured frequency responses and the model of every fit; `ax` is a sequence of three Axes."""
-        rows = [self._ranking.fits[row.name] for row in self._ranking.rows]
-        models = {row.name: fit for row, fit in zip(self._ranking.rows, rows, strict=True)}
-        chosen = fits.choose_experiments(rows[0], experiment)
-        surveys = fit_surveys(rows[0])
-        panels = [
-            panel
-            for one in chosen
-            if one.name in surveys
-            for panel in response_panels(one, surveys[one.name], models, pair=pair)
-        ]
-        if not panels:
-            raise LogError(f"no frequency response of {pair or 'the logs'} can be estimated; look at fit.experiments")
-        return _draw(panels, ax)
+    def make(frontier: Frontier) -> Panel:
+        return frontier_panel(frontier, figure)
+
+    make.__doc__ = f"Draw {FRONTIER_FIGURES[figure][0].lower()} against bandwidth."
+    return make
+
+
+_PREDICTION = {"outputs": fits.outputs_panel, "residuals": fits.residuals_panel, "spectrum": fits.spectrum_panel}
+_DIAGNOSTICS = {
+    "autocorrelation": _draw_diagnostics(fits.autocorrelation_panel),
+    "inputs": _draw_diagnostics(fits.input_correlation_panel),
+}
+KINDS = {
+    "Fit": Kind(
+        figures={
+            **{name: _draw_predictions(panel) for name, panel in _PREDICTION.items()},
+            **_DIAGNOSTICS,
+            "response": _draw_responses,
+            "parameters": fits.parameters_panel,
+            "correlation": fits.correlation_panel,
+        },
+        sheet=_list_fit,
+        missing="no parameter was free, and the fit has no logs",
+    ),
+    "Diagnostics": Kind(figures=_DIAGNOSTICS, sheet=_list_diagnostics),
+    "ModelledOutputs": Kind(figures={name: _draw_prediction(panel) for name, panel in _PREDICTION.items()}),
+    "Log": Kind(
+        figures={
+            "clock": lambda log: logs.clock_panel(log, log.quality),
+            "excitation": lambda log: logs.excitation_panel(log.quality),
+            "channels": _draw_channels,
+            "spectrum": _draw_densities,
+        },
+        sheet=lambda log: [partial(logs.log_panels, log, log.quality)],
+    ),
+    "Controller": Kind(
+        figures={**loops.LOOP_PANELS, "impedance": certificates.impedance_panel},
+        sheet=loops.MAIN,
+        missing="the controller does not know its design plant; read it with Controller.from_dict",
+    ),
+    "Certificate": Kind(
+        figures={
+            "requirements": certificates.requirements_panel,
+            "sensitivity": certificates.worst_panel,
+            "draws": certificates.draws_panel,
+            "step": _draw_steps,
+            "friction": certificates.friction_panel,
+            "bandwidth": _draw_bandwidths,
+            "amplitude": _draw_amplitudes,
+            "simulations": _draw_simulations,
+            "environments": _draw_environments,
+            "impedance": _draw_impedance,
+        },
+        sheet=("requirements", "sensitivity", "draws", "step", "friction", "bandwidth"),
+    ),
+    "Verification": Kind(figures={"runs": _draw_runs}),
+    "LargeSignal": Kind(
+        figures={
+            "bandwidth": lambda sweep: simulations.bandwidth_panel([sweep]),
+            "amplitude": simulations.amplitude_panel,
+            "saturation": simulations.saturation_panel,
+        }
+    ),
+    "StabilityMap": Kind(figures={"environments": simulations.environment_panels}),
+    "ImpedanceRegion": Kind(figures={"region": region_panel}),
+    "Frontier": Kind(
+        figures={name.removesuffix("_deg").removesuffix("_N"): _draw_figure(name) for name in FRONTIER_FIGURES}
+    ),
+    "Ranking": Kind(
+        figures={"evidence": evidence_panel, "octaves": octave_panels, "response": _compare_responses},
+        sheet=("evidence", "octaves"),
+    ),
+}

@@ -16,7 +16,7 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control import sweep
 from seaopt.errors import SeaoptError
-from seaopt.reporting.figures.canvas import COLOURS
+from seaopt.reporting.figures.panel import COLOURS
 
 PERIOD = 1e-3
 

@@ -158,9 +158,9 @@ def test_what_was_done_to_the_data_stands_in_the_report(stand, thor, short_log, 
 def test_a_drawing_on_the_page_has_the_numbers_of_its_axes():
     """Coordinates are shortened there; the numbers at ticks, and what a chart says of its sides, must not be."""
 
-    def draw(axes):
-        axes[0].plot([0.0, 1.0, 2.0], [0.00012, 0.00018, 0.00031], label="a")
-        axes[0].set_yticks([0.0001, 0.0002, 0.0003], ["0.0001", "0.0002", "0.0003"])
+    def draw(axis):
+        axis.plot([0.0, 1.0, 2.0], [0.00012, 0.00018, 0.00031], label="a")
+        axis.set_yticks([0.0001, 0.0002, 0.0003], ["0.0001", "0.0002", "0.0003"])
 
     chart = make_chart(Panel(name="small", title="1.23456", draw=draw))
     assert [f">0.000{k}</text>" in chart.svg for k in (1, 2, 3)] == [True] * 3

@@ -7,46 +7,43 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from seaopt.reporting.figures.canvas import add_axes, new_figure, scale_log
+from seaopt.reporting.figures.canvas import PlainFigure, add_axes, scale_log
 from seaopt.reporting.figures.panel import Panel, draw_panel
 from seaopt.reporting.figures.ticks import simplify_ticks
 
 
-def draw_linear(axes):
-    axes[0].plot([-3.0, 7.0], [-120.0, 4e3])
-    axes[0].set_ylabel("force [N]")
-    axes[0].set_xlabel("time [s]")
+def draw_linear(axis):
+    axis.plot([-3.0, 7.0], [-120.0, 4e3])
 
 
-def draw_log(axes):
-    upper, lower = axes
+def draw_log(upper, lower):
     upper.plot([0.02, 300.0], [1e-3, 40.0])
     lower.plot([0.02, 300.0], [0.0, 1.0])
-    scale_log(axes)
     scale_log([upper], "y")
-    upper.set_ylabel("gain")
-    lower.set_xlabel("frequency [Hz]")
 
 
-def draw_square(axes):
-    axes[0].plot([-1.0, 1.0], [-1.0, 1.0])
-    axes[0].set_aspect("equal", adjustable="box")
+def draw_square(axis):
+    axis.plot([-1.0, 1.0], [-1.0, 1.0])
+    axis.set_aspect("equal", adjustable="box")
 
 
-def draw_names(axes):
-    axes[0].plot([0.0, 2.0], [0.0, 2.0])
-    axes[0].set_yticks([0, 1, 2], ["J", "b_r", "eta"])
-    axes[0].tick_params(length=0)
+def draw_names(axis):
+    axis.plot([0.0, 2.0], [0.0, 2.0])
+    axis.set_yticks([0, 1, 2], ["J", "b_r", "eta"])
+    axis.tick_params(length=0)
+
+
+LABELS = {
+    draw_linear: {"x": "time [s]", "y": ("force [N]",)},
+    draw_log: {"x": "frequency [Hz]", "y": ("gain",), "log": "x", "heights": (0.7, 0.6)},
+}
 
 
 def make_figures(draw):
     """Return the same figure twice, the second with its ticks replaced."""
-    heights = (0.7, 0.6) if draw is draw_log else (1.0,)
+    panel = Panel(name="one", title="one", draw=draw, **LABELS.get(draw, {}))
     plain, finished = (
-        draw_panel(
-            Panel(name="one", title="one", draw=draw, heights=heights), add_axes(new_figure(5.0, 4.0), heights, 0.8)
-        )
-        for _ in range(2)
+        draw_panel(panel, add_axes(PlainFigure(figsize=(5.0, 4.0)), panel.heights, 0.8)) for _ in range(2)
     )
     plain, finished = (each.get_figure(root=True) if isinstance(each, Axes) else each for each in (plain, finished))
     simplify_ticks(finished.axes)
@@ -87,7 +84,7 @@ def test_labels_stand_beyond_the_numbers(draw):
 
 
 def test_a_logarithmic_side_on_which_nothing_is_drawn_has_no_ticks():
-    figure = new_figure(5.0, 4.0)
+    figure = PlainFigure(figsize=(5.0, 4.0))
     (axis,) = add_axes(figure, (1.0,), 0.8)
     axis.plot([1.0, 10.0], [np.inf, np.inf])
     scale_log([axis], "y")

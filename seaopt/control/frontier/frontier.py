@@ -83,7 +83,7 @@ class FrontierRow(Result):
 class Frontier(Result, Worded):
     """The rows of a sweep, and their controllers."""
 
-    plot = PlotAccessor("seaopt.reporting.plots:FrontierPlots")
+    plot = PlotAccessor()
 
     rows: tuple[FrontierRow, ...]
     controllers: tuple[Controller, ...]

@@ -63,7 +63,7 @@ class ImpedanceRegion:
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:ImpedancePlots")
+    plot = PlotAccessor()
 
     stiffness: Float[np.ndarray, " k"]
     damping: Float[np.ndarray, " d"]

@@ -114,7 +114,7 @@ class Controller(LoopDelays, Result, Worded):
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:ControllerPlots")
+    plot = PlotAccessor()
 
     structure: str
     gains: Mapping[str, float]

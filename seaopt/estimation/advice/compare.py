@@ -104,7 +104,7 @@ class Ranking:
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:RankingPlots")
+    plot = PlotAccessor()
 
     rows: tuple[Ranked, ...]
     preferred: str | None

@@ -87,7 +87,7 @@ class Diagnostics:
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:DiagnosticsPlots")
+    plot = PlotAccessor()
 
     outputs: Mapping[str, Mapping[str, OutputDiagnostics]]
     leverage: Mapping[str, Leverage]

@@ -153,7 +153,7 @@ class ModelledOutputs(Worded):
     without a band, `units` are the outputs'.
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:PredictionPlots")
+    plot = PlotAccessor()
 
     time: Float[np.ndarray, " n"]
     inputs: dict[str, Float[np.ndarray, " n"]]

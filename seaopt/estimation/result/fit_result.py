@@ -100,7 +100,7 @@ class Fit(Result, Worded):
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:FitPlots")
+    plot = PlotAccessor()
 
     json_keys = (
         *("met", "findings", "status", "message", "cost", "iterations", "samples", "parameters", "derived"),

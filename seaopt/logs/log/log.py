@@ -51,7 +51,7 @@ class Log:
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:LogPlots")
+    plot = PlotAccessor()
 
     time: Float[np.ndarray, " n"]
     signals: Mapping[str, Signal]

@@ -1,7 +1,4 @@
-"""What figures are drawn on: figures that pyplot does not keep, axes with a light grid, colours, scales and legends.
-
-Colours are those of Okabe and Ito (Color Universal Design, 2008), which people with any colour vision tell apart.
-"""
+"""What figures are drawn on: figures that pyplot does not keep, axes with a light grid, scales and legends."""
 
 from __future__ import annotations
 
@@ -17,10 +14,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 
 from seaopt.formatting import printable
 from seaopt.reporting.drawing import TEXT_AS_TEXT, render_figure
+from seaopt.reporting.figures.panel import GRID
 
-BLUE, VERMILION, GREEN, PINK, ORANGE, SKY = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"
-COLOURS = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY)
-MEASURED, LIMIT, GRID, BAND = "#767676", "#444444", "#e4e4e4", "#c9d0d8"
 WIDTH, HEIGHT = 4.9, 2.5  # inches, of one panel with one axis
 TOP, BARE_TOP, BOTTOM, RIGHT, BETWEEN = 0.34, 0.12, 0.48, 0.16, 0.12  # inches, margins of a panel
 FEW_DECADES = 2.2  # over which 2 and 5 are ticks, too
@@ -58,11 +53,6 @@ class PlainAxes(Axes):
         return figure._repr_png_() if isinstance(figure, PlainFigure) else None
 
 
-def new_figure(width: float, height: float) -> PlainFigure:
-    """Return an empty figure of a size in inches."""
-    return PlainFigure(figsize=(width, height))
-
-
 def add_axes(
     figure: Figure,
     heights: Sequence[float],
@@ -73,37 +63,20 @@ def add_axes(
 ) -> tuple[Axes, ...]:
     """Return axes one above the other, which share x, with this package's grid.
 
-    Margins are the same on every panel: axes stand in line on a sheet, and nothing has to be measured.
-
-    Parameters
-    ----------
-    figure : Figure
-        Where to put them.
-    heights : sequence of float
-        From the top, in heights of a panel, margins included.
-    left : float
-        Inches for the tick labels and the label of y.
-    corner : (float, float)
-        Inches from the figure's left and top edges to the panel's.
-    title : bool
-        Leave room for one.
-
+    Margins are the same on every panel: axes stand in line on a sheet, and nothing has to be measured. `heights`: from
+    the top, in heights of a panel, margins included. `left`: inches for the tick labels and the label of y. `corner`:
+    inches from the figure's left and top edges to the panel's. `title`: leave room for one.
     """
     width, height = figure.get_size_inches()
     top = TOP if title else BARE_TOP
     room = HEIGHT * sum(heights) - top - BOTTOM - BETWEEN * (len(heights) - 1)
     above, axes = corner[1] + top, list[Axes]()
     for share in heights:
-        own = room * share / sum(heights)
-        box = (corner[0] + left, height - above - own, WIDTH - left - RIGHT, own)
-        scale = (width, height, width, height)
-        axis = figure.add_axes(
-            tuple(part / whole for part, whole in zip(box, scale, strict=True)),
-            axes_class=PlainAxes,
-            sharex=axes[0] if axes else None,
-        )
-        axes.append(axis)
-        above += own + BETWEEN
+        tall = room * share / sum(heights)
+        box = np.array([corner[0] + left, height - above - tall, WIDTH - left - RIGHT, tall])
+        box /= (width, height, width, height)
+        axes.append(figure.add_axes(tuple(box), axes_class=PlainAxes, sharex=axes[0] if axes else None))
+        above += tall + BETWEEN
     for axis in axes:
         axis.grid(visible=True, color=GRID, linewidth=0.6)
         axis.set_axisbelow(True)
@@ -118,13 +91,13 @@ def scale_log(axes: Iterable[Axes], side: str = "x") -> None:
     """Make a side logarithmic, with plain numbers at its ticks; call it when what is drawn has its limits."""
     for axis in axes:
         (axis.set_xscale if side == "x" else axis.set_yscale)("log")
-        one = axis.xaxis if side == "x" else axis.yaxis
-        low, high = sorted(one.get_view_interval())
+        scale = axis.xaxis if side == "x" else axis.yaxis
+        low, high = sorted(scale.get_view_interval())
         decades = np.log10(high / low) if low > 0.0 else np.inf
-        one.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,), numticks=12))
-        one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        one.set_minor_locator(LogLocator(subs=(2.0, 5.0)) if decades < MANY_DECADES else NullLocator())
-        one.set_minor_formatter(NullFormatter())
+        scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,), numticks=12))
+        scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        scale.set_minor_locator(LogLocator(subs=(2.0, 5.0)) if decades < MANY_DECADES else NullLocator())
+        scale.set_minor_formatter(NullFormatter())
 
 
 def label_lines(axis: Axes) -> dict[str, Any]:
@@ -137,11 +110,11 @@ def label_lines(axis: Axes) -> dict[str, Any]:
 
 def add_legend(axes: Sequence[Axes]) -> None:
     """Put a legend where there is room, on the first of the axes that has labels which none before it has."""
-    known: set[str] = set()
+    shown: set[str] = set()
     if len({label for axis in axes for label in label_lines(axis)}) < 2:  # one curve has its name on the axis
         return
     for axis in axes:
-        handles = {label: line for label, line in label_lines(axis).items() if label not in known}
+        handles = {label: line for label, line in label_lines(axis).items() if label not in shown}
         if handles:
             axis.legend(
                 list(handles.values()),
@@ -153,7 +126,7 @@ def add_legend(axes: Sequence[Axes]) -> None:
                 borderpad=0.2,
                 loc="best",
             )
-        known |= handles.keys()
+        shown |= handles.keys()
 
 
 def take_literally(axes: Iterable[Axes]) -> None:

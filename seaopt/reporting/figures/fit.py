@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation import Diagnostics, Experiment, Fit, ModelledOutputs
-from seaopt.reporting.figures.panel import Panel
+from seaopt.estimation import Diagnostics, Fit, ModelledOutputs
+from seaopt.reporting.figures.panel import BAND, BLUE, COLOURS, LIMIT, MEASURED, Panel, draw_level, frequency_panel
 from seaopt.reporting.figures.thinning import describe_thinning, thin_series
 from seaopt.units import unit_after
 
@@ -29,13 +28,17 @@ def label_channel(name: str, unit: str) -> str:
     return f"{name} [{unit_after(unit).strip() or '-'}]"
 
 
+def _label_outputs(prediction: ModelledOutputs) -> tuple[str, ...]:
+    return tuple(label_channel(name, prediction.units[name]) for name in prediction.measured)
+
+
 def outputs_panel(prediction: ModelledOutputs, span_s: tuple[float, float] | None = None) -> Panel:
     """Draw measured and model outputs from one time to another, seconds after the log's first sample.
 
-    Left out: the second with the largest motion of the first output.
+    Without `span_s`: the second with the largest motion of the first output.
     """
-    names, time = list(prediction.measured), prediction.time - prediction.time[0]
-    low, high = span_s if span_s is not None else find_busiest(prediction.measured[names[0]], time)
+    time = prediction.time - prediction.time[0]
+    low, high = span_s if span_s is not None else _find_busiest(next(iter(prediction.measured.values())), time)
     near = (time >= low) & (time <= high)
     if np.count_nonzero(near) < 2:
         raise EstimationError(
@@ -43,20 +46,10 @@ def outputs_panel(prediction: ModelledOutputs, span_s: tuple[float, float] | Non
             f"{time[-1]:g} s; give a longer one"
         )
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, MEASURED
-
-        for axis, name in zip(axes, names, strict=True):
-            axis.plot(
-                *thin_series(time[near], prediction.measured[name][near]),
-                color=MEASURED,
-                linewidth=2.2,
-                label="measured",
-            )
+    def draw(*axes: Axes) -> None:
+        for axis, (name, measured) in zip(axes, prediction.measured.items(), strict=True):
+            axis.plot(*thin_series(time[near], measured[near]), color=MEASURED, linewidth=2.2, label="measured")
             axis.plot(*thin_series(time[near], prediction.model[name][near]), color=BLUE, linewidth=1.0, label="model")
-            axis.set_ylabel(label_channel(name, prediction.units[name]))
-            axis.margins(x=0.0)
-        axes[-1].set_xlabel("time [s]")
 
     where = "the second with the largest motion" if span_s is None else f"{low:g} to {high:g} s"
     percents = ", ".join(f"{name} {percent:.2f} %" for name, percent in prediction.fit_percent.items())
@@ -64,14 +57,17 @@ def outputs_panel(prediction: ModelledOutputs, span_s: tuple[float, float] | Non
         name=f"outputs_{prediction.name}",
         title=f"{prediction.name}: measured and model",
         draw=draw,
-        heights=_stack(len(names)),
+        x="time [s]",
+        y=_label_outputs(prediction),
+        tight=True,
+        heights=_stack(len(prediction.measured)),
         link=f"time {prediction.name}",
         caption=f"Measured and model outputs over {where}; fit over the whole log: {percents}. "
         + describe_thinning(int(np.count_nonzero(near))),
     )
 
 
-def find_busiest(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _find_busiest(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """Return the ends of the second about the sample farthest from the mean."""
     usable = np.where(np.isfinite(values), np.abs(values - np.nanmean(values)), 0.0)
     centre = float(time[int(np.argmax(usable))])
@@ -81,20 +77,14 @@ def find_busiest(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"])
 
 def residuals_panel(prediction: ModelledOutputs) -> Panel:
     """Draw measured minus model over the whole log."""
-    names, time = list(prediction.measured), prediction.time - prediction.time[0]
+    time = prediction.time - prediction.time[0]
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import LIMIT, MEASURED
-
-        for axis, name in zip(axes, names, strict=True):
-            rest = prediction.measured[name] - prediction.model[name]
-            axis.plot(*thin_series(time, rest), color=MEASURED, linewidth=0.7, label="measured - model")
-            rms = prediction.rms_residual[name]
-            for side in (-rms, rms):
-                axis.axhline(side, color=LIMIT, linestyle="--", linewidth=0.8, label="± rms")
-            axis.set_ylabel(label_channel(name, prediction.units[name]))
-            axis.margins(x=0.0)
-        axes[-1].set_xlabel("time [s]")
+    def draw(*axes: Axes) -> None:
+        for axis, (name, measured) in zip(axes, prediction.measured.items(), strict=True):
+            residual = thin_series(time, measured - prediction.model[name])
+            axis.plot(*residual, color=MEASURED, linewidth=0.7, label="measured - model")
+            for level in (-prediction.rms_residual[name], prediction.rms_residual[name]):
+                draw_level(axis, level, "± rms")
 
     size = ", ".join(
         f"{name} {rms:.3g}{unit_after(prediction.units[name])}" for name, rms in prediction.rms_residual.items()
@@ -103,7 +93,10 @@ def residuals_panel(prediction: ModelledOutputs) -> Panel:
         name=f"residuals_{prediction.name}",
         title=f"{prediction.name}: residual",
         draw=draw,
-        heights=_stack(len(names)),
+        x="time [s]",
+        y=_label_outputs(prediction),
+        tight=True,
+        heights=_stack(len(prediction.measured)),
         link=f"whole {prediction.name}",
         caption=f"Measured minus model over the whole log; root mean square: {size}. {describe_thinning(time.size)}",
     )
@@ -111,33 +104,25 @@ def residuals_panel(prediction: ModelledOutputs) -> Panel:
 
 def spectrum_panel(prediction: ModelledOutputs) -> Panel:
     """Draw the spectral density of what was measured and of the residual, by Welch's method."""
-    names, period = list(prediction.measured), float(np.median(np.diff(prediction.time)))
+    period = float(np.median(np.diff(prediction.time)))
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, MEASURED, scale_log
+    def draw(*axes: Axes) -> None:
+        for axis, (name, measured) in zip(axes, prediction.measured.items(), strict=True):
+            residual = measured - prediction.model[name]
+            for values, colour, label in ((measured, MEASURED, "measured"), (residual, BLUE, "measured - model")):
+                axis.plot(*amplitude_density(values, period), color=colour, linewidth=1.1, label=label)
 
-        for axis, name in zip(axes, names, strict=True):
-            measured, model = prediction.measured[name], prediction.model[name]
-            for values, colour, label in (
-                (measured, MEASURED, "measured"),
-                (measured - model, BLUE, "measured - model"),
-            ):
-                f, density = amplitude_density(values, period)
-                axis.plot(f, density, color=colour, linewidth=1.1, label=label)
-            axis.set_ylabel(label_channel(name, f"{unit_after(prediction.units[name]).strip() or '1'}/√Hz"))
-            axis.margins(x=0.0)
-        scale_log(axes)
-        scale_log(axes, "y")
-        axes[-1].set_xlabel("frequency [Hz]")
-
-    return Panel(
+    units = {name: unit_after(prediction.units[name]).strip() or "1" for name in prediction.measured}
+    return frequency_panel(
         name=f"spectrum_{prediction.name}",
         title=f"{prediction.name}: spectra",
         draw=draw,
-        heights=_stack(len(names)),
-        link="frequency",
-        caption="Amplitude spectral density of what was measured and of what the model leaves (Welch, Hann window). "
-        "What is left should be flat, as the sensor's noise is.",
+        y=tuple(label_channel(name, f"{unit}/√Hz") for name, unit in units.items()),
+        log="xy",
+        tight=True,
+        heights=_stack(len(prediction.measured)),
+        caption="Amplitude spectral density of the measured output and of the residual (Welch, Hann window). "
+        "The residual should be flat, as the sensor's noise is.",
     )
 
 
@@ -154,7 +139,7 @@ def amplitude_density(
     """
     from scipy.signal import welch  # deferred: 0.3 s
 
-    run = longest_run(values)
+    run = _find_longest_run(values)
     if run.size < FEWEST_SAMPLES:
         raise EstimationError(
             f"a run of {run.size} samples without a gap is too short for a spectrum; choose a longer stretch with "
@@ -165,7 +150,7 @@ def amplitude_density(
     return f[1:], np.sqrt(power[1:])
 
 
-def longest_run(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+def _find_longest_run(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
     """Return the longest run of finite samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isfinite(values).astype(int), [0]])))
     runs = edges.reshape(-1, 2)
@@ -177,26 +162,22 @@ def longest_run(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
 
 def autocorrelation_panel(diagnostics: Diagnostics, experiment: str) -> Panel:
     """Draw the correlation of each output's weighted residual with itself."""
-    outputs = diagnostics.outputs[experiment]
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import MEASURED
+    def draw(*axes: Axes) -> None:
+        for axis, output in zip(axes, diagnostics.outputs[experiment].values(), strict=True):
+            values = output.autocorrelation[1:]
+            lags = np.arange(1, values.size + 1)
+            _shade(axis, output.autocorrelation_bound)
+            axis.vlines(lags, 0.0, values, color=MEASURED, linewidth=1.6)
+            axis.plot(lags, values, ".", color=MEASURED, markersize=3, label="residual with itself")
+            _scale_correlation(axis, [values], output.autocorrelation_bound)
 
-        for axis, (name, one) in zip(axes, outputs.items(), strict=True):
-            _shade(axis, one.autocorrelation_bound)
-            lags = np.arange(1, one.autocorrelation.size)
-            axis.vlines(lags, 0.0, one.autocorrelation[1:], color=MEASURED, linewidth=1.6)
-            axis.plot(lags, one.autocorrelation[1:], ".", color=MEASURED, markersize=3, label="residual with itself")
-            _reach(axis, [one.autocorrelation[1:]], one.autocorrelation_bound)
-            axis.set_ylabel(f"{name} [-]")
-        axes[-1].set_xlabel("lag [samples]")
-
-    return Panel(
-        name=f"autocorrelation_{experiment}",
-        title=f"{experiment}: the residual's own correlation",
+    return _lag_panel(
+        diagnostics,
+        experiment,
+        name="autocorrelation",
+        title="the residual's own correlation",
         draw=draw,
-        heights=_stack(len(outputs)),
-        link=f"lag {experiment}",
         caption="Correlation of the weighted residual with itself. Shaded: what one lag of a hundred exceeds by "
         "chance, were the residual white.",
     )
@@ -204,27 +185,37 @@ def autocorrelation_panel(diagnostics: Diagnostics, experiment: str) -> Panel:
 
 def input_correlation_panel(diagnostics: Diagnostics, experiment: str) -> Panel:
     """Draw the correlation of each output's weighted residual with each input."""
-    outputs = diagnostics.outputs[experiment]
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import COLOURS
-
-        for axis, (name, one) in zip(axes, outputs.items(), strict=True):
-            for (label, cross), colour in zip(one.inputs.items(), COLOURS * 9, strict=False):
+    def draw(*axes: Axes) -> None:
+        for axis, output in zip(axes, diagnostics.outputs[experiment].values(), strict=True):
+            for (label, cross), colour in zip(output.inputs.items(), COLOURS * 9, strict=False):
                 _shade(axis, cross.bound)
                 axis.plot(cross.lags, cross.values, color=colour, linewidth=1.2, marker=".", markersize=3, label=label)
-            _reach(axis, [cross.values for cross in one.inputs.values()], 0.0)
-            axis.set_ylabel(f"{name} [-]")
-        axes[-1].set_xlabel("lag [samples]")
+            _scale_correlation(axis, [cross.values for cross in output.inputs.values()], 0.0)
 
-    return Panel(
-        name=f"inputs_{experiment}",
-        title=f"{experiment}: the residual against inputs",
+    return _lag_panel(
+        diagnostics,
+        experiment,
+        name="inputs",
+        title="the residual against inputs",
         draw=draw,
-        heights=_stack(len(outputs)),
-        link=f"lag {experiment}",
         caption="Correlation of the weighted residual with the inputs. Shaded: what one lag of a hundred exceeds by "
         "chance. A residual that follows an input is something that the model lacks.",
+    )
+
+
+def _lag_panel(diagnostics: Diagnostics, experiment: str, *, name: str, title: str, draw: Any, caption: str) -> Panel:
+    """Return a panel of correlations over lags, an axis per output."""
+    outputs = diagnostics.outputs[experiment]
+    return Panel(
+        name=f"{name}_{experiment}",
+        title=f"{experiment}: {title}",
+        draw=draw,
+        x="lag [samples]",
+        y=tuple(f"{output} [-]" for output in outputs),
+        heights=_stack(len(outputs)),
+        link=f"lag {experiment}",
+        caption=caption,
     )
 
 
@@ -233,95 +224,66 @@ def parameters_panel(fit: Fit) -> Panel:
     free = [one for one in fit.parameters.values() if one.free and one.value and one.std and np.isfinite(one.std)]
     if not free:
         raise EstimationError("no free parameter has a standard deviation, so that there is no interval to draw")
+    widths, before = (
+        100.0 * Z95 * np.array([std or np.nan for std in stds]) / np.abs([parameter.value for parameter in free])
+        for stds in ([parameter.std for parameter in free], [parameter.prior_std for parameter in free])
+    )
+    prior = np.isfinite(before)
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, MEASURED, scale_log
-
-        (axis,) = axes
-        places = np.arange(len(free))[::-1]
-        axis.hlines(places, [1e-300], [_percent(one.std, one.value) for one in free], color=BLUE, linewidth=1.0)
-        axis.plot(
-            [_percent(one.std, one.value) for one in free],
-            places,
-            "o",
-            color=BLUE,
-            markersize=6,
-            label="95 % interval, fitted",
-        )
-        before = [
-            (place, _percent(one.prior_std, one.value))
-            for place, one in zip(places, free, strict=True)
-            if one.prior_std is not None
-        ]
-        if before:
-            axis.plot(
-                [width for _, width in before],
-                [place for place, _ in before],
-                "D",
-                color=MEASURED,
-                fillstyle="none",
-                markersize=7,
-                label="95 % interval, known before",
-            )
-        axis.set_yticks(places, [one.name for one in free])
-        axis.set_ylim(-0.6, len(free) - 0.4)
-        widths = [_percent(one.std, one.value) for one in free] + [width for _, width in before]
-        axis.set_xlim(min(widths) / 3.0, max(widths) * 3.0)
-        scale_log(axes)
-        axis.grid(visible=False, axis="y")
-        axis.set_xlabel("half of the 95 % interval [% of the value]")
+    def draw(axis: Axes) -> None:
+        rows = np.arange(len(free))[::-1]
+        axis.hlines(rows, [1e-300], widths, color=BLUE, linewidth=1.0)
+        axis.plot(widths, rows, "o", color=BLUE, markersize=6, label="95 % interval, fitted")
+        if prior.any():
+            look: dict[str, Any] = {
+                "color": MEASURED,
+                "fillstyle": "none",
+                "markersize": 7,
+                "label": "95 % interval, known before",
+            }
+            axis.plot(before[prior], rows[prior], "D", **look)
+        axis.set_xlim(np.nanmin([widths, before]) / 3.0, np.nanmax([widths, before]) * 3.0)
 
     return Panel(
         name="parameters",
         hover="",
         title="How well the parameters are known",
         draw=draw,
+        x="half of the 95 % interval [% of the value]",
+        rows=[parameter.name for parameter in free],
+        log="x",
         heights=(max(0.35 + 0.14 * len(free), 0.6),),
         caption="Half of each fitted parameter's 95 % interval, in percent of its value, on a logarithmic axis: the "
         "further left, the better known.",
     )
 
 
-def _percent(std: float | None, value: float) -> float:
-    return 100.0 * Z95 * (std or 0.0) / abs(value)
-
-
 def correlation_panel(fit: Fit) -> Panel:
     """Draw the correlation of the free parameters' errors."""
     std = np.sqrt(np.diag(fit.covariance.matrix))
-    known = np.isfinite(std) & (std > 0.0)
-    if np.count_nonzero(known) < 2:
+    identified = np.isfinite(std) & (std > 0.0)
+    n = np.count_nonzero(identified)
+    if n < 2:
         raise EstimationError("fewer than two parameters have a standard deviation: there is no correlation to draw")
-    names = [name for name, used in zip(fit.covariance.names, known, strict=True) if used]
-    matrix = fit.covariance.matrix[known][:, known] / np.outer(std[known], std[known])
+    names = np.array(fit.covariance.names)[identified].tolist()
+    matrix = fit.covariance.matrix[identified][:, identified] / np.outer(std[identified], std[identified])
 
-    def draw(axes: Sequence[Axes]) -> None:
-        (axis,) = axes
-        n = len(names)
+    def draw(axis: Axes) -> None:
         axis.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", interpolation="nearest")
         axis.set_xticks(range(n), names)
         axis.set_yticks(range(n), names)
         axis.grid(visible=False)
         axis.tick_params(length=0)
-        for row in range(n):
-            for column in range(n):
-                value = matrix[row, column]
-                axis.text(
-                    column,
-                    row,
-                    f"{value:.2f}",
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="white" if abs(value) > 0.7 else "black",
-                )
+        for (row, column), value in np.ndenumerate(matrix):
+            colour = "white" if abs(value) > 0.7 else "black"
+            axis.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=8, color=colour)
 
     return Panel(
         name="correlation",
         hover="",
         title="Correlation of the parameters' errors",
         draw=draw,
-        heights=(float(np.clip(0.35 + 0.16 * len(names), 0.7, 2.4)),),
+        heights=(float(np.clip(0.35 + 0.16 * n, 0.7, 2.4)),),
         caption="Correlation coefficients of the fitted parameters' errors. Near ±1 the logs tell a combination of the "
         "two, not each by itself.",
     )
@@ -333,39 +295,11 @@ def _stack(count: int) -> tuple[float, ...]:
 
 
 def _shade(axis: Axes, bound: float) -> None:
-    from seaopt.reporting.figures.canvas import BAND, LIMIT
-
     axis.axhspan(-bound, bound, color=BAND, linewidth=0.0)
     axis.axhline(0.0, color=LIMIT, linewidth=0.6)
 
 
-def _reach(axis: Axes, values: list[Any], bound: float) -> None:
+def _scale_correlation(axis: Axes, values: list[Any], bound: float) -> None:
     """Leave room for the values, and around the bound where they are small."""
     largest = max([bound, 1e-3, *(float(np.max(np.abs(row))) for row in values if row.size)])
     axis.set_ylim(-1.25 * largest, 1.25 * largest)
-
-
-def choose_experiments(fit: Fit, experiment: str | None) -> tuple[Experiment, ...]:
-    """Return the experiment of a name, or all of a fit's.
-
-    Raises
-    ------
-    EstimationError
-        There is none of that name, or the fit was read from a file without its logs.
-
-    """
-    if not fit.experiments:
-        raise EstimationError("this fit was read from a file without its logs; Fit.from_dict(content, experiments)")
-    chosen = tuple(one for one in fit.experiments if experiment in (None, one.name))
-    if not chosen:
-        known = ", ".join(one.name for one in fit.experiments)
-        raise EstimationError(f'experiment = "{experiment}" is none of the fit\'s; give one of {known}')
-    return chosen
-
-
-PredictionPanel = Callable[[ModelledOutputs], Panel]
-PREDICTION_PANELS: Mapping[str, PredictionPanel] = {
-    "outputs": outputs_panel,
-    "residuals": residuals_panel,
-    "spectrum": spectrum_panel,
-}

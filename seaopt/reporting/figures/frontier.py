@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from seaopt.control import Frontier
-from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.figures.panel import BLUE, MEASURED, VERMILION, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,51 +23,36 @@ OBJECTIVES = {"disturbance": "disturbance", "noise": "noise_gain"}  # objective:
 
 
 def frontier_panel(frontier: Frontier, figure: str) -> Panel:
-    """Draw one figure of a sweep against bandwidth; bandwidths that keep not every limit are hollow."""
+    """Draw one figure of a sweep against bandwidth; bandwidths that do not meet every limit are hollow."""
     title, label = FIGURES[figure]
-    values = [getattr(row, figure) for row in frontier.rows]
+    rows = [(row, getattr(row, figure)) for row in frontier.rows if getattr(row, figure) is not None]
+    free = [(row.bandwidth_hz, row.free_law) for row in frontier.rows if row.free_law is not None]
+    free = [(hz, law.bound) for hz, law in free if OBJECTIVES[law.objective] == figure]
 
-    bars = any(row.free_law is not None and OBJECTIVES[row.free_law.objective] == figure for row in frontier.rows)
-
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, MEASURED, VERMILION
-
-        (axis,) = axes
-        known = [
-            (row.bandwidth_hz, y, row.feasible) for y, row in zip(values, frontier.rows, strict=True) if y is not None
-        ]
-        axis.plot([x for x, _, _ in known], [y for _, y, _ in known], color=MEASURED, linewidth=0.8, zorder=1)
-        for met, colour, label_ in ((True, BLUE, "every limit met"), (False, VERMILION, "a limit missed")):
-            points = [(x, y) for x, y, good in known if good == met]
+    def draw(axis: Axes) -> None:
+        axis.plot([row.bandwidth_hz for row, _ in rows], [y for _, y in rows], color=MEASURED, linewidth=0.8, zorder=1)
+        for met, colour, face, name in (
+            (True, BLUE, BLUE, "every limit met"),
+            (False, VERMILION, "white", "a limit missed"),
+        ):
+            points = [(row.bandwidth_hz, y) for row, y in rows if row.feasible == met]
             if points:
-                look: dict[str, Any] = {
-                    "color": colour,
-                    "markerfacecolor": colour if met else "white",
-                    "label": label_,
-                    "markersize": 5,
-                }
-                axis.plot(*zip(*points, strict=True), "o", **look)
-        bounds = [
-            (row.bandwidth_hz, row.free_law.bound)
-            for row in frontier.rows
-            if row.free_law is not None
-            and row.free_law.bound is not None
-            and OBJECTIVES[row.free_law.objective] == figure
-        ]
+                axis.plot(*zip(*points, strict=True), "o", color=colour, markerfacecolor=face, markersize=5, label=name)
+        bounds = [(hz, bound) for hz, bound in free if bound is not None]
         if bounds:
             axis.plot(*zip(*bounds, strict=True), "_", color=MEASURED, markersize=9, label="any linear law, at best")
-        if not known:
+        if not rows:
             axis.text(0.5, 0.5, "no limit of the command", transform=axis.transAxes, ha="center")
-        axis.set_xlabel("bandwidth [Hz]")
-        axis.set_ylabel(label.format(called=frontier.mechanics))
 
     return Panel(
         name=f"frontier_{figure}",
         title=title,
         draw=draw,
+        x="bandwidth [Hz]",
+        y=(label.format(called=frontier.mechanics),),
         link="bandwidth",
-        caption="Of the best controller for each bandwidth; hollow: it misses a limit."
-        + (" Bars: the best of all linear laws on the design plant alone." if bars else ""),
+        caption="The best controller for each bandwidth; hollow: it misses a limit."
+        + (" Bars: the best of all linear laws on the design plant alone." if free else ""),
     )
 
 

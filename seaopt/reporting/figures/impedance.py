@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from seaopt.control import Impedance, ImpedanceRegion
-from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.figures.panel import BLUE, GREEN, LIMIT, SKY, VERMILION, Panel, draw_level
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
 def region_panel(region: ImpedanceRegion, asked: Impedance | None = None) -> Panel:
-    """Draw where stiffness and damping at the link are passive, and where the link by itself is stable.
+    """Draw where stiffness and damping at the link are passive, where the link alone is stable, and what is asked."""
 
-    Parameters
-    ----------
-    region : ImpedanceRegion
-        The map.
-    asked : Impedance, optional
-        What is to be rendered.
-
-    """
-    called = region.called
-
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, GREEN, LIMIT, SKY, VERMILION
-
-        (axis,) = axes
+    def draw(axis: Axes) -> None:
         d, k = np.meshgrid(region.damping, region.stiffness)
         margin = np.clip(region.margin, -1.0, 1.0)
         if np.any(region.passive):
@@ -43,30 +29,22 @@ def region_panel(region: ImpedanceRegion, asked: Impedance | None = None) -> Pan
         if region.critical.stiffness.size:
             axis.plot(region.critical.damping, region.critical.stiffness, color=GREEN, linewidth=1.3, label="critical")
         if region.spring is not None and region.spring <= region.stiffness[-1]:
-            axis.axhline(region.spring, color=LIMIT, linewidth=0.9, linestyle=":", label="the spring")
+            draw_level(axis, region.spring, "the spring", style=":")
         for impedance, marker, label in ((region.stiffest, "^", "stiffest"), (asked, "D", "asked")):
             if impedance is not None:
-                axis.plot(
-                    [impedance.damping],
-                    [impedance.stiffness],
-                    marker,
-                    color=LIMIT,
-                    markersize=6,
-                    linestyle="",
-                    label=label,
-                )
+                point = [impedance.damping], [impedance.stiffness]
+                axis.plot(*point, marker, color=LIMIT, markersize=6, label=label)
         axis.set_xlim(region.damping[0], region.damping[-1])
         axis.set_ylim(region.stiffness[0], region.stiffness[-1])
-        axis.set_xlabel(f"damping D_v [{called.damping}]")
-        axis.set_ylabel(f"stiffness K_v [{called.stiffness}]")
 
-    said = "; ".join(region.describe())
     return Panel(
         name="impedance_region",
         title="What may be rendered at the link",
         draw=draw,
+        x=f"damping D_v [{region.called.damping}]",
+        y=(f"stiffness K_v [{region.called.stiffness}]",),
         heights=(1.3,),
         hover="",
         caption="Inside, no passive linear environment makes the sampled loop unstable; everywhere else one does: "
-        f"{said}.",
+        f"{'; '.join(region.describe())}.",
     )

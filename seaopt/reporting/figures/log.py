@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -10,11 +9,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.logs import Log, Quality, Table
-from seaopt.logs.quality.channel import ChannelQuality
 from seaopt.logs.quality.clock import ClockQuality
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.reporting.figures.fit import label_channel
-from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.figures.panel import BLUE, COLOURS, GREEN, MEASURED, ORANGE, PINK, VERMILION, Panel
 from seaopt.reporting.figures.thinning import STRETCHES, break_at, describe_thinning, thin_series
 from seaopt.reporting.sections.kinds.quality import describe_jitter
 from seaopt.welch import MEAN_SQUARE
@@ -38,10 +36,7 @@ def clock_panel(data: Log | Table, quality: Quality) -> Panel:
     """Draw the steps of time against the period, gaps as marks: they would flatten all else."""
     clock, time = quality.clock, data.time
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, MEASURED, VERMILION
-
-        (axis,) = axes
+    def draw(axis: Axes) -> None:
         step = np.diff(time)
         step = np.where(np.abs(step) > 3.0 * clock.period, np.nan, step)
         _draw_series(axis, time[1:], 1e3 * step, clock.gaps - 1, MEASURED, "step")
@@ -51,14 +46,14 @@ def clock_panel(data: Log | Table, quality: Quality) -> Panel:
         # A perfect clock is drawn as a line, not as its rounding.
         spread = max(1.2e3 * float(np.nanmax(np.abs(step - clock.period), initial=0.0)), 20.0 * clock.period)
         axis.set_ylim(1e3 * clock.period - spread, 1e3 * clock.period + spread)
-        axis.set_xlabel("time [s]")
-        axis.set_ylabel("step [ms]")
-        axis.margins(x=0.0)
 
     return Panel(
         name="clock",
         title=f"Clock: {describe_jitter(clock)}",
         draw=draw,
+        x="time [s]",
+        y=("step [ms]",),
+        tight=True,
         link="log time",
         caption=f"Steps of time between samples. {describe_thinning(time.size)}",
     )
@@ -67,16 +62,10 @@ def clock_panel(data: Log | Table, quality: Quality) -> Panel:
 def excitation_panel(quality: Quality) -> Panel:
     """Draw how coherent the best output is with each input, band by band, and the band that identifies a model."""
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import COLOURS, scale_log
-
-        (axis,) = axes
+    def draw(axis: Axes) -> None:
         axis.set_ylim(0.0, 1.05)
-        axis.set_xlabel("frequency [Hz]")
-        axis.set_ylabel("coherence [-]")
         if not quality.excitation:
             axis.text(0.5, 0.5, "no input, or too few samples", transform=axis.transAxes, ha="center", va="center")
-            return
         for (name, excitation), colour in zip(quality.excitation.items(), COLOURS * 9, strict=False):
             middle = [float(np.sqrt(band.low_hz * band.high_hz)) for band in excitation.bands]
             height = [band.coherence if band.coherence is not None else np.nan for band in excitation.bands]
@@ -84,14 +73,16 @@ def excitation_panel(quality: Quality) -> Panel:
             if excitation.usable_hz is not None:
                 label = f"{name}: band that identifies a model"
                 axis.axvspan(*excitation.usable_hz, color=colour, alpha=0.12, linewidth=0.0, label=label)
-        if quality.spectra is not None:
+        if quality.excitation and quality.spectra is not None:
             axis.set_xlim(0.8 * quality.spectra.frequency_hz[1], 1.1 * quality.spectra.frequency_hz[-1])
-        scale_log(axes)
 
     return Panel(
         name="excitation",
         title="What the inputs excite",
         draw=draw,
+        x="frequency [Hz]",
+        y=("coherence [-]",),
+        log="x" if quality.excitation else "",
         link="log frequency",
         caption="Coherence of the best output with the input, band by band; shaded: where a model can be identified.",
     )
@@ -102,10 +93,7 @@ def channel_panel(data: Log | Table, quality: Quality, name: str) -> Panel:
     channel, time = quality.channels[name], data.time
     values = np.clip(data.signals[name].values, -DRAWN, DRAWN)
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, GREEN, MEASURED, ORANGE, PINK, VERMILION
-
-        (axis,) = axes
+    def draw(axis: Axes) -> None:
         _draw_series(axis, time, values, quality.clock.gaps, MEASURED, name)
         _mark_gaps(axis, time, quality.clock)
         _mark_spans(axis, time, channel.missing, BLUE, "missing")
@@ -118,14 +106,14 @@ def channel_panel(data: Log | Table, quality: Quality, name: str) -> Panel:
             axis.plot(time[rows], values[rows], "o", color=GREEN, markersize=4, fillstyle="none", label="outlier")
         if channel.counter is not None:
             _mark_lines(axis, time, channel.counter.rows, ORANGE, "lost, by the counter")
-        axis.set_xlabel("time [s]")
-        axis.set_ylabel(_label(channel))
-        axis.margins(x=0.0)
 
     return Panel(
         name=f"channel_{name}",
         title=f"{name} over time",
         draw=draw,
+        x="time [s]",
+        y=(label_channel(name, channel.unit) if channel.unit else name,),
+        tight=True,
         link="log time",
         caption=f"The channel {name} as logged, with what is wrong with it marked. {describe_thinning(time.size)}",
     )
@@ -133,48 +121,41 @@ def channel_panel(data: Log | Table, quality: Quality, name: str) -> Panel:
 
 def density_panel(quality: Quality, name: str) -> Panel:
     """Draw the spectral density of one channel, with the lines of the mains where they stand out."""
-    channel, spectra = quality.channels[name], quality.spectra
+    channel, f, density = quality.channels[name], *_measure_density(quality, name)
+    top = float(np.max(density, initial=0.0))
+    empty = not np.isfinite(top) or top <= 0.0
 
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import MEASURED, VERMILION, scale_log
-
-        (axis,) = axes
-        axis.set_xlabel("frequency [Hz]")
-        axis.set_ylabel(f"{name} [{channel.unit or '1'}/√Hz]")
-        density = np.zeros(0) if spectra is None or name not in spectra.channels else _density(quality, name)
-        top = float(np.max(density, initial=0.0))
-        if spectra is None or not np.isfinite(top) or top <= 0.0:
+    def draw(axis: Axes) -> None:
+        if empty:
             axis.text(0.5, 0.5, "no spectrum", transform=axis.transAxes, ha="center", va="center")
             return
-        f = spectra.frequency_hz[1:]
         axis.plot(f, np.maximum(density, 1e-12 * top), color=MEASURED, linewidth=0.9, label=name)
         axis.set_ylim(max(float(np.min(density)), 1e-6 * top) / 2.0, 3.0 * top)
         for line in channel.hum.lines_hz if channel.hum is not None else ():
             axis.axvline(line, color=VERMILION, linewidth=0.8, linestyle=":", label="mains")
         axis.set_xlim(0.8 * f[0], 1.1 * f[-1])
-        scale_log(axes)
-        scale_log(axes, "y")
 
     return Panel(
         name=f"density_{name}",
         title=f"{name} in frequency",
         draw=draw,
+        x="frequency [Hz]",
+        y=(f"{name} [{channel.unit or '1'}/√Hz]",),
+        log="" if empty else "xy",
         link="log frequency",
         caption=f"Amplitude spectral density of {name} (Welch, Hann window).",
     )
 
 
-def _density(quality: Quality, name: str) -> Float[np.ndarray, " m"]:
-    """Return the root of the power density above 0 Hz."""
+def _measure_density(quality: Quality, name: str) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return the frequencies above 0 Hz and the root of the power density there; empty without a spectrum."""
     spectra = quality.spectra
-    assert spectra is not None
+    if spectra is None or name not in spectra.channels:
+        return np.zeros(0), np.zeros(0)
     n = 2 * (spectra.frequency_hz.size - 1)
     with np.errstate(over="ignore", invalid="ignore"):  # numbers near the largest float have no power
-        return np.sqrt(2.0 * spectra.power(name)[1:] * spectra.period / (MEAN_SQUARE * n))
-
-
-def _label(channel: ChannelQuality) -> str:
-    return label_channel(channel.name, channel.unit) if channel.unit else channel.name
+        density = np.sqrt(2.0 * spectra.power(name)[1:] * spectra.period / (MEAN_SQUARE * n))
+    return spectra.frequency_hz[1:], density
 
 
 def _draw_series(
@@ -198,15 +179,12 @@ def _draw_series(
 
 
 def _mark_spans(axis: Axes, time: Float[np.ndarray, " n"], runs: RowRanges, colour: str, label: str) -> None:
-    for start, stop in zip(
-        time[runs.start[:MOST_MARKS]].tolist(), time[runs.stop[:MOST_MARKS] - 1].tolist(), strict=True
-    ):
+    ends = time[runs.start[:MOST_MARKS]], time[runs.stop[:MOST_MARKS] - 1]
+    for start, stop in np.stack(ends, axis=1).tolist():
         axis.axvspan(start, stop, color=colour, alpha=0.35, linewidth=1.0, label=label)
 
 
 def _mark_gaps(axis: Axes, time: Float[np.ndarray, " n"], clock: ClockQuality) -> None:
-    from seaopt.reporting.figures.canvas import ORANGE
-
     _mark_spans(axis, time, RowRanges(start=clock.gaps - 1, stop=clock.gaps + 1), ORANGE, "gap")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from seaopt.frequency import Pair
 from seaopt.records import record
-from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.figures.panel import BAND, MEASURED, Panel, frequency_panel, to_decibel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,47 +27,42 @@ class Curve:
     """A model's response, a function of frequencies in Hz."""
 
     label: str
-    response: Any
+    response: Callable[[Any], Any]
     colour: str
     style: str = "-"
 
 
-def response_panel(name: str, title: str, pair: Pair, curves: Sequence[Curve], caption: str = "") -> Panel:
+def response_panel(name: str, title: str, pair: Pair, curves: Sequence[Curve]) -> Panel:
     """Draw magnitude with two standard deviations, phase and coherence; the first curve tells the phase's branch."""
-
-    def draw(axes: Sequence[Axes]) -> None:
-        _draw(axes, pair, curves)
-
-    said = f"H1 estimate of {pair.name} with two standard deviations, phase and coherence, and models on top."
-    count = pair.estimate.frequency_hz.size
-    if count > LINES:
-        said += f" Of {count} lines, those nearest to {LINES} frequencies evenly spaced on the axis are drawn."
-    return Panel(name=name, title=title, draw=draw, heights=ROWS, link="frequency", caption=f"{said} {caption}".strip())
-
-
-def _draw(axes: Sequence[Axes], pair: Pair, curves: Sequence[Curve]) -> None:
-    from seaopt.reporting.figures.canvas import MEASURED, scale_log
-
-    magnitude, phase, coherence = axes
     estimate = pair.estimate
     f = estimate.frequency_hz
-    shown = (estimate.coherence > SHOWN) & spread_lines(f)
-    ends = (float(f[0]), float(f[shown][-1] if np.any(shown) else f[-1]))
-    dense = np.geomspace(*ends, POINTS)
-    branch = _model_curves(magnitude, phase, curves, dense)
-    if np.any(shown):  # after the models, whose branch it takes
-        _measured(magnitude, phase, pair, shown, np.interp(f[shown], dense, branch))
-    drawn = spread_lines(f)
-    coherence.plot(f[drawn], estimate.coherence[drawn], color=MEASURED, linewidth=0.8)
-    coherence.set_ylim(0.0, 1.05)
-    coherence.set_xlim(*ends)
-    scale_log(axes)
-    for axis, label in zip(axes, (f"|{pair.name}| [dB re {pair.unit}]", "phase [deg]", "coherence [-]"), strict=True):
-        axis.set_ylabel(label)
-    coherence.set_xlabel("frequency [Hz]")
+
+    def draw(magnitude: Axes, phase: Axes, coherence: Axes) -> None:
+        drawn = _spread_lines(f)
+        shown = (estimate.coherence > SHOWN) & drawn
+        ends = (float(f[0]), float(f[shown][-1] if np.any(shown) else f[-1]))
+        dense = np.geomspace(*ends, POINTS)
+        branch = _draw_models(magnitude, phase, curves, dense)
+        if np.any(shown):  # after the models, whose branch it takes
+            _draw_estimate(magnitude, phase, pair, shown, np.interp(f[shown], dense, branch))
+        coherence.plot(f[drawn], estimate.coherence[drawn], color=MEASURED, linewidth=0.8)
+        coherence.set_ylim(0.0, 1.05)
+        coherence.set_xlim(*ends)
+
+    caption = f"H1 estimate of {pair.name} with two standard deviations, phase and coherence, and models on top."
+    if f.size > LINES:
+        caption += f" Of {f.size} lines, those nearest to {LINES} frequencies evenly spaced on the axis are drawn."
+    return frequency_panel(
+        name=name,
+        title=title,
+        draw=draw,
+        y=(f"|{pair.name}| [dB re {pair.unit}]", "phase [deg]", "coherence [-]"),
+        heights=ROWS,
+        caption=caption,
+    )
 
 
-def spread_lines(f: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+def _spread_lines(f: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
     """Return which lines of an estimate are drawn: all, or those nearest to frequencies evenly spaced in log f."""
     drawn = np.full(f.size, f.size <= LINES)
     if f.size > LINES:
@@ -77,32 +72,23 @@ def spread_lines(f: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
     return drawn
 
 
-def _model_curves(magnitude: Axes, phase: Axes, curves: Sequence[Curve], f: Any) -> Any:
+def _draw_models(magnitude: Axes, phase: Axes, curves: Sequence[Curve], f: Any) -> Any:
     """Draw the models, all on the phase branch of the first; return that phase in degrees."""
     branch = np.zeros(f.size)
     for number, curve in enumerate(curves):
         response = curve.response(f)
         angle = np.degrees(np.unwrap(np.angle(response)))
-        if number == 0:
-            branch = angle = angle - 360.0 * np.round(angle[0] / 360.0)
-        else:
-            angle = angle - 360.0 * np.round(np.median(angle - branch) / 360.0)
-        look: dict[str, Any] = {
-            "color": curve.colour,
-            "linestyle": curve.style,
-            "linewidth": 1.4,
-            "zorder": 3,
-            "label": curve.label,
-        }
-        magnitude.plot(f, 20 * np.log10(np.maximum(np.abs(response), 1e-12)), **look)
-        phase.plot(f, angle, **look)
+        turns = np.round((angle[0] if number == 0 else np.median(angle - branch)) / 360.0)
+        angle -= 360.0 * turns
+        branch = angle if number == 0 else branch
+        look: dict[str, Any] = {"color": curve.colour, "linestyle": curve.style, "linewidth": 1.4, "zorder": 3}
+        magnitude.plot(f, to_decibel(response), label=curve.label, **look)
+        phase.plot(f, angle, label=curve.label, **look)
     return branch
 
 
-def _measured(magnitude: Axes, phase: Axes, pair: Pair, shown: Any, branch: Any) -> None:
-    """Draw H1; its phase on the branch nearest the model's: noise at a dip must not shift the rest by a turn."""
-    from seaopt.reporting.figures.canvas import BAND, MEASURED
-
+def _draw_estimate(magnitude: Axes, phase: Axes, pair: Pair, shown: Any, branch: Any) -> None:
+    """Draw H1; its phase on the branch nearest the model's: noise at a dip must not shift what follows by a turn."""
     estimate = pair.estimate
     f, h, std = estimate.frequency_hz[shown], estimate.response[shown], estimate.relative_std[shown]
     level = 20 * np.log10(np.maximum(np.abs(h), 1e-300))
@@ -112,7 +98,7 @@ def _measured(magnitude: Axes, phase: Axes, pair: Pair, shown: Any, branch: Any)
     dots: dict[str, Any] = {"color": MEASURED, "marker": ".", "markersize": 2.5, "linestyle": "", "label": H1}
     magnitude.plot(f, level, **dots)
     phase.plot(f, angle, **dots)
-    span = float(np.ptp(level))
-    magnitude.set_ylim(float(level.min()) - 0.15 * span - 3.0, float(level.max()) + 0.15 * span + 3.0)
-    width = max(float(np.ptp(angle)), 45.0)
-    phase.set_ylim(float(angle.min()) - 0.15 * width, float(angle.max()) + 0.15 * width)
+    room = 0.15 * float(np.ptp(level)) + 3.0
+    magnitude.set_ylim(float(level.min()) - room, float(level.max()) + room)
+    room = 0.15 * max(float(np.ptp(angle)), 45.0)
+    phase.set_ylim(float(angle.min()) - room, float(angle.max()) + room)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from seaopt.control import ScheduledController
-from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.figures.fit import label_channel
+from seaopt.reporting.figures.panel import BLUE, COLOURS, MEASURED, VERMILION, Panel, draw_level
 from seaopt.robustness import ScheduleCertificate
-from seaopt.units import unit_after
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,111 +18,76 @@ if TYPE_CHECKING:
 
 def schedule_panels(schedule: ScheduledController, certificate: ScheduleCertificate | None = None) -> list[Panel]:
     """Return the figures of a schedule: gains, bandwidth, and Ms with what is proved of it."""
-    return [gains_panel(schedule), bandwidth_panel(schedule), sensitivity_panel(schedule, certificate)]
+    panel = partial(Panel, x=label_channel(schedule.over, schedule.unit), link=schedule.over)
+    return [
+        panel(
+            name="schedule_gains",
+            title="Gains over the variable",
+            draw=partial(_draw_gains, schedule),
+            y=("gain, of its largest [-]",),
+            caption="Tuned at the points, interpolated on the lines between them.",
+        ),
+        panel(
+            name="schedule_bandwidth",
+            title="Bandwidth on the design plant",
+            draw=partial(_draw_bandwidth, schedule),
+            y=("bandwidth [Hz]",),
+            caption="With the variable standing still.",
+        ),
+        panel(
+            name="schedule_ms",
+            title="Largest Ms of all plants",
+            draw=partial(_draw_sensitivity, schedule, certificate),
+            y=("Ms [-]",),
+            caption="With the variable standing still, at the points and between them.",
+        ),
+    ]
 
 
-def gains_panel(schedule: ScheduledController) -> Panel:
-    """Draw every gain over the variable, as a share of its largest."""
-    table = schedule.table
-
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import COLOURS
-
-        (axis,) = axes
-        for (name, row), colour in zip(table.gains.items(), COLOURS, strict=False):
-            largest = float(np.max(np.abs(row)))
-            if largest:
-                label = f"{name}, of {largest:.4g}"
-                axis.plot(table.points, row / largest, "o-", color=colour, markersize=4, label=label)
-        axis.set_xlabel(_label(schedule))
-        axis.set_ylabel("gain, of its largest [-]")
-
-    return Panel(
-        name="schedule_gains",
-        title="Gains over the variable",
-        draw=draw,
-        link=schedule.over,
-        caption="Tuned at the points, interpolated on the lines between them.",
-    )
+def _draw_gains(schedule: ScheduledController, axis: Axes) -> None:
+    """Draw every gain as a share of its largest."""
+    for (name, row), colour in zip(schedule.table.gains.items(), COLOURS, strict=False):
+        largest = float(np.max(np.abs(row)))
+        if largest:
+            label = f"{name}, of {largest:.4g}"
+            axis.plot(schedule.table.points, row / largest, "o-", color=colour, markersize=4, label=label)
 
 
-def bandwidth_panel(schedule: ScheduledController) -> Panel:
-    """Draw the bandwidth of the schedule over the variable, and that of the law of its fallback alone."""
-
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, MEASURED, VERMILION
-
-        (axis,) = axes
-        tuned = zip(schedule.points, schedule.controllers, strict=True)
-        reached = [(point, one.achieved.bandwidth_hz) for point, one in tuned]
-        reached += [(one.value, one.bandwidth_hz) for one in schedule.between]
-        known = sorted((x, y) for x, y in reached if y is not None)
-        axis.plot([x for x, _ in known], [y for _, y in known], "o-", color=BLUE, markersize=3, label="schedule")
-        others = [(value, measure_alone(schedule, value)) for value in schedule.points]
-        axis.plot(
-            [x for x, y in others if y],
-            [y for _, y in others if y],
-            "s--",
-            color=VERMILION,
-            markersize=3,
-            label=f"the law of {schedule.over} = {schedule.fallback:g} everywhere",
-        )
-        asked = [schedule.asked_hz(x) for x in schedule.points]
-        axis.plot(schedule.points, asked, ":", color=MEASURED, label="asked")
-        axis.set_ylim(0.0, 1.15 * max([*asked, *(y for _, y in known), *(y or 0.0 for _, y in others)]))
-        axis.set_xlabel(_label(schedule))
-        axis.set_ylabel("bandwidth [Hz]")
-
-    return Panel(
-        name="schedule_bandwidth",
-        title="Bandwidth on the design plant",
-        draw=draw,
-        link=schedule.over,
-        caption="With the variable standing still.",
-    )
+def _draw_bandwidth(schedule: ScheduledController, axis: Axes) -> None:
+    """Draw the bandwidth of the schedule, and that of the law of its fallback alone."""
+    tuned = zip(schedule.points, schedule.controllers, strict=True)
+    reached = [(point, controller.achieved.bandwidth_hz) for point, controller in tuned]
+    reached += [(place.value, place.bandwidth_hz) for place in schedule.between]
+    alone = [(value, _measure_alone(schedule, value)) for value in schedule.points]
+    curves = [sorted((x, y) for x, y in curve if y) for curve in (reached, alone)]
+    labels = "schedule", f"the law of {schedule.over} = {schedule.fallback:g} everywhere"
+    for curve, style, colour, label in zip(curves, ("o-", "s--"), (BLUE, VERMILION), labels, strict=True):
+        axis.plot([x for x, _ in curve], [y for _, y in curve], style, color=colour, markersize=3, label=label)
+    asked = [schedule.asked_hz(x) for x in schedule.points]
+    axis.plot(schedule.points, asked, ":", color=MEASURED, label="asked")
+    axis.set_ylim(0.0, 1.15 * max([*asked, *(y for curve in curves for _, y in curve)]))
 
 
-def measure_alone(schedule: ScheduledController, value: float) -> float | None:
+def _measure_alone(schedule: ScheduledController, value: float) -> float | None:
     """Return the bandwidth on the design plant at a value of the law of the fallback."""
     law = schedule.controllers[schedule.points.index(schedule.fallback)]
-    plant, params = schedule.at(value).design or schedule.design
-    return law.close(plant, params).figures().bandwidth_hz
+    return law.close(*(schedule.at(value).design or schedule.design)).figures().bandwidth_hz
 
 
-def sensitivity_panel(schedule: ScheduledController, certificate: ScheduleCertificate | None) -> Panel:
-    """Draw the largest Ms of all plants over the variable, the worst cases found, and the proved bound."""
-
-    def draw(axes: Sequence[Axes]) -> None:
-        from seaopt.reporting.figures.canvas import BLUE, MEASURED, VERMILION
-
-        (axis,) = axes
-        if certificate is None:
-            rows = [(one.value, one.ms) for one in schedule.between]
-        else:
-            rows = [(place.value, place.ms) for place in certificate.places]
-            worst = [(place.value, place.worst_ms) for place in certificate.places if place.worst_ms is not None]
-            axis.plot(*zip(*worst, strict=True), "^", color=VERMILION, markersize=4, label="worst case found")
-            proved: dict[tuple[float, float], float] = {}
-            for one in certificate.stretches:  # of every plant
-                proved[one.low, one.high] = max(proved.get((one.low, one.high), 0.0), one.ms)
-            for number, ((low, high), bound) in enumerate(proved.items()):
-                label = None if number else "no plant has more, proved of nominal parameters"
-                axis.plot([low, high], [bound, bound], color=MEASURED, linewidth=1.2, label=label)
-        axis.plot(*zip(*rows, strict=True), "o-", color=BLUE, markersize=3, label="nominal")
-        level = schedule.spec.level("max_sensitivity")
-        if level is not None:
-            axis.axhline(level, color="black", linewidth=0.8, linestyle="--", label="limit")
-        axis.set_xlabel(_label(schedule))
-        axis.set_ylabel("Ms [-]")
-
-    return Panel(
-        name="schedule_ms",
-        title="Largest Ms of all plants",
-        draw=draw,
-        link=schedule.over,
-        caption="With the variable standing still, at the points and between them.",
-    )
-
-
-def _label(schedule: ScheduledController) -> str:
-    return f"{schedule.over} [{unit_after(schedule.unit).strip() or '-'}]"
+def _draw_sensitivity(schedule: ScheduledController, certificate: ScheduleCertificate | None, axis: Axes) -> None:
+    """Draw the largest Ms of all plants, the worst cases found, and the proved bound."""
+    if certificate is None:
+        rows = [(place.value, place.ms) for place in schedule.between]
+    else:
+        rows = [(place.value, place.ms) for place in certificate.places]
+        worst = [(place.value, place.worst_ms) for place in certificate.places if place.worst_ms is not None]
+        axis.plot(*zip(*worst, strict=True), "^", color=VERMILION, markersize=4, label="worst case found")
+        proved: dict[tuple[float, float], float] = {}
+        for stretch in certificate.stretches:  # of every plant
+            ends = stretch.low, stretch.high
+            proved[ends] = max(proved.get(ends, 0.0), stretch.ms)
+        for number, (ends, bound) in enumerate(proved.items()):
+            label = None if number else "no plant has more, proved of nominal parameters"
+            axis.plot(ends, [bound, bound], color=MEASURED, linewidth=1.2, label=label)
+    axis.plot(*zip(*rows, strict=True), "o-", color=BLUE, markersize=3, label="nominal")
+    draw_level(axis, schedule.spec.level("max_sensitivity"), "limit")

@@ -263,8 +263,7 @@ def _plates_of_controller(material: Material) -> list[Plate]:
     if controller is None or (controller.design is None and (certificate is None or not certificate.models)):
         return []
     plants = certificates.plants_of(certificate) if certificate is not None else None
-    names = ("step", "bode", "tracking", "sensitivity", "nyquist", "noise")
-    panels = tuple(loops.LOOP_PANELS[name](controller, plants) for name in names)
+    panels = tuple(loops.LOOP_PANELS[name](controller, plants) for name in loops.MAIN)
     return [Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)]
 
 
@@ -332,7 +331,7 @@ def _plates_of_simulation(material: Material) -> list[Plate]:
     played = material.verification
     for name in dict.fromkeys(row.plant for row in played.rows) if played is not None else ():
         assert played is not None
-        panels = simulations.simulation_panels(played, name)
+        panels = [simulations.simulation_panel(played, row) for row in played.worst() if row.plant == name]
         plates.append(
             Plate(name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=tuple(panels))
         )

@@ -116,7 +116,7 @@ class Certificate(Result, Worded):
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:CertificatePlots")
+    plot = PlotAccessor()
 
     requirements: tuple[Requirement, ...]
     plants: Mapping[str, LoopFigures]

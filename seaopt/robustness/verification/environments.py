@@ -90,7 +90,7 @@ class StabilityMap:
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:StabilityPlots")
+    plot = PlotAccessor()
 
     mass: Float[np.ndarray, " m"]
     stiffness: Float[np.ndarray, " k"]

@@ -90,7 +90,7 @@ class LargeSignal:
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:LargeSignalPlots")
+    plot = PlotAccessor()
 
     plant: str
     frequency_hz: Float[np.ndarray, " f"]

@@ -59,7 +59,7 @@ class Verification(Result):
 
     """
 
-    plot = PlotAccessor("seaopt.reporting.plots:VerificationPlots")
+    plot = PlotAccessor()
 
     rows: tuple[Outcome, ...]
     skipped: tuple[tuple[str, str, str], ...]
