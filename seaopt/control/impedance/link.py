@@ -18,7 +18,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.outer_loop import Impedance, OuterLoop
 from seaopt.control.loops.port import PortModel, port_of
-from seaopt.control.loops.sampled_plant import DigitalPlant, hold, linearise_sets
+from seaopt.control.loops.sampled_plant import DigitalPlant, linearise_sets
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -56,18 +56,7 @@ class Link:
 
     def held(self) -> DigitalPlant:
         """Return the sampled plant from motor force to what is measured with the link held."""
-        a, b, c, d = (part[None] for part in self.port.link_held())
-        a, b, c, d = (part[0] for part in hold(a, b, c, d, self.sample_time_s, np.array([self.port.delay_s])))
-        return DigitalPlant(
-            a=a,
-            b=b,
-            c=c[0],
-            d=float(d[0]),
-            sample_time_s=self.sample_time_s,
-            delay_samples=self.delay_samples,
-            static_gain=np.nan,
-            others=(c[1:], d[1:]),
-        )
+        return self.port.hold_link(self.sample_time_s, self.delay_samples)
 
     def outer(self, impedance: Impedance) -> OuterLoop:
         """Return the outer loop that renders an impedance here."""
@@ -100,7 +89,7 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
     port = port_of(sliding, params, controller.signals, per_effort)
     linear, _ = linearise_sets(sliding, [sliding.complete(params)], str(plant.port.motion), per_effort)
     static = port.response(np.array([STATIC_HZ]))
-    ratio = complex(static.motor_to_port[0] / static.motor_to_feedback[0])
+    ratio = complex(static.motor_to_port[0] / static.motor_to_read[0, 0])
     if not (np.isfinite(ratio) and abs(ratio.real) > 1e-6 and abs(ratio.imag) < 1e-3 * abs(ratio.real)):
         raise ControlError(
             f"{measured} of plant {plant.name} does not tell the effort on the link at rest; measure an output that "
@@ -126,7 +115,7 @@ def _read_load(port: PortModel, linear: tuple[Float[np.ndarray, "..."], ...], na
         np.linalg.solve(
             s[:, None, None] * np.eye(b.size) - a, np.broadcast_to(b[:, None].astype(complex), (f.size, b.size, 1))
         )[:, :, 0]
-        @ c
+        @ c[0]
     )
     whole = -drive / (s * moved)
     load = whole - response.motion_to_port

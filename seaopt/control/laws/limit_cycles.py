@@ -146,8 +146,7 @@ def _respond(
     theta = 2 * np.pi * f * loop.plant.sample_time_s
     opened = loop.respond(theta, FUNDAMENTAL, np.eye(loop.motor.size))
     by_friction, by_motor = opened.by_friction[:, 0, :, port], opened.by_motor[:, 0]
-    rows, through = loop.sensed
-    sensed = rows @ by_friction.T + through[:, port, None]
+    sensed = loop.sensed @ by_friction.T + loop.through[:, port, None]
     effort = -np.sum(loop.feedback(theta) * sensed, axis=0)
     x = by_friction + by_motor * effort[:, None]
-    return x @ loop.velocity[port], sensed[0] + (by_motor @ loop.measured) * effort, x
+    return x @ loop.velocity[port], sensed[0] + (by_motor @ loop.sensed[0]) * effort, x

@@ -48,7 +48,6 @@ from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import Frequencies, PortModel, Response, hold_response, port_of, weigh_passivity
-from seaopt.control.loops.sampled_plant import DigitalPlant, hold
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -267,20 +266,7 @@ def passivity_rows(
 
 def is_held_stable(port: PortModel, law: Law, sample_time_s: float, delay_samples: int) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
-    a, b, c, d = port.link_held()
-    delay_s = np.array([port.delay_s])
-    a, b, c, d = hold(a[None], b[None], c[None], d[None], sample_time_s, delay_s)
-    plant = DigitalPlant(
-        a=a[0],
-        b=b[0],
-        c=c[0, 0],
-        d=float(d[0, 0]),
-        sample_time_s=sample_time_s,
-        delay_samples=delay_samples,
-        static_gain=np.nan,
-        others=(c[0, 1:], d[0, 1:]),
-    )
-    poles = Loop(plant=plant, law=law).eigenvalues()
+    poles = Loop(plant=port.hold_link(sample_time_s, delay_samples), law=law).eigenvalues()
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
 
 
@@ -329,7 +315,7 @@ def _find_bands(
 def _find_limit(port: PortModel, f: Frequencies) -> float | None:
     def compare_directions(x: Frequencies) -> Frequencies:
         response = port.response(x)
-        return np.real(response.motor_to_port * np.conj(response.motor_to_feedback))
+        return np.real(response.motor_to_port * np.conj(response.motor_to_read[0]))
 
     crossings = find_crossings(compare_directions, f)
     return float(crossings[0]) if crossings.size else None

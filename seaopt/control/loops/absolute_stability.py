@@ -195,11 +195,10 @@ def find_responses(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) 
     """Return G_v, a (without M) and b at angles; b of each signal, per unit of its K, without the feedback."""
     period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
     orders = np.arange(-ALIASES, ALIASES + 1)
-    rows, through = loop.sensed
-    seen = np.vstack([root[:, None] * loop.velocity, rows])  # phi = slope v: the slope of phi / root is 1
+    seen = np.vstack([root[:, None] * loop.velocity, loop.sensed])  # phi = slope v: the slope of phi / root is 1
     response, ports = loop.respond(theta, orders, seen), len(root)
     by_friction = root * response.by_friction
-    read = np.swapaxes(by_friction[..., ports:, :] + through * root, -1, -2)
+    read = np.swapaxes(by_friction[..., ports:, :] + loop.through * root, -1, -2)
     if feedback:
         read = np.einsum("ym,mkpy->mkp", loop.feedback(theta), read)
     return LoopResponses(

@@ -40,15 +40,15 @@ FUNDAMENTAL = np.zeros(1, dtype=int)  # the order of the angle itself
 
 @record(eq=False)
 class FrictionLoop:
-    r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = c x."""
+    r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = C x."""
 
     a: Float[np.ndarray, "n n"]  # a, motor: the continuous plant without friction, and the effect of the motor effort u
     motor: Float[np.ndarray, " n"]
     friction: Float[np.ndarray, "n p"]  # the effect of each friction effort in the direction of its velocity
-    # velocity, measured: the velocities that friction acts on, and the regulated output
+    # velocity, sensed: the velocities that friction acts on, and the outputs that the law reads, the regulated first
     velocity: Float[np.ndarray, "p n"]
-    measured: Float[np.ndarray, " n"]
-    through: Float[np.ndarray, " p"]  # the effect of each friction effort on that output itself
+    sensed: Float[np.ndarray, "y n"]
+    through: Float[np.ndarray, "y p"]  # the effect of each friction effort on those outputs themselves
     slopes: Float[np.ndarray, " p"]  # the steepest slope of each friction curve, N s/m (N m s/rad)
     plant: DigitalPlant  # the same plant, sampled, from u to y, with its delay
     law: Law  # its C_y closes the loop
@@ -56,14 +56,6 @@ class FrictionLoop:
     linear: bool = True  # besides its friction the plant is linear, once links that turn are linearised at rest
     linearised: bool = False  # some link is
     remembers: bool = False  # some friction has bristles, and is no curve of its velocity
-    # of further outputs that the law reads, shapes (k, n) and (k, p)
-    others: tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k p"]] | None = None
-
-    @property
-    def sensed(self) -> tuple[Float[np.ndarray, "y n"], Float[np.ndarray, "y p"]]:
-        """Rows of the states, and what friction does at once, of every output that the law reads."""
-        rows, through = self.others or (np.zeros((0, self.measured.size)), np.zeros((0, self.through.size)))
-        return np.vstack([self.measured, rows]), np.vstack([self.through, through])
 
     @property
     def obstacle(self) -> str:
@@ -72,7 +64,7 @@ class FrictionLoop:
             return "the plant is not linear besides its friction"
         if self.remembers:
             return "friction with bristles is no curve of its velocity"
-        if np.any(self.sensed[1] * self.slopes):  # a sampled jump has no bounded gain
+        if np.any(self.through * self.slopes):  # a sampled jump has no bounded gain
             return "friction acts on the measured output itself"
         return ""
 
@@ -143,46 +135,42 @@ def make_friction_loops(
 ) -> list[FrictionLoop | None]:
     """Return, per set of parameters, the sliding loop with what friction has above its flattest slope taken out.
 
-    `sets`: all with the same conditions among them. `measured`: the output that is fed back, or several, the regulated
-    one first. `per_effort`: the command that the law's effort becomes, per unit. `delay_samples`: whole samples from
-    measurement to output, besides the hold. `law`: its sample time is the loop's. Returned: None where there is no
-    friction.
+    `sets`: all with the same conditions among them. `measured`: the outputs that are fed back, the regulated one first.
+    `per_effort`: the command that the law's effort becomes, per unit. `delay_samples`: whole samples from measurement
+    to output, besides the hold. `law`: its sample time is the loop's. Returned: None where there is no friction.
     """
     plant = leave_out_drift(freeze_heat(plant), measured)
     values = [plant.complete(params) for params in sets]
     spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
-    bristles = [np.array(find_bristle_stiffness(plant, each)) for each in values]
-    if not np.any(spans) and not np.any(bristles):
+    remembers = [any(find_bristle_stiffness(plant, each)) for each in values]
+    if not np.any(spans) and not any(remembers):
         return [None] * len(sets)
-    sliding = friction_states(plant)[SLIDING]
-    names = (measured,) if isinstance(measured, str) else measured
-    rows = find_rows(plant, names)
-    blocks, delays = linearise_sets(sliding, values, names, per_effort)
+    sliding, rows = friction_states(plant)[SLIDING], find_rows(plant, measured)
+    blocks, delays = linearise_sets(sliding, values, measured, per_effort)
     sampled = sample_linear(blocks, delays, law.sample_time_s, delay_samples)
     loops: list[FrictionLoop | None] = []
-    for k, (each, span, stiffness) in enumerate(zip(values, spans, bristles, strict=True)):
+    for k, each in enumerate(values):
+        if not np.any(spans[k]) and not remembers[k]:
+            loops.append(None)
+            continue
         x, u = find_rest(plant, each)
         on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, each.vector))
         linear, linearised = _check_linear(sliding, x, each.vector)
-        remembers = bool(np.any(stiffness))
         loops.append(
-            None
-            if not np.any(span) and not remembers
-            else FrictionLoop(
+            FrictionLoop(
                 a=blocks[0][k],
                 motor=blocks[1][k],
-                measured=blocks[2][k][0],
                 friction=on_states,
                 velocity=velocity,
-                through=on_outputs[rows[0]],
-                slopes=span,
+                sensed=blocks[2][k],
+                through=on_outputs[rows],
+                slopes=spans[k],
                 plant=sampled[k],
                 law=law,
                 delay_s=float(delays[k]),
                 linear=linear,
                 linearised=linearised,
-                remembers=remembers,
-                others=(blocks[2][k][1:], on_outputs[rows[1:]]),
+                remembers=remembers[k],
             )
         )
     return loops

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.sampled_plant import Measured, find_delay, find_rows, read_conditions
+from seaopt.control.loops.sampled_plant import (
+    DigitalPlant,
+    Measured,
+    find_delay,
+    find_rows,
+    read_conditions,
+    sample_linear,
+)
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -30,16 +37,6 @@ class PortResponse:
     motion_to_port: Response
 
     @property
-    def motor_to_feedback(self) -> Response:
-        """G_11, of the regulated force."""
-        return self.motor_to_read[0]
-
-    @property
-    def motion_to_feedback(self) -> Response:
-        """G_12, of the regulated force."""
-        return self.motion_to_read[0]
-
-    @property
     def determinant(self) -> Complex[np.ndarray, "y m"]:
         """Delta, of every fed-back signal."""
         return self.motor_to_read * self.motion_to_port - self.motion_to_read * self.motor_to_port
@@ -59,18 +56,12 @@ class PortModel:
     a: Float[np.ndarray, "n n"]  # a, motor, force: x' = a x + motor F_m + force F_e, shapes (n, n), (n,), (n,)
     motor: Float[np.ndarray, " n"]
     force: Float[np.ndarray, " n"]
-    feedback: Float[np.ndarray, " n+2"]  # the fed-back force of x, F_m and F_e
+    read: Float[np.ndarray, "y n+2"]  # every signal that the law reads, the regulated force first, of x, F_m and F_e
     speed: int  # speed, place: which states are the port's speed and its position
     place: int
     mass: float  # the inertia on the port (kg or kg m^2), which is taken off again
     delay_s: float = 0.0  # of the motor, besides the controller's
     place_unit: str = LINEAR.place  # of the port's motion: m or rad
-    others: Float[np.ndarray, "k m"] | None = None  # further signals that the law reads, as `feedback`
-
-    @property
-    def read(self) -> Float[np.ndarray, "y m"]:
-        """Every signal that the law reads, of x, F_m and F_e."""
-        return self.feedback[None] if self.others is None else np.vstack([self.feedback, self.others])
 
     def response(self, f: Frequencies) -> PortResponse:
         """Return the responses to motor force and to motion, F_e being what that motion takes.
@@ -84,7 +75,7 @@ class PortModel:
         inner[:, n, self.speed] = 1.0
         causes = np.zeros((n + 1, 2))
         causes[:n, 0], causes[n, 1] = self.motor, 1.0
-        x = np.linalg.solve(inner, np.broadcast_to(causes.astype(complex), (f.size, n + 1, 2)))
+        x = np.linalg.solve(inner, causes[None])
         taken = x[:, n]
         read = np.einsum("yi,mij->ymj", self.read[:, :n], x[:, :n]) + self.read[:, n + 1, None, None] * taken
         read[:, :, 0] += self.read[:, n, None]
@@ -101,19 +92,19 @@ class PortModel:
         poles = self._poles()
         return np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
 
-    def link_held(
-        self,
-    ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"], Float[np.ndarray, "y k"], Float[np.ndarray, " y"]]:
-        """Return (a, b, c, d) from motor force to what is fed back with link 2 at rest, what cannot move left out."""
+    def hold_link(self, sample_time_s: float, delay_samples: int) -> DigitalPlant:
+        """Return the sampled plant from motor force to what is fed back with link 2 at rest."""
         n, at = self.motor.size, self.force[self.speed]
         taken, pulled = -self.a[self.speed] / at, -self.motor[self.speed] / at  # F_e of x and of F_m
         a, b = self.a + np.outer(self.force, taken), self.motor + self.force * pulled
         read, of_motor, of_force = self.read[:, :n], self.read[:, n], self.read[:, n + 1]
         c, d = read + np.outer(of_force, taken), of_motor + of_force * pulled
-        moving = np.arange(n) != self.speed
+        moving = np.arange(n) != self.speed  # states that cannot move are left out
         while np.any(still := moving & ~np.any(a[:, moving], axis=1) & (b == 0.0)):
             moving &= ~still
-        return a[moving][:, moving], b[moving], c[:, moving], d
+        linear = a[moving][:, moving][None], b[moving][None], c[:, moving][None], d[None]
+        (plant,) = sample_linear(linear, np.array([self.delay_s]), sample_time_s, delay_samples)
+        return plant
 
     def _poles(self) -> Complex[np.ndarray, " n"]:
         """Return the poles with link 2 at rest."""
@@ -154,23 +145,19 @@ def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: 
     Raises ControlError: the plant has no such port or output.
     """
     probe = probe_of(plant)
-    values = probe.complete(params)
-    rows = find_rows(probe, (measured,) if isinstance(measured, str) else measured)
+    values, rows, port = probe.complete(params), find_rows(probe, measured), bare_port(probe)
     a, b, c, d = state_space(probe, values)
-    port = bare_port(probe)
-    external = list(probe.inputs).index(port.effort)
-    read = np.column_stack([c[rows], per_effort * d[rows, 0], d[rows, external]])
+    external, states = list(probe.inputs).index(port.effort), list(probe.states)
     return PortModel(
         a=a,
         motor=per_effort * b[:, 0],
         force=b[:, external].copy(),
-        feedback=read[0],
-        speed=list(probe.states).index(port.rate),
-        place=list(probe.states).index(port.coordinate),
+        read=np.column_stack([c[rows], per_effort * d[rows, 0], d[rows, external]]),
+        speed=states.index(port.rate),
+        place=states.index(port.coordinate),
         mass=values[port.inertia].value,
         delay_s=float(find_delay(plant, read_conditions(plant, params))),
         place_unit=probe.states[port.coordinate],
-        others=read[1:] if len(read) > 1 else None,
     )
 
 

@@ -211,7 +211,7 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
 
     ap, bp, cp, dp = plant
     ak, bk, ck, dk = law.a, -law.b[:, 1:], law.c, -law.d[1:]
-    cp, dp, measured = np.atleast_2d(cp), np.atleast_1d(dp), dk.size
+    measured = dk.size
     # u and m = y + n satisfy u = c_k x_k + d_r r - d_y m, m = c_p x_p + d_p (u + w) + n; inputs w, r and every n.
     n, m = bp.size, ck.size
     loop = 1.0 / (1.0 + float(dk @ dp))

@@ -35,18 +35,13 @@ from seaopt.plants.plant import DRIVE_DELAY, dynamics_function, refuse_samples
 from seaopt.records import record
 from seaopt.units import factor
 
-# Of one measured output c is a vector and d a number; of several they have a row each.
-StateSpace = tuple[
-    Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, "... n"], float | Float[np.ndarray, " y"]
-]
+# a, b, c, d from one input; c and d have a row for each output
+StateSpace = tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]
 LinearPlants = tuple[
-    Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k ... n"], Float[np.ndarray, "k ..."]
+    Inexact[np.ndarray, "k n n"], Inexact[np.ndarray, "k n"], Inexact[np.ndarray, "k y n"], Inexact[np.ndarray, "k y"]
 ]
-SampledPlants = tuple[
-    Inexact[np.ndarray, "k m m"],
-    Inexact[np.ndarray, "k m"],
-    Inexact[np.ndarray, "k ... m"],
-    Inexact[np.ndarray, "k ..."],
+SampledPlants = tuple[  # with more states, of commands on their way
+    Inexact[np.ndarray, "k m m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, "k y m"], Inexact[np.ndarray, "k y"]
 ]
 Measured = str | tuple[str, ...]  # one output by its name, or several, the regulated one first
 
@@ -72,7 +67,7 @@ class DigitalPlant:
     static_gain : float
         y/u at 0 Hz, from the continuous plant; infinite where it has an integrator.
     others : (c, d), optional
-        Of further outputs that a law reads, shapes (k, n) and (k,).
+        The same of further outputs that a law reads, shapes (k, n) and (k,).
 
     """
 
@@ -93,42 +88,29 @@ class DigitalPlant:
     @property
     def sensed(self) -> tuple[Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]:
         """Rows c and numbers d of every output, the regulated one's first."""
-        c, d = self.others or (np.zeros((0, self.c.size)), np.zeros(0))
-        return np.vstack([self.c, c]), np.concatenate([[self.d], d])
+        if self.others is None:
+            return self.c[None], np.array([self.d])
+        return np.vstack([self.c, self.others[0]]), np.append(self.d, self.others[1])
 
     def response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return P(z) z^-delay at frequencies in Hz, of the regulated output."""
-        x, late = self._respond(f)
-        return (x @ self.c + self.d) * late
+        return self.responses(f)[0]
 
     def responses(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
         """Return P(z) z^-delay at frequencies in Hz, of every output."""
-        x, late = self._respond(f)
-        return np.array([(x @ c + d) * late for c, d in zip(*self.sensed, strict=True)])
-
-    def _respond(self, f: Float[np.ndarray, " m"]) -> tuple[Complex[np.ndarray, "m n"], Complex[np.ndarray, " m"]]:
-        """Return the states per command that has come through its delay, and that delay."""
         z = np.exp(2j * np.pi * f * self.sample_time_s)
-        n = self.b.size
-        inner = z[:, None, None] * np.eye(n) - self.a
-        x = np.linalg.solve(inner, np.broadcast_to(self.b[:, None].astype(complex), (f.size, n, 1)))[:, :, 0]
-        return x, z**-self.delay_samples
+        x = np.linalg.solve(z[:, None, None] * np.eye(self.b.size) - self.a, self.b[None, :, None])[..., 0]
+        return np.array([(x @ c + d) * z**-self.delay_samples for c, d in zip(*self.sensed, strict=True)])
 
     def delayed(self) -> StateSpace:
         """Return a state-space model with the delay as states."""
-        k, n = self.delay_samples, self.b.size
-        sensed, through = (self.c, self.d) if self.others is None else self.sensed
+        k, n, (rows, through) = self.delay_samples, self.b.size, self.sensed
         if k == 0:
-            return self.a, self.b, sensed, through
-        a = np.zeros((n + k, n + k))
-        a[:n, :n], a[:n, n + k - 1] = self.a, self.b
-        for i in range(1, k):
-            a[n + i, n + i - 1] = 1.0
-        b = np.zeros(n + k)
-        b[n] = 1.0
-        c = np.zeros((*sensed.shape[:-1], n + k))
-        c[..., :n], c[..., n + k - 1] = sensed, through
-        return a, b, c, 0.0 * through
+            return self.a, self.b, rows, through
+        a = np.eye(n + k, k=-1)  # each command moves on by one place a sample
+        a[:n, :n], a[n, n - 1], a[:n, -1] = self.a, 0.0, self.b
+        c = np.hstack([rows, np.zeros((len(rows), k - 1)), through[:, None]])
+        return a, np.eye(n + k)[n], c, 0.0 * through
 
 
 def sample(
@@ -176,24 +158,18 @@ def sample_linear(
     plants: LinearPlants, delay_s: Float[np.ndarray, " k"], sample_time_s: float, delay_samples: int
 ) -> list[DigitalPlant]:
     """Return the digital plants of k linear ones and their delays, seconds besides the whole samples."""
-    several = plants[2].ndim == 3
-
-    def regulated(values: Any) -> Any:
-        return values[0] if several else values
-
-    static = [_compute_static_gain(a, b, regulated(c), float(regulated(d))) for a, b, c, d in zip(*plants, strict=True)]
     return [
         DigitalPlant(
             a=a,
             b=b,
-            c=regulated(c),
-            d=float(regulated(d)),
+            c=c[0],
+            d=float(d[0]),
             sample_time_s=sample_time_s,
             delay_samples=delay_samples,
-            static_gain=gain,
-            others=(c[1:], d[1:]) if several and len(c) > 1 else None,
+            static_gain=_compute_static_gain(*(block[k] for block in plants)),
+            others=(c[1:], d[1:]) if len(c) > 1 else None,
         )
-        for a, b, c, d, gain in zip(*hold(*plants, sample_time_s, delay_s), static, strict=True)
+        for k, (a, b, c, d) in enumerate(zip(*hold(*plants, sample_time_s, delay_s), strict=True))
     ]
 
 
@@ -205,19 +181,17 @@ def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float
     Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised.
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items()}
-    a, b, c, d = linearise(_let_slide(plant), params.vector[:, None], at, output, 1.0)
-    return _compute_static_gain(a[0], b[0], c[0], float(d[0]))
+    return _compute_static_gain(
+        *(part[0] for part in linearise(_let_slide(plant), params.vector[:, None], at, output, 1.0))
+    )
 
 
 def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
     """Return what a plant's `ParameterSet` may hold besides its parameters."""
     described = {DELAY: "delay besides the controller's and the drive's", DRIVE_DELAY: "from a command to its effect"}
-    conditions = {
-        name: Parameter(name=name, value=0.0, unit="s", min=0.0, description=text) for name, text in described.items()
-    }
-    for plant in plants:
-        conditions |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
-    return conditions
+    delays = [Parameter(name=name, value=0.0, unit="s", min=0.0, description=text) for name, text in described.items()]
+    states = [Parameter(name=name, value=0.0, unit=unit) for plant in plants for name, unit in plant.states.items()]
+    return {parameter.name: parameter for parameter in delays + states}
 
 
 def find_delay(plant: Plant, at: Mapping[str, Any]) -> Any:
@@ -251,11 +225,9 @@ def add_drive_delay(params: ParameterSet, drive_delay_s: float) -> ParameterSet:
 def drop_drive_delay(params: ParameterSet) -> ParameterSet:
     """Return parameters without a drive's delay, where samples count it already."""
     given = _list_given(params)
-    return (
-        ParameterSet(parameter for name, parameter in given.items() if name != DRIVE_DELAY)
-        if DRIVE_DELAY in given
-        else params
-    )
+    if DRIVE_DELAY not in given:
+        return params
+    return ParameterSet(parameter for name, parameter in given.items() if name != DRIVE_DELAY)
 
 
 def _list_given(params: ParameterSet) -> ParameterSet:
@@ -297,28 +269,26 @@ def linearise(
     measured: Measured,
     gain: float,
 ) -> LinearPlants:
-    """Return (a, b, c, d) from motor force to a measured output of k plants, one column of parameters each.
+    """Return (a, b, c, d) from motor force to what is measured of k plants, one column of parameters each.
 
-    Of several outputs c and d have a row for each.
-
-    Raises
-    ------
-    ControlError
-        The plant has no such output, or cannot rest where it is to be linearised.
-    PlantError
-        The plant holds samples.
-
+    Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised. Raises PlantError:
+    the plant holds samples.
     """
     refuse_samples(plant)
     plant = leave_out_drift(freeze_heat(plant), measured)
-    row = find_rows(plant, measured)
-    a, b, c, d = _evaluate_jacobians(plant, *_solve_rest(_let_slide(plant), p, at), p)
-    return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
+    blocks = _evaluate_jacobians(plant, *_solve_rest(_let_slide(plant), p, at), p)
+    return _pick(blocks, find_rows(plant, measured), gain)
+
+
+def _pick(blocks: tuple[Float[np.ndarray, "k _ _"], ...], rows: list[int], gain: float) -> LinearPlants:
+    """Return the part of (a, b, c, d) that is from the first input, in units of 1/gain, to some outputs."""
+    a, b, c, d = blocks
+    return a, b[:, :, 0] * gain, c[:, rows], d[:, rows, 0] * gain
 
 
 def list_names(measured: Measured) -> tuple[str, ...]:
     """Return what is measured as names, the regulated output first."""
-    return (measured,) if isinstance(measured, str) else tuple(measured)
+    return (measured,) if isinstance(measured, str) else measured
 
 
 def find_signals(plant: Plant, measured: Measured) -> tuple[str, ...]:
@@ -336,32 +306,27 @@ def find_signals(plant: Plant, measured: Measured) -> tuple[str, ...]:
     ('tau_s', 'theta_m')
 
     """
-    return tuple(_find_signal(plant, name) for name in list_names(measured))
+    sensing, encoders = plant.sensing, dict[str | None, str]()
+    if sensing is not None and sensing.motor_position is not None and sensing.motor_position in plant.outputs:
+        encoders = {sensing.motor_speed: sensing.motor_position}
+    names = list_names(measured)
+    signals = tuple(name if name in plant.outputs else encoders.get(name, name) for name in names)
+    find_rows(plant, signals)  # refuses a name that is neither
+    return signals
 
 
-def _find_signal(plant: Plant, name: str) -> str:
-    sensing = plant.sensing
-    if name in plant.outputs:
-        return name
-    if sensing is not None and name == sensing.motor_speed:
-        encoder = sensing.motor_position
-        if encoder is not None and encoder in plant.outputs:
-            return encoder
-    raise ControlError(f'measured = "{name}" is not an output of {plant.name}; {suggestion(name, plant.outputs)}')
-
-
-def find_rows(plant: Plant, measured: Measured) -> Any:
-    """Return which of a plant's outputs are measured: a number, or a list of several.
+def find_rows(plant: Plant, measured: Measured) -> list[int]:
+    """Return which of a plant's outputs are measured, by their numbers.
 
     Raises ControlError: the plant has no such output.
     """
     names = list(plant.outputs)
-    for name in (measured,) if isinstance(measured, str) else measured:
+    for name in list_names(measured):
         if name not in names:
             raise ControlError(
                 f'measured = "{name}" is not an output of {plant.name}; {suggestion(name, plant.outputs)}'
             )
-    return names.index(measured) if isinstance(measured, str) else [names.index(name) for name in measured]
+    return [names.index(name) for name in list_names(measured)]
 
 
 def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
@@ -446,9 +411,9 @@ def differentiate_linearisation(
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
     plant = leave_out_drift(freeze_heat(plant), measured)
     sliding = _let_slide(plant)
-    row, names = find_rows(plant, measured), list(plant.states)
+    rows, names = find_rows(plant, measured), list(plant.states)
     x, u = _solve_rest(sliding, p, at)
-    a, b, c, d = _evaluate_jacobians(plant, x, u, p)
+    blocks = _evaluate_jacobians(plant, x, u, p)
     dx, du = np.zeros_like(x), np.zeros_like(u)
     fixed = [names.index(name) for name in at if name in names]
     if fixed:  # f(x, u, p) = 0 along the direction: linear in the loose states and the first input
@@ -456,15 +421,12 @@ def differentiate_linearisation(
         for i in fixed:
             dx[i] = dat[names[i]]
         (drift,) = _map_columns(sliding, _drift_function, x, u, p, dp)
-        by_x, by_u = _evaluate_jacobians(sliding, x, u, p)[:2] if sliding is not plant else (a, b)
+        by_x, by_u = (blocks if sliding is plant else _evaluate_jacobians(sliding, x, u, p))[:2]
         moved = drift.T[:, :, None] + by_x[:, :, fixed] @ dx[fixed].T[:, :, None]
         step = np.linalg.solve(np.concatenate([by_x[:, :, loose], by_u[:, :, :1]], axis=2), -moved)[..., 0].T
         dx[loose], du[0] = step[:-1], step[-1]
-    da, db, dc, dd = _stack_blocks(plant, _map_columns(plant, _turn_function, x, u, p, dx, du, dp))
-    return (
-        (a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain),
-        (da, db[:, :, 0] * gain, dc[:, row], dd[:, row, 0] * gain),
-    )
+    derivatives = _stack_blocks(plant, _map_columns(plant, _turn_function, x, u, p, dx, du, dp))
+    return _pick(blocks, rows, gain), _pick(derivatives, rows, gain)
 
 
 def _evaluate_jacobians(
@@ -526,15 +488,15 @@ def _turn_function(plant: Plant) -> Any:
 def hold(
     a: Inexact[np.ndarray, "k n n"],
     b: Inexact[np.ndarray, "k n"],
-    c: Inexact[np.ndarray, "k ... n"],
-    d: Inexact[np.ndarray, "k ..."],
+    c: Inexact[np.ndarray, "k y n"],
+    d: Inexact[np.ndarray, "k y"],
     sample_time_s: float,
     delay_s: Inexact[np.ndarray, " k"],
 ) -> SampledPlants:
     """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's.
 
-    Imaginary parts come through as derivatives do: with 1e-20 of a
-    direction added as one, those of the result are 1e-20 of its derivative (complex step).
+    Imaginary parts come through as derivatives do: with 1e-20 of a direction added as one, those of the result are
+    1e-20 of its derivative (complex step).
     """
     whole_period, gamma = _exponential(a, b, np.full(delay_s.size, sample_time_s))
     if not np.any(delay_s):
@@ -586,10 +548,11 @@ def _exponential(
 
 
 def _compute_static_gain(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, "y n"], d: Float[np.ndarray, " y"]
 ) -> float:
+    """Return the first output of a constant unit at rest; infinite where it integrates."""
     with np.errstate(divide="ignore", invalid="ignore"):
         try:
-            return float(d - c @ np.linalg.solve(a, b)) if np.linalg.cond(a) < 1e14 else np.inf
+            return float(d[0] - c[0] @ np.linalg.solve(a, b)) if np.linalg.cond(a) < 1e14 else np.inf
         except np.linalg.LinAlgError:
             return np.inf

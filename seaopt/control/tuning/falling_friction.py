@@ -64,11 +64,9 @@ def _ease(sliding: PlantWithFriction, share: float) -> PlantWithFriction:
     """Return a sliding plant with a share of the fall of its friction."""
     loop, left = sliding.loop, (1.0 - share) * np.minimum(sliding.flattest, 0.0)
     a = loop.a + (loop.friction * left) @ loop.velocity
-    rows, through = loop.sensed
-    c = rows + (through * left) @ loop.velocity
+    c = loop.sensed + (loop.through * left) @ loop.velocity
     linear = (a[None], loop.motor[None], c[None], loop.plant.sensed[1][None])
     delay_s = np.array([loop.delay_s])
     (plant,) = sample_linear(linear, delay_s, loop.plant.sample_time_s, loop.plant.delay_samples)
-    others = None if loop.others is None else (c[1:], loop.others[1])
-    eased = replace(loop, a=a, measured=c[0], others=others, slopes=loop.slopes + left, plant=plant)
+    eased = replace(loop, a=a, sensed=c, slopes=loop.slopes + left, plant=plant)
     return replace(sliding, loop=eased, flattest=sliding.flattest - left)

@@ -89,12 +89,12 @@ class _Friction:
         nothing = np.zeros(f.size, dtype=complex)
         if loop is None or loop.only_port is None:
             return cls(nothing[None], nothing, nothing, np.zeros(AMPLITUDES.size))
-        port, (rows, through) = loop.only_port, loop.sensed
-        seen = np.vstack([loop.velocity[port], rows])
+        port = loop.only_port
+        seen = np.vstack([loop.velocity[port], loop.sensed])
         opened = loop.respond(2 * np.pi * f * loop.plant.sample_time_s, FUNDAMENTAL, seen)
         mobility, *on_outputs = opened.by_friction[:, 0, :, port].T
         return cls(
-            on_outputs=np.array(on_outputs) + through[:, port, None],
+            on_outputs=np.array(on_outputs) + loop.through[:, port, None],
             mobility=mobility,
             by_motor=opened.by_motor[:, 0, 0],
             gains=describe_friction(plant, params, list(plant.friction)[port], AMPLITUDES),

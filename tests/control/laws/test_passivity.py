@@ -75,7 +75,7 @@ def test_the_loop_is_the_sampled_one_at_low_frequency(thor, stand):
     """G_11 with hold and delay is the zero-order-hold plant but for its images: to 1 % at 30 Hz."""
     controller = controller_of(delay_samples=2)
     f = np.geomspace(0.1, 30, 20)
-    g = port_of(stand, thor, "F1", controller.command.per_effort).response(f).motor_to_feedback
+    g = port_of(stand, thor, "F1", controller.command.per_effort).response(f).motor_to_read[0]
     np.testing.assert_allclose(g * hold_response(f, TS, 2), controller.plant(stand, thor).response(f), rtol=0.01)
 
 

@@ -49,7 +49,7 @@ def loop_of(law, slope=1.0):
     a, b = discretise(PERIOD)
     plant = DigitalPlant(a=a, b=b, c=C, d=0.0, sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0)
     return FrictionLoop(
-        a=A, motor=B, friction=B[:, None], velocity=np.array([[0.0, 1.0]]), measured=C, through=np.zeros(1),
+        a=A, motor=B, friction=B[:, None], velocity=np.array([[0.0, 1.0]]), sensed=C[None], through=np.zeros((1, 1)),
         slopes=np.array([slope]), plant=plant, law=law,
     )  # fmt: skip
 

@@ -148,7 +148,7 @@ def test_stability_is_what_a_simulation_shows(name, request, thor):
     plant = request.getfixturevalue(name)
     for factor in (1.0, 4.0, 7.0, 9.0, 14.0):
         loop = loop_of("pd", plant, thor, k_p=3.2 * factor, k_d=0.033 * factor)
-        a, b, c, _ = loop.plant.delayed()
+        a, b, (c,), _ = loop.plant.delayed()
         ac, bc, cc, dc = measurement_matrices(loop.law)
         x, xc = np.full(len(b), 1e-3), np.zeros(len(bc))
         sizes = []

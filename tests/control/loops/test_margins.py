@@ -61,7 +61,7 @@ def independent(loop, f):
 
 def poles_of(loop, factor=1.0, extra=0):
     """The poles with a (complex) factor and extra samples of delay in the loop."""
-    a, b, c, d = DigitalPlant(
+    a, b, (c,), (d,) = DigitalPlant(
         a=loop.plant.a, b=loop.plant.b, c=loop.plant.c, d=loop.plant.d, sample_time_s=1.0,
         delay_samples=loop.plant.delay_samples + extra, static_gain=1.0,
     ).delayed()  # fmt: skip
@@ -384,7 +384,7 @@ def test_an_angle_is_linearised_where_the_plant_rests(swing, thor):
             a[0][:, i], (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-3 * np.abs(a).max() * 1e-3
         )
         ends = [np.array(h(x0 + s * step, current, p)).ravel()[0] for s in (1, -1)]
-        assert c[0][i] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-4, abs=1e-2)
+        assert c[0][0][i] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-4, abs=1e-2)
     assert params["phi"].value == 0.4
 
 

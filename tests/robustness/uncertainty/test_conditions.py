@@ -147,7 +147,7 @@ def test_small_steps_there_are_the_linear_loops(controller, swing, thor):
     phases = (Phase(duration_s=0.3, force_N=0.05),)
     trace = play(Stage(controller=controller, plant=swing), Scenario(name="s", phases=phases), [drawn])
     plant = controller.close(swing, drawn).plant
-    a, b, c, d = plant.delayed()
+    a, b, (c,), (d,) = plant.delayed()
     law, x, forces = Difference(controller, 0.0, 0.0, 0.0), np.zeros(b.size), []
     for _ in range(300):
         forces.append(float(c @ x))

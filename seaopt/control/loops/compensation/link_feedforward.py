@@ -235,7 +235,7 @@ def model_link_path(
     per_signal, is_speed = _relate(sliding, values, name, per_effort)
     f = np.geomspace(0.1 * bandwidth_hz, bandwidth_hz, FIT_FREQUENCIES)
     response = port_of(sliding, values, regulated, per_effort).response(f)
-    inertia, damping = _fit(-response.motion_to_feedback / response.motor_to_feedback, f, plant.name)
+    inertia, damping = _fit(-response.motion_to_read[0] / response.motor_to_read[0], f, plant.name)
     path = LinkPath(
         measured=name,
         unit=plant.outputs[name],

@@ -57,7 +57,7 @@ from seaopt.control.loops.absolute_stability import (
 )
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.loop import STABLE, Loop
-from seaopt.control.loops.sampled_plant import hold
+from seaopt.control.loops.sampled_plant import sample_linear
 from seaopt.records import record
 
 SHARE = 0.9  # rho, below 1: the sum of what N weighs later or earlier samples with
@@ -86,14 +86,11 @@ class SpeedReading:
         n, period = len(loop.a), loop.plant.sample_time_s
         a, b = np.zeros((n + 1, n + 1)), np.append(loop.motor, 0.0)
         a[:n, :n], a[n, :n] = loop.a, self.velocity
-        row = np.eye(1, n + 1, k=n)[0] if self.differenced else np.append(self.velocity, 0.0)
-        sampled = hold(a[None], b[None], row[None], np.zeros(1), period, np.array([loop.delay_s]))
-        a_d, b_d, c_d, _ = (block[0] for block in sampled)
-        z, size = np.exp(1j * theta), b_d.size
-        inputs = np.broadcast_to(b_d.astype(complex)[:, None], (z.size, size, 1))
-        response = np.linalg.solve(z[:, None, None] * np.eye(size) - a_d, inputs)[..., 0] @ c_d
+        row = np.eye(1, n + 1, k=n) if self.differenced else np.append(self.velocity, 0.0)[None]
+        linear, late = (a[None], b[None], row[None], np.zeros((1, 1))), np.array([loop.delay_s])
+        (plant,) = sample_linear(linear, late, period, loop.plant.delay_samples)
         scale = -np.expm1(-1j * theta) / period if self.differenced else 1.0
-        return response * scale * z**-loop.plant.delay_samples
+        return plant.response(theta / (2 * np.pi * period)) * scale
 
 
 @record
