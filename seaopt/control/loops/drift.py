@@ -15,21 +15,20 @@ A loop that feeds back what drifts, such as a link's angle, keeps it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from seaopt.plants import Plant
 from seaopt.plants.friction import remembers
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import jacobians
 from seaopt.plants.roles import Friction
-from seaopt.records import record
 
 PLACES = 4  # states, inputs and parameters at random where the equations are looked at
 SEED = 1
@@ -37,13 +36,7 @@ ROUNDING = 1e-9  # of a column's size
 CANCELLED = 1e-13  # of a row's largest slope
 
 
-@record(eq=False)
-class _Drift:
-    """A direction that nothing depends on: how far other states move when the state `along` moves by one."""
-
-    along: str
-    others: Mapping[str, Any]
-    """Expressions of the plant's own parameter symbols."""
+Slopes = list[tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "y n"], Any]]
 
 
 @memo
@@ -67,26 +60,38 @@ def leave_out_drift(plant: Plant, measured: str | tuple[str, ...]) -> Plant:
     names = {measured} if isinstance(measured, str) else {*measured}
     if remembers(plant) or not names <= plant.outputs.keys():
         return plant
-    drift = _find_drift(plant)
-    if drift is None:
+    slopes = _sample_slopes(plant)
+    shifts = _find_shifts(plant, slopes)
+    if not shifts:
         return plant
-    remaining = _take_out(plant, drift)
-    return leave_out_drift(remaining, measured) if names <= remaining.outputs.keys() else plant
+    column = ca.vertcat(*(ca.SX(shifts.get(name, 0.0)) for name in plant.states))
+    direction, telling = ca.Function("drift", [plant.p], [ca.densify(column)]), set[str]()
+    for a, c, p in slopes:
+        v = np.array(direction(p)).ravel()
+        if np.any(_depends(a, v)):
+            return plant
+        telling |= {name for name, depends in zip(plant.outputs, _depends(c, v), strict=True) if depends}
+    return plant if names & telling else leave_out_drift(_take_out(plant, shifts, telling), measured)
 
 
-def _look(plant: Plant) -> list[tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "_ n"], Any]]:
+def _depends(block: Float[np.ndarray, "m n"], v: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
+    """Tell which rows of slopes depend on a direction."""
+    return np.abs(block @ v) > ROUNDING * (np.abs(block) @ np.abs(v)) + 1e-300
+
+
+def _sample_slopes(plant: Plant) -> Slopes:
     """Return the slopes of f and h by the states at random places, and the parameters there."""
     rng, function = np.random.default_rng(SEED), jacobians(plant)
     # A parameter of zero has a value all the same: whether a link is held must not hang on where its spring starts.
     defaults = {name: plant.defaults[name].value for name in plant.parameters if name in plant.defaults}
     nominal = np.array([defaults.get(name) or 1.0 for name in plant.parameters])
-    places: list[tuple[Any, Any, Any]] = []
+    slopes: Slopes = []
     for _ in range(PLACES):
         p = nominal * rng.uniform(0.8, 1.25, nominal.size)
         x, u = (0.1 * rng.normal(size=symbols.numel()) for symbols in (plant.x, plant.u))
         a, _, c, _ = (_clean(np.array(block)) for block in function(x, u, p))
-        places.append((a, c, p))
-    return places
+        slopes.append((a, c, p))
+    return slopes
 
 
 def _clean(block: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
@@ -94,68 +99,45 @@ def _clean(block: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
     return np.where(np.abs(block) > CANCELLED * np.max(np.abs(block), axis=1, keepdims=True), block, 0.0)
 
 
-def _find_drift(plant: Plant) -> _Drift | None:
-    """Return a direction that the equations do not depend on; None if there is none."""
-    places = _look(plant)
-    if not all(np.all(np.isfinite(a)) for a, _, _ in places):
-        return None
-    first = places[0][0]
+def _find_shifts(plant: Plant, slopes: Slopes) -> dict[str, Any]:
+    """Return how far states move together without a force, by name: expressions of the plant's parameters.
+
+    Empty if the slopes have no such direction. The last state moves by 1; the ratios are solved for in symbols, from as
+    many equations as there are other states.
+    """
+    first = slopes[0][0]
+    if not all(np.all(np.isfinite(a)) for a, _, _ in slopes):
+        return {}
     size = np.linalg.norm(first, axis=0)
     size[size == 0.0] = 1.0
     _, singular, turned = np.linalg.svd(first / size)
     if singular[-1] > ROUNDING * singular[0]:
-        return None
-    direction = turned[-1] / size
-    touched = np.flatnonzero(np.abs(direction * size) > ROUNDING)
-    along = int(touched[-1])
-    coupled = [int(i) for i in touched[:-1]]
-    moved = _solve_ratios(plant, first, along, coupled)
-    names = list(plant.states)
-    drift = _Drift(along=names[along], others={names[i]: ratio for i, ratio in zip(coupled, moved, strict=True)})
-    return drift if _is_drift(plant, drift, places) else None
+        return {}
+    *coupled, along = (int(i) for i in np.flatnonzero(np.abs(turned[-1]) > ROUNDING))
+    names, ratios = list(plant.states), list[Any]()
+    if coupled:
+        # The rows that tell the ratios best: a triangle with pivots picks them.
+        from scipy.linalg import qr  # deferred: scipy is slow to load
+
+        pivots: Any = qr(first[:, coupled].T, mode="r", pivoting=True)[-1]
+        rows = np.sort(pivots[: len(coupled)])
+        by_state = ca.substitute(ca.jacobian(plant.dynamics, plant.x), plant.t, 0.0)
+        by_state = ca.substitute(by_state, ca.vertcat(plant.x, plant.u), ca.SX.zeros(plant.x.numel() + plant.u.numel()))
+        picked = by_state[rows.tolist(), :]
+        ratios = ca.vertsplit(ca.simplify(-ca.solve(picked[:, coupled], picked[:, along])))
+    return {**{names[i]: ratio for i, ratio in zip(coupled, ratios, strict=True)}, names[along]: ca.SX(1.0)}
 
 
-def _solve_ratios(plant: Plant, a: Float[np.ndarray, "n n"], along: int, coupled: Sequence[int]) -> list[Any]:
-    """Return how far the others move with one, solved for in symbols: from as many equations as there are others."""
-    if not coupled:
-        return []
-    # The rows that tell the others best: a triangle with pivots picks them.
-    from scipy.linalg import qr  # deferred: scipy is slow to load
-
-    pivots: Any = qr(a[:, coupled].T, mode="r", pivoting=True)[-1]
-    rows = np.sort(pivots[: len(coupled)])
-    slopes = ca.substitute(ca.jacobian(plant.dynamics, plant.x), plant.t, 0.0)
-    slopes = ca.substitute(slopes, ca.vertcat(plant.x, plant.u), ca.SX.zeros(plant.x.numel() + plant.u.numel()))
-    picked = slopes[rows.tolist(), :]
-    return ca.vertsplit(ca.simplify(-ca.solve(picked[:, list(coupled)], picked[:, along])))
-
-
-def _is_drift(plant: Plant, drift: _Drift, places: Sequence[tuple[Any, Any, Any]]) -> bool:
-    """Tell whether the equations do not depend on a direction at any of the places."""
-    direction = _direction_function(plant, drift)
-    for a, _, p in places:
-        v = np.array(direction(p)).ravel()
-        if np.any(np.abs(a @ v) > ROUNDING * (np.abs(a) @ np.abs(v)) + 1e-300):
-            return False
-    return True
-
-
-def _direction_function(plant: Plant, drift: _Drift) -> Any:
-    """Return the CasADi function p -> the direction."""
-    column = [ca.SX(1.0) if name == drift.along else ca.SX(drift.others.get(name, 0.0)) for name in plant.states]
-    return ca.Function("drift", [plant.p], [ca.densify(ca.vertcat(*column))])
-
-
-def _take_out(plant: Plant, drift: _Drift) -> Plant:
-    """Return the plant relative to what drifts, with the outputs that do not tell where that is."""
-    ratios = ca.Function("ratios", [plant.p], [ca.vertcat(*drift.others.values(), ca.SX(0.0))])
-    told = _find_telling(plant, drift)
+def _take_out(plant: Plant, shifts: Mapping[str, Any], telling: set[str]) -> Plant:
+    """Return the plant relative to the last state that drifts, without the outputs that tell where that is."""
+    *coupled, along = shifts
+    ratios = ca.Function("ratios", [plant.p], [ca.vertcat(*shifts.values())])
 
     # The equations may differentiate by their states, so that a symbol stands for this one until they are written.
-    zero = ca.SX.sym(drift.along)
+    zero = ca.SX.sym(along)
 
     def fill(x: Any) -> SimpleNamespace:
-        return SimpleNamespace(**{**vars(x), drift.along: zero})
+        return SimpleNamespace(**{**vars(x), along: zero})
 
     def settle(expression: Any) -> Any:
         return ca.substitute(ca.SX(expression), zero, 0.0)
@@ -170,14 +152,14 @@ def _take_out(plant: Plant, drift: _Drift) -> Plant:
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
         rates = {name: settle(rate) for name, rate in plant.f(t, fill(x), u, p).items()}
-        together = rates.pop(drift.along)
+        together = rates.pop(along)
         values = ratios(ca.vertcat(*(getattr(p, name) for name in plant.parameters)))
-        for i, name in enumerate(drift.others):
+        for i, name in enumerate(coupled):
             rates[name] = rates[name] - values[i] * together
         return rates
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        return {name: settle(value) for name, value in plant.h(t, fill(x), u, p).items() if name not in told}
+        return {name: settle(value) for name, value in plant.h(t, fill(x), u, p).items() if name not in telling}
 
     return replace(
         plant,
@@ -189,18 +171,7 @@ def _take_out(plant: Plant, drift: _Drift) -> Plant:
         sensing=None,
         mode=None,
         derived=None,
-        states={name: unit for name, unit in plant.states.items() if name != drift.along},
-        outputs={name: unit for name, unit in plant.outputs.items() if name not in told},
+        states={name: unit for name, unit in plant.states.items() if name != along},
+        outputs={name: unit for name, unit in plant.outputs.items() if name not in telling},
         friction={name: relative(friction) for name, friction in plant.friction.items()},
     )
-
-
-def _find_telling(plant: Plant, drift: _Drift) -> set[str]:
-    """Return the outputs that tell where a drift is."""
-    told: set[str] = set()
-    direction = _direction_function(plant, drift)
-    for _, c, p in _look(plant):
-        v = np.array(direction(p)).ravel()
-        seen = np.abs(c @ v) > ROUNDING * (np.abs(c) @ np.abs(v)) + 1e-300
-        told |= {name for name, depends in zip(plant.outputs, seen, strict=True) if depends}
-    return told
