@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from seaopt.control.laws.command import (
-    Command,
-    actuation_notes,
-    limit_notes,
-    name_rates,
-)
+from seaopt.codec import to_content
+from seaopt.control.laws.command import Command, actuation_notes, limit_notes, name_rates
 from seaopt.control.laws.delay import LoopDelays, place_drive_delay
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.plausibility import PlausibilityGate
@@ -160,13 +156,14 @@ class Controller(LoopDelays, Result, Worded):
 
         Filter and integral are those of the gains where they make the law; of another law they are read off the law.
         """
-        law, ts = self.law, self.sample_time_s
-        made = self._own_gains()
-        if made is not None and made.makes(law, self.spec.structure):
-            filter_samples = made.T_f / ts if made.k_d else np.inf
-            integral = made.integral_rad_s if self.structure != "pd" and made.k_i else np.inf
-        else:
-            filter_samples, integral = count_filter_samples(law), find_integral_rate(law)
+        gains, ts = self._read_gains(), self.sample_time_s
+        filter_samples, integral = count_filter_samples(self.law), find_integral_rate(self.law)
+        if gains is not None and gains.makes(self.law, self.spec.structure):
+            filter_samples = gains.T_f / ts if gains.k_d else np.inf
+            integral = gains.integral_rad_s if self.structure != "pd" and gains.k_i else np.inf
+        outputs = {} if self.design is None else self.design[0].outputs
+        units = {outputs.get(name, "") for name in self.signals[1:]}  # of what the law reads besides
+        unit = units.pop() if len(units) == 1 else ""
         return MeasuredLoop(
             name=name,
             figures=figures,
@@ -174,15 +171,8 @@ class Controller(LoopDelays, Result, Worded):
             filter_samples=filter_samples,
             integral_rad_s=integral,
             gain_unit=self.command.gain_unit,
-            other_gain_unit=self._name_other_gain(),
+            other_gain_unit=divide_units(self.command.effort_unit, unit) if unit else "",
         )
-
-    def _name_other_gain(self) -> str:
-        """Return the unit of effort over what the law reads besides; empty where it is not known, or not one."""
-        outputs = {} if self.design is None else self.design[0].outputs
-        units = {outputs.get(name, "") for name in self.signals[1:]}
-        unit = units.pop() if len(units) == 1 else ""
-        return divide_units(self.command.effort_unit, unit) if unit else ""
 
     def _add_friction(self, loop: MeasuredLoop) -> MeasuredLoop:
         """Return the design plant's loop with its friction margin, where it has friction."""
@@ -193,10 +183,10 @@ class Controller(LoopDelays, Result, Worded):
     @property
     def prefilter(self) -> Prefilter | None:
         """The low-pass of the reference, with its numbers; None without one."""
-        gains = self._own_gains()
+        gains = self._read_gains()
         return None if gains is None else gains.prefilter
 
-    def _own_gains(self) -> Gains | None:
+    def _read_gains(self) -> Gains | None:
         """Return the gains with what else the law is made of; None of a custom law."""
         if not set(LAW_GAINS) <= set(self.gains):
             return None
@@ -208,7 +198,7 @@ class Controller(LoopDelays, Result, Worded):
 
         None without a prefilter, of a loop that never falls to -3 dB, and of a measured design plant.
         """
-        gains = self._own_gains()
+        gains = self._read_gains()
         if gains is None or gains.prefilter is None or self.design is None:
             return None
         law = replace(gains, prefilter=None).law(self.spec.structure, self.sample_time_s)
@@ -252,34 +242,37 @@ class Controller(LoopDelays, Result, Worded):
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
-        lifted = (*self.lifted_notes, *map(str, self.measured))
+        always = (*self.lifted_notes, *map(str, self.measured))
         if self.design is None:
-            return lifted
+            return always
         plant, values = self.design
-        # What the plants of robust_to need is in the same set.
-        vague = warn_unidentified(values, None if self.robust_to else plant.parameters)
-        return (
-            *lifted,
-            *vague,
-            *self._friction_notes(),
-            *actuation_notes(plant, self.command),
-            *limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None),
-            *self._link_notes(),
-            *self._noise_notes(),
-            *self._slow_notes(),
-        )
+        notes = [*always, *warn_unidentified(values, None if self.robust_to else plant.parameters)]
+        if self.friction is None and self.spec.level("min_friction_margin") is not None:
+            notes.append("the design plant has no friction at these values: any min_friction_margin holds on it")
+        notes += actuation_notes(plant, self.command)
+        notes += limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
+        return (*notes, *self._noise_notes(), *self._slow_notes())
 
-    def _link_notes(self) -> tuple[str, ...]:
-        """Say what is fed forward of the link's motion, and what noise on it makes."""
-        if self.link is None:
-            return ()
-        called, noise = self.command.mechanics, self.achieved.other_noise_gains[-1:]
-        made = "".join(
-            f"; 1e-6 {self.link.unit} of noise on it makes up to {1e-6 * gain:.3g} {called.unit} of motor "
-            f"{called.word}, less with a lower corner_hz"
-            for gain in noise
-        )
-        return (f"{self.link.describe()}{made}",)
+    def _noise_notes(self) -> list[str]:
+        """Return what is fed forward of the link, and which noise is large because nothing was asked of it."""
+        called, notes = self.command.mechanics, list[str]()
+        if self.link is not None:
+            text = self.link.describe()
+            if self.achieved.other_noise_gains:
+                text += (
+                    f"; 1e-6 {self.link.unit} of noise on it makes up to "
+                    f"{1e-6 * self.achieved.other_noise_gains[-1]:.3g} {called.unit} of motor {called.word}, less with "
+                    "a lower corner_hz"
+                )
+            notes.append(text)
+        T_f = self.gains.get("T_f", np.inf) if self.gains.get("k_d") else np.inf
+        if self.spec.level("max_noise_gain") is None and T_f <= UNFILTERED * self.sample_time_s:
+            notes.append(
+                f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 "
+                f"{self.command.reference_unit} of noise on {self.spec.regulated} makes up to "
+                f"{self.achieved.noise_gain:.3g} {called.unit} of motor {called.word}; give max_noise_gain"
+            )
+        return notes
 
     def _slow_notes(self) -> tuple[str, ...]:
         """Say that a step is long in arriving, which no limit forbids and friction makes longer."""
@@ -293,24 +286,6 @@ class Controller(LoopDelays, Result, Worded):
         return (
             f"a step of the reference is still {100 * left:.2g} % off after {seconds:.2g} s, {ARRIVAL_PERIODS:.0f} "
             'periods of the bandwidth: the integral is slow, and slower with friction; give objective = "disturbance"',
-        )
-
-    def _friction_notes(self) -> tuple[str, ...]:
-        """Say that a friction margin was asked where there is no friction."""
-        if self.friction is not None or self.spec.level("min_friction_margin") is None:
-            return ()
-        return ("the design plant has no friction at these values: any min_friction_margin holds on it",)
-
-    def _noise_notes(self) -> tuple[str, ...]:
-        """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
-        called, T_f = self.command.mechanics, self.gains.get("T_f", np.inf) if self.gains.get("k_d") else np.inf
-        if self.spec.level("max_noise_gain") is not None or T_f > UNFILTERED * self.sample_time_s:
-            return ()
-        return (
-            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 "
-            f"{self.command.reference_unit} of noise on {self.spec.regulated} makes up to "
-            f"{self.achieved.noise_gain:.3g} {called.unit} of motor "
-            f"{called.word}; give max_noise_gain",
         )
 
     @property
@@ -387,49 +362,44 @@ class Controller(LoopDelays, Result, Worded):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/3)."""
-        reference, *measurements = ({"num": one.num, "den": one.den} for one in multiply_out(self.law, self.link))
-        return {
+        reference, *paths = multiply_out(self.law, self.link)
+        friction = {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope}
+        content = {
             "schema": CONTROLLER_SCHEMA,
             "structure": self.structure,
-            "gains": dict(self.gains),
+            "gains": self.gains,
             "sample_time_s": self.sample_time_s,
             "compute_delay_samples": self.compute_delay_samples,
             "drive_delay_s": self.drive_delay_s,
             "delay_samples": self.delay_samples,
-            "measured": list(self.signals),
+            "measured": self.signals,
             "law": self.law.to_dict(),
             "reference": reference,
-            "measurement": measurements[0] if len(measurements) == 1 else measurements,
-            "command": {field.name: getattr(self.command, field.name) for field in fields(Command)},
-            "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
-            "achieved": _list_achieved(self.achieved)
-            | {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope}
-            | self._prefilter_figures(),
+            "measurement": paths[0] if len(paths) == 1 else paths,
+            "command": self.command,
+            "spec": self.spec.to_dict() | {"robust_to": self.robust_to},
+            "achieved": _list_achieved(self.achieved) | friction | self._prefilter_figures(),
             "met": self.met,
             "feasible": self.met,
-            "active_constraints": list(self.active_constraints),
+            "active_constraints": self.active_constraints,
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
             "observer": None if self.observer is None else self.observer.to_dict(self.sample_time_s),
-            "heat": self._heat_dict(),
-            "link_feedforward": None if self.link is None else asdict(self.link),
-            "impedance": None if self.outer is None else asdict(self.outer),
-            "compensation": None if self.compensation is None else self.compensation.to_dict(),
-            "guards": {"gate": None if self.gate is None else asdict(self.gate)},
-            "blocked_by": list(self.blocked_by),
+            "heat": None if self.rating is None else self.rating.to_dict() | {"guard": self.heat_guard},
+            "link_feedforward": self.link,
+            "impedance": self.outer,
+            "compensation": self.compensation,
+            "guards": {"gate": self.gate},
+            "blocked_by": self.blocked_by,
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
-            "possible": None if self.possible is None else asdict(self.possible),
-            "notes": list(self.notes),
-            "measured_responses": [one.to_dict() for one in self.measured],
+            "possible": self.possible,
+            "notes": self.notes,
+            "measured_responses": self.measured,
         }
+        return to_content(content)
 
     def _prefilter_figures(self) -> dict[str, float | None]:
         """Return what is achieved without the prefilter, where there is one."""
         return {} if self.prefilter is None else {WITHOUT_PREFILTER: self.bandwidth_without_prefilter_hz}
-
-    def _heat_dict(self) -> dict[str, Any] | None:
-        """Return what the motor can do without overheating, and what an exported law takes to keep to it."""
-        rating, guard = self.rating, self.heat_guard
-        return None if rating is None else rating.to_dict() | {"guard": None if guard is None else asdict(guard)}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], plant: Plant | MeasuredResponse, params: ParameterSet) -> Controller:
@@ -447,58 +417,37 @@ class Controller(LoopDelays, Result, Worded):
         from seaopt.control.laws.stored import check_achieved, check_friction_margin, check_link, read_controller
 
         stored = read_controller(content)
+        spec, command, law = stored["spec"], stored["command"], stored["law"]
+        design = friction = None
         if isinstance(plant, MeasuredResponse):
-            return cls._on_measured(stored, content, plant, params)
-        link: LinkPath | None = stored["link"]
-        if link is not None:
-            check_link(link, stored["spec"], plant)
-            plant = link.see(plant)
-        measured = plant.outputs.get(stored["spec"].regulated, "")
-        stored["command"] = replace(
-            stored["command"],
-            largest=find_range(plant, params),
-            measured_unit="" if measured == stored["command"].effort_unit else measured,
-        )
-        gain, spec = stored["command"].per_effort, stored["spec"]
-        sliding = take_sliding(plant, params)
-        reads = stored["reads"] or list_names(spec.measured)
-        params = place_drive_delay(spec, params, stored["drive_delay_s"])
-        sampled = sample(sliding, params, reads, gain, stored["sample_time_s"], stored["compute_delay_samples"])
-        achieved = Loop(plant=sampled, law=stored["law"]).figures()
-        (loop,) = make_friction_loops(plant, [params], reads, gain, stored["compute_delay_samples"], stored["law"])
-        friction = None if loop is None else friction_margin(loop)
+            achieved = DiscLoop(plant=spec.see_response(plant, command), law=law).figures(spec.bandwidth_hz)
+            command = replace(command, largest=find_range(plant.plant, params))
+        else:
+            design_plant = plant
+            if stored["link"] is not None:
+                check_link(stored["link"], spec, plant)
+                design_plant = stored["link"].see(plant)
+            unit = design_plant.outputs.get(spec.regulated, "")
+            unit = "" if unit == command.effort_unit else unit
+            command = replace(command, largest=find_range(design_plant, params), measured_unit=unit)
+            params = place_drive_delay(spec, params, stored["drive_delay_s"])
+            reads, waits = stored["reads"] or list_names(spec.measured), stored["compute_delay_samples"]
+            sliding, gain = take_sliding(design_plant, params), command.per_effort
+            achieved = Loop(plant=sample(sliding, params, reads, gain, law.sample_time_s, waits), law=law).figures()
+            (loop,) = make_friction_loops(design_plant, [params], reads, gain, waits, law)
+            friction = None if loop is None else friction_margin(loop)
+            design = design_plant, params
         check_achieved(content.get("achieved"), _list_achieved(achieved))
         check_friction_margin(content["achieved"].get(FRICTION_MARGIN), friction)
-        controller = cls(**stored, achieved=achieved, design=(plant, params), friction=friction)
+        controller = cls(**stored | {"command": command}, achieved=achieved, design=design, friction=friction)
         check_achieved(content["achieved"], controller._prefilter_figures())
-        loops = [
-            controller.measure(f"design plant{name}", figures) for name, figures in controller.measure_states().items()
-        ]
-        loops[0] = controller._add_friction(loops[0])
-        broken = tuple(list_broken_figures(controller.spec, loops) if controller.met else ())
-        if not broken:
-            return controller
-        return replace(controller, met=False, active_constraints=broken, blocked_by=broken)
-
-    @classmethod
-    def _on_measured(
-        cls, stored: dict[str, Any], content: Mapping[str, Any], measured: MeasuredResponse, params: ParameterSet
-    ) -> Controller:
-        """Return the controller of a file whose design plant is a measured response."""
-        from seaopt.control.laws.stored import check_achieved
-
-        spec: ControllerSpec = stored["spec"]
-        command: Command = stored["command"]
-        seen = spec.see_response(measured, command)
-        achieved = DiscLoop(plant=seen, law=stored["law"]).figures(spec.bandwidth_hz)
-        check_achieved(content.get("achieved"), _list_achieved(achieved))
-        stored["command"] = replace(command, largest=find_range(measured.plant, params))
-        controller = cls(**stored, achieved=achieved)
-        check_achieved(content["achieved"], controller._prefilter_figures())
-        broken = tuple(list_broken_figures(spec, [controller.design_loop]) if controller.met else ())
-        if not broken:
-            return controller
-        return replace(controller, met=False, active_constraints=broken, blocked_by=broken)
+        loops = [controller.design_loop]
+        if design is not None:
+            states = controller.measure_states().items()
+            first, *stuck = (controller.measure(f"design plant{state}", figures) for state, figures in states)
+            loops = [controller._add_friction(first), *stuck]
+        broken = tuple(list_broken_figures(spec, loops) if controller.met else ())
+        return replace(controller, met=False, active_constraints=broken, blocked_by=broken) if broken else controller
 
     def measure_states(self) -> dict[str, LoopFigures]:
         """Return the design plant's figures by its state, " sliding" and " stuck" where it has friction, else ""."""

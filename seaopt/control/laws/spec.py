@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any, Literal
 
+from seaopt.codec import to_content
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.delay import check_delays, count_loop_samples, count_response_samples
 from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, FIELDS, LIMITS, Limit, list_given_limits
@@ -150,30 +151,22 @@ class ControllerSpec:
     def __post_init__(self) -> None:
         self._check_measured()
         check_options(self, ControlError)
-        if not self.bandwidth_hz > 0.0:
-            likely = abs(self.bandwidth_hz) or 30.0
-            raise ControlError(
-                f"bandwidth_hz = {self.bandwidth_hz:g} is not positive; give it in Hz: bandwidth_hz = {likely:g}"
-            )
-        low, high = self.bandwidth_range_hz
-        if not 0.0 < low < high:
-            raise ControlError(
-                f"bandwidth_range_hz = [{low:g}, {high:g}] is not a range; give 0 < low < high: "
-                "bandwidth_range_hz = [15, 60]"
-            )
-        if not low <= self.bandwidth_hz <= high:
-            raise ControlError(
-                f"bandwidth_hz = {self.bandwidth_hz:g} is outside {low:g} to {high:g}; choose one inside, "
-                f"or give another range: bandwidth_range_hz = [{min(low, self.bandwidth_hz):g}, "
-                f"{max(high, self.bandwidth_hz):g}]"
-            )
-        if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
-            raise ControlError(
-                f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
-                f"sample more than four times as fast: sample_rate_hz = {10.0 * self.bandwidth_hz:g}"
-            )
+        self._check_rates()
         check_delays(self, MAX_DELAY_SAMPLES)
-        self._check_limits()
+        for name in LIFTABLE:
+            BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
+        self._check_filters()
+        band: Any = self.passive_band_hz
+        if band is not None:
+            if not isinstance(band, tuple) or len(band) != 2 or not all(isinstance(f, (int, float)) for f in band):
+                raise ControlError(f"passive_band_hz = {band!r} is not a band; give (low, high)")
+            low, high = band
+            if not LOWEST_HZ <= low < high < 0.5 * self.sample_rate_hz:
+                raise ControlError(
+                    f"passive_band_hz = [{low:g}, {high:g}] is not a band; give {LOWEST_HZ:g} <= low < high < "
+                    f"{0.5 * self.sample_rate_hz:g} Hz, half the sample rate"
+                )
+        check_command_limits(self.current_limit_A, self.command_limit)
 
     def _check_measured(self) -> None:
         measured: Any = self.measured
@@ -189,71 +182,68 @@ class ControllerSpec:
                 f'give both: measured = ["{names[0]}", "thetad_m"]'
             )
 
-    def _check_limits(self) -> None:
-        for name in LIFTABLE:
-            BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
-        self._check_notch()
-        self._check_prefilter()
-        self._check_link_feedforward()
-        self._check_band()
-        check_command_limits(self.current_limit_A, self.command_limit)
-
-    def _check_band(self) -> None:
-        if self.passive_band_hz is None:
-            return
-        band: Any = self.passive_band_hz
-        if not isinstance(band, tuple) or len(band) != 2 or not all(isinstance(f, (int, float)) for f in band):
-            raise ControlError(f"passive_band_hz = {band!r} is not a band; give (low, high)")
-        low, high = self.passive_band_hz
-        if not LOWEST_HZ <= low < high < 0.5 * self.sample_rate_hz:
+    def _check_rates(self) -> None:
+        f, (low, high) = self.bandwidth_hz, self.bandwidth_range_hz
+        if not f > 0.0:
             raise ControlError(
-                f"passive_band_hz = [{low:g}, {high:g}] is not a band; give {LOWEST_HZ:g} <= low < high < "
-                f"{0.5 * self.sample_rate_hz:g} Hz, half the sample rate"
+                f"bandwidth_hz = {f:g} is not positive; give it in Hz: bandwidth_hz = {abs(f) or 30.0:g}"
+            )
+        if not 0.0 < low < high:
+            raise ControlError(
+                f"bandwidth_range_hz = [{low:g}, {high:g}] is not a range; give 0 < low < high: "
+                "bandwidth_range_hz = [15, 60]"
+            )
+        if not low <= f <= high:
+            raise ControlError(
+                f"bandwidth_hz = {f:g} is outside {low:g} to {high:g}; choose one inside, or give another range: "
+                f"bandwidth_range_hz = [{min(low, f):g}, {max(high, f):g}]"
+            )
+        if not 4.0 * f < self.sample_rate_hz:
+            raise ControlError(
+                f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {f:g}; sample more than four "
+                f"times as fast: sample_rate_hz = {10.0 * f:g}"
             )
 
-    def _check_notch(self) -> None:
-        if self.notch is None:
-            return
-        if not isinstance(self.notch, Notch):
-            raise ControlError(f"notch = {self.notch!r} is a {type(self.notch).__name__}; give a Notch")
-        top = {"frequency_hz": HIGHEST_CORNER * self.sample_rate_hz, "width": 10.0, "depth": 1.0}
-        _check_numbers("notch", asdict(self.notch), top)
-
-    def _check_prefilter(self) -> None:
-        given: Any = self.prefilter
-        if given is not None and not isinstance(given, Prefilter) and given not in PREFILTER_ORDERS:
+    def _check_filters(self) -> None:
+        notch, path = self.notch, self.link_feedforward
+        for name, value, kind in (("notch", notch, Notch), ("link_feedforward", path, LinkFeedforward)):
+            if not isinstance(value, kind | None):
+                raise ControlError(
+                    f"{name} = {value!r} is a {type(value).__name__}; give a {kind.__name__}, in a file {name} = true"
+                )
+        prefilter: Any = self.prefilter
+        if not isinstance(prefilter, Prefilter | None) and prefilter not in PREFILTER_ORDERS:
             raise ControlError(
-                f"prefilter = {given!r} is not known; {suggestion(str(given), PREFILTER_ORDERS)}; or give a Prefilter"
+                f"prefilter = {prefilter!r} is not known; {suggestion(str(prefilter), PREFILTER_ORDERS)}; or give a "
+                "Prefilter"
             )
-        chosen = self.reference_filter
-        if chosen is None:
-            return
-        if chosen.order not in PREFILTER_ORDERS:
-            raise ControlError(f'prefilter.order = "{chosen.order}" is not known; use "first_order" or "second_order"')
-        if chosen.damping is not None and not chosen.is_second_order:
-            raise ControlError(
-                f"prefilter.damping = {chosen.damping!r} is of a filter of second order; leave it out, or give "
-                'order = "second_order"'
-            )
-        numbers = {"corner_hz": chosen.corner_hz, "damping": chosen.damping}
-        _check_numbers("prefilter", numbers, {"corner_hz": HIGHEST_CORNER * self.sample_rate_hz, "damping": 10.0})
-
-    def _check_link_feedforward(self) -> None:
-        asked = self.link_feedforward
-        if asked is None:
-            return
-        if not isinstance(asked, LinkFeedforward):
-            raise ControlError(
-                f"link_feedforward = {asked!r} is a {type(asked).__name__}; give a LinkFeedforward, in a file "
-                "link_feedforward = true"
-            )
-        numbers = {"fraction": asked.fraction, "corner_hz": asked.corner_hz, "high_pass_hz": asked.high_pass_hz or None}
         highest = HIGHEST_CORNER * self.sample_rate_hz
-        _check_numbers("link_feedforward", numbers, {"fraction": 2.0, "corner_hz": highest, "high_pass_hz": highest})
-        if asked.measured is not None and asked.measured in list_names(self.measured):
-            raise ControlError(
-                f'link_feedforward.measured = "{asked.measured}" is fed back already; measure the link\'s motion'
-            )
+        if notch is not None:
+            _check_numbers("notch", asdict(notch), {"frequency_hz": highest, "width": 10.0, "depth": 1.0})
+        if (chosen := self.reference_filter) is not None:
+            if chosen.order not in PREFILTER_ORDERS:
+                raise ControlError(
+                    f'prefilter.order = "{chosen.order}" is not known; use "first_order" or "second_order"'
+                )
+            if chosen.damping is not None and not chosen.is_second_order:
+                raise ControlError(
+                    f"prefilter.damping = {chosen.damping!r} is of a filter of second order; leave it out, or give "
+                    'order = "second_order"'
+                )
+            numbers = {"corner_hz": chosen.corner_hz, "damping": chosen.damping}
+            _check_numbers("prefilter", numbers, {"corner_hz": highest, "damping": 10.0})
+        if path is not None:
+            numbers = {
+                "fraction": path.fraction,
+                "corner_hz": path.corner_hz,
+                "high_pass_hz": path.high_pass_hz or None,
+            }
+            largest = {"fraction": 2.0, "corner_hz": highest, "high_pass_hz": highest}
+            _check_numbers("link_feedforward", numbers, largest)
+            if path.measured in list_names(self.measured):
+                raise ControlError(
+                    f'link_feedforward.measured = "{path.measured}" is fed back already; measure the link\'s motion'
+                )
 
     @property
     def reference_filter(self) -> Prefilter | None:
@@ -312,12 +302,8 @@ class ControllerSpec:
     def see_response(self, measured: MeasuredResponse, command: Command) -> MeasuredPlant:
         """Return what a controller of this specification, which gives a command, sees of a measured response.
 
-        Raises
-        ------
-        ControlError
-            The law reads several outputs, or the motion of a link that the response's plant does not hold; the response
-            is of another output or input; or as `sample_measured`.
-
+        Raises ControlError: the law reads several outputs, or the motion of a link that the response's plant does not
+        hold; the response is of another output or input; or as `sample_measured`.
         """
         if not isinstance(self.measured, str):
             raise ControlError(
@@ -342,14 +328,13 @@ class ControllerSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        filters = {"notch": self.notch, "prefilter": self.reference_filter, "link_feedforward": self.link_feedforward}
-        stated = {name: None if one is None else asdict(one) for name, one in filters.items()}
+        values["prefilter"] = self.reference_filter
         if self.bandwidth_tolerance == BANDWIDTH_TOLERANCE:
             del values["bandwidth_tolerance"]  # stands in no file of a law that was tuned
         if self.delay_samples is None:
             del values["delay_samples"]
             values["compute_delay_samples"] = self.loop_delay_samples
-        return values | stated
+        return values | {name: to_content(values[name]) for name in ("notch", "prefilter", "link_feedforward")}
 
 
 def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, float]) -> None:
@@ -361,21 +346,14 @@ def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, 
         if value is None:
             continue
         least = LOWEST_HZ if field.endswith("_hz") else 0.0
-        known = not isinstance(value, bool) and isinstance(value, (int, float))
-        if not known or not 0.0 < value <= largest[field] or value < least:
+        numeric = not isinstance(value, bool) and isinstance(value, (int, float))
+        if not numeric or not 0.0 < value <= largest[field] or value < least:
             lower = f"{least:g} to" if least else "above 0 and up to"
             raise ControlError(f"{name}.{field} = {value!r} is not {lower} {largest[field]:g}")
 
 
 def check_command_limits(current_limit_A: float | None, command_limit: float | None) -> None:
-    """Refuse two limits of the command, and one that is not positive or too large to reckon with; infinity is none.
-
-    Raises
-    ------
-    ControlError
-        As said.
-
-    """
+    """Refuse two limits of the command, and one that is not positive or too large to compute with; infinity is none."""
     if current_limit_A is not None and command_limit is not None:
         raise ControlError(
             f"current_limit_A = {current_limit_A:g} and command_limit = {command_limit:g} are both given; give one"
