@@ -11,7 +11,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, Strict, model_validator
 
+from seaopt.codec import from_content
 from seaopt.control.given.pid_forms import Integral, ideal_pid, parallel_pid
+from seaopt.control.laws.stored import StoredLaw
 from seaopt.control.laws.structures import AGREES, COMPARED
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import Measured
@@ -35,6 +37,12 @@ def _bound(value: float) -> float:
 Bounded = Annotated[Finite, AfterValidator(_bound)]
 # A whole one, in one line.
 LAW_EXAMPLE = "sample_rate_hz = 1000, compute_delay_samples = 1, pid = { k_p = 2.0, k_i = 30.0 }"
+# Keys of a controller.json that are not its law.
+TUNING = {
+    "schema", "title", "structure", "gains", "achieved", "met", "feasible", "active_constraints", "engineering",
+    "observer", "heat", "impedance", "link_feedforward", "blocked_by", "largest_bandwidth_hz", "possible", "notes",
+    "measured_responses", "provenance", "fit_met", "guessed", "made_from", "guards",
+}  # fmt: skip
 PID_GAINS = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
 
 
@@ -73,13 +81,6 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class _StateSpace(_Strict):
-    A: list[list[Bounded]]
-    B: list[list[Bounded]]
-    C: list[list[Bounded]]
-    D: list[list[Bounded]]
-
-
 class _Pid(_Strict):
     """The gains of a PID, with the names of its form."""
 
@@ -110,17 +111,8 @@ class _Pid(_Strict):
         return self
 
     def build(self, sample_time_s: float) -> Law:
-        names = PID_GAINS[self.form]
-        gains = {name: value for name in names if (value := getattr(self, name)) is not None}
         make: Any = parallel_pid if self.form == "parallel" else ideal_pid
-        return make(
-            **gains,
-            sample_time_s=sample_time_s,
-            b=self.b,
-            c=self.c,
-            feedforward=self.feedforward,
-            integral=self.integral,
-        )
+        return make(**self.model_dump(exclude={"form"}, exclude_none=True), sample_time_s=sample_time_s)
 
 
 class _Command(BaseModel):
@@ -145,37 +137,18 @@ class LawFile(_Strict):
     delay_samples: Annotated[Number, Field(ge=0.0)] | None = None
     output: Literal["effort", "command"] = "effort"
     measured: list[str] | str | None = None
-    law: _StateSpace | None = None
+    law: dict[Literal["A", "B", "C", "D"], list[list[Bounded]]] | None = None
     reference: FractionTable | None = None
     measurement: FractionTable | list[FractionTable] | None = None
     pid: _Pid | None = None
     command: _Command = _Command()
-    # Of a controller.json; none of them is the law.
-    schema_: Any = Field(default=None, alias="schema")
-    title: Any = None
-    structure: Any = None
-    gains: Any = None
     spec: Any = None
-    achieved: Any = None
-    met: Any = None
-    feasible: Any = None
-    active_constraints: Any = None
-    engineering: Any = None
-    observer: Any = None
-    heat: Any = None
-    impedance: Any = None
-    link_feedforward: Any = None
     compensation: Any = None
-    blocked_by: Any = None
-    largest_bandwidth_hz: Any = None
-    possible: Any = None
-    notes: Any = None
-    measured_responses: Any = None
-    provenance: Any = None
-    fit_met: Any = None
-    guessed: Any = None
-    made_from: Any = None
-    guards: Any = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _leave_out(cls, content: Any) -> Any:
+        return {key: content[key] for key in content if key not in TUNING} if isinstance(content, dict) else content
 
     @model_validator(mode="after")
     def _check_law(self) -> LawFile:
@@ -202,8 +175,8 @@ class LawFile(_Strict):
     def delays(self) -> dict[str, Any]:
         """What is stated of time; of a controller.json what was asked, for its drive's delay may be that of a fit."""
         if self.compute_delay_samples is None:
-            whole = float(self.delay_samples or 0.0).is_integer()
-            return {"delay_samples": int(self.delay_samples or 0) if whole else self.delay_samples}
+            samples = float(self.delay_samples or 0.0)
+            return {"delay_samples": int(samples) if samples.is_integer() else samples}
         spec = self.spec if isinstance(self.spec, dict) else {"drive_delay_s": self.drive_delay_s}
         if spec.get("delay_samples") is not None:  # of a controller.json: its samples are the whole loop's
             return {"delay_samples": self.compute_delay_samples}
@@ -211,11 +184,9 @@ class LawFile(_Strict):
 
     def build(self, source: str) -> GivenLaw:
         """Return the law."""
-        ts = self.sample_time_s or 1.0 / (self.sample_rate_hz or 1.0)
-        names = (self.measured,) if isinstance(self.measured, str) else tuple(self.measured or ())
-        measured = (names[0] if len(names) == 1 else names) if names else None
+        names = tuple([self.measured] if isinstance(self.measured, str) else self.measured or ())
         try:
-            law = self._build_law(source, ts)
+            law = self._build_law(source, self.sample_time_s or 1.0 / (self.sample_rate_hz or 1.0))
         except ControlError as error:
             raise FileError(f"{source}: {error}") from error
         if names and law.d.size != 1 + len(names):
@@ -225,7 +196,7 @@ class LawFile(_Strict):
         return GivenLaw(
             law=law,
             delays=self.delays,
-            measured=measured,
+            measured=names[0] if len(names) == 1 else names or None,
             to_command=self.output == "command",
             per_effort=self.command.per_effort,
         )
@@ -235,24 +206,20 @@ class LawFile(_Strict):
             return self.pid.build(ts)
         fractions: list[tuple[str, TransferFunction]] = []
         if self.reference is not None and self.measurement is not None:
-            read = self.measurement if isinstance(self.measurement, list) else [self.measurement]
-            named = [("reference", self.reference), *(("measurement", fraction) for fraction in read)]
+            paths = self.measurement if isinstance(self.measurement, list) else [self.measurement]
+            named = [("reference", self.reference), *(("measurement", path) for path in paths)]
             fractions = [(name, _normalise(source, name, fraction)) for name, fraction in named]
         if self.law is None:
             return Law.from_transfer_functions(fractions[0][1], [fraction for _, fraction in fractions[1:]], ts)
-        inputs = max(len(self.law.D[0]) if self.law.D else 0, 2)
-        a, b, c, d = (
-            _make_matrix(source, name, getattr(self.law, name), len(self.law.A), inputs)
-            for name in ("A", "B", "C", "D")
-        )
-        law = Law.from_state_space(a, b, c[0], d[0], ts)
-        f = COMPARED / ts
-        if fractions and len(fractions) != inputs:
+        remedy = "give the matrices from (reference, measured) to effort"
+        given = from_content(StoredLaw, self.law, f"{source}: law", remedy=remedy).build(ts)
+        law, f = Law.from_state_space(given.a, given.b, given.c, given.d, ts), COMPARED / ts
+        if fractions and len(fractions) != law.d.size:
             raise FileError(
-                f"{source}: measurement has {len(fractions) - 1} entries, and law reads {inputs - 1} signals"
+                f"{source}: measurement has {len(fractions) - 1} entries, and law reads {law.d.size - 1} signals"
             )
-        read = (law.reference_response(f), *law.feedback_responses(f))
-        for (name, fraction), response in zip(fractions, read, strict=False):
+        responses = (law.reference_response(f), *law.feedback_responses(f))
+        for (name, fraction), response in zip(fractions, responses, strict=False):
             if np.any(np.abs(fraction.response(f, ts) - response) > AGREES * np.max(np.abs(response))):
                 raise FileError(f"{source}: {name} is not what law gives; leave one of them out")
         return law
@@ -308,11 +275,3 @@ def _normalise(source: str, name: str, fraction: FractionTable) -> TransferFunct
             f"num below {1.0 / LARGEST:g}; correct {name}.den or {name}.num"
         )
     return TransferFunction(num=num, den=bottom)
-
-
-def _make_matrix(source: str, name: str, rows: list[list[float]], states: int, inputs: int) -> np.ndarray:
-    """Return a matrix of the law; refuse one whose shape does not fit."""
-    shape = {"A": (states, states), "B": (states, inputs), "C": (1, states), "D": (1, inputs)}[name]
-    if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
-        raise FileError(f"{source}: law.{name} is not a matrix of {shape[0]} x {shape[1]}")
-    return np.array(rows, dtype=float).reshape(shape)

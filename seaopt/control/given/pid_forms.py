@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal, get_args
 
-import numpy as np
-
-from seaopt.control.laws.structures import Gains
+from seaopt.control.laws.structures import Gains, InnerLoop, SpeedLoop
 from seaopt.control.loops.law import Law
 from seaopt.errors import ControlError, require_number
 
@@ -57,11 +55,7 @@ def parallel_pid(
     (1, [2.01, -2.01])
 
     """
-    numbers = {"k_p": k_p, "k_i": k_i, "k_d": k_d, "T_f": T_f, "b": b, "c": c, "feedforward": feedforward}
-    for name, value in {**numbers, "sample_time_s": sample_time_s}.items():
-        require_number(value, name, ControlError)
-    if T_f < 0.0 or not sample_time_s > 0.0:
-        raise ControlError(f"T_f = {T_f:g} s, sample_time_s = {sample_time_s:g} s: give times that are not negative")
+    _check_numbers(k_p=k_p, k_i=k_i, k_d=k_d, T_f=T_f, b=b, c=c, feedforward=feedforward, sample_time_s=sample_time_s)
     if integral not in get_args(Integral):
         raise ControlError(f'integral = "{integral}" is not known; give one of {", ".join(get_args(Integral))}')
     # Sums of the new or the old error are the trapezoid's, and half a sample of it more or less.
@@ -122,20 +116,27 @@ def cascade_pid(
     (2, 3)
 
     """
-    for name, value in (("k_v", k_v), ("T_v", T_v)):
-        require_number(value, name, ControlError)
-    if math.isnan(T_v) or not T_v > 0.0 or not math.isfinite(k_v):
+    require_number(T_v, "T_v", ControlError)
+    if not T_v > 0.0 or not math.isfinite(k_v):
         raise ControlError(f"k_v = {k_v:g}, T_v = {T_v:g}: give a finite gain and a positive time")
-    outer = parallel_pid(k_p=k_p, k_i=k_i, k_d=k_d, T_f=T_f, sample_time_s=sample_time_s, b=b, c=c)
-    n, half = outer.c.size, 1.0 + 0.5 * sample_time_s / T_v  # of the newest error, which the trapezoid counts by half
-    drive = np.append(outer.d, -1.0)  # v_ref - v of reference, measured and speed
-    a = np.zeros((n + 1, n + 1))
-    a[:n, :n], a[n, :n], a[n, n] = outer.a, sample_time_s * outer.c, 1.0
-    columns = np.vstack([np.hstack([outer.b, np.zeros((n, 1))]), sample_time_s * drive])
-    row, through = k_v * np.append(half * outer.c, 1.0 / T_v), k_v * half * drive
-    through[0] += feedforward
-    kept = slice(None) if math.isfinite(T_v) else slice(n)
-    return Law.from_state_space(a[kept, kept], columns[kept], row[kept], through, sample_time_s)
+    _check_numbers(k_p=k_p, k_i=k_i, k_d=k_d, T_f=T_f, b=b, c=c, feedforward=feedforward, sample_time_s=sample_time_s)
+    gains = Gains(
+        k_p=k_v * k_p,
+        k_i=k_v * k_i,
+        k_d=k_v * k_d,
+        T_f=T_f,
+        k_r=k_v * b * k_p,
+        c=c,
+        inner=InnerLoop(k_v=k_v, T_v=T_v, k_ff=feedforward, speed=SpeedLoop(differenced=False)),
+    )
+    return gains.law("cascade", sample_time_s).balanced()
+
+
+def _check_numbers(*, T_f: float, sample_time_s: float, **gains: float) -> None:
+    for name, value in {**gains, "T_f": T_f, "sample_time_s": sample_time_s}.items():
+        require_number(value, name, ControlError)
+    if T_f < 0.0 or not sample_time_s > 0.0:
+        raise ControlError(f"T_f = {T_f:g} s, sample_time_s = {sample_time_s:g} s: give times that are not negative")
 
 
 def ideal_pid(
