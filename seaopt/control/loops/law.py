@@ -23,11 +23,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Complex, Float
+from numpy.polynomial.polynomial import polypow
+from scipy.linalg import block_diag, schur
 
 from seaopt.control.loops.minimal import (
     NEAR_ONE,
@@ -99,6 +101,12 @@ class Law:
         return self.a[m:, m:], self.b[m:], self.c[m:]
 
     @property
+    def static_rest(self) -> Float[np.ndarray, " k"]:
+        """What does not integrate, at 0 Hz: effort per reference and per measured signal."""
+        a, b, c = self.rest
+        return self.d + c @ np.linalg.solve(np.eye(c.size) - a, b)
+
+    @property
     def poles(self) -> Complex[np.ndarray, " n"]:
         """The eigenvalues of `a`, those of the chain exactly 1."""
         return np.concatenate([np.ones(self.integrators), np.linalg.eigvals(self.rest[0])]).astype(complex)
@@ -152,38 +160,25 @@ class Law:
 
     def transfer_functions(self) -> tuple[TransferFunction, ...]:
         """Return C_r and each C_y multiplied out over one denominator, for reading: they say less than the law does."""
-        m = self.integrators
-        a, b, c = self.rest
-        difference = np.array([1.0, -1.0])
-        powers = [_power(difference, k) for k in range(m + 1)]
+        m, (a, b, c) = self.integrators, self.rest
+        powers = [polypow([1.0, -1.0], k) for k in range(m + 1)]  # of 1 - q
         slow = np.real(np.poly(a)) if c.size else np.ones(1)
-        den = np.convolve(powers[m], slow)
         out: list[TransferFunction] = []
         for column, sign in enumerate([1.0] + [-1.0] * (self.d.size - 1)):
-            num = np.zeros(den.size)
             over = (np.real(np.poly(a - np.outer(b[:, column], c))) - slow) if c.size else np.zeros(1)
-            num += np.convolve(powers[m], over + self.d[column] * slow)
-            for j in range(1, m + 1):
-                term = np.convolve(np.convolve(np.eye(1, j + 1, k=j)[0], powers[m - j]), slow)
-                num += self.b[j - 1, column] * term
-            out.append(TransferFunction(num=sign * num, den=den))
+            num = np.convolve(powers[m], over + self.d[column] * slow)
+            for j, gain in enumerate(self.b[:m, column], start=1):  # gain q^j (1 - q)^(m - j)
+                num += gain * np.convolve(np.concatenate([np.zeros(j), powers[m - j]]), slow)
+            out.append(TransferFunction(num=sign * num, den=np.convolve(powers[m], slow)))
         return tuple(out)
 
     def to_control(self) -> control.StateSpace:
         """Return the law as python-control's `StateSpace`, inputs reference and measured, output effort."""
         import control  # deferred: slow to import
 
-        measured = [f"measured{i}" if self.d.size > 2 else "measured" for i in range(1, self.d.size)]
-        return control.StateSpace(
-            self.a,
-            self.b,
-            self.c[None],
-            self.d[None],
-            self.sample_time_s,
-            inputs=["reference", *measured],
-            outputs=["effort"],
-            name="law",
-        )
+        measured = ["measured"] if self.d.size == 2 else [f"measured{i}" for i in range(1, self.d.size)]
+        names: dict[str, Any] = {"inputs": ["reference", *measured], "outputs": ["effort"], "name": "law"}
+        return control.StateSpace(self.a, self.b, self.c[None], self.d[None], self.sample_time_s, **names)
 
     def to_dict(self) -> dict[str, Any]:
         """Return A, B, C and D as matrices, for JSON."""
@@ -274,9 +269,9 @@ class Law:
                 "(reference, measured) as inputs"
             )
         if isinstance(system, control.TransferFunction):
-            parts = [_in_delay(system.num[0][i], system.den[0][i]) for i in range(system.ninputs)]
-            first, *paths = parts if len(parts) > 1 else (parts[0], replace(parts[0], num=-parts[0].num))
-            return cls.from_transfer_functions(first, [replace(path, num=-path.num) for path in paths], float(ts))
+            first, *inputs = (_in_delay(num, den) for num, den in zip(system.num[0], system.den[0], strict=True))
+            paths = [replace(path, num=-path.num) for path in inputs] or [first]
+            return cls.from_transfer_functions(first, paths, float(ts))
         b, d = np.asarray(system.B), np.asarray(system.D)[0]
         if system.ninputs == 1:
             b, d = np.hstack([b, -b]), np.concatenate([d, -d])
@@ -289,22 +284,22 @@ class Law:
         :math:`v_k = (\theta_k - \theta_{k-1})/T_s`: half a sample late, and rounded to one step of the encoder per
         sample. As a part of the law that is in every figure and every simulation.
         """
-        n, ts = self.c.size, self.sample_time_s
-        a, b = np.zeros((n + 1, n + 1)), np.vstack([self.b, np.zeros(self.d.size)])
-        a[:n, :n], a[:n, n] = self.a, -self.b[:, column] / ts
-        b[:n, column], b[n, column] = self.b[:, column] / ts, 1.0
-        d = self.d.copy()
-        d[column] /= ts
-        return Law.from_state_space(a, b, np.append(self.c, -self.d[column] / ts), d, ts)
+        n, ts, per_step = self.c.size, self.sample_time_s, np.ones(self.d.size)
+        per_step[column] /= self.sample_time_s
+        b, d = self.b * per_step, self.d * per_step
+        a = np.block([[self.a, -b[:, [column]]], [np.zeros((1, n + 1))]])  # the last state is the position before
+        return Law.from_state_space(a, np.vstack([b, np.eye(d.size)[column]]), np.append(self.c, -d[column]), d, ts)
 
     def reading(self, feedback: TransferFunction) -> Law:
         """Return the law u - C(q) y that reads one signal more, in a last column of b."""
         a, b, c, d = feedback.state_space()
-        n, more, inputs = self.c.size, c.size, self.d.size
-        whole, into = np.zeros((n + more, n + more)), np.zeros((n + more, inputs + 1))
-        whole[:n, :n], whole[n:, n:] = self.a, a
-        into[:n, :inputs], into[n:, inputs] = self.b, b
-        return replace(self, a=whole, b=into, c=np.concatenate([self.c, -c]), d=np.append(self.d, -d))
+        return replace(
+            self,
+            a=block_diag(self.a, a),
+            b=block_diag(self.b, b[:, None]),
+            c=np.concatenate([self.c, -c]),
+            d=np.append(self.d, -d),
+        )
 
     def scaled(self, factor: float) -> Law:
         """Return the law with its output times a factor; the chain is read as before."""
@@ -348,17 +343,15 @@ class Law:
         made = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s)
 
         def find_wrong(law: Law) -> str | None:
-            responses = lambda f, column: sign[column] * law.responses(f)[column]  # noqa: E731
-            checks = (
-                (name, has_response(tf, partial(responses, column=column), sample_time_s))
-                for column, (name, tf) in enumerate(given.items())
-            )
-            return next((name for name, same in checks if not same), None)
+            for i, (name, tf) in enumerate(given.items()):
+                if not has_response(tf, lambda f, i=i: sign[i] * law.responses(f)[i], sample_time_s):
+                    return name
+            return None
 
         balanced = made.balanced()  # which loses the small states beside those of a pole next to 1
         if find_wrong(balanced) is None:
             made = balanced
-        elif (wrong := find_wrong(made)) is not None:
+        elif wrong := find_wrong(made):
             raise refuse_slow_poles(wrong)
         near = np.any(np.abs(made.poles[m:] - 1.0) < NEAR_ONE)  # of coefficients with fewer digits
         return _set_apart(made) if near else made
@@ -396,11 +389,10 @@ def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -
 def _is_same(law: Law, given: Law, share: float = RESPONSE_TOLERANCE) -> bool:
     """Tell whether two laws have the same responses from `LOWEST` on, but for a share of them."""
     per_sample = np.geomspace(LOWEST, 0.49, 25)
-    found, wanted = (side.responses(per_sample / law.sample_time_s) for side in (law, given))
+    response, wanted = (side.responses(per_sample / law.sample_time_s) for side in (law, given))
     size = np.abs(wanted)
     above = np.maximum.accumulate(size[:, ::-1], axis=1)[:, ::-1]
-    allowed = share * size + ROUNDED * above + TINY
-    return bool(np.all(np.abs(found - wanted) <= allowed))
+    return bool(np.all(np.abs(response - wanted) <= share * size + ROUNDED * above + TINY))
 
 
 def _in_delay(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " m"]) -> TransferFunction:
@@ -435,25 +427,8 @@ def _factorise(
     a, b, c = law.rest
     if not c.size:
         return law.integrators, a + 0j, c + 0j, b + 0j
-    triangle, basis = _triangulate(a)
-    return law.integrators, triangle, c @ basis, basis.conj().T @ b
-
-
-def _triangulate(a: Float[np.ndarray, "n n"]) -> tuple[Complex[np.ndarray, "n n"], Complex[np.ndarray, "n n"]]:
-    """Return the complex Schur form of a matrix, and its basis."""
-    if a.shape[0] == 1:
-        return a.astype(complex), np.ones((1, 1), dtype=complex)
-    from scipy.linalg import schur
-
     triangle, basis = (np.asarray(part) for part in schur(a, output="complex")[:2])
-    return triangle, basis
-
-
-def _power(polynomial: Float[np.ndarray, " n"], exponent: int) -> Float[np.ndarray, " m"]:
-    out = np.ones(1)
-    for _ in range(exponent):
-        out = np.convolve(out, polynomial)
-    return out
+    return law.integrators, triangle, c @ basis, basis.conj().T @ b
 
 
 def make_static_law(gain: float, sample_time_s: float, measured: int = 1) -> Law:
@@ -503,9 +478,7 @@ def find_integral_rate(law: Law) -> float:
     m = law.integrators
     if not m:
         return np.inf
-    a, b, c = law.rest
-    static = float(law.d[1] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, 1]))
-    last, before = -law.b[m - 1, 1], 1.0 - static if m == 1 else -law.b[m - 2, 1]
+    last, before = -law.b[m - 1, 1], 1.0 - law.static_rest[1] if m == 1 else -law.b[m - 2, 1]
     return float(last / (law.sample_time_s * (before - 0.5 * m * last)))
 
 

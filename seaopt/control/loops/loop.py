@@ -120,6 +120,30 @@ class LoopFigures:
         return f"gain margin {gain} dB, phase margin {phase} deg, delay margin {delay} ms"
 
 
+def make_unstable_figures(spectral_radius: float, signals: int = 1) -> LoopFigures:
+    """Return the figures of a loop that is not stable, whose law reads so many signals."""
+    return LoopFigures(
+        stable=False,
+        spectral_radius=spectral_radius,
+        bandwidth_hz=None,
+        tracking_band_hz=None,
+        crossover_hz=None,
+        sensitivity_bandwidth_hz=0.0,
+        ms=np.inf,
+        mt=np.inf,
+        ms_hz=np.nan,
+        reference_peak=np.inf,
+        droop_db=np.inf,
+        return_hz=None,
+        gain_margin_db=0.0,
+        phase_margin_deg=0.0,
+        delay_margin_s=0.0,
+        disk_margin=0.0,
+        noise_gain=np.inf,
+        other_noise_gains=(np.inf,) * (signals - 1),
+    )
+
+
 @record(eq=False)
 class Loop:
     """A plant closed by a law, F_m = C_r F_ref - C_y F."""
@@ -157,21 +181,13 @@ class Loop:
         """
         import control  # deferred: slow to import
 
-        system, measured = self.system(), self.law.d.size - 1
-        inputs, outputs = ["noise", "reference"], ["measured", "effort"]
-        if measured > 1:
-            inputs = ["disturbance", "reference", *(f"noise{number}" for number in range(1, measured + 1))]
-            outputs = ["command", "effort", "measured1"]
-        return control.StateSpace(
-            system.a,
-            system.b,
-            system.c,
-            system.d,
-            self.plant.sample_time_s,
-            inputs=inputs,
-            outputs=outputs,
-            name="loop",
-        )
+        system, signals = self.system(), self.law.d.size - 1
+        names = {"inputs": ["noise", "reference"], "outputs": ["measured", "effort"]}
+        if signals > 1:
+            noises = [f"noise{number}" for number in range(1, signals + 1)]
+            names = {"inputs": ["disturbance", "reference", *noises], "outputs": ["command", "effort", "measured1"]}
+        ts = self.plant.sample_time_s
+        return control.StateSpace(system.a, system.b, system.c, system.d, ts, name="loop", **names)
 
     def eigenvalues(self) -> Complex[np.ndarray, " n"]:
         """Return the closed loop's eigenvalues."""
@@ -237,26 +253,7 @@ class Loop:
         system = self.system()
         radius = float(np.max(np.abs(system.poles), initial=0.0))
         if not radius < STABLE:
-            return LoopFigures(
-                stable=False,
-                spectral_radius=radius,
-                bandwidth_hz=None,
-                tracking_band_hz=None,
-                crossover_hz=None,
-                sensitivity_bandwidth_hz=0.0,
-                ms=np.inf,
-                mt=np.inf,
-                ms_hz=np.nan,
-                reference_peak=np.inf,
-                droop_db=np.inf,
-                return_hz=None,
-                gain_margin_db=0.0,
-                phase_margin_deg=0.0,
-                delay_margin_s=0.0,
-                disk_margin=0.0,
-                noise_gain=np.inf,
-                other_noise_gains=(np.inf,) * (self.law.d.size - 2),
-            )
+            return make_unstable_figures(radius, self.law.d.size - 1)
         extremes = find_extremes(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
         (ms, mt, skew, noise, reference, *further), ms_at = extremes.peaks, extremes.at[0]

@@ -107,25 +107,20 @@ def realise_rest(
     The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles have digits
     that they do not have in z, with its states scaled.
     """
-    groups: list[list[tuple[int, SplitLaw]]] = []
-    for numbered in enumerate(parts):
-        alike = (group for group in groups if np.array_equal(group[0][1].den, numbered[1].den))
-        group = next(alike, None)
-        if group is None:
-            groups.append([numbered])
-        else:
-            group.append(numbered)
+    groups: dict[tuple[float, ...], list[int]] = {}  # by denominator
+    for number, part in enumerate(parts):
+        groups.setdefault(tuple(part.den), []).append(number)
     blocks: list[Float[np.ndarray, "_ _"]] = []
     drives: list[Float[np.ndarray, "_ k"]] = []
     rows: list[Float[np.ndarray, " _"]] = []
-    for group in groups:
-        den = group[0][1].den
-        n = max(p.size for _, part in group for p in (part.rest, den)) - 1
-        whole = np.pad(den, (0, n + 1 - den.size))
+    for den, numbers in groups.items():
+        n = max(len(den), *(parts[number].rest.size for number in numbers)) - 1
+        whole = np.pad(den, (0, n + 1 - len(den)))
         a, b = np.eye(n, k=1), np.zeros((n, len(parts)))
         a[:, :1] -= _shift(whole)[1:, None]
-        for input_number, part in group:
-            b[:, input_number] = _shift((np.pad(part.rest, (0, n + 1 - part.rest.size)) - part.rest[0] * whole)[1:])
+        for number in numbers:
+            num = parts[number].rest
+            b[:, number] = _shift((np.pad(num, (0, n + 1 - num.size)) - num[0] * whole)[1:])
         a, scale = _scale(a)
         blocks.append(np.eye(n) + a)
         drives.append(b / scale[:, None])
@@ -148,7 +143,10 @@ def build_chain(
 
 
 def has_response(
-    tf: TransferFunction, response: Callable[[Float[np.ndarray, " k"]], Complex[np.ndarray, " k"]], sample_time_s: float
+    tf: TransferFunction,
+    response: Callable[[Float[np.ndarray, " k"]], Complex[np.ndarray, " k"]],
+    sample_time_s: float,
+    roundings: float = 256.0,
 ) -> bool:
     """Tell whether a state space has the response of its transfer function, but for its coefficients' rounding."""
     f = np.geomspace(1e-4, 0.49, 25) / sample_time_s
@@ -156,7 +154,7 @@ def has_response(
     bottom = np.polynomial.polynomial.polyval(q, tf.den)
     wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
     rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
-    allowed = RESPONSE_TOLERANCE * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
+    allowed = RESPONSE_TOLERANCE * np.abs(wanted) + roundings * EPS * rounding / np.abs(bottom)
     return bool(np.all(np.abs(response(f) - wanted) <= allowed))
 
 

@@ -32,6 +32,7 @@ from seaopt.control.loops.loop import (
     SHOULDER,
     SHOULDER_FALL,
     LoopFigures,
+    make_unstable_figures,
 )
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.peaks import HALF_POWER
@@ -91,30 +92,19 @@ class DiscLoop:
     def is_stable(self) -> bool:
         """Tell whether the loop is stable with every response in the discs, under the assumptions of the module."""
         f = self.grid()
-        response, reach = self._distance(f)
-        if np.any(np.abs(response) <= reach):
+        if np.any(np.abs(1.0 + self.open_loop(f)) <= self.plant.discs(f) * np.abs(self.law.measurement_response(f))):
             return False
         if np.any(np.abs(self.law.poles[self.law.integrators :]) >= 1.0):
             return False  # a law that grows by itself is not counted here
-        f = np.concatenate([[SLOWEST_HZ], f])
-        steps = self._turns(f)
-        for _ in range(REFINEMENTS):
-            wide = np.flatnonzero(np.abs(steps) > MOST_TURN_RAD)
+        f, turns = np.concatenate([[SLOWEST_HZ], f]), np.zeros(0)
+        for _ in range(REFINEMENTS + 1):
+            distance = 1.0 + self.open_loop(f)
+            turns = np.angle(distance[1:] / distance[:-1])
+            wide = np.flatnonzero(np.abs(turns) > MOST_TURN_RAD)
             if not wide.size:
                 break
             f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
-            steps = self._turns(f)
-        return abs(float(np.sum(steps)) / (0.5 * np.pi) - self.law.integrators) < ROUND
-
-    def _turns(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
-        """Return by how much 1 + L of the centres turns from each frequency to the next (rad)."""
-        distance = 1.0 + self.open_loop(f)
-        return np.angle(distance[1:] / distance[:-1])
-
-    def _distance(self, f: Float[np.ndarray, " m"]) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Return 1 + L of the centres, and how far the discs reach from it."""
-        law = self.law.measurement_response(f)
-        return 1.0 + self.plant.response(f) * law, self.plant.discs(f) * np.abs(law)
+        return abs(float(np.sum(turns)) / (0.5 * np.pi) - self.law.integrators) < ROUND
 
     def figures(self, asked_hz: float | None = None) -> LoopFigures:
         r"""Return the worst figures of all responses in the discs; of a loop that is not shown to be stable, none.
@@ -125,30 +115,13 @@ class DiscLoop:
         :math:`|1 - e^{-j\omega\tau}| < 1/|T|` at every frequency.
         """
         if not self.is_stable():
-            return LoopFigures(
-                stable=False,
-                spectral_radius=np.inf,
-                bandwidth_hz=None,
-                tracking_band_hz=None,
-                crossover_hz=None,
-                sensitivity_bandwidth_hz=0.0,
-                ms=np.inf,
-                mt=np.inf,
-                ms_hz=np.nan,
-                reference_peak=np.inf,
-                droop_db=np.inf,
-                return_hz=None,
-                gain_margin_db=0.0,
-                phase_margin_deg=0.0,
-                delay_margin_s=0.0,
-                disk_margin=0.0,
-                noise_gain=np.inf,
-            )
+            return make_unstable_figures(np.inf)
         f = self.grid()
         p, r = self.plant.response(f), self.plant.discs(f)
         reference, negative = self.law.responses(f)[:2]
         sizes = {name: bound_disc(name, p, r, -negative, reference) for name in ("1", "L", "1 - L", "C_y", "P C_r")}
-        (least, most), s, crossovers = sizes["P C_r"], sizes["1"][1], self._find_crossovers(f)
+        (least, most), s = sizes["P C_r"], sizes["1"][1]
+        crossovers = find_crossings(lambda x: np.abs(self.open_loop(x)) - 1.0, f)
         ms, static = float(np.max(s)), 1.0 if self.law.integrators else float(least[0])
         down, top = (_first(f, HALF_POWER * static - size) for size in (least, most))
         if down is not None and asked_hz is not None and KNOWN_TO * asked_hz <= down <= asked_hz <= (top or np.inf):
@@ -163,7 +136,7 @@ class DiscLoop:
             spectral_radius=0.0,
             bandwidth_hz=down,
             tracking_band_hz=_band(f, least, most),
-            crossover_hz=crossovers[-1] if crossovers else None,
+            crossover_hz=float(crossovers[-1]) if crossovers.size else None,
             sensitivity_bandwidth_hz=_first(f, s - HALF_POWER) or float(f[-1]),
             ms=ms,
             mt=mt,
@@ -185,9 +158,6 @@ class DiscLoop:
         low, high = bound_disc("P C_r", self.plant.response(f), self.plant.discs(f), -negative, reference)
         static = 1.0 if self.law.integrators else float(low[0])
         return _first(f, HALF_POWER * static - low), _first(f, HALF_POWER * static - high)
-
-    def _find_crossovers(self, f: Float[np.ndarray, " m"]) -> list[float]:
-        return [float(x) for x in find_crossings(lambda g: np.abs(self.open_loop(g)) - 1.0, f)]
 
     def _find_return(
         self, f: Float[np.ndarray, " m"], most: Float[np.ndarray, " m"], down: float, static: float
