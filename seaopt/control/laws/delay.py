@@ -38,24 +38,21 @@ from seaopt.records import record
 
 @runtime_checkable
 class DelayedSpec(Protocol):
-    """What a specification says of time."""
+    """What a specification says of time; see the options of these names."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def compute_delay_samples(self) -> int | None:
         """Whole samples from a reading to the command being put out; None: not given."""
-        ...
 
     @property
     def drive_delay_s(self) -> float | None:
         """Seconds from the command to its effect; None: that of the fit."""
-        ...
 
     @property
     def delay_samples(self) -> int | None:
         """The older key: both together, in whole samples; None: not given."""
-        ...
 
     @property
     def sample_rate_hz(self) -> float:
@@ -68,48 +65,27 @@ class DelayedSpec(Protocol):
         ...
 
 
-@runtime_checkable
-class TimedController(Protocol):
-    """What a controller has whose delays `LoopDelays` adds up."""
-
-    @property
-    def spec(self) -> DelayedSpec:
-        """What was asked."""
-        ...
-
-    @property
-    def sample_time_s(self) -> float:
-        """Seconds."""
-        ...
-
-    @property
-    def compute_delay_samples(self) -> int:
-        """Whole samples from a reading to the command being put out."""
-        ...
-
-    @property
-    def drive_delay_s(self) -> float:
-        """Seconds from the command to its effect."""
-        ...
-
-
 class LoopDelays:
     """Both delays of a controller together, for a law and a plan alike."""
 
     __slots__ = ()
+    spec: Any
+    sample_time_s: Any
+    compute_delay_samples: Any
+    drive_delay_s: Any
 
     @property
-    def delay_samples(self: TimedController) -> float:
+    def delay_samples(self) -> float:
         """Both delays together, in samples; a fraction as the drive has it."""
         return self.compute_delay_samples + self.drive_delay_s / self.sample_time_s
 
     @property
-    def delays(self: TimedController) -> str:
+    def delays(self) -> str:
         """Both delays and their sum, in words."""
         older = self.spec.delay_samples is not None
         return describe_delays(self.compute_delay_samples, self.drive_delay_s, self.sample_time_s, older=older)
 
-    def delay(self: TimedController, params: ParameterSet) -> ParameterSet:
+    def delay(self, params: ParameterSet) -> ParameterSet:
         """Return parameters with the delay of this controller's drive, as `place_drive_delay`."""
         return place_drive_delay(self.spec, params, self.drive_delay_s)
 
@@ -123,12 +99,12 @@ class Drive:
 
     def take_covariance(self, fit: Fit) -> Covariance:
         """Return a fit's covariance of the parameters, and of this delay with them."""
-        joint, own = fit.delay_covariance, f"{self.fitted_in}.delay_s"
-        if joint is None or own not in joint.names:
+        joint, fitted = fit.delay_covariance, f"{self.fitted_in}.delay_s"
+        if joint is None or fitted not in joint.names:
             return fit.covariance
-        names = (*fit.covariance.names, own)
-        rows = [joint.names.index(name) for name in names]
-        return Covariance(names=(*fit.covariance.names, DRIVE_DELAY), matrix=joint.matrix[np.ix_(rows, rows)])
+        names = fit.covariance.names
+        rows = [joint.names.index(name) for name in (*names, fitted)]
+        return Covariance(names=(*names, DRIVE_DELAY), matrix=joint.matrix[np.ix_(rows, rows)])
 
 
 SpecT = TypeVar("SpecT", bound=DelayedSpec)
@@ -206,9 +182,9 @@ def find_drive(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> D
         return Drive(delay_s=float(given))
     if not isinstance(source, Fit):
         return Drive(delay_s=read_conditions(plant, source).get(DRIVE_DELAY, 0.0))
-    known = source.list_delayed(plant)
-    name = max(known, key=lambda one: known[one].delay_s, default=None)
-    return Drive(delay_s=0.0) if name is None else Drive(delay_s=known[name].delay_s, fitted_in=name)
+    fitted = {name: experiment.delay_s for name, experiment in source.list_delayed(plant).items()}
+    longest = max(fitted, key=lambda name: fitted[name], default=None)
+    return Drive(delay_s=0.0) if longest is None else Drive(delay_s=fitted[longest], fitted_in=longest)
 
 
 def split_delayed(
@@ -223,15 +199,17 @@ def split_delayed(
     least, nominal = NEGLIGIBLE / spec.sample_rate_hz, source.delay_s(design)
     out: dict[str, Plant] = {}
     for name, plant in plants.items():
-        own = [one for one in source.list_delayed(plant).values() if plant is design or one.plant == plant.name]
-        if not own:
-            out[name] = plant
+        out[name] = plant
+        delayed = source.list_delayed(plant).values()
+        delayed = [each for each in delayed if plant is design or each.plant == plant.name]
+        delayed.sort(key=lambda each: each.delay_s)
+        if not delayed:
             continue
-        first, last = min(own, key=lambda one: one.delay_s), max(own, key=lambda one: one.delay_s)
-        offset = last.delay_s - nominal
-        out[name] = replace(plant, drive_offset_s=offset) if abs(offset) > least else plant
-        spread, std = last.delay_s - first.delay_s, math.hypot(*(one.std.get("delay_s", 0.0) for one in (first, last)))
-        if spread > max(least, TOLD_STDS * std):
+        first, last = delayed[0], delayed[-1]
+        if abs(last.delay_s - nominal) > least:
+            out[name] = replace(plant, drive_offset_s=last.delay_s - nominal)
+        std = math.hypot(first.std.get("delay_s", 0.0), last.std.get("delay_s", 0.0))
+        if last.delay_s - first.delay_s > max(least, TOLD_STDS * std):
             out[f"{name}, shortest delay"] = replace(plant, drive_offset_s=first.delay_s - nominal)
     return out
 
@@ -263,15 +241,11 @@ def settle_delays(
     values = add_drive_delay(drop_drive_delay(values), late)
     if spec.compute_delay_samples is not None or spec.delay_samples is not None:
         return spec, values
-    at_once = isinstance(source, Fit) and source.shows_delay(plant) and not plans
-    return replace(spec, compute_delay_samples=0 if at_once and not _answers_at_once(plant, spec) else 1), values
-
-
-def _answers_at_once(plant: Plant, spec: DelayedSpec) -> bool:
-    """Tell whether what is measured contains the present command."""
     outputs = list(plant.outputs)
     rows = [plant.output[outputs.index(name)] for name in list_names(spec.measured) if name in outputs]
-    return any(ca.depends_on(row, plant.u[0]) for row in rows)
+    held = isinstance(source, Fit) and source.shows_delay(plant) and not plans
+    at_once = held and not any(ca.depends_on(row, plant.u[0]) for row in rows)
+    return replace(spec, compute_delay_samples=0 if at_once else 1), values
 
 
 def describe_delays(
@@ -298,43 +272,32 @@ def describe_delays(
 
 def warn_delays(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> tuple[str, ...]:
     """Return warnings of an older key, of a delay that counts twice, and of less in all than the experiments have."""
-    older = _warn_of_older_key(spec) + _warn_of_dead_times(spec, plant, source)
-    if not isinstance(source, Fit):
-        return older
-    settled, _ = settle_delays(spec, plant, source)
-    found, rate = source.delay_s(plant), spec.sample_rate_hz
-    counted = count_loop_samples(settled) + find_drive_delay(spec, plant, source) * rate
-    if counted >= found * rate - NEGLIGIBLE:
-        return older
-    name = "delay_samples" if spec.delay_samples is not None else "drive_delay_s"
-    stated = f"{name} = {getattr(spec, name):g}"
-    return (
-        *older,
-        f"{stated}, but the experiments have a delay of {1e3 * found:.4g} ms, {found * rate:.4g} samples at "
-        f"{rate:g} Hz: a loop with that delay has smaller margins than stated for {counted:.4g} samples; leave {name} "
-        "out, and the fit's delay is taken",
-    )
-
-
-def _warn_of_older_key(spec: DelayedSpec) -> tuple[str, ...]:
-    if spec.delay_samples is None:
-        return ()
-    return (
-        f"delay_samples = {spec.delay_samples} is an older key, the whole loop in samples with the drive's delay "
-        "in it; give compute_delay_samples (from a reading to the command being put out), and drive_delay_s where "
-        "no log tells it",
-    )
-
-
-def _warn_of_dead_times(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> tuple[str, ...]:
-    """Return a warning where the drive's delay is stated, and the plant has delays of its own as parts."""
+    warnings: list[str] = []
+    if spec.delay_samples is not None:
+        warnings.append(
+            f"delay_samples = {spec.delay_samples} is an older key, the whole loop in samples with the drive's delay "
+            "in it; give compute_delay_samples (from a reading to the command being put out), and drive_delay_s where "
+            "no log tells it"
+        )
     stated = [f"{name} = {getattr(spec, name):g}" for name in ("delay_samples", "drive_delay_s") if getattr(spec, name)]
     parts = list_dead_times(plant) if stated else ()
-    if not parts:
-        return ()
-    values = plant.complete(source.parameters if isinstance(source, Fit) else source)
-    own = join_words([f"{name} = {1e3 * values[name].value:.4g} ms" for name in parts])
-    return (
-        f"{own} of the plant counts besides {stated[0]}: if that is the same delay, it counts twice; leave out one of "
-        "them",
-    )
+    if parts:
+        values = plant.complete(source.parameters if isinstance(source, Fit) else source)
+        delays = join_words([f"{name} = {1e3 * values[name].value:.4g} ms" for name in parts])
+        warnings.append(
+            f"{delays} of the plant counts besides {stated[0]}: if that is the same delay, it counts twice; leave out "
+            "one of them"
+        )
+    if not isinstance(source, Fit):
+        return tuple(warnings)
+    settled, _ = settle_delays(spec, plant, source)
+    fitted, rate = source.delay_s(plant), spec.sample_rate_hz
+    counted = count_loop_samples(settled) + find_drive_delay(spec, plant, source) * rate
+    if counted < fitted * rate - NEGLIGIBLE:
+        name = "delay_samples" if spec.delay_samples is not None else "drive_delay_s"
+        warnings.append(
+            f"{name} = {getattr(spec, name):g}, but the experiments have a delay of {1e3 * fitted:.4g} ms, "
+            f"{fitted * rate:.4g} samples at {rate:g} Hz: a loop with that delay has smaller margins than stated for "
+            f"{counted:.4g} samples; leave {name} out, and the fit's delay is taken"
+        )
+    return tuple(warnings)

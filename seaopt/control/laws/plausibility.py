@@ -134,9 +134,18 @@ class PlausibilityGate:
     ramp_A_per_s: float
 
     def __post_init__(self) -> None:
-        _check_range(self.range_N)
+        ends: Any = self.range_N
+        if not isinstance(ends, tuple | list) or len(ends) != 2:
+            raise ControlError(f"range_N = {ends!r} is not a range; give (low, high)")
+        low, high = (require_number(end, "range_N", ControlError) for end in ends)
+        if not -LARGEST < low < high < LARGEST:
+            raise ControlError(f"range_N = ({low:g}, {high:g}) is not a range; give finite low < high")
         for name in ("max_step_N", "ramp_A_per_s"):
-            _check_positive(getattr(self, name), name)
+            value = require_number(getattr(self, name), name, ControlError)
+            if not 1.0 / LARGEST < value < LARGEST:  # which a target's `float` holds, too
+                raise ControlError(
+                    f"{name} = {value:g} is not between {1.0 / LARGEST:g} and {LARGEST:g}; give such a number"
+                )
         held: Any = self.max_held
         if isinstance(held, bool) or not isinstance(held, int | np.integer) or not 0 <= held <= MOST_HELD:
             raise ControlError(f"max_held = {held!r} is not a number of samples; give 0, 1, ... up to {MOST_HELD}")
@@ -162,8 +171,7 @@ class PlausibilityGate:
         if state.fault:
             return state.measurement, state
         low, high = self.range_N
-        known = math.isfinite(state.measurement)
-        moved = abs(measurement - state.measurement) if known else 0.0
+        moved = abs(measurement - state.measurement) if math.isfinite(state.measurement) else 0.0
         if low <= measurement <= high and moved <= self.max_step_N * (state.held + 1):
             return measurement, GateState(measurement=measurement)
         held = state.held + 1
@@ -175,11 +183,7 @@ class PlausibilityGate:
         return math.copysign(max(abs(current_A) - step, 0.0), current_A)
 
     @classmethod
-    def of_controller(
-        cls,
-        controller: Any,
-        **asked: Any,
-    ) -> PlausibilityGate:
+    def of_controller(cls, controller: Any, **asked: Any) -> PlausibilityGate:
         """Return a gate with the step that the design plant makes at most, times a margin for what the world does.
 
         Parameters
@@ -207,14 +211,13 @@ class PlausibilityGate:
         """
         if not hasattr(controller, "command_limit"):
             raise ControlError(f"controller = {controller!r:.80}: give a Controller, or a ForceMPC")
-        spec = GateSpec(**asked)
-        limit = controller.command_limit
+        spec, limit = GateSpec(**asked), controller.command_limit
         if limit is None:
             raise ControlError("the controller has no current limit (or command_limit); give its specification one")
-        if spec.max_step_N is None and controller.design is None:
-            raise ControlError("the controller has no design plant to compute the largest step of; give max_step_N")
         largest = spec.max_step_N
         if largest is None:
+            if controller.design is None:
+                raise ControlError("the controller has no design plant to compute the largest step of; give max_step_N")
             plant = controller.close(*controller.design).plant
             largest = spec.margin * largest_step(plant, limit / controller.per_effort)
         return cls(range_N=spec.range_N, max_step_N=largest, max_held=spec.max_held, ramp_A_per_s=limit / spec.ramp_s)
@@ -226,21 +229,6 @@ class PlausibilityGate:
             f"readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample are "
             f"believed, {self.max_held} others in a row are bridged; the certificate's runs are without this gate"
         )
-
-
-def _check_range(range_N: Any) -> None:
-    """Refuse what is not two finite numbers, the lower one first."""
-    if not isinstance(range_N, tuple | list) or len(range_N) != 2:
-        raise ControlError(f"range_N = {range_N!r} is not a range; give (low, high)")
-    low, high = (require_number(end, "range_N", ControlError) for end in range_N)
-    if not -LARGEST < low < high < LARGEST:
-        raise ControlError(f"range_N = ({low:g}, {high:g}) is not a range; give finite low < high")
-
-
-def _check_positive(value: Any, name: str) -> None:
-    """Refuse what is not a positive number that a target's `float` holds too."""
-    if not 1.0 / LARGEST < require_number(value, name, ControlError) < LARGEST:
-        raise ControlError(f"{name} = {value:g} is not between {1.0 / LARGEST:g} and {LARGEST:g}; give such a number")
 
 
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:

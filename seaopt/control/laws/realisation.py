@@ -441,8 +441,6 @@ def _compute_tracking_time(law: Law) -> float:
     """Return T_s abs(a_1/a_0) of C_r, of C_y where the reference is not integrated; a sample at least."""
     m = law.integrators
     column = 0 if law.b[m - 1, 0] else 1
-    a_0 = law.b[m - 1, column]
-    a, b, c = law.rest
     # The coefficient of w^(m-1), w = 1/(z - 1): the next one of the chain, or what is left at 0 Hz.
-    following = law.b[m - 2, column] if m > 1 else law.d[column] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, column])
-    return law.sample_time_s * max(abs(float(following / a_0) - m), 1.0)
+    following = law.b[m - 2, column] if m > 1 else law.static_rest[column]
+    return law.sample_time_s * max(abs(float(following / law.b[m - 1, column]) - m), 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import accumulate
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -36,7 +37,6 @@ class Limits(Protocol):
 
     def allowed(self, limit: Limit) -> float | None:
         """Return the value that a limit allows; None where it is not imposed."""
-        ...
 
 
 @record(eq=False)
@@ -71,34 +71,20 @@ class Verdict:
 
 @record
 class PossibleBandwidths:
-    """The bandwidths at which the tuner keeps all limits, from a quarter to twice the one asked.
+    """The bandwidths at which the tuner keeps all limits, from a quarter to twice the one asked."""
 
-    Parameters
-    ----------
-    nearest_hz : tuple of float
-        Next to the one asked, below and above it; empty if none was found.
-    largest_hz : float or None
-        The largest.
-    closest_hz, missed_by : float or None
-        Where the limits are missed least, and by which share; zero where they are kept, None where no law was stable.
-    fall, largest_fall : float or None
-        By how much friction falls with speed, where that makes the sliding plant grow without control, and with how
-        much the limits are kept at the bandwidth asked; None where that is not what blocks.
-    fall_unit : str
-        Of the two.
-    fall_parameters : tuple of str
-        The parameters that the fall depends on.
-
-    """
-
-    nearest_hz: tuple[float, ...] = ()
+    nearest_hz: tuple[float, ...] = ()  # next to the one asked, below and above it; empty if none was found
     largest_hz: float | None = None
+    # closest_hz, missed_by: where the limits are missed least, and by which share; zero where they are kept, None where
+    # no law was stable
     closest_hz: float | None = None
     missed_by: float | None = None
+    # fall, largest_fall: by how much friction falls with speed, where that makes the sliding plant grow without
+    # control, and with how much the limits are kept at the bandwidth asked; None where that is not what blocks
     fall: float | None = None
     largest_fall: float | None = None
-    fall_unit: str = ""
-    fall_parameters: tuple[str, ...] = ()
+    fall_unit: str = ""  # of the two
+    fall_parameters: tuple[str, ...] = ()  # that the fall depends on
 
     def __post_init__(self) -> None:
         for pair in (("closest_hz", "missed_by"), ("fall", "largest_fall")):
@@ -106,11 +92,12 @@ class PossibleBandwidths:
                 raise ControlError(f"has one of {' and '.join(pair)}; give both, or neither")
 
     def __str__(self) -> str:
+        bandwidths = self._format_bandwidths()
         if self.fall is None:
-            return self._format_bandwidths()
+            return bandwidths
         values = f"check {join_words(self.fall_parameters)}, " if self.fall_parameters else ""
         return (
-            f"{self._format_bandwidths()}; friction that falls by {self.fall:.4g} {self.fall_unit} makes sliding "
+            f"{bandwidths}; friction that falls by {self.fall:.4g} {self.fall_unit} makes sliding "
             f"unstable, {self.largest_fall:.4g} can be had here: {values}sample faster or cut the delay"
         )
 
@@ -184,13 +171,14 @@ def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLo
     `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says more.
     """
     broken: dict[str, list[Verdict]] = {}
-    for verdict in sorted((verdict for verdict in verdicts if not verdict.met), key=lambda one: -one.severity):
+    for verdict in sorted((verdict for verdict in verdicts if not verdict.met), key=lambda each: -each.severity):
         broken.setdefault(verdict.limit.name, []).append(verdict)
     if "stability" in broken:
         broken = {"stability": broken["stability"]}
     texts = [
-        _explain(spec, worst, design, loop) + _format_plants([one.plant for one in (worst, *others) if one.names_plant])
-        for worst, *others in broken.values()
+        _explain(spec, worst, design, loop)
+        + _format_plants([each.plant for each in (worst, *less) if each.names_plant])
+        for worst, *less in broken.values()
     ]
     alone = list(broken) == ["min_friction_margin"]  # the tuner then gives the law that has most of it
     return [f"{text}, the largest found at this bandwidth" for text in texts] if alone else texts
@@ -214,20 +202,18 @@ def join_labels(labels: Sequence[str]) -> str:
 
 def shorten_blocked(blocked: Sequence[str]) -> str:
     """Return the first of some broken limits, as many as a message has room for, and how many more there are."""
-    shown = 1
-    while shown < len(blocked) and sum(map(len, blocked[: shown + 1])) <= BLOCKED_CHARACTERS:
-        shown += 1
-    rest = len(blocked) - shown
-    return join_words([*blocked[:shown], *([format_count(rest, "more limit")] if rest else [])])
+    sizes = accumulate(map(len, blocked))
+    shown = [
+        text for i, (text, size) in enumerate(zip(blocked, sizes, strict=True)) if not i or size <= BLOCKED_CHARACTERS
+    ]
+    more = len(blocked) - len(shown)
+    return join_words([*shown, format_count(more, "more limit")] if more else shown)
 
 
 def _format_plants(plants: Sequence[str]) -> str:
     """Return up to two plants by name, in brackets, and how many more there are."""
-    if not plants:
-        return ""
-    if len(plants) > 2:
-        return f" ({plants[0]} and {len(plants) - 1} more)"
-    return f" ({' and '.join(plants)})"
+    named = plants if len(plants) < 3 else (plants[0], f"{len(plants) - 1} more")
+    return f" ({' and '.join(named)})" if plants else ""
 
 
 @record(eq=False)
@@ -250,17 +236,18 @@ class DesignFigure:
 
 def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[DesignFigure]:
     """Return each limit of one loop's figures; of friction and of further signals only where there are, or one asks."""
+    known = {"min_friction_margin": design.slope_unit != "", OTHER_NOISE: design.figures.other_noise_gains != ()}
     rows: list[DesignFigure] = []
     for limit in spec.limits:
-        if limit.has_field and limit.condition is None:  # a figure of the loop alone
-            value, allowed, unit = limit.figure(design), spec.allowed(limit), design.unit(limit)
-            margin = limit.name == "min_friction_margin"
-            if margin and not design.slope_unit and allowed is None:
-                continue
-            if limit.name == OTHER_NOISE and not design.figures.other_noise_gains and allowed is None:
-                continue
-            reached = limit.sense == "at most" or np.isfinite(value) or (margin and design.slope_unit)
-            rows.append(DesignFigure(limit=limit, value=value if reached else None, allowed=allowed, unit=unit))
+        allowed = spec.allowed(limit)
+        alone = limit.has_field and limit.condition is None  # a figure of the loop alone
+        if not alone or (allowed is None and not known.get(limit.name, True)):
+            continue
+        value = limit.figure(design)
+        reached = limit.sense == "at most" or np.isfinite(value) or (limit.name in known and known[limit.name])
+        rows.append(
+            DesignFigure(limit=limit, value=value if reached else None, allowed=allowed, unit=design.unit(limit))
+        )
     return rows
 
 
