@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,18 +11,9 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError
+from seaopt.logs.formats.columns import open_columns
 from seaopt.logs.formats.simulink import assign_clocks, make_object_field
-from seaopt.logs.formats.source import (
-    MAX_DEPTH,
-    MAX_FIELDS,
-    Field,
-    Place,
-    Source,
-    check_size,
-    import_optional,
-    make_row_loader,
-    spread,
-)
+from seaopt.logs.formats.source import MAX_DEPTH, MAX_FIELDS, Field, Place, Source, check_size, import_optional, spread
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")
@@ -34,22 +26,15 @@ def open_hdf5(path: Path) -> Source:
 
 def open_mat73(path: Path) -> Source:
     """List the variables of a MATLAB 7.3 file; structs become dotted paths."""
-    return _open(path, "MAT 7.3", _walk_matlab)
+    source = _open(path, "MAT 7.3", _walk_matlab)
+    return replace(source, fields=tuple(assign_clocks(source.fields)))
 
 
 def _open(path: Path, form: str, walk: Any) -> Source:
     h5py = import_optional("h5py", "hdf5", path, form)
     _check_length(path)
-    places: dict[str, tuple[Place, str | None]] = {}
-    fields: list[Field] = []
     with h5py.File(path, "r") as file:
-        for field, place, part in walk(file, path):
-            fields.append(field)
-            places[field.name] = (place, part)
-            if len(fields) > MAX_FIELDS:
-                break
-    kept = assign_clocks(fields) if form == "MAT 7.3" else fields
-    return Source(path=path, format=form, fields=tuple(kept), load=make_row_loader(partial(_load, path, form, places)))
+        return open_columns(path, form, walk(file, path), partial(_load, path))
 
 
 def _check_length(path: Path) -> None:
@@ -78,7 +63,8 @@ def _check_length(path: Path) -> None:
         )
 
 
-Fields = Iterator[tuple[Field, Place, str | None]]
+Location = tuple[Place, str | None]  # with the column of a table
+Fields = Iterator[tuple[Field, Location]]
 
 
 def _walk_datasets(file: Any, path: Path, prefix: str = "", depth: int = 0) -> Fields:
@@ -99,18 +85,17 @@ def _walk_datasets(file: Any, path: Path, prefix: str = "", depth: int = 0) -> F
 
 def _list_dataset(node: Any, name: str) -> Fields:
     if node.external or node.is_virtual:
-        yield Field(name=name, kind="data in another file", length=None), Place(array=node.name), None
+        yield Field(name=name, kind="data in another file", length=None), (Place(array=node.name), None)
         return
     dtype = node.dtype
     if dtype.names:  # a table: one field per column
         for part in dtype.names:
             kind = dtype[part].name if not dtype[part].shape else f"array {dtype[part]}"
-            field = Field(name=f"{name}.{part}", kind=kind, length=node.size)
-            yield field, Place(array=node.name), part
+            yield Field(name=f"{name}.{part}", kind=kind, length=node.size), (Place(array=node.name), part)
         return
     unit = next((_decode_text(node.attrs[key]) for key in _UNIT_ATTRIBUTES if key in node.attrs), None)
     for field, place in spread(name, node.shape or (), _name_kind(node), unit=unit):
-        yield field, Place(array=node.name, index=place.index, axis=place.axis), None
+        yield field, (replace(place, array=node.name), None)
 
 
 def _name_kind(node: Any) -> str:
@@ -163,11 +148,11 @@ def _walk_variable(file: Any, node: Any, path: Path, name: str, depth: int) -> F
     if "MATLAB_object_decode" in node.attrs or h5py.check_ref_dtype(node.dtype) or kind in {"char", "cell"}:
         word = {"char": "text", "cell": "a cell array"}.get(kind)
         field = Field(name=name, kind=word, length=None) if word else make_object_field(name, kind)
-        yield field, Place(array=node.name), None
+        yield field, (Place(array=node.name), None)
         return
     shape = tuple(reversed(node.shape or ()))
     for field, place in spread(name, shape, _name_kind(node), matlab=True):
-        yield field, Place(array=node.name, index=place.index, axis=1 - place.axis), None
+        yield field, (replace(place, array=node.name, axis=1 - place.axis), None)
 
 
 def _is_struct_array(node: Any) -> bool:
@@ -178,22 +163,21 @@ def _is_struct_array(node: Any) -> bool:
     )
 
 
-def _check_chunks(path: Path, name: str, node: Any) -> None:
-    """Refuse chunks that no filter is said to pack, and that take another size than their numbers do."""
-    if node.chunks is None or node.id.get_create_plist().get_nfilters():
-        return
-    whole = node.id.get_num_chunks() * int(np.prod(node.chunks)) * node.dtype.itemsize
-    if node.id.get_storage_size() != whole:
-        raise LogError(f'{path}: "{name}" is stored in another size than it says; the file is damaged, copy it again')
+def _load(path: Path, location: Location, rows: slice) -> Any:
+    import h5py
 
-
-def _load(path: Path, form: str, places: dict[str, tuple[Place, str | None]], name: str, rows: slice) -> Any:
-    h5py = import_optional("h5py", "hdf5", path, form)
-    place, part = places[name]
+    place, part = location
     with h5py.File(path, "r") as file:
-        node = file[place.array]
+        node: Any = file[place.array]
+        name = place.array.removeprefix("/")
         check_size(path, int(node.size) * 8, f'"{name}"')
-        _check_chunks(path, name, node)
+        # Chunks that no filter packs take as much as their numbers do.
+        if node.chunks is not None and not node.id.get_create_plist().get_nfilters():
+            whole = node.id.get_num_chunks() * int(np.prod(node.chunks)) * node.dtype.itemsize
+            if node.id.get_storage_size() != whole:
+                raise LogError(
+                    f'{path}: "{name}" is stored in another size than it says; the file is damaged, copy it again'
+                )
         if node.shape == ():
             return node[()]
         return node.fields(part)[place.index_rows(rows)] if part is not None else node[place.index_rows(rows)]

@@ -1,6 +1,6 @@
 """MATLAB 5 files: numbers, and structs of them, straight from the bytes; objects stay closed.
 
-TextLayout (MathWorks, "MAT-File Format"): a header of 128 bytes, then elements of type and size; one of type 15 is
+The layout (MathWorks, "MAT-File Format"): a header of 128 bytes, then elements of type and size; one of type 15 is
 compressed; a matrix (14) holds flags, dimensions, name and data, and cells and structs hold matrices. Numbers may be
 stored in a smaller type than their class. SciPy's reader is not used: a damaged file makes it crash the interpreter.
 """
@@ -10,7 +10,8 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ import numpy as np
 from jaxtyping import Shaped
 
 from seaopt.errors import LogError
+from seaopt.logs.formats.columns import open_columns
 from seaopt.logs.formats.simulink import OBJECT, assign_clocks, make_object_field
-from seaopt.logs.formats.source import MAX_DEPTH, MAX_FIELDS, Field, Place, Source, check_size, make_row_loader, spread
+from seaopt.logs.formats.source import MAX_DEPTH, Field, Place, Source, check_size, spread
 from seaopt.records import record
 
 HEADER_BYTES = 128
@@ -74,42 +76,35 @@ class MatrixHeader:
         return "complex" if self.flags & COMPLEX else "bool" if self.flags & LOGICAL else NUMBER_CLASSES[self.kind]
 
 
-VariablePlaces = Mapping[str, tuple[StoredVariable, Place]]
+MatrixPlace = tuple[StoredVariable, MatrixHeader, Place]
 
 
 def open_mat(path: Path) -> Source:
     """List the variables of a MATLAB 5 file; structs become dotted paths."""
-    fields: list[Field] = []
-    places: dict[str, tuple[StoredVariable, Place]] = {}
+    source = open_columns(path, "MAT 5", _walk_columns(path), partial(_load, path))
+    return replace(source, fields=tuple(assign_clocks(source.fields)))
+
+
+def _walk_columns(path: Path) -> Iterator[tuple[Field, MatrixPlace]]:
     for variable, head in _walk_variables(path):
         matrix = _read_header(head, 0, variable.order)
         if not matrix.name:
             continue  # MATLAB's own store of objects
         body = _read_body(path, variable) if matrix.kind == STRUCT else head
         for leaf in _walk_leaves(body, 0, variable.order, matrix.name):
-            for field, place in _list_fields(leaf):
-                fields.append(field)
-                places[field.name] = (variable, place)
-            if len(fields) > MAX_FIELDS:
-                break
-    load = make_row_loader(partial(_load, path, places))
-    return Source(path=path, format="MAT 5", fields=tuple(assign_clocks(fields)), load=load)
+            if leaf.kind in NUMBER_CLASSES:
+                columns = spread(leaf.name, leaf.dims, leaf.word, matlab=True)
+            elif leaf.kind == OPAQUE:
+                columns = [(make_object_field(leaf.name, leaf.owner), Place(array=leaf.name))]
+            else:
+                columns = [(Field(name=leaf.name, kind=leaf.word, length=None), Place(array=leaf.name))]
+            for field, place in columns:
+                yield field, (variable, leaf, place)
 
 
-def _list_fields(leaf: MatrixHeader) -> list[tuple[Field, Place]]:
-    if leaf.kind == OPAQUE:
-        return [(make_object_field(leaf.name, leaf.owner), Place(array=leaf.name))]
-    if leaf.kind not in NUMBER_CLASSES:
-        return [(Field(name=leaf.name, kind=leaf.word, length=None), Place(array=leaf.name))]
-    return spread(leaf.name, leaf.dims, leaf.word, matlab=True)
-
-
-def _load(path: Path, places: VariablePlaces, name: str, rows: slice) -> Any:
-    variable, place = places[name]
-    body = _read_body(path, variable)
-    top = _read_header(body, 0, variable.order).name
-    leaf = next(leaf for leaf in _walk_leaves(body, 0, variable.order, top) if leaf.name == place.array)
-    return _read_numbers(body, leaf, variable.order)[place.index_rows(rows)]
+def _load(path: Path, location: MatrixPlace, rows: slice) -> Any:
+    variable, leaf, place = location
+    return _read_numbers(_read_body(path, variable), leaf, variable.order)[place.index_rows(rows)]
 
 
 def _walk_variables(path: Path) -> Iterator[tuple[StoredVariable, bytes]]:
@@ -185,9 +180,7 @@ def _walk_leaves(body: bytes, at: int, order: str, name: str, depth: int = 0) ->
     if depth > MAX_DEPTH:
         raise ValueError(f"structs are nested deeper than {MAX_DEPTH}")
     if matrix.kind != STRUCT:
-        yield MatrixHeader(
-            name=name, kind=matrix.kind, flags=matrix.flags, dims=matrix.dims, data=matrix.data, owner=matrix.owner
-        )
+        yield replace(matrix, name=name)
         return
     _, width_at, _, after = _read_element(body, matrix.data, order)
     width = struct.unpack_from(f"{order}i", body, width_at)[0]

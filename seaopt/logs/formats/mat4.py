@@ -8,6 +8,7 @@ number is stored, T numbers, text or a sparse matrix.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import MAX_FIELDS, Field, Place, Source, make_row_loader, spread
+from seaopt.logs.formats.columns import open_columns
+from seaopt.logs.formats.source import Field, Place, Source, spread
 from seaopt.records import record
 
 HEADER = 20  # bytes
@@ -48,10 +50,11 @@ def is_mat4(head: bytes) -> bool:
 
 def open_mat4(path: Path) -> Source:
     """List the variables of a MATLAB 4 file."""
-    size = path.stat().st_size
-    fields: list[Field] = []
-    places: dict[str, tuple[Matrix, Place]] = {}
-    at = 0
+    return open_columns(path, "MAT 4", _walk_columns(path), partial(_load, path))
+
+
+def _walk_columns(path: Path) -> Iterator[tuple[Field, tuple[Matrix, Place]]]:
+    size, at = path.stat().st_size, 0
     with path.open("rb") as stream:
         while at < size:
             stream.seek(at)
@@ -60,18 +63,14 @@ def open_mat4(path: Path) -> Source:
                 raise LogError(f"{path}: is cut off after {size} bytes; copy or save the file again")
             if matrix.kind in KINDS:
                 for field, place in spread(matrix.name, matrix.shape, matrix.kind, matlab=True):
-                    fields.append(field)
-                    places[field.name] = matrix, place
+                    yield field, (matrix, place)
             else:
-                fields.append(Field(name=matrix.name, kind=matrix.kind, length=None))
-            if len(fields) > MAX_FIELDS:
-                break
+                yield Field(name=matrix.name, kind=matrix.kind, length=None), (matrix, Place(array=matrix.name))
             at = matrix.end
-    return Source(path=path, format="MAT 4", fields=tuple(fields), load=make_row_loader(partial(_load, path, places)))
 
 
-def _load(path: Path, places: dict[str, tuple[Matrix, Place]], name: str, rows: slice) -> Any:
-    matrix, place = places[name]
+def _load(path: Path, location: tuple[Matrix, Place], rows: slice) -> Any:
+    matrix, place = location
     count = matrix.shape[0] * matrix.shape[1]
     numbers = np.fromfile(path, matrix.stored, count=count, offset=matrix.start)
     if numbers.size < count:

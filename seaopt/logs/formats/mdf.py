@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, Window, check_size, find_rows, import_optional
+from seaopt.logs.formats.source import Field, Source, Window, check_size, import_optional, make_row_loader
 from seaopt.records import record
 
 NUMERIC_CONVERSIONS = frozenset({0, 1, 2, 4, 5, 6})  # conversions: none, linear, rational, tables of numbers
@@ -55,16 +55,15 @@ def open_mdf(path: Path) -> Source:
             master = file.masters_db.get(number)
             for index, (label, channel) in enumerate(zip(labels, group.channels, strict=True)):
                 is_time = index == master and channel.sync_type == TIME_MASTER
-                fields.append(
-                    Field(
-                        name=label,
-                        kind=_name_kind(channel),
-                        length=int(group.channel_group.cycles_nr),
-                        unit=channel.unit or getattr(channel.conversion, "unit", "") or ("s" if is_time else None),
-                        clock=None if master is None else labels[master],
-                    )
-                )
                 places[label] = (number, index)
+                field = Field(
+                    name=label,
+                    kind=_name_kind(channel),
+                    length=int(group.channel_group.cycles_nr),
+                    unit=channel.unit or getattr(channel.conversion, "unit", "") or ("s" if is_time else None),
+                    clock=None if master is None else labels[master],
+                )
+                fields.append(field)
     return Source(path=path, format="MDF", fields=tuple(fields), load=partial(_load, path, places))
 
 
@@ -113,6 +112,8 @@ def _load(
             group, index = places[name]
             start = rows.start or 0
             count = None if rows.stop is None else rows.stop - start
+            if count == 0:  # asammdf would read them all
+                return np.empty(0)
             samples, invalid = file.get(
                 group=group,
                 index=index,
@@ -121,15 +122,12 @@ def _load(
                 samples_only=True,
                 ignore_invalidation_bits=False,
             )
-            values = np.array(samples, dtype=float).reshape(-1)
+            values = np.array(samples, dtype=float)
             if invalid is not None:
                 values[np.asarray(invalid, dtype=bool)] = np.nan
             return values
 
-        rows = slice(None) if window is None else find_rows(load_column(window.clock, slice(None)), window)
-        if rows.stop is not None and rows.stop <= (rows.start or 0):
-            return {name: np.empty(0) for name in names}
-        return {name: load_column(name, rows) for name in names}
+        return make_row_loader(load_column)(names, window)
 
 
 @record
@@ -236,8 +234,8 @@ class Blocks:
         check_size(self.path, length, "a block")
         if how in DEFLATE:
             unpacker = zlib.decompressobj()
-            found = len(unpacker.decompress(self.stream.read(packed), length + 1))
-            if found != length or not unpacker.eof or unpacker.unused_data:
+            unpacked = len(unpacker.decompress(self.stream.read(packed), length + 1))
+            if unpacked != length or not unpacker.eof or unpacker.unused_data:
                 raise LogError(
                     f"{self.path}: a compressed block does not unpack to the {length} bytes that it says, {WHOLE}"
                 )

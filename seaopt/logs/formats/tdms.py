@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,41 +11,42 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, check_size, import_optional, make_row_loader
+from seaopt.logs.formats.columns import open_columns
+from seaopt.logs.formats.source import Field, Source, check_size, import_optional
 
 UNIT_PROPERTIES = ("unit_string", "NI_UnitDescription")
 LEAD_IN = 28  # bytes before each segment: tag, contents, version, where the next segment and this one's data begin
 BIG_ENDIAN, DAQMX = 1 << 6, 1 << 7  # of the contents
+ChannelPlace = tuple[str, str, bool]  # group, channel, and whether its clock is meant
 CUT_OFF = "cannot be read as TDMS (it is cut off within its last segment, or damaged); copy it again, or save it anew"
 
 
 def open_tdms(path: Path) -> Source:
     """List the channels of a TDMS file."""
     nptdms = import_optional("nptdms", "tdms", path, "TDMS")
-    fields: list[Field] = []
-    places: dict[str, tuple[str, str]] = {}
     size = _measure_segments(path)
     with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
         if file.file_status.incomplete_final_segment:
             raise LogError(f"{path}: {CUT_OFF}")
         _check_lengths(path, [channel for group in file.groups() for channel in group.channels()], size)
-        for group in file.groups():
-            clocks = _name_clocks(group)
-            for channel in group.channels():
-                name = f"{group.name}/{channel.name}"
-                clock = clocks.get(channel.name)
-                places[name] = (group.name, channel.name)
-                if clock is not None and clock not in places:
-                    places[clock] = (group.name, channel.name)
-                    fields.append(Field(name=clock, kind="float64", length=len(channel), unit="s", clock=clock))
-                unit = next(
-                    (str(channel.properties[key]) for key in UNIT_PROPERTIES if channel.properties.get(key)), None
-                )
-                fields.append(Field(name=name, kind=_name_kind(channel), length=len(channel), unit=unit, clock=clock))
-    clock_names = frozenset(field.clock for field in fields if field.clock is not None)
-    return Source(
-        path=path, format="TDMS", fields=tuple(fields), load=make_row_loader(partial(_load, path, places, clock_names))
-    )
+        return open_columns(path, "TDMS", _walk_columns(file), partial(_load, path))
+
+
+def _walk_columns(file: Any) -> Iterator[tuple[Field, ChannelPlace]]:
+    listed: set[str] = set()
+    for group in file.groups():
+        clocks = _name_clocks(group)
+        for channel in group.channels():
+            length, clock = len(channel), clocks.get(channel.name)
+            if clock is not None and clock not in listed:
+                listed.add(clock)
+                field = Field(name=clock, kind="float64", length=length, unit="s", clock=clock)
+                yield field, (group.name, channel.name, True)
+            unit = next((str(channel.properties[key]) for key in UNIT_PROPERTIES if channel.properties.get(key)), None)
+            dtype = np.dtype(channel.dtype)
+            kind = dtype.name if dtype.kind in "fiub" else "times" if dtype.kind == "M" else "text"
+            field = Field(name=f"{group.name}/{channel.name}", kind=kind, length=length, unit=unit, clock=clock)
+            yield field, (group.name, channel.name, False)
 
 
 def _measure_segments(path: Path) -> int | None:
@@ -95,18 +96,13 @@ def _name_clocks(group: Any) -> dict[str, str]:
     return {name: f"{group.name}/{name}:time" for name in waves}
 
 
-def _name_kind(channel: Any) -> str:
-    kind = np.dtype(channel.dtype).kind
-    return np.dtype(channel.dtype).name if kind in "fiub" else "times" if kind == "M" else "text"
-
-
-def _load(path: Path, places: Mapping[str, tuple[str, str]], clocks: frozenset[str], name: str, rows: slice) -> Any:
+def _load(path: Path, location: ChannelPlace, rows: slice) -> Any:
     nptdms = import_optional("nptdms", "tdms", path, "TDMS")
-    group, channel_name = places[name]
+    group, name, is_clock = location
     with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
-        channel = file[group][channel_name]
-        check_size(path, len(channel) * 8, f'"{name}"')
-        if name in clocks:
+        channel = file[group][name]
+        check_size(path, len(channel) * 8, f'"{group}/{name}"')
+        if is_clock:
             return channel.time_track()[rows]
         start, stop, _ = rows.indices(len(channel))
         return channel.read_data(offset=start, length=max(stop - start, 0))

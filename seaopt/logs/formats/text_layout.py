@@ -15,6 +15,7 @@ from pathlib import Path
 
 from seaopt.errors import LogError
 from seaopt.formatting import format_count
+from seaopt.logs.formats.source import Field
 from seaopt.records import record
 from seaopt.units import bare_name, header_unit, is_unit
 
@@ -30,7 +31,9 @@ _CONSTANT = re.compile(
     r"(?P<name>[^=:;,\t|]{1,80}?)\s*[=:;,\t|]\s*\"?(?P<value>[-+]?[\d.,]+(?:[eE][-+]?\d+)?)\"?\s*[;,\t|]?\s*"
     r"(?P<unit>[^\d=:;,\t|][^=:;,\t|]{0,19})?"
 )
-_DELIMITERS = ("\t", ";", "|", ",", " ")
+# Delimiters, each with a decimal point and a decimal comma.
+_CHOICES = [(delimiter, comma) for delimiter in ("\t", ";", "|", ",", " ") for comma in (False, True)]
+_CHOICES.remove((",", True))
 WINDOWS = "cp1252"  # of which Latin-1's signs and letters are a part
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 
@@ -39,14 +42,13 @@ _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codec
 class TextLayout:
     """How a text file is laid out."""
 
+    path: Path
     encoding: str
     delimiter: str  # a space stands for any run of blanks
     comma: bool  # whether the decimal sign is a comma
-    # headers, units: one a column; an empty header belongs to no column
-    headers: tuple[str, ...]
-    units: tuple[str | None, ...]
-    numeric: tuple[bool, ...]  # whether the column's first filled cell is a number
+    width: int  # cells in a row
     first: int  # lines above the data
+    fields: tuple[Field, ...]  # the columns that have a header
     notes: tuple[str, ...]
     constants: Mapping[str, tuple[float, str | None]]  # lines above the data such as "kp = 200" or "mass [kg]; 0.5"
 
@@ -70,11 +72,27 @@ def find_layout(path: Path) -> TextLayout:
     if first >= len(lines):
         raise LogError(f"{path}: 0 rows below the header; record the log again")
     data = [line for at, line in filled if at >= first]
-    if encoding == WINDOWS:
-        _check_ascii(path, data)
+    if encoding == WINDOWS and (odd := next((line for line in data if not line.isascii()), None)) is not None:
+        # Among the data such bytes may be damage, and not a header's µ or °.
+        raise LogError(
+            f'{path}: is not UTF-8 text ("{odd[:40]}"); save the log as UTF-8 CSV, or convert it: '
+            f"iconv -f WINDOWS-1252 -t UTF-8 {path.name} > utf8_{path.name}"
+        )
     rows = [split_cells(line, delimiter) for line in data]
     headers, units, notes = _find_headers(path, lines[:first], delimiter, width, rows)
-    numeric = tuple(_is_numeric(rows, index, comma) for index in range(len(headers)))
+    counts = Counter(headers)
+    fields = tuple(
+        Field(
+            name=_number_header(header, at + 1) if counts[header] > 1 else header,
+            kind="float64" if _is_numeric(rows, at, comma) else "text",
+            length=None,
+            unit=unit,
+            position=at + 1,
+            header=header if counts[header] > 1 else None,
+        )
+        for at, (header, unit) in enumerate(zip(headers, units, strict=True))
+        if header
+    )
     if comma:
         notes.append("the decimal sign is a comma")
     if (unended := _read_unended(path, encoding)) is not None:
@@ -85,17 +103,33 @@ def find_layout(path: Path) -> TextLayout:
     if encoding == WINDOWS:
         signs = sorted({sign for line in lines[:first] for sign in line if not sign.isascii()})
         notes.append(f"its header is no UTF-8 text and was read as Windows-1252: {' '.join(signs)}")
+    if repeated := [field.name for field in fields if field.header]:
+        named = ", ".join(repeated[:4]) + (", ..." if len(repeated) > 4 else "")
+        notes.append(f"headers that several columns have were numbered: {named}")
     return TextLayout(
+        path=path,
         encoding=encoding,
         delimiter=delimiter,
         comma=comma,
-        headers=tuple(headers),
-        units=tuple(units),
-        numeric=numeric,
+        width=len(headers),
         first=first,
+        fields=fields,
         notes=tuple(notes),
         constants=_find_constants(lines[:first], delimiter, comma),
     )
+
+
+def _number_header(header: str, number: int) -> str:
+    """Return the header of a column that others have, too, with its number before the brackets.
+
+    Examples
+    --------
+    >>> _number_header("X [s]", 3)
+    'X#3 [s]'
+
+    """
+    bare = bare_name(header)
+    return f"{bare}#{number}{header[len(bare) :]}"
 
 
 def _read_unended(path: Path, encoding: str) -> str | None:
@@ -179,19 +213,6 @@ def _decode(path: Path, encoding: str, raw: bytes) -> tuple[str, str]:
             raise refused from error
 
 
-def _check_ascii(path: Path, data: list[str]) -> None:
-    """Refuse bytes that are no UTF-8 among the data, where they may be damage and not a header's µ or °.
-
-    Raises LogError: there is such a byte.
-    """
-    for line in data:
-        if not line.isascii():
-            raise LogError(
-                f'{path}: is not UTF-8 text ("{line[:40]}"); save the log as UTF-8 CSV, or convert it: '
-                f"iconv -f WINDOWS-1252 -t UTF-8 {path.name} > utf8_{path.name}"
-            )
-
-
 def encoding_error(path: Path, encoding: str, error: UnicodeError) -> LogError:
     """Return the error of a byte that is not text."""
     name = {"utf-16": "UTF-16", WINDOWS: "Windows-1252"}.get(encoding, "UTF-8")
@@ -210,15 +231,9 @@ def _is_comment(line: str) -> bool:
 
 def _find_delimiter(sample: list[str], header: str) -> tuple[str, bool]:
     """Return the delimiter and decimal sign that make most cells numbers."""
-    best = max(
-        (
-            (_score(sample, delimiter, comma), delimiter, comma)
-            for delimiter in _DELIMITERS
-            for comma in ((False,) if delimiter == "," else (False, True))
-        ),
-        key=lambda scored: scored[0],
-    )
-    return (best[1], best[2]) if best[0] > 0 else (max(",;\t|", key=header.count), False)
+    scores = {choice: _score(sample, *choice) for choice in _CHOICES}
+    best = max(_CHOICES, key=scores.__getitem__)
+    return best if scores[best] > 0 else (max(",;\t|", key=header.count), False)
 
 
 def _score(sample: list[str], delimiter: str, comma: bool) -> float:
@@ -234,9 +249,10 @@ def _score(sample: list[str], delimiter: str, comma: bool) -> float:
 
 
 def _is_data(line: str, delimiter: str, comma: bool, width: int) -> bool:
-    row = [cell for cell in split_cells(line, delimiter) if cell.casefold() not in BLANK]
-    numbers = sum(is_number(cell, comma) for cell in row)
-    return len(split_cells(line, delimiter)) == width and numbers > 0 and 2 * numbers >= len(row)
+    row = split_cells(line, delimiter)
+    filled = [cell for cell in row if cell.casefold() not in BLANK]
+    numbers = sum(is_number(cell, comma) for cell in filled)
+    return len(row) == width and numbers > 0 and 2 * numbers >= len(filled)
 
 
 def _is_numeric(rows: list[list[str]], index: int, comma: bool) -> bool:
@@ -255,11 +271,8 @@ def _find_headers(
     above = _join_quoted_lines(above)
     candidates = [(at, _split_header(line, delimiter)) for at, line in enumerate(above) if line.strip()]
     table = [(at, row) for at, row in candidates if not _is_comment(above[at])]
-    header_rows = [
-        (at, row) for at, row in table if _fits(row, width, rows) and sum(map(bool, row)) > min(1, width - 1)
-    ]
-    named = [(at, row) for at, row in header_rows if not _CONSTANT.fullmatch(above[at].strip())]
-    header_rows = named or header_rows
+    fitting = [(at, row) for at, row in table if _fits(row, width, rows) and sum(map(bool, row)) > min(1, width - 1)]
+    header_rows = [(at, row) for at, row in fitting if not _CONSTANT.fullmatch(above[at].strip())] or fitting
     if not header_rows and table:  # a lone line above the data is the header, whatever its width
         at, row = table[-1]
         raise LogError(
