@@ -112,18 +112,15 @@ class Column:
 
 
 def spell_column(**keys: str | int) -> str:
-    """Return how a column is written in Python, and in a problem file.
+    """Return how a column is given: by keys that are called alike in `Column` and in a file of settings.
 
     Examples
     --------
     >>> spell_column(column="cur", unit="A")
-    'Column(column="cur", unit="A"), in a problem file { column = "cur", unit = "A" }'
+    'column = "cur", unit = "A"'
 
     """
-    spelt = {name: json.dumps(value, ensure_ascii=False) for name, value in keys.items()}
-    python = ", ".join(f"{name}={value}" for name, value in spelt.items())
-    toml = ", ".join(f"{name} = {value}" for name, value in spelt.items())
-    return f"Column({python}), in a problem file {{ {toml} }}"
+    return ", ".join(f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in keys.items())
 
 
 def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> int | None:

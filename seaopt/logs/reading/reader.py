@@ -109,7 +109,11 @@ def _read_files(
     if not files:
         raise LogError("path is an empty list; give a file")
     sources = [open_source(file) for file in files]
-    _check_window(window_s)
+    if window_s is not None:
+        require_type(window_s, (tuple, list), "window_s", "give (start, stop)", LogError)
+        edges = [require_number(edge, "window_s", LogError) for edge in window_s]
+        if not (len(edges) == 2 and edges[0] < edges[1]):
+            raise LogError(f"window_s = {window_s}: give (start, stop) with start before stop")
     with ThreadPoolExecutor(max_workers=1) as pool:  # the files are hashed while they are parsed
         digests = {source.path: pool.submit(_hash_file, source.path) if digest else None for source in sources}
         chosen = select(sources, time, channels, align, counter, rate_hz)
@@ -118,7 +122,8 @@ def _read_files(
     notes = [*chosen.notes, *notes]
     signals = {}
     for name, channel in chosen.channels.items():
-        signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, hashes[channel.source.path])
+        digest_of_file = hashes[channel.found.source.path]
+        signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, digest_of_file)
         notes += _remark_on(signals[name])
     table = Table(time=clock, signals=signals, source=", ".join(map(str, files)), notes=tuple(notes))
     return table, chosen.clock
@@ -211,61 +216,57 @@ def _hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _check_window(window_s: tuple[float, float] | None) -> None:
-    if window_s is not None:
-        require_type(window_s, (tuple, list), "window_s", "give (start, stop)", LogError)
-        for edge in window_s:
-            require_number(edge, "window_s", LogError)
-    if window_s is not None and not (len(window_s) == 2 and window_s[0] < window_s[1]):
-        raise LogError(f"window_s = {window_s}: give (start, stop) with start before stop")
-
-
 def _read_channels(
     chosen: Selection, window: tuple[float, float] | None, counter: Counter | None
 ) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"], list[str]]:
     """Return the channels in their files' units and the clock in seconds, and what was done."""
     notes: list[str] = []
-    arrays: dict[str, Float[np.ndarray, " n"]] = {}
-    read = {name: channel for name, channel in chosen.channels.items() if channel.constant is None}
-    on_clock = {name: channel for name, channel in read.items() if channel.clock == chosen.clock}
+    # Each clock is read once, for all of its channels.
+    groups: dict[ClockColumn, dict[str, SelectedChannel]] = {chosen.clock: {}}
+    for name, channel in chosen.channels.items():
+        if channel.constant is None:
+            groups.setdefault(channel.clock, {})[name] = channel
+    on_clock, path = groups.pop(chosen.clock), str(chosen.clock.path)
     extra = [counter.column] if counter is not None else []
-    columns, clock = _read_clock(chosen.clock, [channel.field.name for channel in on_clock.values()] + extra, window)
+    columns, clock = _read_clock(chosen.clock, [*_name_fields(on_clock), *extra], window)
     if clock.size < 2:
         span = f" in window_s = {window}" if window else ""
-        raise LogError(f"{chosen.clock.source.path}: too few samples ({clock.size}){span}; a log needs at least 2")
+        raise LogError(f"{path}: too few samples ({clock.size}){span}; a log needs at least 2")
     if counter is not None:
-        clock, note = counter.open_gaps(clock, columns[counter.column], str(chosen.clock.source.path))
+        clock, note = counter.open_gaps(clock, columns[counter.column], path)
         notes.append(note)
-    arrays |= _separate_arrays(on_clock, columns)
+    arrays = _separate_arrays(on_clock, columns)
     for name, channel in chosen.channels.items():
         if channel.constant is not None:
             arrays[name] = np.full(clock.size, channel.constant)
-    other_clocks = [channel.clock for channel in read.values() if channel.clock != chosen.clock]
-    # Each other clock is read once, for all of its channels.
-    for other in dict.fromkeys(other_clocks):
-        group = {name: channel for name, channel in read.items() if channel.clock == other}
-        columns, time = _read_clock(
-            other, [channel.field.name for channel in group.values()], _widen_window(window, group)
-        )
+    for other, group in groups.items():
+        columns, time = _read_clock(other, _name_fields(group), _widen_window(window, group))
         if all(channel.rule is None for channel in group.values()) and np.array_equal(time, clock):
             arrays |= _separate_arrays(group, columns)  # rows of one table, at the same instants
             continue
-        where = f'{other.source.path}: clock "{other.name}"' + (f" of {other.rows}" if other.rows else "")
+        where = f'{other.path}: clock "{other.name}"' + (f" of {other.rows}" if other.rows else "")
         check_increasing(time, where)
         for name, channel in group.items():
             if channel.rule is None:
                 raise LogError(f"{where}: has other instants than the log's clock; {HOW_TO_ALIGN}")
-            arrays[name] = channel.rule(clock, time, columns[channel.field.name])
-            notes.append(_describe_alignment(name, channel, clock, time))
+            arrays[name] = channel.rule(clock, time, columns[channel.found.field.name])
+            outside = int(np.sum(~((clock >= time[0]) & (clock <= time[-1]))))
+            note = f'{name}: brought from clock "{other.name}" by {channel.rule}'
+            if outside:
+                note += f"; {outside} of {clock.size} samples lie outside its {time[0]:.6g} to {time[-1]:.6g} s "
+                note += "and are missing"
+            notes.append(note)
     return arrays, clock, notes
+
+
+def _name_fields(group: Mapping[str, SelectedChannel]) -> list[str]:
+    return [channel.found.field.name for channel in group.values()]
 
 
 def _read_clock(
     clock: ClockColumn, names: list[str], window: tuple[float, float] | None
 ) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
     """Return columns that share a clock, and the clock in seconds, cut to the window."""
-    scale = factor(clock.unit, "s")
-    span = None
     if clock.rate_hz is not None:
         columns = clock.source.read(names)
         sizes = {values.size for values in columns.values()}
@@ -273,6 +274,7 @@ def _read_clock(
             raise LogError(f"{clock.path}: its columns hold {min(sizes)} to {max(sizes)} samples; choose one length")
         time = np.arange(float(max(sizes, default=0))) / clock.rate_hz + clock.offset_s
         return _cut_window(columns, time, window)
+    scale, span = factor(clock.unit, "s"), None
     if window is not None:
         start, stop = ((edge - clock.offset_s) / scale for edge in window)
         slack = 1e-9 * max(abs(start), abs(stop))  # the exact cut is below, in seconds
@@ -302,10 +304,11 @@ def _separate_arrays(
     group: Mapping[str, SelectedChannel], columns: dict[str, Float[np.ndarray, " n"]]
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Return an array of its own for each channel: two channels of one column are converted apart."""
-    counts = collections.Counter(channel.field.name for channel in group.values())
+    fields = _name_fields(group)
+    counts = collections.Counter(fields)
     return {
-        name: columns[channel.field.name].copy() if counts[channel.field.name] > 1 else columns[channel.field.name]
-        for name, channel in group.items()
+        name: columns[field].copy() if counts[field] > 1 else columns[field]
+        for name, field in zip(group, fields, strict=True)
     }
 
 
@@ -319,29 +322,19 @@ def _widen_window(
     return window[0] - margin, window[1] + margin
 
 
-def _describe_alignment(
-    name: str, channel: SelectedChannel, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
-) -> str:
-    """Return a note: by which rule a channel came over, and how much of the log its clock does not reach."""
-    outside = int(np.sum(~((at >= time[0]) & (at <= time[-1]))))
-    text = f'{name}: brought from clock "{channel.clock.name}" by {channel.rule}'
-    if outside:
-        text += f"; {outside} of {at.size} samples lie outside its {time[0]:.6g} to {time[-1]:.6g} s and are missing"
-    return text
-
-
 def _build_signal(
     name: str, channel: SelectedChannel, values: Float[np.ndarray, " n"], clock: ClockColumn, digest: str
 ) -> Signal:
-    column, unit = channel.column, channel.unit
-    converted = column.to_si(values, unit, str(channel.source.path))
-    words = [
-        text for text in (column.describe_conversion(unit), "" if channel.clock == clock else str(channel.rule)) if text
-    ]
-    origin = Origin(
-        file=str(channel.source.path), sha256=digest, column=channel.field.name, conversion=", then ".join(words)
+    found, unit = channel.found, channel.unit
+    path = str(found.source.path)
+    steps = [found.column.describe_conversion(unit), "" if channel.clock == clock else str(channel.rule)]
+    conversion = ", then ".join(filter(None, steps))
+    return Signal(
+        name=name,
+        values=found.column.to_si(values, unit, path),
+        unit=si_unit(unit),
+        origin=Origin(file=path, sha256=digest, column=found.field.name, conversion=conversion),
     )
-    return Signal(name=name, values=converted, unit=si_unit(unit), origin=origin)
 
 
 def _remark_on(signal: Signal) -> list[str]:
@@ -357,11 +350,9 @@ def _remark_on(signal: Signal) -> list[str]:
             f"{signal.name}: looks like signed numbers in an unsigned field of {bits} bits; if so, give "
             f"{spell_column(column=signal.origin.column, wrap_bits=bits)}"
         ]
-    loss = Counter.suspect(signal.values)
-    if loss:
+    if loss := Counter.suspect(signal.values):
         return [
-            f"{signal.name}: looks like a sample counter that misses {format_count(loss, 'sample')}; to open "
-            f'gaps there, give counter=Counter(column="{signal.origin.column}", ...), in a problem file '
-            f'counter = {{ column = "{signal.origin.column}", samples_per_count = ... }}'
+            f"{signal.name}: looks like a sample counter that misses {format_count(loss, 'sample')}; to open gaps "
+            f"there, give it as counter: {spell_column(column=signal.origin.column, samples_per_count='...')}"
         ]
     return []

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import collections
-import dataclasses
 import re
 import shlex
+from collections import Counter as Counts
 from collections.abc import Mapping, Sequence
+from dataclasses import field as record_field
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -22,9 +22,7 @@ from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
 MAX_NAMES = 20  # in a message
-HOW_TO_ALIGN = (
-    "bring it over by align=Hold(), Linear() or Nearest(tolerance_s=...), in a problem file align = { linear = {} }"
-)
+HOW_TO_ALIGN = "align it by Hold(), Linear() or Nearest(tolerance_s=...)"
 
 
 class ClockError(LogError):
@@ -39,13 +37,22 @@ class ClockError(LogError):
 class ClockColumn:
     """A column of times, or without one a rate: two are the same clock if all of this is the same."""
 
-    source: Source = dataclasses.field(compare=False)
+    source: Source = record_field(compare=False)
     path: Path
     name: str
     unit: str
     offset_s: float = 0.0
     rows: str = ""
     rate_hz: float | None = None
+
+    @property
+    def field(self) -> Field | None:
+        """Its field in the file; None where it is a rate."""
+        return next((field for field in self.source.fields if field.name == self.name), None)
+
+    def shift(self, column: Column) -> ClockColumn:
+        """Return the clock of a column whose samples are late or early by a stated time."""
+        return replace(self, offset_s=self.offset_s + column.clock_offset_s)
 
 
 @record
@@ -62,8 +69,8 @@ class FoundColumn:
         unit = self.column.unit if self.column.unit is not None else self.field.unit
         where = f'{self.source.path}: column "{self.field.name}"'
         if unit is None:
-            spelt = spell_column(column=self.column.column, unit="...")
             named = f'write it in the header\'s brackets, "{self.field.name} [unit]", or '
+            spelt = spell_column(column=self.column.column, unit="...")
             raise LogError(f"{where} has no unit; {named * (self.source.format == 'CSV')}give it: {spelt} (--unit)")
         try:
             factor(unit, si_unit(unit))
@@ -74,14 +81,12 @@ class FoundColumn:
 
 @record
 class SelectedChannel:
-    """A channel before it is read."""
+    """A channel before it is read; `unit` is its column's, `constant` its value where that stands in a header."""
 
-    column: Column
-    source: Source
-    field: Field
+    found: FoundColumn
     unit: str
     clock: ClockColumn
-    rule: Rule | None
+    rule: Rule | None = None
     constant: float | None = None
 
 
@@ -118,36 +123,36 @@ def select(
         notes += more
     if counter is not None:
         find_column([clock.source], "the counter", Column(column=counter.column))
-    selected: dict[str, SelectedChannel] = {}
-    for name, found in columns.items():
-        source, field = found.source, found.field
-        channel_clock = _find_channel_clock(clock, found)
-        rule = found.column.align or align
-        # Rows of one table may be at the same instants; whether they are is seen on reading.
-        if channel_clock != clock and rule is None and not (source.rows and clock.rows and source.path == clock.path):
-            raise LogError(
-                f'{source.path}: "{field.name}" is on the clock "{channel_clock.name}", the log on "{clock.name}" of '
-                f"{clock.path.name}; {HOW_TO_ALIGN}"
-            )
-        selected[name] = SelectedChannel(
-            column=found.column,
-            source=source,
-            field=field,
-            unit=found.unit,
-            clock=channel_clock,
-            rule=rule if channel_clock != clock else None,
-        )
+    selected = {name: _select_channel(clock, found, align) for name, found in columns.items()}
     origins = {
-        name: ((str(channel.source.path), " ".join((channel.field.name, channel.source.rows)).strip()))
-        for name, channel in selected.items()
-        if not channel.column.shared
+        name: (
+            (str(found.source.path), f"{found.field.name} {found.source.rows}".strip()),
+            si_unit(selected[name].unit),
+        )
+        for name, found in columns.items()
+        if not found.column.shared
     }
-    notes += check_distinct({name: (place, si_unit(selected[name].unit)) for name, place in origins.items()})
+    notes += check_distinct(origins)
     for name, column in declared.items():
         if column.from_header:
             selected[name] = _select_constant(sources, clock, name, column)
     ordered = {name: selected[name] for name in declared or selected}
     return Selection(clock=clock, channels=ordered, notes=tuple(notes))
+
+
+def _select_channel(clock: ClockColumn, found: FoundColumn, align: Rule | None) -> SelectedChannel:
+    """Return a channel with its clock, and the rule that brings it to the log's."""
+    channel_clock = _find_channel_clock(clock, found)
+    if channel_clock == clock:
+        return SelectedChannel(found=found, unit=found.unit, clock=clock)
+    rule, source = found.column.align or align, found.source
+    # Rows of one table may be at the same instants; whether they are is seen on reading.
+    if rule is None and not (source.rows and clock.rows and source.path == clock.path):
+        raise LogError(
+            f'{source.path}: "{found.field.name}" is on the clock "{channel_clock.name}", the log on "{clock.name}" of '
+            f"{clock.path.name}; {HOW_TO_ALIGN}"
+        )
+    return SelectedChannel(found=found, unit=found.unit, clock=channel_clock, rule=rule)
 
 
 def _find_columns(sources: Sequence[Source], columns: Mapping[str, Column]) -> dict[str, FoundColumn]:
@@ -164,24 +169,17 @@ def _find_columns(sources: Sequence[Source], columns: Mapping[str, Column]) -> d
 def _select_constant(sources: Sequence[Source], clock: ClockColumn, name: str, column: Column) -> SelectedChannel:
     """Return a channel that has the value that a header states."""
     files = [source for source in sources if column.file is None or source.path == Path(column.file)]
-    stated = {constant: source for source in files for constant in source.constants}
+    constant = str(column.column)
+    stated = {other: source for source in files for other in source.constants}
     if column.column not in stated:
         raise LogError(
-            f'{_list_paths(files)}: the header states no constant "{column.column}" for {name}; '
-            f"{suggestion(str(column.column), stated)}"
+            f'{_list_paths(files)}: the header states no constant "{constant}" for {name}; '
+            f"{suggestion(constant, stated)}"
         )
-    source = stated[str(column.column)]
-    value, unit = source.constants[str(column.column)]
-    field = Field(name=str(column.column), kind="float64", length=None, unit=unit)
-    return SelectedChannel(
-        column=column,
-        source=source,
-        field=field,
-        unit=FoundColumn(column=column, source=source, field=field).unit,
-        clock=clock,
-        rule=None,
-        constant=value,
-    )
+    value, unit = stated[constant].constants[constant]
+    field = Field(name=constant, kind="float64", length=None, unit=unit)
+    found = FoundColumn(column=column, source=stated[constant], field=field)
+    return SelectedChannel(found=found, unit=found.unit, clock=clock, constant=value)
 
 
 def as_column(column: str | int | Column) -> Column:
@@ -250,25 +248,17 @@ def _list_paths(sources: Sequence[Source]) -> str:
 
 
 def _make_clock(found: FoundColumn) -> ClockColumn:
-    column, source, field = found.column, found.source, found.field
-    if column.unit is None and field.unit is None:
+    column, source, name = found.column, found.source, found.field.name
+    if column.unit is None and found.field.unit is None:
         raise ClockError(
-            f'{source.path}: column "{field.name}" has no unit, and is the time; give it, in seconds if it is: '
-            f"time={spell_column(column=column.column, unit='s')} (--unit time=s)",
-            column=field.name,
+            f'{source.path}: column "{name}" has no unit, and is the time; give it, in seconds if it is: '
+            f"time with {spell_column(column=column.column, unit='s')} (--unit time=s)",
+            column=name,
         )
     if not same_dimension(found.unit, "s"):
-        raise UnitError(
-            f'{source.path}: column "{field.name}" is in {found.unit}, not a unit of time; {advise_time(source)}'
-        )
-    return ClockColumn(
-        source=source,
-        path=source.path,
-        name=field.name,
-        unit=found.unit,
-        offset_s=column.clock_offset_s,
-        rows=source.rows,
-    )
+        raise UnitError(f'{source.path}: column "{name}" is in {found.unit}, not a unit of time; {advise_time(source)}')
+    clock = ClockColumn(source=source, path=source.path, name=name, unit=found.unit, rows=source.rows)
+    return clock.shift(column)
 
 
 def _find_log_clock(
@@ -282,13 +272,12 @@ def _find_log_clock(
         return _make_rate_clock(sources, time, channels, rate_hz)
     if time is not None:
         column = as_column(time)
-        if column.where:
-            found = find_column(sources, "time", column)
-            return _make_clock(replace(found, source=keep_rows(found.source, column.where)))
-        if channels and ((len(sources) > 1 and column.file is None) or channels[0].source.rows):
-            # A header that several files have, or rows, is the clock of the first channel's.
-            sources = [channels[0].source] if _match_fields(channels[0].source, column.column) else sources
-        return _make_clock(find_column(sources, "time", column))
+        first = channels[0].source if channels else None
+        # A header that several files have, or rows, is the clock of the first channel's.
+        if first and not column.where and ((len(sources) > 1 and column.file is None) or first.rows):
+            sources = [first] if _match_fields(first, column.column) else sources
+        found = find_column(sources, "time", column)
+        return _make_clock(replace(found, source=keep_rows(found.source, column.where)) if column.where else found)
     if channels is None:
         places = [(source, field) for source in sources for field in source.fields if field.numeric]
     else:
@@ -366,16 +355,16 @@ def is_time_name(name: str) -> bool:
 def _find_channel_clock(clock: ClockColumn, found: FoundColumn) -> ClockColumn:
     """Return the clock a channel is on: its own, the log's, the format's, or in another file one of the same name."""
     column, source, field = found.column, found.source, found.field
-    reference = _find_reference(clock)
+    reference = clock.field
     if column.time is not None:
         time = as_column(column.time)
     elif source is clock.source and (reference is None or field.clock == reference.clock):
-        if reference is not None and None not in (lengths := {field.length, reference.length}) and len(lengths) > 1:
+        if reference is not None and not _is_as_long(field, reference):
             raise LogError(
                 f'{source.path}: "{field.name}" has {field.length} samples and the clock "{clock.name}" '
                 f"{reference.length}; give it its own with {spell_column(column=field.name, time='...')}"
             )
-        return _shift_clock(clock, column)
+        return clock.shift(column)
     elif field.clock is not None:
         time = Column(column=field.clock)
     elif source is not clock.source:
@@ -384,65 +373,57 @@ def _find_channel_clock(clock: ClockColumn, found: FoundColumn) -> ClockColumn:
     else:
         how = spell_column(column=field.name, time="...")
         raise LogError(f'{source.path}: "{field.name}" has no clock of its own; give it one: {how}')
-    return _shift_clock(_make_clock(find_column([source], f'time of "{field.name}"', time)), column)
+    return _make_clock(find_column([source], f'time of "{field.name}"', time)).shift(column)
 
 
-def _find_reference(clock: ClockColumn) -> Field | None:
-    """Return the field of a clock; None for one that is a rate."""
-    return next((field for field in clock.source.fields if field.name == clock.name), None)
-
-
-def _shift_clock(clock: ClockColumn, column: Column) -> ClockColumn:
-    return replace(clock, offset_s=clock.offset_s + column.clock_offset_s)
+def _is_as_long(field: Field, other: Field) -> bool:
+    """Tell whether two columns have as many samples, as far as the format tells."""
+    return None in (field.length, other.length) or field.length == other.length
 
 
 def _select_every_channel(
     sources: Sequence[Source], clock: ClockColumn, align: Rule | None
 ) -> tuple[dict[str, FoundColumn], list[str]]:
     """Return every column of numbers on the clock; with a rule for all, those on other clocks too."""
-    reference = _find_reference(clock)
+    reference = clock.field
+
+    def is_on_clock(source: Source, field: Field) -> bool:
+        if source is not clock.source or field.clock != (reference.clock if reference else None):
+            return False
+        return reference is None or _is_as_long(field, reference)
+
     clock_names = {(str(source.path), field.clock) for source in sources for field in source.fields if field.clock}
-    notes: list[str] = []
+    chosen: list[tuple[Source, Field]] = []
+    words: list[str] = []
+    elsewhere: list[str] = []
     every = [(source, field) for source in sources for field in source.fields if field.name != clock.name]
-    numeric = [(source, field) for source, field in every if field.numeric]
-    words = [
-        field.name for source, field in every if not field.numeric and _is_on_clock(clock, reference, source, field)
-    ]
-    if words:
-        notes.append(f"columns that hold no numbers were left out: {_list_names(words)}")
-    # A clock is not a channel too.
-    numeric = [(source, field) for source, field in numeric if (str(source.path), field.name) not in clock_names]
-    chosen = [
-        (source, field)
-        for source, field in numeric
-        if _is_on_clock(clock, reference, source, field) or (align is not None and field.clock is not None)
-    ]
-    taken = {(str(source.path), field.name) for source, field in chosen}
-    if other := [field.name for source, field in numeric if (str(source.path), field.name) not in taken]:
-        notes.append(f'columns on other clocks than "{clock.name}" were left out: {_list_names(other)}')
+    for source, field in every:
+        on_clock = is_on_clock(source, field)
+        if not field.numeric:
+            words += [field.name] * on_clock
+        elif (str(source.path), field.name) in clock_names:
+            continue  # a clock is not a channel too
+        elif on_clock or (align is not None and field.clock is not None):
+            chosen.append((source, field))
+        else:
+            elsewhere.append(field.name)
+    notes = [f"columns that hold no numbers were left out: {_list_names(words)}"] if words else []
+    if elsewhere:
+        notes.append(f'columns on other clocks than "{clock.name}" were left out: {_list_names(elsewhere)}')
     if not chosen:
         raise LogError(
             f'{clock.path}: no column of numbers is on the clock "{clock.name}"; choose another time= (--time)'
         )
-    units, unknown = _find_units(chosen)
-    notes += unknown
-    bare = [bare_name(field.name) if units[index] else field.name for index, (_, field) in enumerate(chosen)]
-    counts = collections.Counter(bare)
+    units, remarks = _find_units(chosen)
+    bare = [bare_name(field.name) if unit else field.name for unit, (_, field) in zip(units, chosen, strict=True)]
+    counts = Counts(bare)
     columns: dict[str, FoundColumn] = {}
     for name, unit, (source, field) in zip(bare, units, chosen, strict=True):
         key = name if counts[name] == 1 and name != "time" else field.name
         key = key if key not in columns else f"{source.path.name}:{field.name}"
         column = Column(column=field.name, unit=unit, file=source.path)
         columns[key] = FoundColumn(column=column, source=source, field=field)
-    return columns, notes
-
-
-def _is_on_clock(clock: ClockColumn, reference: Field | None, source: Source, field: Field) -> bool:
-    if reference is None:
-        return source is clock.source and field.clock is None
-    lengths = (field.length, reference.length)
-    same = None in lengths or lengths[0] == lengths[1]
-    return source is clock.source and field.clock == reference.clock and same
+    return columns, notes + remarks
 
 
 def _list_names(names: Sequence[str]) -> str:
@@ -451,21 +432,24 @@ def _list_names(names: Sequence[str]) -> str:
 
 def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str]]:
     """Return each column's unit, "" where none is known; brackets that hold no unit are part of the name."""
-    declared = [field.unit for _, field in chosen]
-    text = [source.format == "CSV" for source, _ in chosen]
-    for source, field in chosen:
-        some_known = any(unit and is_unit(unit) for unit in declared)
-        if source.format == "CSV" and some_known and _is_unit_bracket(field) and not is_unit(field.unit or ""):
+    some_known = any(field.unit and is_unit(field.unit) for _, field in chosen)
+    odd = [(source, field) for source, field in chosen if source.format == "CSV" and not is_unit(field.unit or "")]
+    for source, field in odd:
+        # Square brackets without a number, which would be an index, are meant as a unit.
+        if some_known and field.name.endswith("]") and not str(field.unit).isdecimal():
             _check_bracket(source, field)
-    if any(csv and unit is not None and not is_unit(unit) for csv, unit in zip(text, declared, strict=True)):
-        notes = ["brackets in the headers that are not units were taken as names; no unit is known"]
-        return [""] * len(declared), notes
-    units = [unit if unit is not None and _converts_by_factor(unit) else "" for unit in declared]
-    lost = [
-        f"{field.name} [{old}]" for old, new, (_, field) in zip(declared, units, chosen, strict=True) if old and not new
-    ]
-    notes = [f"units that are not known were left out: {_list_names(lost)}"] if lost else []
-    return units, notes
+    if odd:
+        return [""] * len(chosen), ["brackets in the headers that are not units were taken as names; no unit is known"]
+    units: list[str] = []
+    lost: list[str] = []
+    for _, field in chosen:
+        try:  # a unit comes to SI by a factor alone
+            factor(field.unit or "", si_unit(field.unit or ""))
+            units.append(field.unit or "")
+        except SeaoptError:
+            units.append("")
+            lost.append(f"{field.name} [{field.unit}]")
+    return units, [f"units that are not known were left out: {_list_names(lost)}"] if lost else []
 
 
 def _check_bracket(source: Source, field: Field) -> None:
@@ -478,17 +462,3 @@ def _check_bracket(source: Source, field: Field) -> None:
         options = ["--channel", f"{name}={field.name}", "--unit", f"{name}=N"]
         command = shlex.join(["seaopt", "inspect", str(source.path), *options])
         raise UnitError(f"{error}; or name the column, and give its own unit, as in {command}") from error
-
-
-def _is_unit_bracket(field: Field) -> bool:
-    """Return whether a header's brackets are meant as a unit: square ones without a number, which would be an index."""
-    return field.unit is not None and field.name.endswith("]") and not field.unit.isdecimal()
-
-
-def _converts_by_factor(unit: str) -> bool:
-    """Return whether a unit comes to SI by a factor alone."""
-    try:
-        factor(unit, si_unit(unit))
-    except SeaoptError:
-        return False
-    return True
