@@ -163,8 +163,7 @@ class Log:
                 raise LogError(
                     f"{self.source}: a step of time differs by {worst / self.period:.0%} from the period "
                     f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={round_rate:g}), or "
-                    "log.restamp() where only the timestamps are rounded or late (in a problem file: "
-                    f'resample = {{ rate_hz = {round_rate:g} }}, or resample = "restamp")'
+                    "log.restamp() where only the timestamps are rounded or late"
                 )
         return segments
 
@@ -432,7 +431,7 @@ def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
     how = "repeats" if step[row - 1] == 0 else "runs backwards" if step[row - 1] < 0 else "leaps"
     remedy = "sort or remove such rows"
     if how == "repeats":
-        remedy = 'give read_log (or [[experiment]]) duplicates = "first" or "mean", or rate_hz where no clock is'
+        remedy = 'read it with duplicates = "first" or "mean", or with rate_hz where no clock is'
     return f"time {how} at sample {row + 1} (t = {time[row]:g} s); {remedy}"
 
 

@@ -20,7 +20,7 @@ RESOLVED = 5.0  # standard deviations of the drift's slope: less is jitter
 MOST_RESAMPLED = 100  # samples that interpolation may make of one
 LEAST_RATE = 0.8  # of the log's rate; below it interpolation would fold what is above the new Nyquist frequency
 
-HOW_TO_BRIDGE = "bridge_s = ... interpolates across longer ones (in a problem file resample = { ..., bridge_s = ... })"
+HOW_TO_BRIDGE = "bridge_s interpolates across longer ones"
 
 Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]
 
@@ -98,9 +98,8 @@ def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tupl
         if np.ptp(deviations) > 2.0 * resolution + 1e-9 * period:
             raise LogError(
                 f"{log.source}: the timestamps deviate by {np.ptp(deviations) / 2:.3g} s from a uniform clock, more "
-                f"than their rounding to {resolution:.3g} s explains; call log.resample(rate_hz=...), in TOML "
-                f"resample = {{ rate_hz = ... }}; or where a PC stamped the samples of a perfect clock, "
-                f'log.restamp(rate_hz=...), in a problem file resample = {{ rate_hz = ..., rule = "restamp" }}'
+                f"than their rounding to {resolution:.3g} s explains; call log.resample(rate_hz=...), or "
+                "log.restamp(rate_hz=...) where a PC stamped the samples of a perfect clock"
             )
         uniform[segment] = line + 0.5 * (np.min(deviations) + np.max(deviations))
     rounded = f", rounded to {resolution:.3g} s," if resolution else ""
@@ -130,8 +129,7 @@ def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Flo
         raise LogError(
             f"{log.source}: rate_hz = {rate_hz:g} is not the rate of the timestamps, which drift from it by "
             f"{np.ptp(line) * abs(drift) + left:.3g} s and rise at {sample_rate_hz(mean_period):.6g} Hz on "
-            "average; correct it, or call log.resample(rate_hz=...), in a problem file "
-            "resample = { rate_hz = ... }"
+            "average; correct it, or call log.resample(rate_hz=...)"
         )
     clock = f"the stated clock of {rate_hz:g} Hz"
     if drift:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import field
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
 from seaopt.logs.quality import faults
 from seaopt.logs.quality.faults import CounterLosses, Rail, RowRanges
@@ -15,7 +15,6 @@ from seaopt.records import record
 from seaopt.signals import Signal
 
 BEYOND = 1e30  # in SI: more than any sensor gives, and with a square that is still a number
-MOVING_STD = 0.05  # of its standard deviation over the log: what makes a channel move during a run of another
 
 
 @record(eq=False)
@@ -47,6 +46,11 @@ class ChannelQuality:
         return self.low == self.high
 
     @property
+    def varies(self) -> bool:
+        """Whether it has a spectrum that means something: a constant has none, and that of a counter means nothing."""
+        return self.std > 0.0 and self.counter is None
+
+    @property
     def saturated(self) -> int:
         """Samples at rails."""
         return sum(rail.runs.samples for rail in self.rails)
@@ -69,65 +73,25 @@ def assess_channel(signal: Signal) -> ChannelQuality:
     finite[beyond] = False
     present = values[finite]
     values = values if np.all(finite) else np.where(finite, values, np.nan)
-    if not present.size or present.min() == present.max():
-        edge = float(present[0]) if present.size else np.nan
-        return ChannelQuality(
-            name=signal.name,
-            unit=signal.unit,
-            low=edge,
-            high=edge,
-            mean=edge,
-            std=0.0 if present.size else np.nan,
-            missing=missing,
-            beyond=beyond,
-        )
+    figures: dict[str, Any] = {"name": signal.name, "unit": signal.unit, "missing": missing, "beyond": beyond}
+    if not present.size:
+        return ChannelQuality(low=np.nan, high=np.nan, mean=np.nan, std=np.nan, **figures)
+    low, high = float(present.min()), float(present.max())
+    if low == high:
+        return ChannelQuality(low=low, high=low, mean=low, std=0.0, **figures)
+    figures |= {"low": low, "high": high, "mean": float(present.mean()), "std": float(present.std())}
     quantum, still = faults.find_quantisation(values), faults.measure_stillness(values)
+    figures |= {"quantum": quantum, "still": still}
+    figures["held"] = faults.count_repeats(values) if still >= faults.HOLDS else 1
     losses = faults.find_counter_losses(values)
-    outliers = faults.find_outliers(values, quantum) if losses is None else np.zeros(0, dtype=int)
+    if losses is not None:
+        return ChannelQuality(counter=losses, **figures)
+    outliers = faults.find_outliers(values, quantum)
     tame = values
     if outliers.size:  # what lies beyond a rail would hide it
         tame = values.copy()
         tame[outliers] = np.nan
-    rails = tuple(faults.find_rails(tame, quantum, still)) if losses is None else ()
-    return ChannelQuality(
-        name=signal.name,
-        unit=signal.unit,
-        low=float(present.min()),
-        high=float(present.max()),
-        mean=float(present.mean()),
-        std=float(present.std()),
-        missing=missing,
-        quantum=quantum,
-        still=still,
-        held=faults.count_repeats(values) if still >= faults.HOLDS else 1,
-        stuck=_off_rails(faults.find_stuck(values, quantum, still), values, rails) if losses is None else RowRanges(),
-        rails=rails,
-        outliers=outliers,
-        counter=losses,
-        beyond=beyond,
-    )
-
-
-def _off_rails(runs: RowRanges, values: Float[np.ndarray, " n"], rails: Sequence[Rail]) -> RowRanges:
-    """Leave out the runs at a rail: those are saturated."""
-    at_rail = np.isin(values[runs.start], [rail.value for rail in rails]) if len(runs) else np.zeros(0, dtype=bool)
-    return runs.where(~at_rail)
-
-
-def keep_runs_while_others_move(runs: RowRanges, others: Sequence[tuple[Float[np.ndarray, " n"], float]]) -> RowRanges:
-    """Keep the runs of equal samples during which another channel moves; all where there is no other.
-
-    `others`: the samples of the other channels and their standard deviations.
-    """
-    active = [(values, std) for values, std in others if std > 0.0]
-    if not active or not len(runs):
-        return runs
-
-    def moves(start: int, stop: int) -> bool:
-        pieces = [(values[start:stop], std) for values, std in active]
-        return any(np.nanstd(piece) > MOVING_STD * std for piece, std in pieces if np.any(np.isfinite(piece)))
-
-    chosen: Bool[np.ndarray, " k"] = np.array(
-        [moves(start, stop) for start, stop in zip(runs.start.tolist(), runs.stop.tolist(), strict=True)]
-    )
-    return runs.where(chosen)
+    rails = tuple(faults.find_rails(tame, quantum, still))
+    stuck = faults.find_stuck(values, quantum, still)
+    at_rail = np.isin(values[stuck.start], [rail.value for rail in rails])  # such a run is saturated
+    return ChannelQuality(stuck=stuck.where(~at_rail), rails=rails, outliers=outliers, **figures)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from seaopt.codec import Key
 from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
 
@@ -19,6 +20,11 @@ LEAST_COHERENCE = 0.5  # of an output with the input, power-weighted; below it m
 @record
 class ThirdOctave:
     """A band of a third of an octave."""
+
+    json_keys = (
+        *("low_hz", "high_hz", "reach_hz", "share", "level_db", "coherence", "gain"),
+        Key(field="usable", name="told"),
+    )
 
     # low_hz, high_hz: edges
     low_hz: float
@@ -42,6 +48,8 @@ class ThirdOctave:
 @record
 class InputExcitation:
     """The bands of one input; `output` is the one whose gains they have, "" where there is none."""
+
+    json_keys = (Key(field="usable_hz", name="told_hz"), "sentence", "bands")
 
     channel: str
     bands: tuple[ThirdOctave, ...]

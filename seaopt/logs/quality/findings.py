@@ -7,16 +7,17 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from seaopt.formatting import format_count, format_figure
 from seaopt.logs.quality.channel import BEYOND, ChannelQuality
 from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality
 from seaopt.logs.quality.excitation import InputExcitation
-from seaopt.logs.quality.faults import CounterLosses, RowRanges
+from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.lags import ChannelPair
 from seaopt.records import record
 from seaopt.signals import SAME_SIGN
@@ -75,58 +76,55 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
     ):
         if rows.size:
             text = f"{format_count(rows.size, 'row')} of {clock.samples} with {what}"
-            yield _rows_finding(kind, "error", "", rows, time, text)
+            yield _locate(RowRanges(start=rows, stop=rows + 1), time, kind=kind, severity="error", sentence=text)
     share = clock.jitter_max / clock.period
     if share > JITTER_LIMIT:
-        yield _jitter_finding(clock, share)
+        text = f"steps of time differ by up to {share:.0%} from the period of {clock.period:.4g} s"
+        if clock.rounded_only:
+            text += f", which the rounding of the timestamps to {clock.rounding:.3g} s explains; call log.restamp()"
+        else:
+            rate = float(f"{clock.rate_hz:.3g}")
+            text += f" (rms {clock.jitter_rms / clock.period:.1%}); to fit it call log.resample(rate_hz={rate:g})"
+        yield Finding(kind="jitter", severity="error", value=100.0 * share, unit="% of the period", sentence=text)
     if clock.gaps.size:
         total, longest = int(np.sum(clock.lost)), int(np.max(clock.lost))
-        yield Finding(
+        yield _locate(
+            RowRanges(start=clock.gaps - 1, stop=clock.gaps + 1),
+            time,
             kind="gap",
             severity="warning",
             count=int(clock.gaps.size),
             value=float(total),
             unit="samples",
-            where_s=tuple((float(time[row - 1]), float(time[row])) for row in clock.gaps[:MAX_PLACES]),
             sentence=f"{format_count(clock.gaps.size, 'gap')}, {format_count(total, 'sample')} lost, {longest} in the "
             'longest; a fit starts anew after each (gaps = "split")',
         )
 
 
-def _jitter_finding(clock: ClockQuality, share: float) -> Finding:
-    what = f"steps of time differ by up to {share:.0%} from the period of {clock.period:.4g} s"
-    if clock.rounded_only:
-        text = (
-            f"{what}, which the rounding of the timestamps to {clock.rounding:.3g} s explains; call log.restamp() "
-            '(resample = "restamp" in a problem file)'
-        )
-    else:
-        rate = float(f"{clock.rate_hz:.3g}")
-        text = (
-            f"{what} (rms {clock.jitter_rms / clock.period:.1%}); to fit it call log.resample(rate_hz={rate:g}) "
-            f"(resample = {{ rate_hz = {rate:g} }} in a problem file)"
-        )
-    return Finding(kind="jitter", severity="error", value=100.0 * share, unit="% of the period", sentence=text)
-
-
 def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
     """Yield what is wrong with one channel."""
-    name = channel.name
-    if len(channel.missing):
-        yield _missing_finding(channel, time)
-    if channel.beyond.size:
-        count = format_count(channel.beyond.size, "sample")
+    name, unit, missing, beyond = channel.name, channel.unit, channel.missing, channel.beyond
+    fault = partial(_locate, time=time, channel=name)
+    if missing.samples == time.size:
+        text = f"{name} has no number in any sample; leave it out"
+        yield fault(missing, kind="missing", severity="error", unit=unit, sentence=text)
+    elif len(missing):
+        text = (
+            f"{name} lacks {format_count(missing.samples, 'sample')} of {time.size}; in an output they have no weight, "
+            "in an input cut the log there (log.between)"
+        )
+        yield fault(missing, kind="missing", severity="warning", unit=unit, sentence=text)
+    if beyond.size:
+        count = format_count(beyond.size, "sample")
         text = (
             f"{name} has {count} beyond any sensor (above {BEYOND:g}): nothing else here counts them; set them to NaN"
         )
-        yield _rows_finding("beyond", "error", name, channel.beyond, time, text)
-    if channel.missing.samples + channel.beyond.size == time.size:
+        yield fault(RowRanges(start=beyond, stop=beyond + 1), kind="beyond", severity="error", sentence=text)
+    if missing.samples + beyond.size == time.size:
         return
     if channel.constant:
-        text = f"{name} is {format_figure(channel.low, channel.unit)} throughout; check its wiring, or leave it out"
-        yield Finding(
-            kind="constant", severity="warning", channel=name, value=channel.low, unit=channel.unit, sentence=text
-        )
+        text = f"{name} is {format_figure(channel.low, unit)} throughout; check its wiring, or leave it out"
+        yield Finding(kind="constant", severity="warning", channel=name, value=channel.low, unit=unit, sentence=text)
         return
     if len(channel.stuck):
         longest = int(np.max(channel.stuck.lengths))
@@ -137,65 +135,55 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
             "leave those samples, for a fit of friction needs them; else cut the log there, or set them to NaN. An "
             f"input that holds its value is named: {typed}"
         )
-        yield _runs_finding("stuck", "warning", channel, channel.stuck, time, text)
-    yield from _check_rails(channel, time)
-    yield from _check_levels(channel)
-    if channel.outliers.size:
-        text = (
-            f"{format_count(channel.outliers.size, 'outlier')} in {name}; fit with loss=so.Huber(), or set them to NaN"
-        )
-        yield _rows_finding("outlier", "warning", name, channel.outliers, time, text)
-    if channel.counter is not None and channel.counter.rows.size:
-        yield _counter_finding(name, channel.counter, time)
-    if channel.hum is not None:
-        yield _hum_finding(channel)
-
-
-def _missing_finding(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Finding:
-    name, count = channel.name, channel.missing.samples
-    if count == time.size:
-        text = f"{name} has no number in any sample; leave it out"
-        return _runs_finding("missing", "error", channel, channel.missing, time, text)
-    text = (
-        f"{name} lacks {format_count(count, 'sample')} of {time.size}; in an output they have no weight, in an input "
-        "cut the log there (log.between)"
-    )
-    return _runs_finding("missing", "warning", channel, channel.missing, time, text)
-
-
-def _counter_finding(name: str, losses: CounterLosses, time: Float[np.ndarray, " n"]) -> Finding:
-    total = int(np.sum(losses.lost))
-    per_count = f", samples_per_count={losses.held}" if losses.held > 1 else ""
-    text = (
-        f"{name} counts, and skips at {format_count(losses.rows.size, 'place')}: {format_count(total, 'sample')} "
-        f'lost that the clock does not show; read the log with counter=Counter(column="{name}"{per_count}), which '
-        "opens the gaps"
-    )
-    return _rows_finding("gap", "error", name, losses.rows, time, text, value=float(total), unit="samples")
-
-
-def _check_rails(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
-    name = channel.name
+        yield fault(channel.stuck, kind="stuck", severity="warning", unit=unit, sentence=text)
     for rail in channel.rails:
         edge = "largest" if rail.side == "high" else "least"
-        count = f"{format_count(rail.runs.samples, 'sample')} ({rail.runs.samples / time.size:.2%})"
-        text = f"{name} is flat at its {edge} value, {format_figure(rail.value, channel.unit)}, for {count}"
-        text += (
-            ": it is clipped; a fit masks these samples of an output"
-            if rail.clear
-            else ": clipped, or at rest there; if clipped, declare its range, "
-            f"saturation = {{ {_spell_key(name)} = [low, high] }}"
-        )
+        share = f"{format_count(rail.runs.samples, 'sample')} ({rail.runs.samples / time.size:.2%})"
+        text = f"{name} is flat at its {edge} value, {format_figure(rail.value, unit)}, for {share}"
+        if rail.clear:
+            text += ": it is clipped; a fit masks these samples of an output"
+        else:
+            text += ": clipped, or at rest there; if clipped, declare its range, "
+            text += f"saturation = {{ {_spell_key(name)} = [low, high] }}"
         severity: Severity = "warning" if rail.clear else "note"
-        yield _runs_finding("clipping", severity, channel, rail.runs, time, text, value=rail.value)
+        yield fault(rail.runs, kind="clipping", severity=severity, value=rail.value, unit=unit, sentence=text)
+    yield from _find_level_faults(channel)
+    if (rows := channel.outliers).size:
+        text = f"{format_count(rows.size, 'outlier')} in {name}; fit with loss=so.Huber(), or set them to NaN"
+        yield fault(RowRanges(start=rows, stop=rows + 1), kind="outlier", severity="warning", sentence=text)
+    losses = channel.counter
+    if losses is not None and losses.rows.size:
+        total = int(np.sum(losses.lost))
+        per_count = f", samples_per_count={losses.held}" if losses.held > 1 else ""
+        text = (
+            f"{name} counts, and skips at {format_count(losses.rows.size, 'place')}: {format_count(total, 'sample')} "
+            f'lost that the clock does not show; read the log with counter=Counter(column="{name}"{per_count}), which '
+            "opens the gaps"
+        )
+        runs = RowRanges(start=losses.rows, stop=losses.rows + 1)
+        yield fault(runs, kind="gap", severity="error", value=float(total), unit="samples", sentence=text)
+    if channel.hum is not None:
+        lines = ", ".join(f"{line:g} Hz" for line in channel.hum.lines_hz)
+        yield Finding(
+            kind="hum",
+            severity="warning",
+            channel=name,
+            count=len(channel.hum.lines_hz),
+            value=channel.hum.rms,
+            unit=unit,
+            sentence=f"{name} hums with the mains at {lines}: {format_figure(channel.hum.rms, unit)} rms, "
+            f"{max(channel.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it "
+            "(band_hz)",
+        )
 
 
 def _spell_key(name: str) -> str:
-    """Return a name as a key of TOML."""
+    """Return a name as a key that a file of settings may have."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
 
 
-def _check_levels(channel: ChannelQuality) -> Iterator[Finding]:
+def _find_level_faults(channel: ChannelQuality) -> Iterator[Finding]:
+    """Yield what is wrong with the levels that a channel takes."""
     if channel.held > 1:
         text = (
             f"{channel.name} repeats each value {channel.held} times: its own rate is lower than the log's; "
@@ -204,35 +192,17 @@ def _check_levels(channel: ChannelQuality) -> Iterator[Finding]:
         yield Finding(kind="held", severity="note", channel=channel.name, count=channel.held, sentence=text)
     levels = (channel.high - channel.low) / channel.quantum if channel.quantum else np.inf
     if channel.counter is None and levels < FINE_LEVELS:
+        coarse = levels < COARSE_LEVELS
         step = format_figure(channel.quantum, channel.unit)
         text = f"{channel.name} moves in steps of {step}, {levels:.0f} over its range"
-        text += "; use a finer range, or expect coloured residuals" if levels < COARSE_LEVELS else ""
         yield Finding(
             kind="quantisation",
-            severity="warning" if levels < COARSE_LEVELS else "note",
+            severity="warning" if coarse else "note",
             channel=channel.name,
             value=channel.quantum,
             unit=channel.unit,
-            sentence=text,
+            sentence=text + "; use a finer range, or expect coloured residuals" * coarse,
         )
-
-
-def _hum_finding(channel: ChannelQuality) -> Finding:
-    assert channel.hum is not None
-    lines = ", ".join(f"{line:g} Hz" for line in channel.hum.lines_hz)
-    text = (
-        f"{channel.name} hums with the mains at {lines}: {format_figure(channel.hum.rms, channel.unit)} rms, "
-        f"{max(channel.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it (band_hz)"
-    )
-    return Finding(
-        kind="hum",
-        severity="warning",
-        channel=channel.name,
-        count=len(channel.hum.lines_hz),
-        value=channel.hum.rms,
-        unit=channel.unit,
-        sentence=text,
-    )
 
 
 def find_pair_faults(pair: ChannelPair, period: float, driven: bool) -> Iterator[Finding]:
@@ -282,38 +252,8 @@ def count_findings(findings: Sequence[Finding]) -> Mapping[str, int]:
     return {level: sum(finding.severity == level for finding in findings) for level in SEVERITIES}
 
 
-def _rows_finding(
-    kind: str,
-    severity: Severity,
-    channel: str,
-    rows: Int[np.ndarray, " k"],
-    time: Float[np.ndarray, " n"],
-    text: str,
-    **fields: Any,
-) -> Finding:
-    where_s = tuple((float(time[row]), float(time[row])) for row in rows[:MAX_PLACES])
-    return Finding(
-        kind=kind, severity=severity, channel=channel, count=int(rows.size), where_s=where_s, sentence=text, **fields
-    )
-
-
-def _runs_finding(
-    kind: str,
-    severity: Severity,
-    channel: ChannelQuality,
-    runs: RowRanges,
-    time: Float[np.ndarray, " n"],
-    text: str,
-    value: float = 0.0,
-) -> Finding:
+def _locate(runs: RowRanges, time: Float[np.ndarray, " n"], count: int | None = None, **fields: Any) -> Finding:
+    """Return a finding with its first places, and the number of its samples where no other is counted."""
     pairs = zip(runs.start[:MAX_PLACES], runs.stop[:MAX_PLACES], strict=True)
-    return Finding(
-        kind=kind,
-        severity=severity,
-        channel=channel.name,
-        count=runs.samples,
-        value=value,
-        unit=channel.unit,
-        where_s=tuple((float(time[a]), float(time[b - 1])) for a, b in pairs),
-        sentence=text,
-    )
+    where_s = tuple((float(time[start]), float(time[stop - 1])) for start, stop in pairs)
+    return Finding(count=runs.samples if count is None else count, where_s=where_s, **fields)

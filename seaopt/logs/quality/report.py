@@ -6,16 +6,17 @@ It reads a `Log`, or a `Table` as a file holds it, whose time may repeat or run 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import to_content
 from seaopt.errors import LogError, suggestion
 from seaopt.formatting import format_count
-from seaopt.logs.quality.channel import ChannelQuality, assess_channel, keep_runs_while_others_move
+from seaopt.logs.quality.channel import ChannelQuality, assess_channel
 from seaopt.logs.quality.clock import ClockQuality, assess_clock, split_rows
 from seaopt.logs.quality.excitation import InputExcitation, assess_excitation
 from seaopt.logs.quality.faults import RowRanges
@@ -36,6 +37,7 @@ from seaopt.signals import HOLDING_NAMES, INPUT_NAMES, INPUT_UNITS, SAME_SIGN, R
 
 QUALITY_SCHEMA = "seaopt/quality/1"
 CHANNELS, PAIRS = 0.6, 0.4  # of the time
+MOVING_STD = 0.05  # of its standard deviation over the log: what makes a channel move during a run of another
 MOST_PAIRED = 100  # outputs; of more only `SAME_SIGN` are correlated with each other
 ENOUGH_SAMPLES = FEWEST_SEGMENTS * SHORTEST_SEGMENT  # for spectra, in one segment
 
@@ -118,8 +120,8 @@ class Quality(Result, Worded):
             "time_missing": int(clock.not_numbers.size),
             "channels": {name: _channel_dict(channel) for name, channel in self.channels.items()},
             "inputs": list(self.inputs),
-            "pairs": [asdict(pair) for pair in self.pairs],
-            "excitation": {name: _excitation_dict(excitation) for name, excitation in self.excitation.items()},
+            "pairs": to_content(self.pairs),
+            "excitation": to_content(self.excitation),
             "findings": [finding.to_dict() for finding in self.findings],
             "counts": dict(count_findings(self.findings)),
             "notes": list(self.notes),
@@ -169,26 +171,27 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     channels = {name: assess_channel(data.signals[name]) for name in count_off(list(data.signals), "channel", looking)}
     holding = {*(inputs or ()), *(name for name in channels if name.lower() in HOLDING_NAMES)}
     channels = {
-        name: replace(channel, stuck=RowRanges()) if name in holding else _judge_stuck_runs(channel, channels, data)
+        name: replace(channel, stuck=RowRanges() if name in holding else _find_stuck_runs(channel, channels, data))
         for name, channel in channels.items()
     }
     # A constant has no spectrum, and a counter one that means nothing.
     varying = {
-        name: _drop_beyond(data.signals[name].values, channel) for name, channel in channels.items() if _varies(channel)
+        name: _drop_beyond(data.signals[name].values, channel) for name, channel in channels.items() if channel.varies
     }
     correlating("spectra and pairs of channels", 0.0)
     inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)
-    spectra = compute_spectra(varying, _segments(clock, len(data)), clock.period)
+    segments = split_rows(np.unique(np.concatenate([clock.gaps, clock.backwards, clock.not_numbers])), len(data))
+    spectra = compute_spectra(varying, segments, clock.period)
     if spectra is not None:
         hums = {name: find_hum(spectra, name, inputs) for name in spectra.channels}
         channels = {name: replace(channel, hum=hums.get(name)) for name, channel in channels.items()}
-    pairs = _correlate_pairs(spectra, inputs, channels)
-    excitation = _assess_inputs(spectra, inputs)
+    pairs = () if spectra is None else _correlate_pairs(spectra, inputs, channels)
+    excitation = {} if spectra is None else _assess_inputs(spectra, inputs)
     findings = [*find_clock_faults(clock, data.time)]
     findings += [finding for channel in channels.values() for finding in find_channel_faults(channel, data.time)]
     findings += [finding for pair in pairs for finding in find_pair_faults(pair, clock.period, pair.first in inputs)]
     findings += [describe_excitation(bands) for bands in excitation.values()]
-    findings += _list_unjudged(inputs, spectra, clock, data)
+    findings += _list_unjudged(inputs, spectra, [rows.stop - rows.start for rows in segments])
     finite = data.time[np.isfinite(data.time)]
     progress(format_count(len(channels), "channel"), 1.0)
     return Quality(
@@ -214,33 +217,29 @@ def _drop_beyond(values: Float[np.ndarray, " n"], channel: ChannelQuality) -> Fl
     return tame
 
 
-def _varies(channel: ChannelQuality) -> bool:
-    return channel.std > 0.0 and channel.counter is None
-
-
-def _judge_stuck_runs(
-    channel: ChannelQuality, channels: Mapping[str, ChannelQuality], data: Recording
-) -> ChannelQuality:
-    """Keep the runs of a channel as stuck during which another one moves."""
-    if not len(channel.stuck):
-        return channel
-    moving = [
+def _find_stuck_runs(channel: ChannelQuality, channels: Mapping[str, ChannelQuality], data: Recording) -> RowRanges:
+    """Return the runs of a channel's equal samples during which another channel moves; all where there is no other."""
+    others = [
         (data.signals[name].values, other.std)
         for name, other in channels.items()
-        if name != channel.name and _varies(other)
+        if other.varies and other is not channel
     ]
-    return replace(channel, stuck=keep_runs_while_others_move(channel.stuck, moving))
+    runs = channel.stuck
+    if not others:
+        return runs
 
+    def moves(start: int, stop: int) -> bool:
+        segments = [(values[start:stop], std) for values, std in others]
+        return any(np.nanstd(part) > MOVING_STD * std for part, std in segments if np.any(np.isfinite(part)))
 
-def _segments(clock: ClockQuality, n: int) -> list[slice]:
-    """Return the rows without a gap or a step backwards."""
-    return split_rows(np.unique(np.concatenate([clock.gaps, clock.backwards, clock.not_numbers])), n)
+    pairs = zip(runs.start.tolist(), runs.stop.tolist(), strict=True)
+    return runs.where(np.array([moves(start, stop) for start, stop in pairs], dtype=bool))
 
 
 def _likely_inputs(channels: Mapping[str, ChannelQuality]) -> tuple[str, ...]:
-    active = [name for name, channel in channels.items() if _varies(channel)]
-    named = tuple(name for name in active if name.casefold() in INPUT_NAMES and not _is_speed(channels[name]))
-    return named or tuple(name for name in active if channels[name].unit in INPUT_UNITS)
+    active = {name: channel for name, channel in channels.items() if channel.varies}
+    named = tuple(name for name in active if name.casefold() in INPUT_NAMES and not _is_speed(active[name]))
+    return named or tuple(name for name, channel in active.items() if channel.unit in INPUT_UNITS)
 
 
 def _is_speed(channel: ChannelQuality) -> bool:
@@ -249,11 +248,9 @@ def _is_speed(channel: ChannelQuality) -> bool:
 
 
 def _correlate_pairs(
-    spectra: Spectra | None, inputs: Sequence[str], channels: Mapping[str, ChannelQuality]
+    spectra: Spectra, inputs: Sequence[str], channels: Mapping[str, ChannelQuality]
 ) -> tuple[ChannelPair, ...]:
     """Correlate inputs with outputs, and outputs of one unit, or of the same sign by their names, with each other."""
-    if spectra is None:
-        return ()
     outputs = [name for name in spectra.channels if name not in inputs]
     wanted = [(first, second) for first in inputs if first in spectra.channels for second in outputs]
     if len(outputs) <= MOST_PAIRED:
@@ -268,41 +265,29 @@ def _correlate_pairs(
     return tuple(pair for pair in pairs if pair is not None)
 
 
-def _assess_inputs(spectra: Spectra | None, inputs: Sequence[str]) -> dict[str, InputExcitation]:
-    if spectra is None:
-        return {}
+def _assess_inputs(spectra: Spectra, inputs: Sequence[str]) -> dict[str, InputExcitation]:
     outputs = [name for name in spectra.channels if name not in inputs]
     bands = {name: assess_excitation(spectra, name, outputs) for name in inputs if name in spectra.channels}
     return {name: excitation for name, excitation in bands.items() if excitation is not None}
 
 
-def _list_unjudged(
-    inputs: Sequence[str], spectra: Spectra | None, clock: ClockQuality, data: Recording
-) -> list[Finding]:
-    """Return what could not be looked at, and why."""
-    segments = _segments(clock, len(data))
-    if spectra is None and len(data) >= ENOUGH_SAMPLES and len(segments) > 1:
-        longest = max(rows.stop - rows.start for rows in segments)
+def _list_unjudged(inputs: Sequence[str], spectra: Spectra | None, lengths: Sequence[int]) -> list[Finding]:
+    """Return what could not be looked at, and why; `lengths` are those of the segments between gaps."""
+    total = sum(lengths)
+    if spectra is None and total >= ENOUGH_SAMPLES and len(lengths) > 1:
         text = (
-            f"{len(segments) - 1} gaps leave segments of at most {longest} samples, too short for spectra: hum, "
+            f"{len(lengths) - 1} gaps leave segments of at most {max(lengths)} samples, too short for spectra: hum, "
             "delays, signs and excitation were not looked at; where the sampling is irregular, resample the log with "
-            "bridge_s, in a problem file resample = { rate_hz = ..., bridge_s = ... }"
+            "bridge_s"
         )
     elif spectra is None:
-        text = f"{len(data)} samples are too few for spectra: hum, delays, signs and excitation were not looked at"
+        text = f"{total} samples are too few for spectra: hum, delays, signs and excitation were not looked at"
     elif not inputs:
         text = "no channel is known to be an input: excitation and delays were not looked at; name it: --input NAME "
         text += '(inputs=["NAME"])'
     else:
         return []
     return [Finding(kind="unjudged", severity="note", sentence=text)]
-
-
-def _excitation_dict(excitation: InputExcitation) -> dict[str, Any]:
-    bands = [asdict(band) for band in excitation.bands]
-    for band in bands:
-        band["told"] = band.pop("usable")  # the name in schema 1
-    return {"told_hz": excitation.usable_hz, "sentence": excitation.sentence, "bands": bands}
 
 
 def _channel_dict(channel: ChannelQuality) -> dict[str, Any]:
@@ -323,5 +308,5 @@ def _channel_dict(channel: ChannelQuality) -> dict[str, Any]:
             for rail in channel.rails
         ],
         "outliers": int(channel.outliers.size),
-        "hum": asdict(channel.hum) if channel.hum else None,
+        "hum": to_content(channel.hum),
     }

@@ -125,14 +125,11 @@ def select(
         find_column([clock.source], "the counter", Column(column=counter.column))
     selected = {name: _select_channel(clock, found, align) for name, found in columns.items()}
     origins = {
-        name: (
-            (str(found.source.path), f"{found.field.name} {found.source.rows}".strip()),
-            si_unit(selected[name].unit),
-        )
+        name: (str(found.source.path), f"{found.field.name} {found.source.rows}".strip())
         for name, found in columns.items()
         if not found.column.shared
     }
-    notes += check_distinct(origins)
+    notes += check_distinct({name: (origin, si_unit(selected[name].unit)) for name, origin in origins.items()})
     for name, column in declared.items():
         if column.from_header:
             selected[name] = _select_constant(sources, clock, name, column)
