@@ -103,6 +103,18 @@ class Parameter:
         return self.free and (self.value - self.min <= width or self.max - self.value <= width)
 
 
+def declare(
+    name: str,
+    value: float,
+    unit: str,
+    least: float,
+    description: str,
+    plausible: tuple[float, float] | None = None,
+) -> Parameter:
+    """Return a parameter from a row of a plant's table: its default, the least value, and what such actuators have."""
+    return Parameter(name=name, value=value, unit=unit, min=least, description=description, plausible=plausible)
+
+
 class ParameterSet(Mapping[str, Parameter]):
     """An ordered, immutable set of parameters; every change returns a new set.
 

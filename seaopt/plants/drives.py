@@ -35,7 +35,7 @@ from typing import Any
 import casadi as ca
 
 from seaopt.errors import PlantError
-from seaopt.parameters import Parameter
+from seaopt.parameters import Parameter, declare
 from seaopt.plants.motor.thermal import RESISTANCE, find_resistance
 from seaopt.plants.plant import Plant, refuse_clash
 from seaopt.plants.roles import Actuation, Port, change_ports, put_behind, with_values
@@ -45,28 +45,17 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "voltage_input": (RESISTANCE,),
     "duty_input": (
         RESISTANCE,
-        Parameter(name="V_s", value=24.0, unit="V", min=1e-9, description="supply voltage", plausible=(1.0, 1e3)),
+        declare("V_s", 24.0, "V", 1e-9, "supply voltage", (1.0, 1e3)),
     ),
-    "inductance": (
-        Parameter(name="L_m", value=1e-3, unit="H", min=1e-12, description="winding inductance", plausible=(1e-7, 1)),
-    ),
+    "inductance": (declare("L_m", 1e-3, "H", 1e-12, "winding inductance", (1e-7, 1)),),
     "position_servo": (
-        Parameter(
-            name="k_p",
-            value=1.0,
-            unit="-",
-            min=0.0,
-            description="gain of the servo, in the units that g_s, 1 unless given, converts",
-        ),
-        Parameter(name="k_d", value=0.0, unit="s", min=0.0, description="damping of the servo, in its own units"),
-        Parameter(name="g_s", value=1.0, unit="-", min=0.0, description="command of one unit of gain and error"),
+        declare("k_p", 1.0, "-", 0.0, "gain of the servo, in the units that g_s, 1 unless given, converts"),
+        declare("k_d", 0.0, "s", 0.0, "damping of the servo, in its own units"),
+        declare("g_s", 1.0, "-", 0.0, "command of one unit of gain and error"),
     ),
-    "servo_integral": (
-        Parameter(name="k_i", value=0.0, unit="1/s", min=0.0, description="integral gain of the servo"),
-    ),
-    "servo_limit": (Parameter(name="c_max", value=1.0, unit="-", min=0.0, description="limit of the servo's command"),),
+    "servo_integral": (declare("k_i", 0.0, "1/s", 0.0, "integral gain of the servo"),),
+    "servo_limit": (declare("c_max", 1.0, "-", 0.0, "limit of the servo's command"),),
 }
-SERVO = ("position_servo", "servo_integral", "servo_limit")
 STATED = ("k_p",)  # without a default: who has a servo knows its gain, and any other one would be a guess
 INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
 

@@ -74,7 +74,7 @@ from typing import Any, Literal
 import casadi as ca
 
 from seaopt.errors import PlantError, suggestion
-from seaopt.parameters import Parameter
+from seaopt.parameters import Parameter, declare
 from seaopt.plants import drives
 from seaopt.plants.motor.thermal import PARAMETERS, add_heat
 from seaopt.plants.plant import Plant
@@ -111,64 +111,50 @@ Part = Literal[
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "stribeck": (
-        Parameter(
-            name="f_s", value=0.0, unit="N", min=0.0, description="breakaway friction at the screw",
-            plausible=(0, 100000),
-        ),
-        Parameter(
-            name="v_st", value=5e-3, unit="m/s", min=1e-9, description="Stribeck speed", plausible=(0.00001, 10)
-        ),
+        declare("f_s", 0.0, "N", 0.0, "breakaway friction at the screw", (0, 100000)),
+        declare("v_st", 5e-3, "m/s", 1e-9, "Stribeck speed", (0.00001, 10)),
     ),
     "load_friction": (
-        Parameter(name="c_m", value=0.0, unit="-", min=0.0, description="friction over the motor's effort"),
-        Parameter(name="c_e", value=0.0, unit="-", min=0.0, description="friction over the spring's effort"),
+        declare("c_m", 0.0, "-", 0.0, "friction over the motor's effort"),
+        declare("c_e", 0.0, "-", 0.0, "friction over the spring's effort"),
     ),
     "load_stribeck": (
-        Parameter(name="c_ms", value=0.0, unit="-", min=0.0, description="of the motor's effort, at breakaway"),
-        Parameter(name="c_es", value=0.0, unit="-", min=0.0, description="of the spring's effort, at breakaway"),
+        declare("c_ms", 0.0, "-", 0.0, "of the motor's effort, at breakaway"),
+        declare("c_es", 0.0, "-", 0.0, "of the spring's effort, at breakaway"),
     ),
     "load_square": (
-        Parameter(name="q_m", value=0.0, unit="1/N", min=0.0, description="of the motor's squared, at breakaway"),
-        Parameter(name="q_e", value=0.0, unit="1/N", min=0.0, description="of the spring's squared, at breakaway"),
+        declare("q_m", 0.0, "1/N", 0.0, "of the motor's squared, at breakaway"),
+        declare("q_e", 0.0, "1/N", 0.0, "of the spring's squared, at breakaway"),
     ),
     "lugre": (
-        Parameter(
-            name="f_c", value=20.0, unit="N", min=1e-9, description="Coulomb friction at the screw",
-            plausible=(0, 100000),
-        ),
-        Parameter(name="sigma_0", value=5e6, unit="N/m", min=0.0, description="stiffness of the bristles"),
-        Parameter(name="sigma_1", value=2e3, unit="N s/m", min=0.0, description="damping of the bristles"),
+        declare("f_c", 20.0, "N", 1e-9, "Coulomb friction at the screw", (0, 100000)),
+        declare("sigma_0", 5e6, "N/m", 0.0, "stiffness of the bristles"),
+        declare("sigma_1", 2e3, "N s/m", 0.0, "damping of the bristles"),
     ),
     "hysteresis": (
-        Parameter(name="k_h", value=0.0, unit="N/m", min=0.0, description="stiffness of the spring that gives way"),
-        Parameter(name="y_h", value=1e-4, unit="m", min=1e-12, description="deflection at which it gives way"),
+        declare("k_h", 0.0, "N/m", 0.0, "stiffness of the spring that gives way"),
+        declare("y_h", 1e-4, "m", 1e-12, "deflection at which it gives way"),
     ),
     "backlash": (
-        Parameter(name="g_b", value=2e-5, unit="m", min=0.0, description="half of the play", plausible=(0, 0.1)),
-        Parameter(name="eps_b", value=2e-6, unit="m", min=1e-12, description="rounding of the play's corners"),
+        declare("g_b", 2e-5, "m", 0.0, "half of the play", (0, 0.1)),
+        declare("eps_b", 2e-6, "m", 1e-12, "rounding of the play's corners"),
     ),
-    "hardening": (Parameter(name="k_3", value=0.0, unit="N/m^3", min=0.0, description="cubic stiffness"),),
-    "spring_damping": (Parameter(name="c_k", value=0.0, unit="N s/m", min=0.0, description="spring damping"),),
+    "hardening": (declare("k_3", 0.0, "N/m^3", 0.0, "cubic stiffness"),),
+    "spring_damping": (declare("c_k", 0.0, "N s/m", 0.0, "spring damping"),),
     "screw_mode": (
-        Parameter(name="k_b", value=6.55e6, unit="N/m", min=0.0, description="axial stiffness of the screw"),
-        Parameter(name="c_b", value=860.0, unit="N s/m", min=0.0, description="damping of the screw"),
-        Parameter(name="m_n", value=27.9, unit="kg", min=1e-9, description="effective mass at the nut"),
+        declare("k_b", 6.55e6, "N/m", 0.0, "axial stiffness of the screw"),
+        declare("c_b", 860.0, "N s/m", 0.0, "damping of the screw"),
+        declare("m_n", 27.9, "kg", 1e-9, "effective mass at the nut"),
     ),
-    "current_loop": (
-        Parameter(name="current_loop_hz", value=500.0, unit="Hz", min=1e-6, description="current loop bandwidth"),
-    ),
-    "load_cell": (
-        Parameter(name="load_cell_hz", value=500.0, unit="Hz", min=1e-6, description="load cell bandwidth"),
-    ),
-    "command_delay": (Parameter(name="T_c", value=1e-3, unit="s", min=1e-9, description="delay of the command"),),
-    "measurement_delay": (
-        Parameter(name="T_m", value=1e-3, unit="s", min=1e-9, description="delay of the measurement"),
-    ),
-    "servo_delay": (Parameter(name="T_v", value=1e-3, unit="s", min=1e-9, description="delay of the servo's command"),),
+    "current_loop": (declare("current_loop_hz", 500.0, "Hz", 1e-6, "current loop bandwidth"),),
+    "load_cell": (declare("load_cell_hz", 500.0, "Hz", 1e-6, "load cell bandwidth"),),
+    "command_delay": (declare("T_c", 1e-3, "s", 1e-9, "delay of the command"),),
+    "measurement_delay": (declare("T_m", 1e-3, "s", 1e-9, "delay of the measurement"),),
+    "servo_delay": (declare("T_v", 1e-3, "s", 1e-9, "delay of the servo's command"),),
     **drives.PARTS,
     **SENSOR_PARTS,
     "thermal": PARAMETERS,
-}  # fmt: skip
+}
 INSIDE: tuple[Part, ...] = (
     "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
     "spring_damping", "screw_mode",

@@ -2,47 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
-from seaopt.parameters import Parameter, ParameterSet
+from seaopt.parameters import Parameter, ParameterSet, declare
 
 ACTUATOR = (
-    Parameter(
-        name="m_l", value=0.646, unit="kg", min=0.0, description="translational sprung mass", plausible=(0.001, 1000)
-    ),
-    Parameter(name="k", value=655e3, unit="N/m", min=0.0, description="spring stiffness", plausible=(1000, 1e09)),
-    Parameter(name="l", value=0.002, unit="m", min=1e-9, description="ball-screw lead", plausible=(0.0001, 0.2)),
-    Parameter(name="N_p", value=3.0, unit="-", min=1e-9, description="pulley reduction", plausible=(0.02, 1000)),
-    Parameter(
-        name="K_tau", value=0.0255, unit="N m/A", min=0.0, description="motor torque constant", plausible=(0.001, 20)
-    ),
-    Parameter(
-        name="J",
-        value=3.31e-6,
-        unit="kg m^2",
-        min=0.0,
-        description="motor and transmission inertia",
-        plausible=(1e-09, 1),
-    ),
-    Parameter(
-        name="b_r", value=1.31e-4, unit="N m s", min=0.0, description="rotary viscous damping", plausible=(0, 10)
-    ),
-    Parameter(name="eta", value=1.0, unit="-", min=0.0, description="transmission efficiency", plausible=(0.25, 1.25)),
-    Parameter(
-        name="f_c", value=0.0, unit="N", min=0.0, description="Coulomb friction at the screw", plausible=(0, 100000)
-    ),
-    Parameter(name="v_s", value=1e-3, unit="m/s", min=1e-9, description="smoothing speed of f_c"),
+    declare("m_l", 0.646, "kg", 0.0, "translational sprung mass", (0.001, 1000)),
+    declare("k", 655e3, "N/m", 0.0, "spring stiffness", (1000, 1e09)),
+    declare("l", 0.002, "m", 1e-9, "ball-screw lead", (0.0001, 0.2)),
+    declare("N_p", 3.0, "-", 1e-9, "pulley reduction", (0.02, 1000)),
+    declare("K_tau", 0.0255, "N m/A", 0.0, "motor torque constant", (0.001, 20)),
+    declare("J", 3.31e-6, "kg m^2", 0.0, "motor and transmission inertia", (1e-09, 1)),
+    declare("b_r", 1.31e-4, "N m s", 0.0, "rotary viscous damping", (0, 10)),
+    declare("eta", 1.0, "-", 0.0, "transmission efficiency", (0.25, 1.25)),
+    declare("f_c", 0.0, "N", 0.0, "Coulomb friction at the screw", (0, 100000)),
+    declare("v_s", 1e-3, "m/s", 1e-9, "smoothing speed of f_c"),
 )
 PENDULUM = (
-    Parameter(
-        name="I_p", value=0.36, unit="kg m^2", min=1e-9, description="inertia about the pivot", plausible=(1e-07, 1000)
-    ),
-    Parameter(name="m", value=4.0, unit="kg", min=0.0, description="pendulum mass", plausible=(0, 10000)),
-    Parameter(name="L", value=0.3, unit="m", min=0.0, description="centre of mass to pivot", plausible=(0, 10)),
-    Parameter(name="L_a", value=0.0725, unit="m", min=0.0, description="lever arm", plausible=(0, 10)),
-    Parameter(name="d", value=0.0, unit="N m s", min=0.0, description="pivot damping", plausible=(0, 10000)),
+    declare("I_p", 0.36, "kg m^2", 1e-9, "inertia about the pivot", (1e-07, 1000)),
+    declare("m", 4.0, "kg", 0.0, "pendulum mass", (0, 10000)),
+    declare("L", 0.3, "m", 0.0, "centre of mass to pivot", (0, 10)),
+    declare("L_a", 0.0725, "m", 0.0, "lever arm", (0, 10)),
+    declare("d", 0.0, "N m s", 0.0, "pivot damping", (0, 10000)),
 )
-GRAVITY = Parameter(name="g", value=9.81, unit="m/s^2", description="gravity")
+GRAVITY = declare("g", 9.81, "m/s^2", -math.inf, "gravity")
 
 
 def all_parameters() -> list[Parameter]:
@@ -59,7 +43,7 @@ def pendulum(suffix: str) -> list[Parameter]:
 
 def link_mass(number: int) -> Parameter:
     """Return the mass of a link that slides."""
-    return Parameter(name=f"m_{number}", value=10.0, unit="kg", min=1e-9, description=f"mass of link {number}")
+    return declare(f"m_{number}", 10.0, "kg", 1e-9, f"mass of link {number}")
 
 
 def thor() -> ParameterSet:

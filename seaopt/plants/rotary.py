@@ -15,7 +15,7 @@ from typing import Any, Literal
 import casadi as ca
 
 from seaopt.errors import PlantError
-from seaopt.parameters import Parameter
+from seaopt.parameters import Parameter, declare
 from seaopt.plants.actuator import (
     DRIVES,
     SPRINGS,
@@ -36,72 +36,48 @@ RotaryLink = Literal["free", "locked", "pendulum"]
 LINKS = ("free", "locked", "pendulum")
 
 _DRIVE = (
-    Parameter(name="J_m", value=1e-4, unit="kg m^2", min=1e-15, description="motor inertia", plausible=(1e-10, 10)),
-    Parameter(name="b_r", value=1e-4, unit="N m s", min=0.0, description="motor damping", plausible=(0, 100)),
-    Parameter(
-        name="K_tau", value=0.05, unit="N m/A", min=0.0, description="motor torque constant", plausible=(0.0001, 100)
-    ),
-    Parameter(name="N", value=50.0, unit="-", min=1e-9, description="gear ratio", plausible=(0.02, 10000)),
-    Parameter(name="k_s", value=300.0, unit="N m/rad", min=0.0, description="spring stiffness", plausible=(0.01, 1e08)),
-    Parameter(name="c_s", value=0.0, unit="N m s/rad", min=0.0, description="spring damping", plausible=(0, 1e06)),
-    Parameter(name="eta", value=1.0, unit="-", min=0.0, description="transmission efficiency", plausible=(0.25, 1.25)),
-    Parameter(
-        name="f_c", value=0.0, unit="N m", min=0.0, description="Coulomb friction at the motor", plausible=(0, 1000)
-    ),
-    Parameter(name="v_s", value=1.0, unit="rad/s", min=1e-9, description="smoothing speed of f_c, at the motor"),
+    declare("J_m", 1e-4, "kg m^2", 1e-15, "motor inertia", (1e-10, 10)),
+    declare("b_r", 1e-4, "N m s", 0.0, "motor damping", (0, 100)),
+    declare("K_tau", 0.05, "N m/A", 0.0, "motor torque constant", (0.0001, 100)),
+    declare("N", 50.0, "-", 1e-9, "gear ratio", (0.02, 10000)),
+    declare("k_s", 300.0, "N m/rad", 0.0, "spring stiffness", (0.01, 1e08)),
+    declare("c_s", 0.0, "N m s/rad", 0.0, "spring damping", (0, 1e06)),
+    declare("eta", 1.0, "-", 0.0, "transmission efficiency", (0.25, 1.25)),
+    declare("f_c", 0.0, "N m", 0.0, "Coulomb friction at the motor", (0, 1000)),
+    declare("v_s", 1.0, "rad/s", 1e-9, "smoothing speed of f_c, at the motor"),
 )
-_HOUSING = Parameter(
-    name="J_h", value=0.0, unit="kg m^2", min=0.0, description="housing inertia about the axis", plausible=(0, 100000)
-)
+_HOUSING = declare("J_h", 0.0, "kg m^2", 0.0, "housing inertia about the axis", (0, 100000))
 _LINK = (
-    Parameter(name="J_l", value=0.1, unit="kg m^2", min=1e-15, description="link inertia", plausible=(1e-08, 100000)),
-    Parameter(name="d_l", value=0.0, unit="N m s/rad", min=0.0, description="link damping", plausible=(0, 100000)),
+    declare("J_l", 0.1, "kg m^2", 1e-15, "link inertia", (1e-08, 100000)),
+    declare("d_l", 0.0, "N m s/rad", 0.0, "link damping", (0, 100000)),
 )
 _PENDULUM = (
-    Parameter(name="m", value=3.0, unit="kg", min=0.0, description="pendulum mass", plausible=(0, 10000)),
-    Parameter(name="L", value=0.15, unit="m", min=0.0, description="centre of mass to pivot", plausible=(0, 10)),
+    declare("m", 3.0, "kg", 0.0, "pendulum mass", (0, 10000)),
+    declare("L", 0.15, "m", 0.0, "centre of mass to pivot", (0, 10)),
     GRAVITY,
 )
 _PARTS: dict[str, tuple[Parameter, ...]] = {
     "stribeck": (
-        Parameter(name="f_s", value=0.0, unit="N m", min=0.0, description="breakaway friction at the motor"),
-        Parameter(name="v_st", value=10.0, unit="rad/s", min=1e-9, description="Stribeck speed, at the motor"),
+        declare("f_s", 0.0, "N m", 0.0, "breakaway friction at the motor"),
+        declare("v_st", 10.0, "rad/s", 1e-9, "Stribeck speed, at the motor"),
     ),
     "load_friction": PARTS["load_friction"],
     "load_stribeck": PARTS["load_stribeck"],
     "load_square": tuple(replace(item, unit="1/(N m)") for item in PARTS["load_square"]),
     "lugre": (
-        Parameter(
-            name="f_c",
-            value=0.02,
-            unit="N m",
-            min=1e-12,
-            description="Coulomb friction at the motor",
-            plausible=(0, 1000),
-        ),
-        Parameter(
-            name="sigma_0", value=5.0, unit="N m/rad", min=0.0, description="stiffness of the bristles, at the motor"
-        ),
-        Parameter(
-            name="sigma_1", value=0.01, unit="N m s/rad", min=0.0, description="damping of the bristles, at the motor"
-        ),
+        declare("f_c", 0.02, "N m", 1e-12, "Coulomb friction at the motor", (0, 1000)),
+        declare("sigma_0", 5.0, "N m/rad", 0.0, "stiffness of the bristles, at the motor"),
+        declare("sigma_1", 0.01, "N m s/rad", 0.0, "damping of the bristles, at the motor"),
     ),
     "hysteresis": (
-        Parameter(name="k_h", value=0.0, unit="N m/rad", min=0.0, description="stiffness of the spring that gives way"),
-        Parameter(name="y_h", value=5e-3, unit="rad", min=1e-12, description="deflection at which it gives way"),
+        declare("k_h", 0.0, "N m/rad", 0.0, "stiffness of the spring that gives way"),
+        declare("y_h", 5e-3, "rad", 1e-12, "deflection at which it gives way"),
     ),
     "backlash": (
-        Parameter(
-            name="g_b",
-            value=5e-4,
-            unit="rad",
-            min=0.0,
-            description="half of the play, at the spring",
-            plausible=(0, 1),
-        ),
-        Parameter(name="eps_b", value=5e-5, unit="rad", min=1e-12, description="rounding of the play's corners"),
+        declare("g_b", 5e-4, "rad", 0.0, "half of the play, at the spring", (0, 1)),
+        declare("eps_b", 5e-5, "rad", 1e-12, "rounding of the play's corners"),
     ),
-    "hardening": (Parameter(name="k_3", value=0.0, unit="N m/rad^3", min=0.0, description="cubic stiffness"),),
+    "hardening": (declare("k_3", 0.0, "N m/rad^3", 0.0, "cubic stiffness"),),
     "spring_damping": (),  # c_s is there without it
     "deflection_sensor": tuple(replace(item, unit="N m/rad") for item in PARTS["deflection_sensor"]),
 }

@@ -32,7 +32,7 @@ def test_a_plant_in_a_few_lines():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"parameters": {"m": "", "c": "N s/m"}}, '"m" has no unit'),
+        ({"parameters": {"m": "", "c": "N s/m"}}, '"m" in parameters has no unit'),
         ({"parameters": {"m": "kg", "c": "N s/m", "x": "m"}}, '"x" is in states and in parameters'),
         ({"h": lambda t, x, u, p: {"x": p.m}}, '"x" depends on no state'),
         ({"f": lambda t, x, u, p: {"x": x.v, "v": p.c}}, '"v" is driven by nothing'),

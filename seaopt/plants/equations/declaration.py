@@ -50,10 +50,13 @@ def check_names(plant: Plant) -> None:
         if not isinstance(getattr(plant, group), Mapping):
             raise PlantError(f"plant {plant.name}: {group} is no mapping; give {{name: unit}}")
         for name, declared in getattr(plant, group).items():
-            if not isinstance(declared, str | Parameter):
+            unit = declared.unit if isinstance(declared, Parameter) else declared
+            if not isinstance(unit, str) or (group == "parameters" and not unit.strip()):
                 raise PlantError(
                     f'plant {plant.name}: "{name}" in {group} has no unit; give one, "-" for a pure number'
                 )
+            if unit.strip() not in DIMENSIONLESS and unit not in COMMON_UNITS:
+                si_unit(unit)
     seen: dict[str, str] = {}
     for group in ("states", "inputs", "parameters", "friction"):
         for name in getattr(plant, group):
@@ -67,15 +70,6 @@ def check_names(plant: Plant) -> None:
             f'plant {plant.name}: the output "{ENERGY}" has the name of the simulated energy (J); rename the output, '
             "and give energy=lambda x, p: ... where it is what the plant stores"
         )
-    for name, declared in plant.parameters.items():
-        unit = declared.unit if isinstance(declared, Parameter) else declared
-        if not unit.strip():
-            raise PlantError(f'plant {plant.name}: parameter "{name}" has no unit; give one, "-" for a pure number')
-    for group in ("states", "inputs", "outputs", "parameters"):
-        for declared in getattr(plant, group).values():
-            unit = declared.unit if isinstance(declared, Parameter) else declared
-            if unit.strip() not in DIMENSIONLESS and unit not in COMMON_UNITS:
-                si_unit(unit)
     unknown = sorted(plant.optional_inputs - set(plant.inputs))
     if unknown:
         raise PlantError(f"plant {plant.name}: optional input {unknown[0]} is not an input; add it to inputs")
@@ -95,46 +89,43 @@ def check_loads(plant: Plant, name: str, friction: Friction, spaces: list[Simple
         raise PlantError(f'plant {plant.name}: load "{taken[0]}" of friction {name} is a parameter; name it otherwise')
 
 
+# What the fields of a role name.
+_REFERENCES: Mapping[str, Mapping[str, str]] = {
+    "actuation": {"input": "inputs", "efficiency": "parameters"},
+    "sensing": {"regulated": "outputs", "from_encoders": "outputs"}
+    | dict.fromkeys(("motor_position", "motor_speed", "link_position"), "signals"),
+    "spring": {"stiffness": "parameters", "play": "parameters", "mass": "figures", "damping": "figures"},
+    "port": {"motion": "outputs", "effort": "inputs", "payload": "parameters"}
+    | dict.fromkeys(("coordinate", "rate", "drive"), "states"),
+    "friction": {"smoothing": "parameters"},
+    "bristles": {"state": "states"},
+    "mode": {"parameter": "parameters", "state": "states"},
+    "winding": {"rises": "states", "temperatures": "outputs"},
+}
+
+
 def check_roles(plant: Plant) -> None:
     """Refuse a role that names what the plant does not have."""
-    signals = {**plant.outputs, **plant.states}
-    named: list[tuple[str, str | None, Mapping[str, Any]]] = []
-    if plant.actuation is not None:
-        named += [
-            ("actuation.input", plant.actuation.input, plant.inputs),
-            ("actuation.efficiency", plant.actuation.efficiency, plant.parameters),
+    groups: dict[str, Mapping[str, Any]] = {
+        name: getattr(plant, name) for name in ("inputs", "outputs", "states", "parameters")
+    }
+    groups |= {"signals": {**plant.outputs, **plant.states}, "figures": plant.derived_values()}
+    roles = [(kind, kind, getattr(plant, kind)) for kind in ("actuation", "sensing", "spring", "mode", "winding")]
+    roles += [("port", "port", port) for port in plant.ports]
+    for name, friction in plant.friction.items():
+        roles += [
+            ("friction", f"friction.{name}", friction),
+            ("bristles", f"friction.{name}.bristles", friction.bristles),
         ]
-    if plant.sensing is not None:
-        named += [("sensing.regulated", name, plant.outputs) for name in plant.sensing.regulated]
-        named += [("sensing.from_encoders", name, plant.outputs) for name in plant.sensing.from_encoders]
-        fields = ("motor_position", "motor_speed", "link_position")
-        named += [(f"sensing.{name}", getattr(plant.sensing, name), signals) for name in fields]
-    if plant.spring is not None:
-        named.append(("spring.stiffness", plant.spring.stiffness, plant.parameters))
-        named.append(("spring.play", plant.spring.play, plant.parameters))
-        named += [
-            (f"spring.{name}", getattr(plant.spring, name), plant.derived_values()) for name in ("mass", "damping")
-        ]
-    for port in plant.ports:
-        named += [("port.motion", port.motion, plant.outputs), ("port.effort", port.effort, plant.inputs)]
-        fields = ("coordinate", "rate", "drive")
-        named += [(f"port.{name}", getattr(port, name), plant.states) for name in fields]
-        named += [("port.payload", name, plant.parameters) for name in port.payload]
-    named += [
-        (f"friction.{name}.smoothing", friction.smoothing, plant.parameters)
-        for name, friction in plant.friction.items()
-    ]
-    bristled = {name: friction.bristles for name, friction in plant.friction.items() if friction.bristles is not None}
-    named += [(f"friction.{name}.bristles.state", bristles.state, plant.states) for name, bristles in bristled.items()]
-    if plant.mode is not None:
-        named += [("mode.parameter", plant.mode.parameter, plant.parameters)]
-        named += [("mode.state", plant.mode.state, plant.states)]
-    if plant.winding is not None:
-        named += [("winding.rises", name, plant.states) for name in plant.winding.rises]
-        named += [("winding.temperatures", name, plant.outputs) for name in plant.winding.temperatures]
-    for role, name, names in named:
-        if name is not None and name not in names:
-            raise PlantError(f'plant {plant.name}: {role} = "{name}" is not one of its own; {suggestion(name, names)}')
+    for kind, place, role in roles:
+        for field, group in _REFERENCES[kind].items():
+            stated = getattr(role, field, None) or ()
+            for name in (stated,) if isinstance(stated, str) else stated:
+                if name not in groups[group]:
+                    raise PlantError(
+                        f'plant {plant.name}: {place}.{field} = "{name}" is not one of its own; '
+                        f"{suggestion(name, groups[group])}"
+                    )
     if plant.actuation is not None and plant.actuation.input != next(iter(plant.inputs)):
         raise PlantError(
             f'plant {plant.name}: actuation.input = "{plant.actuation.input}" is not the first input; put it first'
@@ -154,19 +145,14 @@ def check_bristles(plant: Plant, spaces: list[SimpleNamespace]) -> None:
         symbols = [plant.t, plant.x, plant.u, plant.p]
         rng = np.random.default_rng(0)
         values = [rng.uniform(0.5, 1.5, symbol.shape[0]) for symbol in symbols]
-        found = [
-            float(number) for number in ca.Function("bristles", symbols, [slip, stated, moves, speed]).call(values)
-        ]
-        for given, expected, message in (
-            (found[1], found[0], f'f gives "{bristles.state}" another rate than bristles.rate; use the same in both'),
-            (
-                found[2],
-                found[3],
-                "the rate of bristles.coordinate is not the velocity; give the coordinate it belongs to",
-            ),
+        rates = map(float, ca.Function("bristles", symbols, [stated, slip, moves, speed]).call(values))
+        for message in (
+            f'f gives "{bristles.state}" another rate than bristles.rate; use the same in both',
+            "the rate of bristles.coordinate is not the velocity; give the coordinate it belongs to",
         ):
-            if abs(given - expected) > 1e-6 * max(abs(given), abs(expected)):  # what is not finite there is not judged
-                raise PlantError(f"plant {plant.name}: friction {name}: {message} ({given:.6g} against {expected:.6g})")
+            rate, expected = next(rates), next(rates)
+            if abs(rate - expected) > 1e-6 * max(abs(rate), abs(expected)):  # what is not finite there is not judged
+                raise PlantError(f"plant {plant.name}: friction {name}: {message} ({rate:.6g} against {expected:.6g})")
 
 
 def stack_rows(plant: Plant, what: str, equations: Mapping[str, Any], names: Mapping[str, str]) -> Any:

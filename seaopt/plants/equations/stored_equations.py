@@ -89,54 +89,47 @@ def _arrange(layout: Any, leaves: list[Any]) -> Any:
     return layout if isinstance(layout, str) else leaves[layout]
 
 
+# What the functions of a plant and of its roles take: time t, states x, inputs u, parameters p (with rated loads, l), a
+# velocity v and the deflection of bristles z.
+_ARGUMENTS = {
+    "f": "txup", "h": "txup", "derived": "p", "energy": "xp",
+    "effort": "p", "speed": "xp", "largest": "p", "deflection": "xp", "ratio": "p",
+    "velocity": "xp", "force": "vl", "slopes": "l", "jump": "vl", "loads": "xup",
+    "coordinate": "xp", "stiffness": "p", "damping": "p", "rate": "zvl",
+}  # fmt: skip
+
+
 def store_plant(plant: Any) -> dict[str, Any]:
     """Return what a `Plant` is made of, with every function of its own as a `StoredFunction`."""
-    x, p = tuple(plant.states), tuple(plant.parameters)
-    u = (*plant.inputs, *plant.friction)
-    content = {field.name: getattr(plant, field.name) for field in fields(plant) if field.init}
+    spaces: dict[str, Any] = {"t": "t", "v": "velocity", "z": "z", "x": tuple(plant.states)}
+    spaces |= {"u": (*plant.inputs, *plant.friction), "p": tuple(plant.parameters)}
 
-    def store(function: Callable[..., Any] | None, *arguments: Iterable[str] | str) -> Any:
-        return function if function is None or _has_name(function) else store_function(function, *arguments)
+    def store(owner: Any, loads: Iterable[str] = ()) -> dict[str, Any]:
+        """Return the functions of a plant or a role that do not pickle as they are, stored."""
+        own = spaces | {"l": (*spaces["p"], *loads)}
+        functions = {name: getattr(owner, name, None) for name in _ARGUMENTS}
+        return {
+            name: store_function(function, *(own[letter] for letter in _ARGUMENTS[name]))
+            for name, function in functions.items()
+            if callable(function) and not _has_name(function)
+        }
 
     def store_friction(friction: Friction) -> Friction:
-        return replace(
-            friction,
-            velocity=store(friction.velocity, x, p),
-            force=store(friction.force, "velocity", (*p, *friction.rated)),
-            effort=store(friction.effort, p),
-            slopes=store(friction.slopes, (*p, *friction.rated)),
-            jump=store(friction.jump, "speed", (*p, *friction.rated)),
-            loads=store(friction.loads, x, u, p),
-            bristles=None
-            if friction.bristles is None
-            else replace(
-                friction.bristles,
-                coordinate=store(friction.bristles.coordinate, x, p),
-                stiffness=store(friction.bristles.stiffness, p),
-                damping=store(friction.bristles.damping, p),
-                rate=store(friction.bristles.rate, "z", "velocity", (*p, *friction.rated)),
-            ),
-        )
+        bristles, loads = friction.bristles, friction.rated
+        bristles = bristles and replace(bristles, **store(bristles, loads))
+        return replace(friction, **store(friction, loads), bristles=bristles)
 
     def store_port(port: Port) -> Port:
-        return replace(port, ratio=store(port.ratio, p), held=_store_maker(port.held), probe=_store_maker(port.probe))
+        return replace(port, **store(port), held=_store_maker(port.held), probe=_store_maker(port.probe))
 
-    content |= {name: store(getattr(plant, name), "t", x, u, p) for name in ("f", "h")}
-    content |= {"derived": store(plant.derived, p), "energy": store(plant.energy, x, p)}
-    if plant.actuation is not None:
-        content["actuation"] = replace(
-            plant.actuation,
-            effort=store(plant.actuation.effort, p),
-            speed=store(plant.actuation.speed, x, p),
-            largest=store(plant.actuation.largest, p),
-        )
-    if plant.winding is not None:
-        content["winding"] = replace(plant.winding, effort=store(plant.winding.effort, p))
-    if plant.spring is not None:
-        content["spring"] = replace(plant.spring, deflection=store(plant.spring.deflection, x, p))
-    content["ports"] = tuple(store_port(port) for port in plant.ports)
-    content["friction"] = {name: store_friction(friction) for name, friction in plant.friction.items()}
-    return content
+    roles = {name: getattr(plant, name) for name in ("actuation", "winding", "spring")}
+    return {
+        **{field.name: getattr(plant, field.name) for field in fields(plant) if field.init},
+        **store(plant),
+        **{name: role and replace(role, **store(role)) for name, role in roles.items()},
+        "ports": tuple(map(store_port, plant.ports)),
+        "friction": {name: store_friction(friction) for name, friction in plant.friction.items()},
+    }
 
 
 def _has_name(function: Any) -> bool:

@@ -32,7 +32,7 @@ from jaxtyping import Float
 
 from seaopt.errors import PlantError, require_number
 from seaopt.formatting import html_text, join_words
-from seaopt.parameters import Parameter, ParameterSet
+from seaopt.parameters import ParameterSet, declare
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import Plant, find_range, refuse_clash
 from seaopt.plants.roles import Friction, Winding, change_ports, with_values
@@ -46,18 +46,16 @@ OPTIONAL = ("largest_A", "largest_V")  # of a MotorRating
 SIGNED = ("slope", "ambient", "hottest", "per_ampere")
 RISES = ("rise_winding", "rise_case")
 TEMPERATURES = ("T_winding", "T_case")
-RESISTANCE = Parameter(
-    name="R", value=1.0, unit="ohm", min=1e-9, description="winding resistance", plausible=(1e-3, 1e3)
-)
+RESISTANCE = declare("R", 1.0, "ohm", 1e-9, "winding resistance", (1e-3, 1e3))
 PARAMETERS = (
     RESISTANCE,
-    Parameter(name="alpha_cu", value=COPPER, unit="1/K", min=0.0, description="of the winding's resistance"),
-    Parameter(name="R_wc", value=1.0, unit="K/W", min=1e-9, description="from winding to case", plausible=(1e-3, 1e3)),
-    Parameter(name="R_ca", value=4.0, unit="K/W", min=1e-9, description="from case to air", plausible=(1e-3, 1e3)),
-    Parameter(name="C_w", value=20.0, unit="J/K", min=1e-9, description="heat of the winding", plausible=(1e-2, 1e5)),
-    Parameter(name="C_c", value=400.0, unit="J/K", min=1e-9, description="heat of the case", plausible=(1e-1, 1e6)),
-    Parameter(name=AMBIENT, value=25.0, unit="degC", min=-273.15, description="of the air", plausible=(-60, 80)),
-    Parameter(name="T_max", value=125.0, unit="degC", min=-273.15, description="largest of the winding"),
+    declare("alpha_cu", COPPER, "1/K", 0.0, "of the winding's resistance"),
+    declare("R_wc", 1.0, "K/W", 1e-9, "from winding to case", (1e-3, 1e3)),
+    declare("R_ca", 4.0, "K/W", 1e-9, "from case to air", (1e-3, 1e3)),
+    declare("C_w", 20.0, "J/K", 1e-9, "heat of the winding", (1e-2, 1e5)),
+    declare("C_c", 400.0, "J/K", 1e-9, "heat of the case", (1e-1, 1e6)),
+    declare(AMBIENT, 25.0, "degC", -273.15, "of the air", (-60, 80)),
+    declare("T_max", 125.0, "degC", -273.15, "largest of the winding"),
 )
 
 NETWORK = ("R", "R_wc", "R_ca", "C_w", "C_c")  # these and T_max differ from motor to motor

@@ -24,7 +24,7 @@ from typing import Any
 import casadi as ca
 
 from seaopt.errors import PlantError
-from seaopt.parameters import Parameter
+from seaopt.parameters import Parameter, declare
 from seaopt.plants.plant import CompletedParameters, Plant, name_parameters
 from seaopt.plants.roles import Sensing, change_ports
 from seaopt.units import ROTARY
@@ -32,9 +32,7 @@ from seaopt.units import ROTARY
 NOMINAL = "k_n"
 # Of a screw; whoever has such a sensor states the constant that it multiplies by: a plant has no default for it.
 PARTS: dict[str, tuple[Parameter, ...]] = {
-    "deflection_sensor": (
-        Parameter(name=NOMINAL, value=655e3, unit="N/m", min=0.0, description="stiffness that the sensor assumes"),
-    )
+    "deflection_sensor": (declare(NOMINAL, 655e3, "N/m", 0.0, "stiffness that the sensor assumes"),)
 }
 
 
