@@ -56,6 +56,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "servo_integral": (declare("k_i", 0.0, "1/s", 0.0, "integral gain of the servo"),),
     "servo_limit": (declare("c_max", 1.0, "-", 0.0, "limit of the servo's command"),),
 }
+SERVO = ("position_servo", "servo_integral", "servo_limit")
 STATED = ("k_p",)  # without a default: who has a servo knows its gain, and any other one would be a guess
 INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
 
@@ -178,9 +179,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
             dict.fromkeys(commanded, limited_command),
         )
 
-    added = [
-        item for part in ("position_servo", "servo_integral", "servo_limit") if part in parts for item in PARTS[part]
-    ]
+    added = [item for part in SERVO if part in parts for item in PARTS[part]]
     unit = plant.outputs.get(position) or plant.states[position]
     return _put_before(
         plant,

@@ -79,13 +79,14 @@ SCREW = Transmission(
 
 @record
 class _Build:
-    """What kind of actuator is built: its links with the endings of their names, drive, spring and parts."""
+    """What kind of actuator is built: its links with the endings of their names, and whether forces act on them."""
 
     links: tuple[LinkKind, LinkKind]
     suffixes: tuple[str, str]
     drive: Drive
     spring: Spring
     parts: tuple[Part, ...]
+    external: bool = False
 
 
 def _make_link(kind: LinkKind, number: int, suffix: str) -> Link:
@@ -120,16 +121,27 @@ def _make_link(kind: LinkKind, number: int, suffix: str) -> Link:
     )
 
 
-def _actuator(name: str, build: _Build, external: bool) -> Plant:
-    """Return the plant of a build."""
+def _build_plant(
+    name: str,
+    links: tuple[LinkKind, LinkKind],
+    drive: Drive,
+    spring: Spring,
+    parts: Sequence[Part],
+    suffixes: tuple[str, str] = ("1", "2"),
+    external: bool = False,
+) -> Plant:
+    """Return the plant of a user's choices."""
     kinds = ("fixed", "mass", "pendulum")
     check_choices(
-        ("drive", build.drive, DRIVES),
-        ("spring", build.spring, SPRINGS),
-        ("link1", build.links[0], kinds),
-        ("link2", build.links[1], kinds),
+        ("drive", drive, DRIVES), ("spring", spring, SPRINGS), ("link1", links[0], kinds), ("link2", links[1], kinds)
     )
-    part_laws.check_parts(build.parts)
+    part_laws.check_parts(parts)
+    build = _Build(links=links, suffixes=suffixes, drive=drive, spring=spring, parts=tuple(parts), external=external)
+    return _actuator(f"{name}{drive})", build)
+
+
+def _actuator(name: str, build: _Build) -> Plant:
+    """Return the plant of a build."""
     links = tuple(_make_link(build.links[i], i + 1, build.suffixes[i]) for i in (0, 1))
     if "pendulum" in build.links:  # one gravity for both, the last parameter
         links = (links[0], replace(links[1], parameters=(*links[1].parameters, GRAVITY)))
@@ -150,8 +162,8 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
             link_position="x_2" if "x_2" in outputs else None,
         ),
         second_order=None if rides else ("m_k", "b_m"),
-        inputs=("Fe1", "Fe2") if external else (),
-        ports=_ports(name, build, external),
+        inputs=("Fe1", "Fe2") if build.external else (),
+        ports=_ports(name, build),
     )
 
 
@@ -176,34 +188,27 @@ def _list_outputs(build: _Build) -> dict[str, tuple[str, Any]]:
     return outputs
 
 
-def _as_tuple(parts: Sequence[Part]) -> tuple[Part, ...]:
-    part_laws.check_parts(parts)
-    return tuple(parts)
-
-
-def _ports(name: str, build: _Build, external: bool) -> tuple[Port, ...]:
+def _ports(name: str, build: _Build) -> tuple[Port, ...]:
     """Return the ports at link 2 and, where it moves, at link 1."""
-    inside = tuple(part for part in build.parts if part in part_laws.INSIDE)
-    bare = replace(build, links=("fixed", "mass"), suffixes=("1", "2"), parts=inside)
+    held = replace(build, parts=tuple(part for part in build.parts if part in part_laws.INSIDE))
+    bare = replace(held, links=("fixed", "mass"), suffixes=("1", "2"), external=True)
     ports: list[Port] = []
     for number, ratio in ((2, 1.0), (1, -1.0)):  # the spring's compression is q + x_2 - x_1
-        link, suffix = build.links[number - 1], build.suffixes[number - 1]
-        links = (build.links[0], "fixed") if number == 2 else ("fixed", build.links[1])
-        probe = partial(_actuator, f"port of {name}", bare, external=True) if number == 2 else None
-        if link == "fixed":
-            ports += [Port(probe=probe)] if number == 2 else []
+        kind, suffix = build.links[number - 1], build.suffixes[number - 1]
+        probe = partial(_actuator, f"port of {name}", bare) if number == 2 else None
+        if kind == "fixed":
+            ports += [Port(probe=probe)] if probe else []
             continue
-        mass = link == "mass"
+        link = _make_link(kind, number, suffix)
+        links = (build.links[0], "fixed") if number == 2 else ("fixed", build.links[1])
         ports.append(
             Port(
                 motion=f"x_{number}",
-                coordinate=f"x_{number}" if mass else f"phi{suffix}",
-                rate=f"v_{number}" if mass else f"phid{suffix}",
-                effort=f"Fe{number}" if external else None,
-                payload=(f"m_{number}",) if mass else (f"I_p{suffix}", f"m{suffix}"),
-                held=partial(
-                    _actuator, f"{name}, link {number} held", replace(build, links=links, parts=inside), external
-                ),
+                coordinate=link.coordinate,
+                rate=link.rate,
+                effort=link.effort if build.external else None,
+                payload=(f"m_{number}",) if kind == "mass" else (f"I_p{suffix}", f"m{suffix}"),
+                held=partial(_actuator, f"{name}, link {number} held", replace(held, links=links)),
                 drive="q",
                 ratio=lambda p, ratio=ratio: ratio,
                 probe=probe,
@@ -262,8 +267,7 @@ def two_link(
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
 
     """
-    build = _Build(links=(link1, link2), suffixes=("1", "2"), drive=drive, spring=spring, parts=_as_tuple(parts))
-    return _actuator(f"two_link({link1}, {link2}, {drive})", build, external=True)
+    return _build_plant(f"two_link({link1}, {link2}, ", (link1, link2), drive, spring, parts, external=True)
 
 
 def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = ()) -> Plant:
@@ -297,8 +301,7 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: S
     True
 
     """
-    build = _Build(links=("fixed", "fixed"), suffixes=("1", "2"), drive=drive, spring=spring, parts=_as_tuple(parts))
-    return _actuator(f"high_impedance({drive})", build, external=False)
+    return _build_plant("high_impedance(", ("fixed", "fixed"), drive, spring, parts)
 
 
 def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = ()) -> Plant:
@@ -325,5 +328,4 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Se
     ['F1', 'F2', 'q', 'phi', 'x_2']
 
     """
-    build = _Build(links=("fixed", "pendulum"), suffixes=("1", ""), drive=drive, spring=spring, parts=_as_tuple(parts))
-    return _actuator(f"moving_output({drive})", build, external=False)
+    return _build_plant("moving_output(", ("fixed", "pendulum"), drive, spring, parts, suffixes=("1", ""))

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from seaopt.codec import check_agrees, from_content, to_content
 from seaopt.control.deploy.c_text import (
     LARGEST_NUMBER,
     Precision,
@@ -193,15 +194,11 @@ def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard |
     guard = heat.get("guard") if isinstance(heat, Mapping) else None
     if not isinstance(heat, Mapping) or not isinstance(guard, Mapping):
         return None
-    stated, rating, period = HeatGuard.from_dict(guard), MotorRating.from_dict(heat), content["sample_time_s"]
-    made = HeatGuard.of_rating(rating, period)
-    for field in fields(HeatGuard):
-        one, other = getattr(stated, field.name), getattr(made, field.name)
-        if not math.isclose(one, other, rel_tol=AGREES, abs_tol=0.0):
-            raise FileError(
-                f"controller.json: heat.guard.{field.name} is {one:.6g}, and the network of heat makes {other:.6g}; "
-                "tune again"
-            )
+    source, remedy, period = "controller.json: heat", "tune again", content["sample_time_s"]
+    rating = from_content(MotorRating, heat, source, remedy=remedy)
+    stated = from_content(HeatGuard, guard, f"{source}.guard", remedy=remedy)
+    made = to_content(HeatGuard.of_rating(rating, period))
+    check_agrees(to_content(stated), made, f"{source}.guard", remedy=remedy, rtol=AGREES)
     return HeatGuard.of_rating(rating, period, margin_K=margin_K)
 
 

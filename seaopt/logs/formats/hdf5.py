@@ -11,9 +11,18 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.columns import open_columns
 from seaopt.logs.formats.simulink import assign_clocks, make_object_field
-from seaopt.logs.formats.source import MAX_DEPTH, MAX_FIELDS, Field, Place, Source, check_size, import_optional, spread
+from seaopt.logs.formats.source import (
+    MAX_DEPTH,
+    MAX_FIELDS,
+    Field,
+    Place,
+    Source,
+    check_size,
+    import_optional,
+    open_columns,
+    spread,
+)
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit")

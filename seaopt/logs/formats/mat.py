@@ -20,9 +20,8 @@ import numpy as np
 from jaxtyping import Shaped
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.columns import open_columns
 from seaopt.logs.formats.simulink import OBJECT, assign_clocks, make_object_field
-from seaopt.logs.formats.source import MAX_DEPTH, Field, Place, Source, check_size, spread
+from seaopt.logs.formats.source import MAX_DEPTH, Field, Place, Source, check_size, open_columns, spread
 from seaopt.records import record
 
 HEADER_BYTES = 128

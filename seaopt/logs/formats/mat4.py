@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.columns import open_columns
-from seaopt.logs.formats.source import Field, Place, Source, spread
+from seaopt.logs.formats.source import Field, Place, Source, open_columns, spread
 from seaopt.records import record
 
 HEADER = 20  # bytes

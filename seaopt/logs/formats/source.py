@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import field, replace
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +27,7 @@ MAX_FIELDS = 100_000
 MAX_PARTS = 256  # columns of one matrix, or elements of one array, that get a name each
 MAX_DEPTH = 32  # of groups, structs, objects or messages inside one another
 
+Location = TypeVar("Location")
 Where = Mapping[str, str | float]  # column to the value that its rows have
 
 
@@ -172,6 +174,20 @@ def make_row_loader(
         return {name: load_column(name, rows) for name in names}
 
     return load_columns
+
+
+def open_columns(
+    path: Path, form: str, columns: Iterable[tuple[Field, Location]], load: Callable[[Location, slice], Any]
+) -> Source:
+    """Return a source of columns; `load` returns the rows of the column at a location."""
+    listed = list(islice(columns, MAX_FIELDS + 1))  # one more than allowed, so that the file is refused
+    locations = {field.name: location for field, location in listed}
+    return Source(
+        path=path,
+        format=form,
+        fields=tuple(field for field, _ in listed),
+        load=make_row_loader(lambda name, rows: load(locations[name], rows)),
+    )
 
 
 def find_rows(clock: Float[np.ndarray, " n"], window: Window) -> slice:

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.columns import open_columns
-from seaopt.logs.formats.source import Field, Source, check_size, import_optional
+from seaopt.logs.formats.source import Field, Source, check_size, import_optional, open_columns
 
 UNIT_PROPERTIES = ("unit_string", "NI_UnitDescription")
 LEAD_IN = 28  # bytes before each segment: tag, contents, version, where the next segment and this one's data begin

@@ -21,9 +21,6 @@ as long as the current limit warms it more slowly than that.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any
 
 import numpy as np
 
@@ -98,20 +95,6 @@ class HeatGuard:
             share=-math.expm1(-sample_time_s / tau),
             ambient=rating.ambient,
         )
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> HeatGuard:
-        """Return the guard of its fields.
-
-        Raises ControlError: one is missing or not a finite number.
-        """
-        values: dict[str, float] = {}
-        for field in fields(cls):
-            value = content.get(field.name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise ControlError(f"heat.guard.{field.name} = {value!r} is not a finite number; tune again")
-            values[field.name] = float(value)
-        return cls(**values)
 
     def limit(self, rises: tuple[float, float]) -> float:
         """Return the largest current (A) of the next sample, from winding and case above the ambient (K)."""

@@ -23,13 +23,14 @@ two time constants. Where the feedback of the resistance makes one positive the 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
-from dataclasses import asdict, fields, replace
-from typing import Any
+from collections.abc import Collection
+from dataclasses import asdict, replace
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import Limits
 from seaopt.errors import PlantError, require_number
 from seaopt.formatting import html_text, join_words
 from seaopt.parameters import ParameterSet, declare
@@ -42,8 +43,7 @@ COPPER = 0.00393  # 1/K, at 20 to 25 degC
 REFERENCE_DEGC = 25.0
 AMBIENT = "T_ambient"
 PEAK_S = 10.0
-OPTIONAL = ("largest_A", "largest_V")  # of a MotorRating
-SIGNED = ("slope", "ambient", "hottest", "per_ampere")
+Positive = Annotated[float, Limits(gt=0.0)]
 RISES = ("rise_winding", "rise_case")
 TEMPERATURES = ("T_winding", "T_case")
 RESISTANCE = declare("R", 1.0, "ohm", 1e-9, "winding resistance", (1e-3, 1e3))
@@ -215,40 +215,18 @@ class MotorRating:
 
     """
 
-    resistance: float
+    resistance: Positive
     slope: float
-    to_case: float
-    to_air: float
-    winding: float
-    case: float
+    to_case: Positive
+    to_air: Positive
+    winding: Positive
+    case: Positive
     ambient: float
     hottest: float
     per_ampere: float
     unit: str
-    largest_A: float | None = None
-    largest_V: float | None = None
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> MotorRating:
-        """Return the rating of what `to_dict` gives.
-
-        Raises
-        ------
-        PlantError
-            A number is missing, not finite or not positive.
-
-        """
-        values: dict[str, Any] = {"unit": str(content.get("unit", ""))}
-        for field in fields(cls):
-            value = content.get(field.name)
-            if field.name == "unit" or (value is None and field.name in OPTIONAL):
-                continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise PlantError(f"heat.{field.name} = {value!r} is not a finite number; tune again")
-            if value <= 0.0 and field.name not in SIGNED:
-                raise PlantError(f"heat.{field.name} = {value:g} is not positive; tune again")
-            values[field.name] = float(value)
-        return cls(**values)
+    largest_A: Positive | None = None
+    largest_V: Positive | None = None
 
     @property
     def allowed_rise(self) -> float:
@@ -305,19 +283,16 @@ class MotorRating:
         high = max(self.continuous_A, 1e-6)
         while excess(high) < 0.0:
             high *= 2.0
-        root: Any = brentq(excess, 0.0, high, xtol=1e-12 * high)
-        most = float(root)
-        if self.largest_V is not None:
-            volts = self.largest_V
+        most: Any = brentq(excess, 0.0, high, xtol=1e-12 * high)
+        volts = math.inf if self.largest_V is None else self.largest_V
 
-            def dropped(current_A: float) -> float:
-                warm = self.resistance + self.slope * float(self.rises(current_A, duration_s, start)[0])
-                return current_A * warm - volts
+        def exceed_voltage(current_A: float) -> float:
+            warm = self.resistance + self.slope * float(self.rises(current_A, duration_s, start)[0])
+            return current_A * warm - volts
 
-            if dropped(most) > 0.0:  # the winding, as warm as it is at the end, does not take so much
-                root = brentq(dropped, 0.0, most, xtol=1e-12 * most)
-                most = float(root)
-        return self._limit(most)
+        if exceed_voltage(most) > 0.0:  # the winding, as warm as it is at the end, does not take so much
+            most = brentq(exceed_voltage, 0.0, most, xtol=1e-12 * most)
+        return self._limit(float(most))
 
     def peak_effort(self, duration_s: float = PEAK_S, start: tuple[float, float] = (0.0, 0.0)) -> float:
         """Return the effort of that current at the spring."""

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.codec import from_content
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import runnable
-from seaopt.errors import ControlError, FileError, PlantError
+from seaopt.errors import ControlError, FileError
 from seaopt.files import plain
 from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import STRICT
@@ -158,16 +159,16 @@ def test_the_file_has_what_the_code_needs(controller, tmp_path):
         export(source, tmp_path / folder, name="law", derate=True)
     code = [(tmp_path / folder / "law.c").read_text() for folder in "ab"]
     assert code[0] == code[1]
-    assert HeatGuard.from_dict(content["heat"]["guard"]) == controller.heat_guard
+    assert from_content(HeatGuard, content["heat"]["guard"], "heat.guard", remedy="") == controller.heat_guard
     assert f"({continuous_current():.4g} A)" in repr(controller)
     for change in ({"ambient": 80.0}, {"winding": 0.4}, {"to_air": 1.0}):  # of the network, which the guard then is not
         with pytest.raises(FileError, match=r"heat\.guard"):
             export(content | {"heat": content["heat"] | change}, tmp_path / "c", derate=True)
     for change in ({"winding": 0.0}, {"case": "?"}):
-        with pytest.raises(PlantError, match=next(iter(change))):
+        with pytest.raises(FileError, match=next(iter(change))):
             export(content | {"heat": content["heat"] | change}, tmp_path / "c", derate=True)
     content["heat"]["guard"]["b_1"] = None
-    with pytest.raises(ControlError, match="b_1"):
+    with pytest.raises(FileError, match="b_1"):
         export(content, tmp_path / "c", derate=True)
 
 
