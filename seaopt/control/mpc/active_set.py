@@ -38,22 +38,11 @@ Ending = Literal["solved", "maximum iterations reached", "the bounds contradict 
 
 
 @record(eq=False)
-class Nearest:
-    """What the search ends with.
+class Solution:
+    """A point, where its rows are held, how the search ended, and the rows taken in or let go after the start."""
 
-    Parameters
-    ----------
-    point : array, shape (n,)
-    sides : array of int, shape (m,)
-        1: the row is held at its high end, -1: at its low one, 0: at none. The next search starts here.
-    status : Ending
-    iterations : int
-        Rows taken in or let go after the start.
-
-    """
-
-    point: Float[np.ndarray, " n"]
-    sides: Int[np.ndarray, " m"]
+    x: Float[np.ndarray, " n"]
+    sides: Int[np.ndarray, " m"]  # 1: held at the high end, -1: at the low one, 0: not held; the next start
     status: Ending
     iterations: int
 
@@ -62,8 +51,7 @@ class Nearest:
 class _Held:
     """The nearest point on held rows, its multipliers, and Q with the upper triangle R of the rows' normals."""
 
-    rows: tuple[int, ...]
-    signs: tuple[int, ...]
+    sides: dict[int, int]  # by row
     point: Float[np.ndarray, " n"]
     dual: Float[np.ndarray, " k"]
     Q: Float[np.ndarray, "n n"]
@@ -77,45 +65,44 @@ class _Bounds:
     low: Float[np.ndarray, " m"]
     high: Float[np.ndarray, " m"]
 
-    def hold(self, rows: tuple[int, ...], signs: tuple[int, ...]) -> _Held:
-        """Return the point nearest to the start on which each row has its end: the high one where its sign is 1."""
-        k, at, inward = len(rows), list(rows), -np.array(signs, dtype=float)
-        normals = inward[:, None] * self.normals[at]
-        ends = inward * np.where(inward < 0.0, self.high[at], self.low[at])
+    def hold(self, sides: dict[int, int]) -> _Held:
+        """Return the point nearest to the start on which each row has its end: the high one where its side is 1."""
+        rows, inward = list(sides), -np.array(list(sides.values()), dtype=float)
+        normals = inward[:, None] * self.normals[rows]
+        ends = inward * np.where(inward < 0.0, self.high[rows], self.low[rows])
         Q, tall = np.linalg.qr(normals.T, mode="complete")
-        R = tall[:k]
+        R = tall[: len(rows)]
         w = np.linalg.solve(R.T, ends - normals @ self.start)
-        return _Held(rows=rows, signs=signs, point=self.start + Q[:, :k] @ w, dual=np.linalg.solve(R, w), Q=Q, R=R)
+        return _Held(sides=sides, point=self.start + Q[:, : len(rows)] @ w, dual=np.linalg.solve(R, w), Q=Q, R=R)
 
     def let_go(self, state: _Held, j: int) -> _Held:
         """Return what holds without the j-th of the held rows."""
-        return self.hold(state.rows[:j] + state.rows[j + 1 :], state.signs[:j] + state.signs[j + 1 :])
+        row = list(state.sides)[j]
+        return self.hold({each: side for each, side in state.sides.items() if each != row})
 
     def find_broken(self, state: _Held) -> tuple[int, int, float]:
         """Return the row that is broken most, its side, and by how much."""
         values = self.normals @ state.point
         broken = np.maximum(values - self.high, self.low - values)
-        broken[list(state.rows)] = 0.0
+        broken[list(state.sides)] = 0.0
         row = int(np.argmax(broken))
         return row, 1 if values[row] > self.high[row] else -1, float(broken[row])
 
-    def take_in(self, state: _Held, row: int, sign: int, broken: float, most: int) -> tuple[_Held, Ending, int]:
+    def take_in(self, state: _Held, row: int, side: int, broken: float, most: int) -> tuple[_Held, Ending, int]:
         """Return what holds with a broken row, once the rows that are in its way are let go; in `most` changes."""
         dual = state.dual
         for used in range(1, most + 1):
-            k = len(state.rows)
-            d = state.Q.T @ (-sign * self.normals[row])
+            k = len(state.sides)
+            d = state.Q.T @ (-side * self.normals[row])
             share, remaining = np.linalg.solve(state.R, d[:k]), float(d[k:] @ d[k:])
             ratios = np.where(share > 0.0, dual / np.where(share > 0.0, share, 1.0), np.inf)
-            partial, full = (
-                float(np.min(ratios, initial=np.inf)),
-                broken / remaining if remaining > DEPENDENT else np.inf,
-            )
+            partial = float(np.min(ratios, initial=np.inf))
+            full = broken / remaining if remaining > DEPENDENT else np.inf
             step = min(partial, full)
             if step == np.inf:
                 return state, INFEASIBLE, used
             if full <= partial:
-                return self.hold((*state.rows, row), (*state.signs, sign)), SOLVED, used
+                return self.hold({**state.sides, row: side}), SOLVED, used
             j = int(np.argmin(ratios))
             dual, broken = np.delete(dual - step * share, j), broken - (step * remaining if full < np.inf else 0.0)
             state = self.let_go(state, j)
@@ -129,34 +116,33 @@ def find_nearest(
     high: Float[np.ndarray, " m"],
     sides: Int[np.ndarray, " m"],
     max_iterations: int,
-) -> Nearest:
+) -> Solution:
     """Return the point nearest to `start` within bounds.
 
     `low`, `high`: their bounds, low <= high: of a row that is held at one end the other is not looked at. `sides`:
-    where rows are held to begin with, as `Nearest.sides`; the held ones are linearly independent. `max_iterations`:
+    where rows are held to begin with, as `Solution.sides`; the held ones are linearly independent. `max_iterations`:
     changes of the held rows at most, besides the rows that are let go at the start.
 
     Examples
     --------
     >>> high = np.array([2.0, 2.0])
-    >>> found = find_nearest(np.array([3.0, 1.0]), np.eye(2), -high, high, np.zeros(2, int), max_iterations=10)
-    >>> found.point.tolist(), found.sides.tolist(), found.status
+    >>> nearest = find_nearest(np.array([3.0, 1.0]), np.eye(2), -high, high, np.zeros(2, int), max_iterations=10)
+    >>> nearest.x.tolist(), nearest.sides.tolist(), nearest.status
     ([2.0, 1.0], [1, 0], 'solved')
 
     """
     bounds = _Bounds(start=start, normals=normals, low=low, high=high)
-    at = np.flatnonzero(sides)
-    state = bounds.hold(tuple(at.tolist()), tuple(sides[at].tolist()))
+    state = bounds.hold({row: side for row, side in enumerate(sides.tolist()) if side})
     while np.min(state.dual, initial=0.0) < 0.0:
         state = bounds.let_go(state, int(np.argmin(state.dual)))
     status: Ending = SOLVED
     iterations, tolerance = 0, TOLERANCE * (1.0 + float(np.max(np.abs(normals @ start))))
     while status == SOLVED:
-        row, sign, broken = bounds.find_broken(state)
+        row, side, broken = bounds.find_broken(state)
         if not broken > tolerance:
             break
-        state, status, used = bounds.take_in(state, row, sign, broken, max_iterations - iterations)
+        state, status, used = bounds.take_in(state, row, side, broken, max_iterations - iterations)
         iterations += used
     ended = np.zeros_like(sides)
-    ended[list(state.rows)] = state.signs
-    return Nearest(point=state.point, sides=ended, status=status, iterations=iterations)
+    ended[list(state.sides)] = list(state.sides.values())
+    return Solution(x=state.point, sides=ended, status=status, iterations=iterations)

@@ -19,7 +19,7 @@ Every matrix is public: a step is two products of small matrices, as easily writ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -191,13 +191,22 @@ class Estimator:
 
     def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
         """Process one sample: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
+        applied = self.list_acting(np.vstack([state.past, u]))
+        return self.go_on(state, u, *self.correct(state, y, applied))
+
+    def go_on(
+        self,
+        state: EstimatorState,
+        u: Float[np.ndarray, " nu"],
+        corrected: Float[np.ndarray, " n"],
+        innovation: Float[np.ndarray, " ny"],
+    ) -> EstimatorState:
+        """Return the state after a sample: the inputs u commanded at it, and what `correct` gave."""
         line = np.vstack([state.past, u])
-        applied = self.list_acting(line)
-        corrected, innovation = self.correct(state, y, applied)
         return EstimatorState(
             predicted=self.advance(corrected, line[0], line[1]),
             corrected=corrected,
-            applied=applied,
+            applied=self.list_acting(line),
             past=line[1:],
             innovation=innovation,
         )
@@ -328,10 +337,19 @@ def estimator(
         expm_with_derivatives(block * seconds, np.zeros((0, nx + nu, nx + nu)))[0]
         for seconds in (sample_time_s, sample_time_s - rest_s)
     )
-    disturbances = _disturbances_of(plant, noise, sample_time_s)
-    A, total, Q = _augment(whole[:nx, :nx], whole[:nx, nx:], disturbances)
-    B = np.vstack([part[:nx, nx:], np.zeros((len(disturbances), nu))])  # acts from when it has arrived
-    columns = [column for column, _, _ in disturbances]
+    inputs = list(plant.inputs)
+    kinds = (noise.input_noise, 0.0, 1.0 / sample_time_s), (noise.input_drift, 1.0, sample_time_s)
+    disturbances = [  # input, pole (of white noise 0, of a walk 1), variance over one sample
+        (inputs.index(name), pole, density**2 * per)
+        for levels, pole, per in kinds
+        for name, density in levels.items()
+        if density > 0.0
+    ]
+    columns, poles, variances = (list(each) for each in zip(*disturbances, strict=True))
+    below = np.zeros((len(disturbances), nx + nu))
+    A = np.block([[whole[:nx, :nx], whole[:nx, nx:][:, columns]], [below[:, :nx], np.diag(poles)]])
+    total, B = (np.vstack([each[:nx, nx:], below[:, nx:]]) for each in (whole, part))  # B acts once it has arrived
+    Q = np.diag([0.0] * nx + variances)
     rows = [list(plant.outputs).index(name) for name in chosen]
     C, D = np.hstack([c, d[:, columns]])[rows], d[rows]
     R = np.diag([noise.sensor_std[name] ** 2 for name in chosen])
@@ -429,50 +447,27 @@ def run_recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> F
     return x
 
 
-def _disturbances_of(plant: Plant, noise: NoiseModel, sample_time_s: float) -> list[tuple[int, float, float]]:
-    """Return (input, pole, variance over one sample) of each disturbance: white ones have pole 0, walks pole 1."""
-    inputs, root = list(plant.inputs), np.sqrt(sample_time_s)
-    white = [(inputs.index(name), 0.0, (s / root) ** 2) for name, s in noise.input_noise.items() if s > 0.0]
-    return white + [(inputs.index(name), 1.0, (s * root) ** 2) for name, s in noise.input_drift.items() if s > 0.0]
-
-
-def _augment(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, "nx nu"], disturbances: list[tuple[int, float, float]]
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n nu"], Float[np.ndarray, "n n"]]:
-    """Return A, B and Q of the plant with its disturbances as states."""
-    nx, count = len(a), len(disturbances)
-    A, Q = np.zeros((nx + count, nx + count)), np.zeros((nx + count, nx + count))
-    A[:nx, :nx] = a
-    for i, (column, pole, variance) in enumerate(disturbances, start=nx):
-        A[:nx, i], A[i, i], Q[i, i] = b[:, column], pole, variance
-    return A, np.vstack([b, np.zeros((count, b.shape[1]))]), Q
-
-
 def _list_estimates(
     plant: Plant,
     params: CompletedParameters,
     matrices: tuple[Any, Any, Any, Any],
-    disturbances: list[tuple[int, float, float]],
+    disturbances: Sequence[tuple[int, float, float]],
 ) -> tuple[tuple[str, ...], tuple[str, ...], Float[np.ndarray, "nz n"], Float[np.ndarray, "nz nu"]]:
     """Return names, units, G and H of everything that is estimated."""
     a, b, c, d = matrices
     nx, nu = b.shape
-    columns = [column for column, _, _ in disturbances]
-    units = dict(plant.outputs)
-    rows = {name: (c[i], d[i]) for i, name in enumerate(plant.outputs)}
-    for i, (name, unit) in enumerate(plant.states.items()):
-        if name not in rows:
-            rows[name], units[name] = (np.eye(nx)[i], np.zeros(nu)), unit
+    none = np.zeros(nu)
+    rows = {name: (c[i], d[i], unit) for i, (name, unit) in enumerate(plant.outputs.items())}
+    for row, (name, unit) in zip(np.eye(nx), plant.states.items(), strict=True):
+        rows.setdefault(name, (row, none, unit))
     if plant.spring is not None:
         row, unit = deflection_row(plant, params), plant.spring.unit
-        rows |= {"spring_deflection": (row, np.zeros(nu)), "spring_rate": (row @ a, row @ b)}
-        units |= {"spring_deflection": unit, "spring_rate": f"{unit}/s"}
-    count = len(disturbances)
-    wide = {name: (np.concatenate([x, u[columns]]), u) for name, (x, u) in rows.items()}
-    for i, (column, pole, _) in enumerate(disturbances, start=nx):
+        rows |= {"spring_deflection": (row, none, unit), "spring_rate": (row @ a, row @ b, f"{unit}/s")}
+    columns = [column for column, _, _ in disturbances]
+    wide = {name: (np.concatenate([x, u[columns]]), u, unit) for name, (x, u, unit) in rows.items()}
+    for row, (column, pole, _) in zip(np.eye(nx + len(columns))[nx:], disturbances, strict=True):
         if pole == 1.0:
-            name = list(plant.inputs)[column]
-            wide[f"{name}_drift"] = (np.eye(nx + count)[i], np.zeros(nu))
-            units[f"{name}_drift"] = plant.inputs[name]
-    G, H = (np.array([pair[k] for pair in wide.values()]) for k in (0, 1))
-    return tuple(wide), tuple(units[name] for name in wide), G, H
+            name, unit = list(plant.inputs.items())[column]
+            wide[f"{name}_drift"] = (row, none, unit)
+    G, H, units = zip(*wide.values(), strict=True)
+    return tuple(wide), units, np.array(G), np.array(H)

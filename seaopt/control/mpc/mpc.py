@@ -50,6 +50,7 @@ from seaopt.control.loops.sampled_plant import (
 )
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
+from seaopt.control.mpc.force_plant import ForcePlant
 from seaopt.control.mpc.knots import interpolate_knots, spread_knots
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.output_bounds import SLACK_UNIT, bound_outputs
@@ -68,7 +69,7 @@ from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
-from seaopt.plants import CompletedParameters, Plant, state_space
+from seaopt.plants import Plant, state_space
 from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
@@ -297,7 +298,7 @@ class ForceMPC(LoopDelays, Result, Worded):
             status, age, sides = "sensor fault", self.spec.samples, np.zeros_like(sides)
             planned = np.full(shifted.size, self.gate.ramp(last, self.spec.sample_time_s))
         current = self.admissible(float(planned[0]), last)
-        kalman = self._advance(state.kalman, corrected, innovation, current)
+        kalman = self._command(state.kalman, corrected, innovation, current)
         return MPCStep(
             current_A=current,
             solved=not status,
@@ -391,53 +392,44 @@ class ForceMPC(LoopDelays, Result, Worded):
         broken = "" if outside <= VIOLATION else f"solution breaks a limit by {outside:.1%} of it"
         return f"{UNFINISHED}, {broken}" if broken and solution.status == UNFINISHED else broken
 
-    def _advance(
+    def _command(
         self,
         kalman: EstimatorState,
         corrected: Float[np.ndarray, " n"],
         innovation: Float[np.ndarray, " 1"],
         current: float,
     ) -> EstimatorState:
-        u = np.zeros(self.kalman.B.shape[1])
-        u[0] = current
-        line = np.vstack([kalman.past, u])
-        return EstimatorState(
-            predicted=self.kalman.advance(corrected, line[0], line[1]),
-            corrected=corrected,
-            applied=self.kalman.list_acting(line),
-            past=line[1:],
-            innovation=innovation,
-        )
+        """Return the filter's state after a sample at which a current was commanded."""
+        return self.kalman.go_on(kalman, current * np.eye(self.kalman.B.shape[1])[0], corrected, innovation)
 
     def unlimited(self) -> Law:
         """Return what the controller is as long as no limit is active: from reference and measurement to current."""
         gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.command_limit
-        n, delay, b, late = len(self.kalman.A), self.kalman.delay_samples, self.kalman.B[:, 0], self.kalman.late[:, 0]
-        past = max(delay + bool(np.any(late)), 1)  # commands that still act, of which the last is one
+        rest, kalman, start = self.rest, self.kalman, self.kalman.start
+        n, delay = len(kalman.A), kalman.delay_samples
+        acting = max(delay + bool(np.any(kalman.late)), 1)  # commands that still act, of which the last is one
 
-        def respond(s: Float[np.ndarray, " k"], r: float, y: float) -> Float[np.ndarray, " k1"]:
-            z, line = s[:n], np.concatenate([np.zeros(delay + 1 - past), s[n:]])
-            corrected = z + self.kalman.gain[:, 0] * (y - self.kalman.C[0] @ z)
-            ahead = corrected
-            for older, newer in pairwise(line):
-                ahead = self.kalman.A @ ahead + b * newer + late * older
+        def respond(inputs: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k1"]:
+            """Return z and the acting commands a sample later, and the current, from z, commands, reference, force."""
+            z, past, (r, y) = inputs[:n], start.past.copy(), inputs[-2:]
+            past[delay + 1 - acting :, 0] = inputs[n:-2]
+            state = replace(start, predicted=z, past=past)
+            corrected, innovation, ahead = self._observe(state, y)
             u_s = r / self.static_gain - ahead[-1]
-            xi = ahead[: self.rest.size] - self.rest * r / self.static_gain
-            current = u_s + gains @ np.append(xi, line[-1] - u_s)
-            queue = np.append(line, current)
-            after = self.kalman.A @ corrected + b * queue[1] + late * queue[0]
-            return np.concatenate([after, queue[-past:], [current]])
+            current = u_s + gains @ np.append(ahead[: rest.size] - rest * r / self.static_gain, past[-1, 0] - u_s)
+            after = self._command(state, corrected, innovation, current)
+            return np.concatenate([after.predicted, after.past[delay + 1 - acting :, 0], [current]])
 
-        size = n + past
-        whole = np.column_stack(
-            [
-                *[respond(e, 0.0, 0.0) for e in np.eye(size)],
-                respond(np.zeros(size), 1.0, 0.0),
-                respond(np.zeros(size), 0.0, 1.0),
-            ]
+        size = n + acting
+        offset = respond(np.zeros(size + 2))
+        whole = np.column_stack([respond(unit) - offset for unit in np.eye(size + 2)])
+        return Law(
+            a=whole[:size, :size],
+            b=whole[:size, size:],
+            c=whole[size, :size],
+            d=whole[size, size:],
+            sample_time_s=self.spec.sample_time_s,
         )
-        a, c = whole[:size, :size], whole[size, :size]
-        return Law(a=a, b=whole[:size, size:], c=c, d=whole[size, size:], sample_time_s=self.spec.sample_time_s)
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
         """Return the loop around a plant while no limit is active; its figures are in newtons of motor force.
@@ -542,14 +534,13 @@ def _design(
     digital = sample(plant, completed, spec.measured, 1.0, spec.sample_time_s, 0)
     limit = limit_command(spec, plant, completed)
     gain = _static_gain(plant, digital, spec, limit)
+    drive = next(iter(plant.inputs))
     noise = spec.noise or NoiseModel(
-        sensor_std={spec.measured: SENSOR * abs(gain)},
-        input_noise={_drive(plant): 1.0},
-        input_drift={_drive(plant): 3.0},
+        sensor_std={spec.measured: SENSOR * abs(gain)}, input_noise={drive: 1.0}, input_drift={drive: 3.0}
     )
-    if not noise.input_drift.get(_drive(plant), 0.0) > 0.0 or len(noise.input_drift) > 1:
+    if not noise.input_drift.get(drive, 0.0) > 0.0 or len(noise.input_drift) > 1:
         raise ControlError(
-            f"noise: input_drift must be of {_drive(plant)} alone and above zero, for it takes the force's offset away"
+            f"noise: input_drift must be of {drive} alone and above zero, for it takes the force's offset away"
         )
     kalman = estimator(
         plant,
@@ -559,14 +550,23 @@ def _design(
         sample_time_s=spec.sample_time_s,
         delay_samples=spec.loop_delay_samples,
     )
-    a, c, nx = digital.a, digital.c, digital.b.size
-    b, late = kalman.B[:nx, 0], kalman.late[:nx, 0]
-    weighted = c + spec.lag_s * _rate(plant, completed, spec.measured)
-    regulator = tune_regulator(a, b, late, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
+    nx = digital.b.size
+    a, _, c, _ = state_space(plant, completed)
+    rate = c[list(plant.outputs).index(spec.measured)] @ a  # of the force, without the current's own part
+    sampled = ForcePlant(
+        a=digital.a,
+        b=kalman.B[:nx, 0],
+        late=kalman.late[:nx, 0],
+        c=digital.c,
+        w=digital.c + spec.lag_s * rate,
+        gain=gain,
+        sample_time_s=spec.sample_time_s,
+    )
+    regulator = tune_regulator(sampled, spec.bandwidth_hz)
     knots = spread_knots(spec.samples, spec.moves)
-    outputs = bound_outputs(spec.bounds, kalman, a, b, late, interpolate_knots(knots), limit)
+    outputs = bound_outputs(spec.bounds, kalman, sampled, interpolate_knots(knots), limit)
     preview = max(spec.preview_samples - kalman.delay_samples, 0)
-    prediction = condense(a, b, late, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A, preview, outputs)
+    prediction = condense(sampled, regulator, knots, limit, spec.slew_per_sample_A, preview, outputs)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
         spec=spec,
@@ -575,22 +575,12 @@ def _design(
         regulator=regulator,
         prediction=prediction,
         static_gain=gain,
-        rest=np.linalg.solve(np.eye(nx) - a, digital.b),
+        rest=np.linalg.solve(np.eye(nx) - digital.a, digital.b),
         shift=shift,
         solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate,
         warnings=warnings,
     )
-
-
-def _rate(plant: Plant, params: CompletedParameters, measured: str) -> Float[np.ndarray, " nx"]:
-    """Return the row that gives the measured output's time derivative, without the current's own part."""
-    a, _, c, _ = state_space(plant, params)
-    return c[list(plant.outputs).index(measured)] @ a
-
-
-def _drive(plant: Plant) -> str:
-    return next(iter(plant.inputs))
 
 
 def limit_command(spec: MPCSpec, plant: Plant, values: ParameterSet) -> float:

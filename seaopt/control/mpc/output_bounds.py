@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.mpc.estimator import Estimator
+from seaopt.control.mpc.force_plant import ForcePlant
 from seaopt.control.mpc.knots import spread_knots
 from seaopt.errors import ControlError, suggestion
 from seaopt.records import record
@@ -49,15 +50,10 @@ class OutputBounds:
         """At how many samples of the horizon each signal is held."""
         return len(self.free) // len(self.names) if self.names else 0
 
-    @property
-    def slacks(self) -> Float[np.ndarray, "km k"]:
-        """Which signal's slack each row has, one column per signal."""
-        return SLACK_UNIT * np.repeat(np.eye(len(self.names)), self.samples, axis=0)
-
     def rows(self) -> Float[np.ndarray, "r nv"]:
         """Return the rows of the program, over knots and slacks: upper ends, lower ends, slacks."""
         k, n = len(self.names), self.forced.shape[1]
-        slack = self.slacks
+        slack = SLACK_UNIT * np.repeat(np.eye(k), self.samples, axis=0)  # one column per signal
         return np.block([[self.forced, -slack], [self.forced, slack], [np.zeros((k, n)), np.eye(k)]])
 
     def limits(
@@ -89,42 +85,21 @@ class OutputBounds:
         return (low, high) if low <= high else (middle, middle)
 
 
-def go_on(
-    a: Float[np.ndarray, "nx nx"],
-    b: Float[np.ndarray, " nx"],
-    late: Float[np.ndarray, " nx"],
-    free: Float[np.ndarray, "nx nx1"],
-    forced: Float[np.ndarray, "nx samples"],
-    j: int,
-) -> tuple[Float[np.ndarray, "nx nx1"], Float[np.ndarray, "nx samples"]]:
-    """Return the state at sample j + 1, as shares of the start (state, last command) and of the commands, from j's."""
-    free, forced = a @ free, a @ forced
-    forced[:, j] += b
-    if j:
-        forced[:, j - 1] += late
-    else:
-        free[:, -1] += late
-    return free, forced
-
-
 def bound_outputs(
     bounds: Mapping[str, tuple[float, float]],
     kalman: Estimator,
-    a: Float[np.ndarray, "nx nx"],
-    b: Float[np.ndarray, " nx"],
-    late: Float[np.ndarray, " nx"],
+    plant: ForcePlant,
     W: Float[np.ndarray, "samples n"],
     limit: float,
 ) -> OutputBounds:
     """Return the rows of bounds by name.
 
-    `bounds`: of outputs and states of the plant, deflection and rate of its spring, in their units. `a`, `b`, `late`:
-    the sampled plant, and what the command before adds. `W`: from the knots to the command at each sample of the
-    horizon. `limit`: of the command, the unit of the knots.
+    `bounds`: of outputs and states of the plant, deflection and rate of its spring, in their units. `W`: from the knots
+    to the command at each sample of the horizon. `limit`: of the command, the unit of the knots.
 
     Raises ControlError: a name is not one of the estimates.
     """
-    nx, N = b.size, len(W)
+    nx, N = plant.b.size, len(W)
     available = [name for name, row in zip(kalman.names, kalman.G, strict=True) if np.any(row[:nx])]
     for name in bounds:
         if name not in available:
@@ -133,26 +108,18 @@ def bound_outputs(
             )
     rows = [kalman.names.index(name) for name in bounds]
     C, D = kalman.G[rows][:, :nx], kalman.H[rows, 0]
+    direct = (D != 0.0)[:, None]
     ends = np.array(list(bounds.values()), dtype=float).reshape(-1, 2)
     half = 0.5 * (ends[:, 1] - ends[:, 0])
-    at = set(spread_knots(N, min(BOUND_SAMPLES, N)).tolist())
-    free, forced = np.eye(nx, nx + 1), np.zeros((nx, N))
-    frees: list[Float[np.ndarray, "k nx1"]] = []
-    forces: list[Float[np.ndarray, "k n"]] = []
-    for j in range(N):  # a signal that the command reaches at once is held at j, with mu_j; another one sample later
-        now = C @ forced + np.outer(D, np.eye(N)[j])
-        free_now = C @ free
-        free, forced = go_on(a, b, late, free, forced, j)
-        direct = (D != 0.0)[:, None]
-        if j in at:
-            frees.append(np.where(direct, free_now, C @ free))
-            forces.append(limit * np.where(direct, now, C @ forced) @ W)
-    scale = half[:, None, None]
+    states, at = list(plant.respond(N)), np.unique(spread_knots(N, min(BOUND_SAMPLES, N))).tolist()
+    # A signal that the command reaches at once is held at j, with mu_j; another one sample later.
+    free = [np.where(direct, C @ states[j][0], C @ states[j + 1][0]) for j in at]
+    forced = [np.where(direct, C @ states[j][1] + np.outer(D, np.eye(N)[j]), C @ states[j + 1][1]) @ W for j in at]
     return OutputBounds(
         names=tuple(bounds),
         middle=ends.mean(axis=1),
         half=half,
-        static=(C @ np.linalg.solve(np.eye(nx) - a, b + late) + D) / half,
-        free=(np.stack(frees, axis=1) / scale).reshape(-1, nx + 1),
-        forced=(np.stack(forces, axis=1) / scale).reshape(-1, W.shape[1]),
+        static=(C @ np.linalg.solve(np.eye(nx) - plant.a, plant.b + plant.late) + D) / half,
+        free=(np.stack(free, axis=1) / half[:, None, None]).reshape(-1, nx + 1),
+        forced=(limit * np.stack(forced, axis=1) / half[:, None, None]).reshape(-1, W.shape[1]),
     )

@@ -30,8 +30,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.control.mpc.force_plant import ForcePlant
 from seaopt.control.mpc.knots import interpolate_knots
-from seaopt.control.mpc.output_bounds import OutputBounds, go_on
+from seaopt.control.mpc.output_bounds import OutputBounds
 from seaopt.errors import ControlError
 from seaopt.records import record
 
@@ -69,70 +70,51 @@ class HorizonProgram:
     rows: Float[np.ndarray, "r nv"]
 
 
-def solve_regulator(
-    a: Float[np.ndarray, "nx nx"],
-    b: Float[np.ndarray, " nx"],
-    late: Float[np.ndarray, " nx"],
-    w: Float[np.ndarray, " nx"],
-    gain: float,
-    rho: float,
-) -> Regulator:
-    """Return the linear-quadratic regulator of w xi over `gain` and current increments."""
+def solve_regulator(plant: ForcePlant, rho: float) -> Regulator:
+    """Return the linear-quadratic regulator of w xi over the gain, and of the current's increments."""
     from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
 
-    nx = b.size
-    A, B = np.eye(nx + 1), np.append(b, 1.0)[:, None]
-    A[:nx, :nx], A[:nx, nx] = a, b + late
-    row = np.append(w / gain, 0.0)
+    A, b = plant.add_command()
+    row = np.append(plant.w / plant.gain, 0.0)
     try:
-        Pi = np.asarray(solve_discrete_are(A, B, np.outer(row, row), np.array([[rho]])))
+        Pi = np.asarray(solve_discrete_are(A, b[:, None], np.outer(row, row), np.array([[rho]])))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ControlError(
             f"the plant has a mode that the current cannot steer ({error}); design on another, such as the stand"
         ) from error
-    K = (B.T @ Pi @ A / (rho + B.T @ Pi @ B))[0]
-    return Regulator(rho=rho, K_x=K[:nx], K_u=float(K[nx]), Pi=Pi)
+    K = b @ Pi @ A / (rho + b @ Pi @ b)
+    return Regulator(rho=rho, K_x=K[:-1], K_u=float(K[-1]), Pi=Pi)
 
 
-def tune_regulator(
-    a: Float[np.ndarray, "nx nx"],
-    b: Float[np.ndarray, " nx"],
-    late: Float[np.ndarray, " nx"],
-    c: Float[np.ndarray, " nx"],
-    w: Float[np.ndarray, " nx"],
-    gain: float,
-    bandwidth_hz: float,
-    sample_time_s: float,
-) -> Regulator:
+def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
     """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by a search for rho."""
     from scipy.optimize import brentq  # deferred: scipy is slow to load
 
-    nx = b.size
-    resting = np.linalg.solve(np.eye(nx) - a, b + late) / gain  # x_s per newton
-    A = np.block([[a, (b + late)[:, None]], [np.zeros((1, nx)), np.eye(1)]])
-    B, row = np.append(b, 1.0), np.append(c, 0.0)
+    A, b = plant.add_command()
+    rest = np.linalg.solve(np.eye(plant.b.size) - plant.a, plant.b + plant.late) / plant.gain  # x_s per newton
     below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
 
-    def tracking(candidate: Regulator, f: Float[np.ndarray, " m"] = below[-1:]) -> Float[np.ndarray, " m"]:
+    def tracking(candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
-        z = np.exp(2j * np.pi * f * sample_time_s)[:, None, None]
-        drive = (B * (candidate.K_x @ resting + candidate.K_u / gain)).astype(complex)[:, None]
-        closed = A - np.outer(B, np.append(candidate.K_x, candidate.K_u))
-        return np.abs(np.linalg.solve(z * np.eye(nx + 1) - closed, drive)[:, :, 0] @ row)
+        z = np.exp(2j * np.pi * f * plant.sample_time_s)[:, None, None]
+        drive = (b * (candidate.K_x @ rest + candidate.K_u / plant.gain)).astype(complex)[:, None]
+        closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))
+        return np.abs(np.linalg.solve(z * np.eye(b.size) - closed, drive)[:, :, 0] @ np.append(plant.c, 0.0))
 
     def excess(log_rho: float) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth; it falls with the weight."""
-        return float(np.log(tracking(solve_regulator(a, b, late, w, gain, float(np.exp(log_rho))))[0] / HALF_POWER))
+        return float(np.log(tracking(solve_regulator(plant, float(np.exp(log_rho))), below[-1:])[0] / HALF_POWER))
 
-    low, high = (float(np.log(w)) for w in WEIGHTS)
+    low, high = np.log(WEIGHTS).tolist()
     if excess(low) < 0.0:
         raise ControlError(
-            f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / sample_time_s:g} Hz; lower it"
+            f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / plant.sample_time_s:g} Hz; lower "
+            "it"
         )
     if excess(high) > 0.0:
         raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
     root: Any = brentq(excess, low, high, xtol=1e-12)
-    regulator = solve_regulator(a, b, late, w, gain, float(np.exp(root)))
+    regulator = solve_regulator(plant, float(np.exp(root)))
     dips = np.flatnonzero(tracking(regulator, below) < 0.99 * HALF_POWER)
     if dips.size:
         raise ControlError(
@@ -143,11 +125,7 @@ def tune_regulator(
 
 
 def condense(
-    a: Float[np.ndarray, "nx nx"],
-    b: Float[np.ndarray, " nx"],
-    late: Float[np.ndarray, " nx"],
-    w: Float[np.ndarray, " nx"],
-    gain: float,
+    plant: ForcePlant,
     regulator: Regulator,
     knots: Int[np.ndarray, " n"],
     limit: float,
@@ -161,35 +139,28 @@ def condense(
     samples besides the last.
     """
     W = interpolate_knots(knots)
-    N, nx = len(W), b.size
-    free, forced = np.eye(nx, nx + 1), np.zeros((nx, N))  # xi_j = free [xi_0, mu_-1] + forced mu
-    hessian, cross, ahead = np.zeros((N, N)), np.zeros((N, nx + 1)), np.zeros((N, N))
-    for j in range(N):
-        row, start = w @ forced / gain, w @ free / gain
-        hessian += np.outer(row, row)
-        cross += np.outer(row, start)
-        ahead[:, j] = -row / gain
-        free, forced = go_on(a, b, late, free, forced, j)
+    N, n, size = len(W), knots.size, plant.b.size + 1
+    *states, (free, forced) = plant.respond(N)  # xi_j = free [xi_0, mu_-1] + forced mu
+    rows = np.array([plant.w @ each / plant.gain for _, each in states])
+    starts = np.array([plant.w @ each / plant.gain for each, _ in states])
     step = np.eye(N) - np.eye(N, k=-1)  # mu_j - mu_{j-1}, of which the first has mu_-1
-    hessian += regulator.rho * step.T @ step
-    cross[0, nx] -= regulator.rho
-    end = np.vstack([forced, np.eye(N)[-1]])
-    begin = np.zeros((nx + 1, nx + 1))
-    begin[:nx] = free
-    hessian += end.T @ regulator.Pi @ end
-    cross += end.T @ regulator.Pi @ begin
-    H, F, R = limit**2 * W.T @ hessian @ W, limit * W.T @ cross, limit * W.T @ ahead[:, :known]
-    scale = knots.size / float(np.trace(H))
-    steps = np.diff(knots, prepend=knots[0] - 1)
-    slopes = (np.eye(knots.size) - np.eye(knots.size, k=-1)) * limit / (slew_per_sample * steps)[:, None]
-    M = slopes if np.isfinite(slew_per_sample) else slopes[:0]
-    limits = np.vstack([np.eye(knots.size), M])
+    end, begin = np.vstack([forced, np.eye(N)[-1]]), np.vstack([free, np.zeros(size)])
+    hessian = rows.T @ rows + regulator.rho * step.T @ step + end.T @ regulator.Pi @ end
+    cross = rows.T @ starts + end.T @ regulator.Pi @ begin
+    cross[0, -1] -= regulator.rho
+    H, F, R = limit**2 * W.T @ hessian @ W, limit * W.T @ cross, -limit * W.T @ rows.T[:, :known] / plant.gain
+    scale = n / float(np.trace(H))
+    slopes = np.zeros((0, n))
+    if np.isfinite(slew_per_sample):
+        steps = np.diff(knots, prepend=knots[0] - 1)
+        slopes = (np.eye(n) - np.eye(n, k=-1)) * limit / (slew_per_sample * steps)[:, None]
+    limits = np.vstack([np.eye(n), slopes])
     slackless = np.zeros((len(limits), len(outputs.names)))
     return HorizonProgram(
         knots=knots,
         H=0.5 * (H + H.T) * scale,
         F=F * scale,
-        M=M,
+        M=slopes,
         R=R * scale,
         outputs=outputs,
         rows=np.vstack([np.hstack([limits, slackless]), outputs.rows()]),

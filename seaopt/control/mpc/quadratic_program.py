@@ -9,10 +9,12 @@ furthest away.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.control.mpc.active_set import Ending, find_nearest
+from seaopt.control.mpc.active_set import Solution, find_nearest
 from seaopt.control.mpc.prediction import HorizonProgram
 from seaopt.records import record
 
@@ -25,16 +27,6 @@ def stack_hessian(prediction: HorizonProgram) -> Float[np.ndarray, "nv nv"]:
     """Return the Hessian over knots and slacks."""
     n, k = prediction.knots.size, len(prediction.outputs.names)
     return np.block([[prediction.H, np.zeros((n, k))], [np.zeros((k, n)), CURVATURE * np.eye(k)]])
-
-
-@record(eq=False)
-class Solution:
-    """Of a program: x, where its rows are held (as in `active_set.Nearest`), how the search ended, and its changes."""
-
-    x: Float[np.ndarray, " n"]
-    sides: Int[np.ndarray, " m"]
-    status: Ending
-    iterations: int
 
 
 @record(eq=False)
@@ -57,9 +49,7 @@ class QuadraticProgram:
         nearest = find_nearest(
             -self.inverse @ q, self.normals, low * self.scale, high * self.scale, sides, max_iterations
         )
-        return Solution(
-            x=self.inverse.T @ nearest.point, sides=nearest.sides, status=nearest.status, iterations=nearest.iterations
-        )
+        return replace(nearest, x=self.inverse.T @ nearest.x)
 
 
 def factor_program(hessian: Float[np.ndarray, "n n"], rows: Float[np.ndarray, "m n"]) -> QuadraticProgram:

@@ -1,0 +1,44 @@
+"""The sampled plant that a plan is made for, and what a start and commands make of its state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.records import record
+
+
+@record(eq=False)
+class ForcePlant:
+    """The plant x+ = A x + b u + b' u-, u- the command before, whose measured force is c x."""
+
+    a: Float[np.ndarray, "nx nx"]
+    b: Float[np.ndarray, " nx"]
+    late: Float[np.ndarray, " nx"]  # b', where the drive's delay leaves a part of a sample
+    c: Float[np.ndarray, " nx"]
+    w: Float[np.ndarray, " nx"]  # the row whose square the cost weighs: force and lag times its rate
+    gain: float  # N/A at rest
+    sample_time_s: float
+
+    def add_command(self) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+        """Return A and b of the plant with its last command as a state, driven by the command's increments."""
+        nx = self.b.size
+        A = np.eye(nx + 1)
+        A[:nx, :nx], A[:nx, nx] = self.a, self.b + self.late
+        return A, np.append(self.b, 1.0)
+
+    def respond(self, samples: int) -> Iterator[tuple[Float[np.ndarray, "nx nx1"], Float[np.ndarray, "nx samples"]]]:
+        """Yield the state at samples 0 to `samples`, by the start (state, last command) and by the commands."""
+        nx = self.b.size
+        free, forced = np.eye(nx, nx + 1), np.zeros((nx, samples))
+        yield free, forced
+        for j in range(samples):
+            free, forced = self.a @ free, self.a @ forced
+            forced[:, j] += self.b
+            if j:
+                forced[:, j - 1] += self.late
+            else:
+                free[:, -1] += self.late
+            yield free, forced
