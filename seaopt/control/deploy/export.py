@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +28,7 @@ from seaopt.control.deploy.c_text import (
     render,
     strip_markup,
 )
-from seaopt.control.deploy.schedule_export import export_schedule, is_schedule
+from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_schedule, is_schedule, read_runnable
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
@@ -37,8 +37,8 @@ from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.loops.compensation.link_feedforward import multiply_out
-from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE
-from seaopt.control.loops.compensation.terms import Compensation
+from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE, RippleTerm
+from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
@@ -120,68 +120,78 @@ def export(
     ['knee.h', 'knee.c', 'knee_gains.h', 'knee_gains.m']
 
     """
-    if isinstance(controller, ScheduledController) or (isinstance(controller, Mapping) and is_schedule(controller)):
+    if precision not in LARGEST_NUMBER:
+        raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
+    prefix = check_prefix(name)
+    check_folder(Path(folder))
+    check_command_limits(current_limit_A, command_limit)
+    require_type(derate, (bool, HeatGuard), "derate", "give True, False or a HeatGuard", ControlError)
+    limit = command_limit if current_limit_A is None else current_limit_A
+    if isinstance(controller, Mapping) and fit_met is None:
+        fit_met = controller.get("fit_met", True) is True
+    content = controller.to_dict() if isinstance(controller, ScheduledController) else controller
+    if isinstance(content, Mapping) and is_schedule(content):
         if gate or derate:
             raise ControlError(
                 f"{'gate' if gate else 'derate'}: is not exported with a schedule; leave it out, and check "
                 "the reading, or lower the command's limit, before the step"
             )
-        return export_schedule(
-            controller,
-            folder,
-            precision=precision,
-            name=name,
-            current_limit_A=current_limit_A,
-            command_limit=command_limit,
-            tracking_time_s=tracking_time_s,
-            allow_infeasible=allow_infeasible,
-            fit_met=fit_met,
-        )
-    if precision not in LARGEST_NUMBER:
-        raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
-    prefix = check_prefix(name)
-    check_folder(Path(folder))
-    if isinstance(controller, Controller):
-        stored = {field.name: getattr(controller, field.name) for field in fields(Controller)}
-        figures, heat = _figures(controller), controller.heat_guard
+        law, stored = read_runnable(content, limit, tracking_time_s)
+        templates, missed = SCHEDULE_TEMPLATES, "; ".join(content["broken"])
+        met, what, words = content["feasible"], "schedule", describe_schedule(content, law, stored, precision)
+        numbers: dict[str, dict[str, Any]] = {}
     else:
-        from seaopt.control.laws.stored import read_controller  # deferred: pydantic
-
-        if "mpc" in controller:
+        stored, figures, heat = _read(content)
+        templates, missed, met, what = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"
+        heat = derate if isinstance(derate, HeatGuard) else heat
+        if derate and heat is None:
             raise ControlError(
-                "the controller plans, and its law here is that of no active limit; write its C code with export_mpc, "
-                "or type seaopt export DIR"
+                "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that "
+                "is commanded a current"
             )
-        stored, figures, heat = read_controller(controller), _stated(controller), read_guard(controller)
-        fit_met = controller.get("fit_met", True) is True if fit_met is None else fit_met
-    if not stored["met"] and not allow_infeasible:
-        missed = join_labels(stored["active_constraints"])
-        raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
-    check_command_limits(current_limit_A, command_limit)
-    require_type(derate, (bool, HeatGuard), "derate", "give True, False or a HeatGuard", ControlError)
-    heat = derate if isinstance(derate, HeatGuard) else heat
-    if derate and heat is None:
-        raise ControlError(
-            "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that is "
-            "commanded a current"
+        command = stored["command"]
+        law = realise(
+            stored["law"],
+            per_effort=command.per_effort,
+            current_limit_A=choose_limit(command, stored["spec"], limit),
+            command=(command.input, command.unit),
+            tracking_time_s=tracking_time_s,
+            gate=stored["gate"] if gate is None else (gate or None),
+            heat=heat if derate else None,
+            compensation=stored["compensation"],
         )
-    limit = command_limit if current_limit_A is None else current_limit_A
-    believed: PlausibilityGate | None = stored["gate"] if gate is None else (gate or None)
-    law = _law(stored, limit, tracking_time_s, believed, heat if derate else None)
-    context = _describe(stored, law) | {
-        "achieved": figures,
-        "precision": precision,
+        words = _describe(stored, law) | {"achieved": figures}
+        writers = {".m": repr, ".h": literal(precision), ".c": literal(precision)}
+        numbers = {suffix: _numbers(stored, law, write, precision) for suffix, write in writers.items()}
+    if not met and not allow_infeasible:
+        raise ControlError(f"the {what} misses {missed}; tune one that does not, or allow an infeasible one")
+    context = words | {
         "name": prefix,
         "NAME": prefix.upper(),
+        "precision": precision,
         "fit_met": fit_met,
         "raised_from": strip_markup(find_raised_limit(stored["command"], stored["spec"], limit)),
     }
-    numbers = {".m": repr, ".h": literal(precision), ".c": literal(precision)}
     texts = {
-        pattern.format(prefix): render(template, context | _numbers(stored, law, numbers[pattern[-2:]], precision))
-        for pattern, template in TEMPLATES.items()
+        pattern.format(prefix): render(template, context | numbers.get(pattern[-2:], {}))
+        for pattern, template in templates.items()
     }
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+
+
+def _read(controller: Controller | Mapping[str, Any]) -> tuple[dict[str, Any], list[str], HeatGuard | None]:
+    """Return the fields of a controller, the lines on its figures, and its heat guard."""
+    if isinstance(controller, Controller):
+        stored = {field.name: getattr(controller, field.name) for field in fields(Controller)}
+        return stored, _figures(controller), controller.heat_guard
+    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+
+    if "mpc" in controller:
+        raise ControlError(
+            "the controller plans, and its law here is that of no active limit; write its C code with export_mpc, or "
+            "type seaopt export DIR"
+        )
+    return read_controller(controller), _stated(controller), read_guard(controller)
 
 
 def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard | None:
@@ -229,25 +239,6 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
     if len(parts) == len(FIGURES):
         return [f"{whence}: {', '.join(parts[:3])},", f"{', '.join(parts[3:])}."]
     return [f"{whence}: {', '.join(parts) or 'nothing that was measured'}."]
-
-
-def _law(
-    stored: Mapping[str, Any],
-    limit: float | None,
-    tracking_time_s: float | None,
-    gate: PlausibilityGate | None,
-    heat: HeatGuard | None,
-) -> RunnableLaw:
-    return realise(
-        stored["law"],
-        per_effort=stored["command"].per_effort,
-        current_limit_A=choose_limit(stored["command"], stored["spec"], limit),
-        command=(stored["command"].input, stored["command"].unit),
-        tracking_time_s=tracking_time_s,
-        gate=gate,
-        heat=heat,
-        compensation=stored["compensation"],
-    )
 
 
 def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
@@ -308,6 +299,7 @@ def _numbers(
         np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
     )
     others = [strip_markup(name) for name in _list_signals(stored)[1:]]
+    added = law.compensation or Compensation(sample_time_s=law.sample_time_s)
     units = name_gain_units(stored["command"])
     largest = float(LARGEST_NUMBER[precision])
     return {
@@ -349,11 +341,17 @@ def _numbers(
             for key, value in stored["gains"].items()
         ],
         "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
-        "friction": _write_friction(law.compensation, number),
-        "gravity": _write_gravity(law.compensation, number),
-        "ripple": _write_ripple(law.compensation, number),
-        "further": _list_further(law.compensation, others),
-        "resets": _list_resets(law.compensation, others),
+        "friction": {} if added.friction is None else _write_friction(added.friction, added.sample_time_s, number),
+        "gravity": {} if added.gravity is None else _write_gravity(added.gravity, number),
+        "ripple": {} if added.ripple is None else _write_ripple(added.ripple, number),
+        "further": [
+            {"output": name, "symbol": f"read_{identifier(name)}"} for name in added.reads if name not in others
+        ],
+        "resets": [
+            f"read_{identifier(name)}"
+            for name in dict.fromkeys(term.reads for term in (added.gravity, added.ripple) if term is not None)
+            if name not in others
+        ],
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
             for key, tf in zip(
@@ -379,27 +377,21 @@ def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, 
     }
 
 
-def _write_friction(compensation: Compensation | None, number: Callable[[float], str]) -> dict[str, str]:
-    """Return the compensation of friction as text; empty where there is none."""
-    if compensation is None or compensation.friction is None:
-        return {}
-    term = compensation.friction
+def _write_friction(term: FrictionTerm, sample_time_s: float, number: Callable[[float], str]) -> dict[str, str]:
+    """Return the compensation of friction as text."""
     return {
         "effort": number(term.effort),
         "speed": number(term.speed),
         "speed_unit": term.speed_unit,
-        "share": number(term.share_per_step(compensation.sample_time_s)),
+        "share": number(term.share_per_step(sample_time_s)),
         "read": f"read_{identifier(term.reads)}" if term.reads else "",
         "whence": f"the speed of {strip_markup(term.reads)}" if term.reads else "the rate of the reference",
         "percent": f"{100.0 * term.fraction:.3g}",
     }
 
 
-def _write_gravity(compensation: Compensation | None, number: Callable[[float], str]) -> dict[str, Any]:
-    """Return the compensation of gravity as text; empty where there is none."""
-    if compensation is None or compensation.gravity is None:
-        return {}
-    term = compensation.gravity
+def _write_gravity(term: GravityTerm, number: Callable[[float], str]) -> dict[str, Any]:
+    """Return the compensation of gravity as text."""
     middle, scale, *coefficients = term.numbers
     return {
         "middle": number(middle),
@@ -413,17 +405,14 @@ def _write_gravity(compensation: Compensation | None, number: Callable[[float], 
     }
 
 
-def _write_ripple(compensation: Compensation | None, number: Callable[[float], str]) -> dict[str, Any]:
-    """Return the compensation of torque ripple as text, every harmonic up to the last; empty where there is none."""
-    if compensation is None or compensation.ripple is None:
-        return {}
-    term = compensation.ripple
+def _write_ripple(term: RippleTerm, number: Callable[[float], str]) -> dict[str, Any]:
+    """Return the compensation of torque ripple as text, every harmonic up to the last."""
     series = {n: (cos, sin) for n, cos, sin in zip(term.cycles, term.cos, term.sin, strict=True)}
     rows = [series.get(n, (0.0, 0.0)) for n in range(1, max(term.cycles) + 1)]
     return {
         "terms": len(rows),
-        "cos": ", ".join(number(one) for one, _ in rows),
-        "sin": ", ".join(number(one) for _, one in rows),
+        "cos": ", ".join(number(cos) for cos, _ in rows),
+        "sin": ", ".join(number(sin) for _, sin in rows),
         "per_unit": number(1.0 / term.period),
         "quarter": number(0.5 * math.pi),
         "most": number(MOST_TURNS),
@@ -438,16 +427,3 @@ def _write_ripple(compensation: Compensation | None, number: Callable[[float], s
         "period": f"{term.period:.6g}",
         "percent": f"{100.0 * term.fraction:.3g}",
     }
-
-
-def _list_resets(compensation: Compensation | None, others: Sequence[str]) -> list[str]:
-    """Return the arguments of a reset that the compensation reads and the law does not."""
-    terms = () if compensation is None else (compensation.gravity, compensation.ripple)
-    names = dict.fromkeys(term.reads for term in terms if term is not None)
-    return [f"read_{identifier(name)}" for name in names if name not in others]
-
-
-def _list_further(compensation: Compensation | None, others: Sequence[str]) -> list[dict[str, str]]:
-    """Return what the compensation reads and the law does not."""
-    reads = () if compensation is None else compensation.reads
-    return [{"output": name, "symbol": f"read_{identifier(name)}"} for name in reads if name not in others]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -18,75 +17,27 @@ import numpy as np
 from seaopt.control.deploy.c_text import (
     LARGEST_NUMBER,
     Precision,
-    check_prefix,
     describe_timing,
     identifier,
     literal,
-    render,
     strip_markup,
 )
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.plausibility import LARGEST
-from seaopt.control.laws.realisation import choose_limit, find_raised_limit
-from seaopt.control.laws.spec import check_command_limits
+from seaopt.control.laws.realisation import choose_limit
 from seaopt.control.laws.structures import AGREES, LAW_GAINS
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
-from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA, ScheduledController
-from seaopt.errors import ControlError, FileError
-from seaopt.files import check_folder, write_text
+from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
+from seaopt.errors import FileError
 
-TEMPLATES = {"{}.h": "schedule.h.jinja", "{}.c": "schedule.c.jinja"}
+SCHEDULE_TEMPLATES = {"{}.h": "schedule.h.jinja", "{}.c": "schedule.c.jinja"}
 COLUMNS = (*LAW_GAINS, "anti_windup")
 
 
 def is_schedule(content: Mapping[str, Any]) -> bool:
     """Tell whether the content of a file is that of a schedule.json."""
     return content.get("schema") == SCHEDULE_SCHEMA
-
-
-def export_schedule(
-    schedule: ScheduledController | Mapping[str, Any],
-    folder: Path | str,
-    *,
-    precision: Precision = "double",
-    name: str = "force_law",
-    current_limit_A: float | None = None,
-    command_limit: float | None = None,
-    tracking_time_s: float | None = None,
-    allow_infeasible: bool = False,
-    fit_met: bool | None = None,
-) -> tuple[Path, ...]:
-    """Write a scheduled controller as C99: NAME.h and NAME.c.
-
-    `schedule`: the schedule, or the content of its schedule.json.
-
-    Raises ControlError: the schedule is not feasible, or an argument is out of range.
-    Raises FileError: the content is malformed or contradicts itself, or the folder cannot be written.
-    """
-    if precision not in LARGEST_NUMBER:
-        raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
-    prefix = check_prefix(name)
-    check_folder(Path(folder))
-    check_command_limits(current_limit_A, command_limit)
-    content = schedule.to_dict() if isinstance(schedule, ScheduledController) else schedule
-    limit = command_limit if current_limit_A is None else current_limit_A
-    law, first = read_runnable(content, limit, tracking_time_s)
-    if not content["feasible"] and not allow_infeasible:
-        raise ControlError(
-            f"the schedule misses {'; '.join(content['broken'])}; tune one that does not, or allow an infeasible one"
-        )
-    if not isinstance(schedule, ScheduledController):
-        fit_met = content.get("fit_met", True) is True if fit_met is None else fit_met
-    context = _describe(content, law, first, precision) | {
-        "name": prefix,
-        "NAME": prefix.upper(),
-        "precision": precision,
-        "fit_met": fit_met,
-        "raised_from": strip_markup(find_raised_limit(first["command"], first["spec"], limit)),
-    }
-    texts = {pattern.format(prefix): render(template, context) for pattern, template in TEMPLATES.items()}
-    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
 
 
 def read_runnable(
@@ -130,7 +81,7 @@ def read_runnable(
     return law, first
 
 
-def _describe(
+def describe_schedule(
     content: Mapping[str, Any], law: RunnableSchedule, first: Mapping[str, Any], precision: Precision
 ) -> dict[str, Any]:
     """Return words and numbers of the files."""
