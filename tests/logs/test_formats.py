@@ -410,3 +410,19 @@ def test_a_library_that_does_not_fit_into_memory_is_no_damaged_file(tmp_path):
 
     with pytest.raises(LogError, match=r"cannot be loaded.*ulimit"), translate_errors(tmp_path / "log.csv", "CSV"):
         raise NameError("name 'PyLazyFrame' is not defined")
+
+
+def test_an_mcap_topic_of_two_types_is_refused(tmp_path):
+    writing = pytest.importorskip("mcap.writer")
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = writing.Writer(stream)
+        writer.start()
+        for time, kind in enumerate(("Float64", "Int64")):
+            definition = f"{kind.lower()} data".encode()
+            schema = writer.register_schema(name=f"std_msgs/{kind}", encoding="ros1msg", data=definition)
+            channel = writer.register_channel(topic="/a", message_encoding="ros1", schema_id=schema)
+            writer.add_message(channel_id=channel, log_time=time, publish_time=time, data=bytes(8))
+        writer.finish()
+    with pytest.raises(LogError, match="/a carries std_msgs/msg/Float64 and std_msgs/msg/Int64"):
+        contents(path)

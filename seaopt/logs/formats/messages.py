@@ -7,8 +7,9 @@ every number is aligned to its own size after a header of four bytes.
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from seaopt.logs.formats.source import MAX_DEPTH
@@ -21,26 +22,17 @@ NUMBER_CODES = {
     "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
     "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
-TIMES = {"builtin_interfaces/msg/Time": "Ii", "builtin_interfaces/msg/Duration": "ii"}
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
 @record
-class NumberNode:
-    """A number of fixed size."""
+class Leaf:
+    """A number, a stamp of seconds and nanoseconds, or a text, of which the length alone is read."""
 
     kind: str
-    code: str
-    size: int
-
-
-@record
-class StampNode:
-    """Seconds and nanoseconds, decoded as whole nanoseconds."""
-
-
-@record
-class TextNode:
-    """A string."""
+    code: str  # struct's
+    size: int  # to which it is aligned
+    width: int | None  # bytes; None of a text
 
 
 @record
@@ -58,34 +50,37 @@ class StructNode:
     parts: tuple[tuple[str, Node], ...]
 
 
-Node = NumberNode | StampNode | TextNode | ArrayNode | StructNode
+Node = Leaf | ArrayNode | StructNode
 Wanted = Mapping[str | int, Any]
+STAMP = Leaf(kind="float64", code="iI", size=4, width=8)
+TEXT = Leaf(kind="text", code="I", size=4, width=None)
 
 
 def build_tree(name: str, types: Mapping[str, Any], depth: int = 0) -> Node:
     """Return the tree of a message type, from rosbags' parsed definitions."""
     if name in TIMES:
-        return StampNode()
+        return STAMP
     if depth > MAX_DEPTH or name not in types:
         raise ValueError(f"message type {name} is not defined in the file")
-    parts = tuple((part, _build_node(definition, types, depth + 1)) for part, definition in types[name][1])
-    # A struct without members takes a byte in CDR.
-    return StructNode(parts=parts or ((PAD, NumberNode(kind="uint8", code="B", size=1)),))
+    parts = [(part, _build_node(definition, types, depth + 1)) for part, definition in types[name][1]]
+    return StructNode(parts=tuple(parts or [(PAD, _make_number("uint8"))]))  # in CDR an empty struct takes a byte
 
 
 def _build_node(definition: Any, types: Mapping[str, Any], depth: int) -> Node:
     kind, detail = int(definition[0]), definition[1]
     if kind == 1:  # a base type
-        if detail[0] in ("string", "wstring"):
-            return TextNode()
-        if detail[0] not in NUMBER_CODES:
-            raise ValueError(f"numbers of type {detail[0]} are not read")
-        code = NUMBER_CODES[detail[0]]
-        number = detail[0] if detail[0].rstrip("0123456789") in ("int", "uint", "float", "bool") else "uint8"
-        return NumberNode(kind=number, code=code, size=struct.calcsize("=" + code))
+        return TEXT if detail[0] in ("string", "wstring") else _make_number(detail[0])
     if kind == 2:
         return build_tree(detail, types, depth)
     return ArrayNode(child=_build_node(detail[0], types, depth), count=detail[1] if kind == 3 else None)
+
+
+def _make_number(name: str) -> Leaf:
+    if name not in NUMBER_CODES:
+        raise ValueError(f"numbers of type {name} are not read")
+    size = struct.calcsize("=" + NUMBER_CODES[name])
+    kind = "uint8" if name in ("byte", "char", "octet") else name
+    return Leaf(kind=kind, code=NUMBER_CODES[name], size=size, width=size)
 
 
 @record
@@ -144,20 +139,12 @@ def build_wanted_tree(paths: Mapping[str, str]) -> dict[str | int, Any]:
     """
     root: dict[str | int, Any] = {}
     for path, name in paths.items():
-        keys = list(_split_path(path))
+        keys = [int(key) if key.isdecimal() else key for key in re.findall(r"[^.\[\]]+", path)]
         branch = root
         for key in keys[:-1]:
             branch = branch.setdefault(key, {})
         branch[keys[-1]] = name
     return root
-
-
-def _split_path(path: str) -> Iterator[str | int]:
-    for part in path.split("."):
-        name, *indices = part.split("[")
-        if name:
-            yield name
-        yield from (int(index.rstrip("]")) for index in indices)
 
 
 def _read_count(node: ArrayNode, wire: Wire, data: bytes, at: int) -> tuple[int, int]:
@@ -171,46 +158,35 @@ def _read_count(node: ArrayNode, wire: Wire, data: bytes, at: int) -> tuple[int,
     return count, at + 4
 
 
-def _skip_text(wire: Wire, data: bytes, at: int) -> int:
-    at = wire.align(at, 4)
-    return at + 4 + struct.unpack_from(wire.order + "I", data, at)[0]
-
-
 def _describe(node: Node, wire: Wire, data: bytes, at: int, path: str, leaves: list[tuple[str, str]]) -> int:
+    """Walk one node, list its leaves, and return where the next begins."""
+    if isinstance(node, Leaf):
+        leaves.append((path, node.kind))
+        return _take(node, wire, data, at, None, {})
     if isinstance(node, StructNode):
         for name, part in node.parts:
             if name != PAD or wire.cdr:
                 at = _describe(part, wire, data, at, f"{path}.{name}" if path else name, leaves)
         return at
-    if isinstance(node, ArrayNode):
-        count, at = _read_count(node, wire, data, at)
-        for index in range(count):
-            # Beyond the limit elements are walked, and not listed.
-            listed = leaves if index < MAX_ELEMENTS else []
-            at = _describe(node.child, wire, data, at, f"{path}[{index}]", listed)
-        return at
-    kind = "float64" if isinstance(node, StampNode) else "text" if isinstance(node, TextNode) else node.kind
-    leaves.append((path, kind))
-    return _take(node, wire, data, at, None, {})
+    count, at = _read_count(node, wire, data, at)
+    for index in range(count):
+        # Beyond the limit elements are walked, and not listed.
+        at = _describe(node.child, wire, data, at, f"{path}[{index}]", leaves if index < MAX_ELEMENTS else [])
+    return at
 
 
 def _take(
     node: Node, wire: Wire, data: bytes, at: int, wanted: Wanted | str | None, out: dict[str, float | int]
 ) -> int:
     """Walk one node, decode what is wanted, and return where the next begins."""
-    if isinstance(node, NumberNode):
+    if isinstance(node, Leaf):
         at = wire.align(at, node.size)
+        if node.width is None:
+            return at + 4 + struct.unpack_from(wire.order + node.code, data, at)[0]
         if isinstance(wanted, str):
-            out[wanted] = struct.unpack_from(wire.order + node.code, data, at)[0]
-        return at + node.size
-    if isinstance(node, StampNode):
-        at = wire.align(at, 4)
-        if isinstance(wanted, str):
-            seconds, nanoseconds = struct.unpack_from(wire.order + "iI", data, at)
-            out[wanted] = seconds * 1_000_000_000 + nanoseconds
-        return at + 8
-    if isinstance(node, TextNode):
-        return _skip_text(wire, data, at)
+            numbers = struct.unpack_from(wire.order + node.code, data, at)
+            out[wanted] = numbers[0] if node is not STAMP else numbers[0] * 1_000_000_000 + numbers[1]
+        return at + node.width
     branches: Wanted = wanted if isinstance(wanted, Mapping) else {}
     if isinstance(node, StructNode):
         for name, part in node.parts:
@@ -218,13 +194,13 @@ def _take(
                 at = _take(part, wire, data, at, branches.get(name), out)
         return at
     count, at = _read_count(node, wire, data, at)
-    if isinstance(node.child, NumberNode) and count:
-        at = wire.align(at, node.child.size)
+    child = node.child
+    if isinstance(child, Leaf) and child.width == child.size and count:  # numbers lie at equal distances
+        at, code = wire.align(at, child.size), wire.order + child.code
         for index, name in branches.items():
             if isinstance(index, int) and index < count and isinstance(name, str):
-                begin = at + index * node.child.size
-                out[name] = struct.unpack_from(wire.order + node.child.code, data, begin)[0]
-        return at + count * node.child.size
+                out[name] = struct.unpack_from(code, data, at + index * child.size)[0]
+        return at + count * child.size
     for index in range(count):
-        at = _take(node.child, wire, data, at, branches.get(index), out)
+        at = _take(child, wire, data, at, branches.get(index), out)
     return at

@@ -10,10 +10,11 @@ import bz2
 import json
 import struct
 import zlib
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ MCAP_FOOTER = struct.Struct("<BQQQI")  # kind, length, begin of the summary and 
 MCAP_DATA_END = struct.Struct("<BQI")  # kind, length, checksum
 UNIX_STAMP_NS = 1_000_000_000 * 1_000_000_000  # stamps after 2001 count from 1970; earlier ones are a simulation's
 ENCODINGS = ("cdr", "ros1", "json")
+SYNTAXES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl", "omgidl": "idl"}  # of definitions in MCAP
 
 
 @record
@@ -58,22 +60,8 @@ class Bag:
 BagOpener = Callable[[Path], AbstractContextManager[Bag]]
 
 
-def open_bag(path: Path) -> Source:
-    """List a ROS 1 bag."""
-    return _list_recording(path, "ROS 1 bag", _open_bag_file)
-
-
-def open_db3(path: Path) -> Source:
-    """List a ROS 2 SQLite recording."""
-    return _list_recording(path, "ROS 2 db3", _open_db3_file)
-
-
-def open_mcap(path: Path) -> Source:
-    """List an MCAP recording."""
-    return _list_recording(path, "MCAP", _open_mcap_file)
-
-
 def _list_recording(path: Path, form: str, open_file: BagOpener) -> Source:
+    """List the topics of a recording, and what their first messages hold."""
     import_optional("rosbags", "ros", path, form)
     fields: list[Field] = []
     notes: list[str] = []
@@ -155,10 +143,13 @@ def _load(
             f"{path}: {topic.name} counts {topic.count} messages and holds {len(times)}, the file is damaged; "
             "copy or record it again"
         )
-    out = {name: np.array([row.get(name, np.nan) for row in rows], dtype=float) for name in paths.values()}
+    out: dict[str, Float[np.ndarray, " n"]] = {}
     for name in paths.values():
-        if _find_unit(name) == "s":
-            out[name] = _to_seconds([int(row[name]) for row in rows], bag.start)
+        if _find_unit(name) == "s":  # of stamps from 1970 on, count from the start of the recording
+            stamps = np.array([int(row[name]) for row in rows], dtype=np.int64)
+            out[name] = np.where(stamps > UNIX_STAMP_NS, stamps - bag.start, stamps) * 1e-9
+        else:
+            out[name] = np.array([row.get(name, np.nan) for row in rows], dtype=float)
     if topic.name in names:
         out[topic.name] = np.array(times, dtype=np.int64) * 1e-9
     return out
@@ -184,19 +175,13 @@ def _make_taker(
     return from_json
 
 
-def _to_seconds(stamps: list[int], start: int) -> Float[np.ndarray, " n"]:
-    """Return stamps in seconds, from the start of the recording where they are of its kind."""
-    whole = np.array(stamps, dtype=np.int64)
-    return np.where(whole > UNIX_STAMP_NS, whole - start, whole) * 1e-9
-
-
 @contextmanager
 def _open_bag_file(path: Path) -> Generator[Bag]:
     from rosbags.rosbag1 import Reader
 
     with Reader(path) as reader:
         reader.chunks = {at: chunk._replace(decompressor=_limit_size(chunk)) for at, chunk in reader.chunks.items()}
-        yield _wrap_rosbags(reader, reader.connections, reader.start_time if reader.message_count else 0, "ros1")
+        yield _wrap_rosbags(reader, reader.start_time if reader.message_count else 0, "ros1")
 
 
 @contextmanager
@@ -212,7 +197,7 @@ def _open_db3_file(path: Path) -> Generator[Bag]:
         if verdict != "ok":
             raise LogError(f"{path}: its pages contradict each other, the file is damaged; copy or record it again")
         meta = reader.metadata
-        yield _wrap_rosbags(reader, reader.connections, meta.start_time if meta.message_count else 0, "cdr")
+        yield _wrap_rosbags(reader, meta.start_time if meta.message_count else 0, "cdr")
     finally:
         reader.close()
 
@@ -227,33 +212,39 @@ def _check_pages(path: Path) -> None:
         raise LogError(f"{path}: is cut off, {path.stat().st_size} of {whole} bytes are there; copy or record it again")
 
 
-def _wrap_rosbags(reader: Any, connections: Sequence[Any], start: int, encoding: str) -> Bag:
-    """Return rosbags' reader as a Bag; a topic with several publishers has several connections."""
-    topics: dict[str, Topic] = {}
-    for connection in connections:
-        earlier = topics.get(connection.topic)
-        if earlier is not None and earlier.kind != connection.msgtype:
-            raise ValueError(
-                f"topic {connection.topic} carries {earlier.kind} and {connection.msgtype}; "
-                "record them on topics of their own"
-            )
-        message_encoding = getattr(connection.ext, "serialization_format", encoding) or encoding
-        definition = connection.msgdef
-        topics[connection.topic] = Topic(
+def _wrap_rosbags(reader: Any, start: int, encoding: str) -> Bag:
+    """Return rosbags' reader as a Bag."""
+    topics = [
+        Topic(
             name=connection.topic,
             kind=connection.msgtype,
-            encoding=message_encoding,
-            definition=definition.data,
-            count=connection.msgcount + (earlier.count if earlier else 0),
-            syntax=definition.format.name.lower().replace("none", ""),
+            encoding=getattr(connection.ext, "serialization_format", encoding) or encoding,
+            definition=connection.msgdef.data,
+            count=connection.msgcount,
+            syntax=connection.msgdef.format.name.lower().replace("none", ""),
         )
+        for connection in reader.connections
+    ]
 
     def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
-        chosen = [connection for connection in connections if connection.topic == topic]
+        chosen = [connection for connection in reader.connections if connection.topic == topic]
         for _, time, data in reader.messages(chosen, start, stop):
             yield time, bytes(data)
 
-    return Bag(start=start, topics=topics, messages=messages)
+    return Bag(start=start, topics=_join_publishers(topics), messages=messages)
+
+
+def _join_publishers(publishers: Iterable[Topic]) -> dict[str, Topic]:
+    """Return each topic once, with the messages of all that publish it."""
+    topics: dict[str, Topic] = {}
+    for topic in publishers:
+        earlier = topics.get(topic.name)
+        if earlier is not None and earlier.kind != topic.kind:
+            raise ValueError(
+                f"topic {topic.name} carries {earlier.kind} and {topic.kind}; record them on topics of their own"
+            )
+        topics[topic.name] = replace(topic, count=topic.count + (earlier.count if earlier else 0))
+    return topics
 
 
 def _limit_size(chunk: Any) -> Callable[[bytes], bytes]:
@@ -279,62 +270,63 @@ def _limit_size(chunk: Any) -> Callable[[bytes], bytes]:
 @contextmanager
 def _open_mcap_file(path: Path) -> Generator[Bag]:
     reading = import_optional("mcap.reader", "ros", path, "MCAP")
+    begin = _check_mcap_summary(path)
+    check_data = cache(partial(_check_mcap_data, path, begin))  # of all messages, once they are read
     with path.open("rb") as stream:
-        _check_mcap_summary(path)
         reader = reading.make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
         if summary is None or summary.statistics is None:
             raise LogError(f"{path}: has no summary, its recorder did not end in order; run mcap recover on it")
         if any(chunk.uncompressed_size > MAX_CHUNK for chunk in summary.chunk_indexes):
             raise LogError(f"{path}: a chunk unpacks to more than {MAX_CHUNK >> 20} MiB; is it damaged?")
-        counts = summary.statistics.channel_message_counts
-        topics: dict[str, Topic] = {}
+        statistics, topics = summary.statistics, list[Topic]()
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
-            earlier = topics[channel.topic].count if channel.topic in topics else 0
-            topics[channel.topic] = Topic(
+            name = schema.name if schema else ""
+            topic = Topic(
                 name=channel.topic,
-                kind=_long_type_name(schema.name) if schema else "",
-                count=earlier + counts.get(channel.id, 0),
+                kind=name.replace("/", "/msg/") if name.count("/") == 1 else name,  # as rosbags writes it
+                count=statistics.channel_message_counts.get(channel.id, 0),
                 encoding=channel.message_encoding,
                 definition=schema.data.decode(errors="replace") if schema else "",
-                syntax=_definition_syntax(schema.encoding) if schema else "",
+                syntax=SYNTAXES.get(schema.encoding, "") if schema else "",
             )
+            topics.append(topic)
 
         def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
-            _check_mcap_data(path)
+            check_data()
             for _, _, message in reader.iter_messages([topic], starting_at=start, ending_before=stop):
                 yield message.log_time, message.data
 
-        start = summary.statistics.message_start_time if summary.statistics.message_count else 0
-        yield Bag(start=start, topics=topics, messages=messages)
+        start = statistics.message_start_time if statistics.message_count else 0
+        yield Bag(start=start, topics=_join_publishers(topics), messages=messages)
 
 
-def _check_mcap_summary(path: Path) -> None:
-    """Refuse a summary that is not the one its checksum is of; the library looks at those of the chunks alone."""
+def _check_mcap_summary(path: Path) -> int:
+    """Return where the summary begins, refusing one that its checksum is not of: the library checks chunks alone."""
     start, checksum = _read_mcap_footer(path)
     with path.open("rb") as stream:
         stream.seek(start)
         summary = stream.read()[: -len(MCAP_MAGIC) - 4]
     if checksum and zlib.crc32(summary) != checksum:
         raise LogError(f"{path}: its summary does not have its checksum, the file is damaged; copy or record it again")
+    return start
 
 
-def _check_mcap_data(path: Path) -> None:
+def _check_mcap_data(path: Path, summary: int) -> None:
     """Refuse messages that are not those that the checksum of all of them is of, where the recorder wrote one."""
-    start, _ = _read_mcap_footer(path)
-    end = start - MCAP_DATA_END.size
+    end = summary - MCAP_DATA_END.size
     with path.open("rb") as stream:
         stream.seek(max(end, 0))
         code, size, checksum = MCAP_DATA_END.unpack(stream.read(MCAP_DATA_END.size))
         if (code, size) != (0x0F, 4):
             raise LogError(f"{path}: its data do not end before its summary, the file is damaged; record it again")
         stream.seek(0)
-        found, left = 0, end if checksum else 0
+        computed, left = 0, end if checksum else 0
         while left > 0:
             part = stream.read(min(left, 1 << 22))
-            found, left = zlib.crc32(part, found), left - len(part)
-    if checksum and found != checksum:
+            computed, left = zlib.crc32(part, computed), left - len(part)
+    if checksum and computed != checksum:
         raise LogError(f"{path}: its messages do not have their checksum, the file is damaged; copy or record it again")
 
 
@@ -354,10 +346,6 @@ def _read_mcap_footer(path: Path) -> tuple[int, int]:
     return start, checksum
 
 
-def _definition_syntax(encoding: str) -> str:
-    return {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl", "omgidl": "idl"}.get(encoding, "")
-
-
-def _long_type_name(name: str) -> str:
-    """Return a type's name as rosbags writes it: "std_msgs/String" is "std_msgs/msg/String"."""
-    return "/msg/".join(name.split("/")) if name.count("/") == 1 else name
+open_bag = partial(_list_recording, form="ROS 1 bag", open_file=_open_bag_file)
+open_db3 = partial(_list_recording, form="ROS 2 db3", open_file=_open_db3_file)
+open_mcap = partial(_list_recording, form="MCAP", open_file=_open_mcap_file)
