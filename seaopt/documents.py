@@ -16,7 +16,6 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationError, WithJsonSchema
 
 from seaopt.errors import FileError, SeaoptError, suggestion
-from seaopt.files import check_seal, plain
 
 EXAMPLES = {
     "float": "1.0",
@@ -37,8 +36,6 @@ Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 _OR_NULL = WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "null"}]})
 NullIsInfinite = Annotated[Number, BeforeValidator(lambda value: math.inf if value is None else value), _OR_NULL]
-NullIsMinusInfinite = Annotated[Number, BeforeValidator(lambda value: -math.inf if value is None else value), _OR_NULL]
-NullIsNaN = Annotated[Number, BeforeValidator(lambda value: math.nan if value is None else value), _OR_NULL]
 
 
 class ResultTable(BaseModel):
@@ -83,16 +80,6 @@ def check_table(
         raise error(f"{source}: {_describe(model, problem, remedy)}") from problem
 
 
-def check_result(model: type[Document], content: Mapping[str, Any], source: str, *, remedy: str) -> Document:
-    """Return a result as a model, as `check_table` does; one that carries a digest was not edited since.
-
-    Raises FileError: a key is missing, a value is of the wrong kind, or the digest is not that of the content.
-    """
-    if "made_from" in content:
-        check_seal(content, source, remedy)
-    return check_table(model, plain(content), source, remedy=remedy)
-
-
 def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> str:
     """Return the mistake that the others follow from: place, value and remedy."""
     mistakes = problem.errors(include_url=False)
@@ -107,19 +94,19 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     is_table = first["type"] == "string_type" or isinstance(first["input"], Mapping)
     first = inside[0] if inside and is_table else first
     place = _place(first["loc"])
-    own = place.rpartition(".")[2]
+    key = place.rpartition(".")[2]
     if first["type"] == "extra_forbidden":
-        known = _known_keys(model, first["loc"])
-        near = get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.6)
+        keys = [field.alias or name for name, field in _find_model(model, first["loc"]).model_fields.items()]
+        near = get_close_matches(str(first["loc"][-1]), keys, n=1, cutoff=0.6)
         line = f" write {near[0]} = {_spell(first['input'])}" if near else ""
-        return f"unknown key {place}; {suggestion(str(first['loc'][-1]), known)}{line}"
+        return f"unknown key {place}; {suggestion(str(first['loc'][-1]), keys)}{line}"
     if _is_range(first):
         at = _place(first["loc"][:-1] if first["type"] == "missing" else first["loc"])
         return (
             f"{at} = {shorten(first['input'])} is not a range; give [low, high]: {at.rpartition('.')[2]} = [1.0, 2.0]"
         )
     if first["type"] == "missing":
-        return f"key {place} is missing; {remedy or f'add it: {own} = ...'}"
+        return f"key {place} is missing; {remedy or f'add it: {key} = ...'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
     words = "should be a table" if first["type"] == "model_type" else words
     if not first["loc"]:  # of the whole file
@@ -130,13 +117,13 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
         return f"{place} = {shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
     kind = first["type"].partition("_")[0]
     if kind in ("greater", "less"):
-        correct = f"correct it: {own} = {_suggest_number(model, first)}"
+        correct = f"correct it: {key} = {_suggest_number(model, first)}"
     elif kind in ("float", "int") and isinstance(
         first["input"], str
     ):  # with its unit, as a rule: a number may be another
         correct = "give the number alone, without quotes, in the key's own unit"
     else:
-        correct = f"correct it: {own} = {EXAMPLES.get(kind, '...')}"
+        correct = f"correct it: {key} = {EXAMPLES.get(kind, '...')}"
     return f"{place} = {shorten(first['input'])}: {words}; {remedy or correct}"
 
 
@@ -178,11 +165,6 @@ def _place(loc: Sequence[int | str]) -> str:
     return ".".join(key for key in keys if not UNION_BRANCH.fullmatch(key))
 
 
-def _known_keys(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:
-    """Return the keys that are known where `loc` points."""
-    return [field.alias or name for name, field in _find_model(model, loc).model_fields.items()]
-
-
 def _find_model(model: type[BaseModel], loc: Sequence[int | str]) -> type[BaseModel]:
     """Return the model of the table that `loc` points into; of several, it names the one that was tried."""
     inner: list[type[BaseModel]] = []
@@ -190,7 +172,7 @@ def _find_model(model: type[BaseModel], loc: Sequence[int | str]) -> type[BaseMo
         if key in model.model_fields:
             inner = _models_in(model.model_fields[str(key)].annotation)
             model = inner[0] if inner else model
-        model = next((one for one in inner if one.__name__ == key), model)
+        model = next((table for table in inner if table.__name__ == key), model)
     return model
 
 

@@ -96,9 +96,11 @@ class InternalError(Exception):
     @classmethod
     def of(cls, error: Exception, call: str, request: str) -> InternalError:
         """Return the error that reports another one of a call, with what was asked of it."""
-        own = Path(__file__).parent
-        places = [frame for frame in traceback.extract_tb(error.__traceback__) if own in Path(frame.filename).parents]
-        place = "".join(f" at {Path(frame.filename).relative_to(own)}:{frame.lineno}" for frame in places[-1:])
+        package = Path(__file__).parent
+        places = [
+            frame for frame in traceback.extract_tb(error.__traceback__) if package in Path(frame.filename).parents
+        ]
+        place = "".join(f" at {Path(frame.filename).relative_to(package)}:{frame.lineno}" for frame in places[-1:])
         reason = " ".join(str(error).split()) or "no text"
         out = cls(
             f"{call} came upon a defect of seaopt, {type(error).__name__}{place}: {reason}; please report it with the "

@@ -166,7 +166,7 @@ class _Cluster(Executor):
             self._client.close(timeout=2)
 
 
-def solve_ipopt(solver: Any, **given: Any) -> Any:
+def solve_ipopt(solver: Any, **arguments: Any) -> Any:
     """Return what a solver of CasADi's that is IPOPT finds, one at a time in a process.
 
     Raises KeyboardInterrupt: it was interrupted: by Ctrl-C, or by any signal whose handler raises. CasADi takes that
@@ -174,7 +174,7 @@ def solve_ipopt(solver: Any, **given: Any) -> Any:
     """
     with IPOPT:
         try:
-            return solver(**given)
+            return solver(**arguments)
         finally:
             if solver.stats()["return_status"] == "NonIpopt_Exception_Thrown":
                 raise KeyboardInterrupt
@@ -222,7 +222,7 @@ def map_ordered(
 
 
 class Shared(Generic[Item]):
-    """What every part of some work needs: pickled once, and restored once in each process that works on it.
+    """A value that every part of some work needs: pickled once, and restored once in each process that works on it.
 
     A plant that is restored for every part would each time build again what it remembers: its linearisations and
     its kernels.

@@ -125,11 +125,11 @@ def write_text(path: Path | str, content: str) -> Path:
 def plain(value: Any) -> Any:
     """Return `value` as what JSON can hold: arrays become lists, numbers that are not finite become null."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}  # pyright: ignore[reportUnknownArgumentType]
+        return {str(key): plain(entry) for key, entry in value.items()}  # pyright: ignore[reportUnknownArgumentType]
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, np.generic):
         return plain(value.item())
     if isinstance(value, float):
@@ -140,7 +140,7 @@ def plain(value: Any) -> Any:
 def to_json(content: dict[str, Any]) -> str:
     """Return `content` as strict JSON (no NaN, no Infinity), indented."""
     text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    return _ESCAPED.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
+    return _ESCAPED.sub(lambda match: f"\\u{ord(match.group()):04x}", text)
 
 
 def digest_content(content: Mapping[str, Any]) -> str:
@@ -245,8 +245,8 @@ def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage aga
     """
     source = Path(path)
     content = parse_file(source, json.loads, "JSON", remedy=remedy)
-    found = content.get("schema") if isinstance(content, dict) else None
-    if found != schema:
-        raise FileError(f'{source}: schema is {found!r}, expected "{schema}"; {remedy}')
+    stated = content.get("schema") if isinstance(content, dict) else None
+    if stated != schema:
+        raise FileError(f'{source}: schema is {stated!r}, expected "{schema}"; {remedy}')
     check_seal(content, source, remedy)
     return content

@@ -56,7 +56,7 @@ def printable(text: str) -> str:
     F1\x1b]0;title\x07
 
     """
-    return _UNPRINTABLE.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
+    return _UNPRINTABLE.sub(lambda match: match.group().encode("unicode_escape").decode(), text)
 
 
 def format_band(ends: tuple[float, float] | None, unit: str = "", missing: str = "none") -> str:

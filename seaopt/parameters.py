@@ -148,7 +148,7 @@ class ParameterSet(Mapping[str, Parameter]):
         'N/m'
 
         """
-        pairs = {name: given if isinstance(given, tuple) else (given, "-") for name, given in values.items()}
+        pairs = {name: value if isinstance(value, tuple) else (value, "-") for name, value in values.items()}
         return cls(
             Parameter(name=name, value=require_number(value, name, ParameterError), unit=unit)
             for name, (value, unit) in pairs.items()
@@ -158,12 +158,12 @@ class ParameterSet(Mapping[str, Parameter]):
     def _from_json(cls, content: Mapping[str, Annotated[Mapping[str, Any], Fields(of=Parameter)]]) -> ParameterSet:
         """Return the parameters of a file; one that is free and has no std there has an infinite one."""
 
-        def build(name: str, own: Mapping[str, Any]) -> Parameter:
-            std = (math.inf if own["std"] is None else own["std"]) if own["free"] else None
-            identified = own["identified"] and std != math.inf  # an older file does not say it
-            return Parameter(**dict(own, name=name, std=std, identified=identified))
+        def build(name: str, stored: Mapping[str, Any]) -> Parameter:
+            std = (math.inf if stored["std"] is None else stored["std"]) if stored["free"] else None
+            identified = stored["identified"] and std != math.inf  # an older file does not say it
+            return Parameter(**dict(stored, name=name, std=std, identified=identified))
 
-        return cls(build(name, own) for name, own in content.items())
+        return cls(build(name, stored) for name, stored in content.items())
 
     def __getitem__(self, name: str) -> Parameter:
         try:
@@ -210,9 +210,9 @@ class ParameterSet(Mapping[str, Parameter]):
 
         """
         changed: list[Parameter] = []
-        for name, given in values.items():
+        for name, stated in values.items():
             old = self[name]
-            value, unit = given if isinstance(given, tuple) else (given, old.unit)
+            value, unit = stated if isinstance(stated, tuple) else (stated, old.unit)
             try:
                 scale = factor(unit, old.unit)
             except UnitError as error:
@@ -247,11 +247,11 @@ class ParameterSet(Mapping[str, Parameter]):
 
     def _rows(self) -> list[tuple[str, str, str, str, str]]:
         rows: list[tuple[str, str, str, str, str]] = []
-        for name, item in self._items.items():
-            std = "" if item.std is None else f"± {item.std:.2g}"
-            note = "at bound" if item.at_bound else ("free" if item.free else "")
-            note = note if item.identified else f"{note}, not identified".removeprefix(", ")
-            rows.append((name, f"{item.value:.6g}", std, item.unit, note))
+        for name, parameter in self._items.items():
+            std = "" if parameter.std is None else f"± {parameter.std:.2g}"
+            note = "at bound" if parameter.at_bound else ("free" if parameter.free else "")
+            note = note if parameter.identified else f"{note}, not identified".removeprefix(", ")
+            rows.append((name, f"{parameter.value:.6g}", std, parameter.unit, note))
         return rows
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""What this package's data have in common: one decorator, and the attribute through which results draw themselves."""
+"""The base of this package's data: one decorator, and the attribute through which results draw themselves."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = Tru
     """
     decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=eq, repr=repr)
 
-    def make(own: type[Any]) -> type[Any]:
-        made = decorate(own)
-        if any("option" in one.metadata for one in fields(made)):
+    def make(plain: type[Any]) -> type[Any]:
+        made = decorate(plain)
+        if any("option" in each.metadata for each in fields(made)):
             made.__doc__ = document_options(made)
         return _explain_keywords(made) if keywords else made
 
@@ -73,11 +73,11 @@ def _explain_keywords(cls: type[Any]) -> type[Any]:
         try:
             make(self, *args, **fields)
         except TypeError as error:
-            known = [name for name, one in cls.__dataclass_fields__.items() if one.init]
-            wrong = next((name for name in fields if name not in known), None)
+            keywords = [name for name, each in cls.__dataclass_fields__.items() if each.init]
+            wrong = next((name for name in fields if name not in keywords), None)
             if wrong is None:
                 raise
-            raise KeywordError(f"{cls.__name__} has no {wrong}; {suggestion(wrong, known)}") from error
+            raise KeywordError(f"{cls.__name__} has no {wrong}; {suggestion(wrong, keywords)}") from error
 
     cls.__init__ = construct
     return cls
@@ -88,7 +88,7 @@ PLOTS = "seaopt.reporting.plots"
 
 
 class Worded:
-    """What prints itself, in text and in notebooks, with the sections that the report has of it, too."""
+    """A result that prints itself, in text and in notebooks, with the sections that the report has of it, too."""
 
     __slots__ = ()
 
@@ -100,7 +100,7 @@ class Worded:
 
 
 class Result:
-    """What all results with a verdict have in common: `met`; a wrong name is answered with the right one."""
+    """A result with a verdict: `met`; a wrong name is answered with the right one."""
 
     __slots__ = ()
 
@@ -124,13 +124,13 @@ class Result:
         def __getattr__(self, name: str) -> Any:
             if hasattr(type(self), name):  # a property that failed by itself, whose own error tells more
                 return object.__getattribute__(self, name)
-            own = type(self).__name__
+            kind = type(self).__name__
             if name.startswith("_"):
-                raise UnknownAttributeError(f"{own} has no attribute {name}")
-            known = [each for each in dir(type(self)) if not each.startswith("_")]
+                raise UnknownAttributeError(f"{kind} has no attribute {name}")
+            names = [each for each in dir(type(self)) if not each.startswith("_")]
             guess = GUESSES.get(name, "")
-            remedy = f"use .{guess}" if guess and re.split(r"\W", guess)[0] in known else suggestion(name, known)
-            raise UnknownAttributeError(f"{own} has no attribute {name}; {remedy}")
+            remedy = f"use .{guess}" if guess and re.split(r"\W", guess)[0] in names else suggestion(name, names)
+            raise UnknownAttributeError(f"{kind} has no attribute {name}; {remedy}")
 
 
 class PlotAccessor:

@@ -45,7 +45,7 @@ class Signal:
 
 @runtime_checkable
 class Recording(Protocol):
-    """What is read of a log and of a table alike: channels of one clock, their source, and what was done to them."""
+    """A log or a table, as far as both are read alike: channels of one clock, source and notes."""
 
     @property
     def time(self) -> Float[np.ndarray, " n"]:

@@ -142,7 +142,7 @@ class Transmission:
 
 @record(eq=False)
 class Actuator:
-    """What is between which links: the parts of the derivation that are chosen."""
+    """The chosen parts of the derivation: transmission, links, drive, spring and effects."""
 
     transmission: Transmission
     links: tuple[Link, Link]

@@ -1,4 +1,4 @@
-r"""What drives the motor: a voltage or a duty in place of a current, and a firmware that holds a position.
+r"""Inputs ahead of the motor: a voltage or a duty in place of a current, and a firmware that holds a position.
 
 Parts around any plant:
 
@@ -63,7 +63,7 @@ INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
 
 @record(eq=False)
 class _Drive:
-    """What stands before a plant's first input: its own input, states and outputs with units, and its equations.
+    """A drive ahead of a plant's first input: its own input, states and outputs with units, and its equations.
 
     `solve` is (t, x, u, p) -> (what the plant's input is, {state: rate}, {output: value}).
     """
@@ -130,7 +130,7 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
         return flows, {}, {current: flows}
 
     added = (*PARTS[part], *(PARTS["inductance"] if inductive else ()))
-    added = tuple(item for item in added if winding is None or item is not RESISTANCE)
+    added = tuple(parameter for parameter in added if winding is None or parameter is not RESISTANCE)
     unit_of_current = plant.inputs[current]
     return _put_before(
         plant,
@@ -179,7 +179,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
             dict.fromkeys(commanded, limited_command),
         )
 
-    added = [item for part in SERVO if part in parts for item in PARTS[part]]
+    added = [parameter for part in SERVO if part in parts for parameter in PARTS[part]]
     unit = plant.outputs.get(position) or plant.states[position]
     return _put_before(
         plant,
@@ -189,7 +189,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
             unit=unit,
             states={"error_sum": f"{unit} s"} if integral else {},
             outputs=commanded,
-            parameters=tuple(item for item in added if rate or item.name != "k_d"),
+            parameters=tuple(parameter for parameter in added if rate or parameter.name != "k_d"),
             solve=solve,
             effort=lambda p: p.g_s * p.k_p,
         ),
@@ -200,7 +200,9 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
 def _put_before(plant: Plant, drive: _Drive, ports: tuple[Port, ...]) -> Plant:
     """Return a plant behind a drive, with ports whose plants are behind it, too."""
     source = next(iter(plant.inputs))
-    refuse_clash(plant, drive.name, (drive.input, *drive.outputs, *(item.name for item in drive.parameters)), source)
+    refuse_clash(
+        plant, drive.name, (drive.input, *drive.outputs, *(parameter.name for parameter in drive.parameters)), source
+    )
 
     def solve_inside(t: Any, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, Mapping[str, Any], Mapping[str, Any]]:
         inside, rates, outputs = drive.solve(t, x, u, p)
@@ -214,7 +216,9 @@ def _put_before(plant: Plant, drive: _Drive, ports: tuple[Port, ...]) -> Plant:
         inside, _, outputs = solve_inside(t, x, u, p)
         return {**plant.h(t, x, inside, p), **outputs}
 
-    added = {item.name: item.unit if item.name in STATED else item for item in drive.parameters}
+    added = {
+        parameter.name: parameter.unit if parameter.name in STATED else parameter for parameter in drive.parameters
+    }
     before = plant.actuation
     actuation = before and Actuation(
         input=drive.input,

@@ -114,8 +114,8 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
 
 def _find_drive_delay(params: ParameterSet) -> float:
     """Return the drive's delay among what is given, s."""
-    given = params.given if isinstance(params, CompletedParameters) else params
-    return given[DRIVE_DELAY].value * factor(given[DRIVE_DELAY].unit, "s") if DRIVE_DELAY in given else 0.0
+    stated = params.given if isinstance(params, CompletedParameters) else params
+    return stated[DRIVE_DELAY].value * factor(stated[DRIVE_DELAY].unit, "s") if DRIVE_DELAY in stated else 0.0
 
 
 def _describe(plant: Plant, drive_delay_s: float) -> str:

@@ -33,7 +33,7 @@ from seaopt.plants.plant import (
     name_symbols,
     state_space,
 )
-from seaopt.plants.roles import Friction, change_ports, with_values
+from seaopt.plants.roles import Bristles, Friction, change_ports, with_values
 from seaopt.records import record
 
 SLIDING, STUCK = "sliding", "stuck"
@@ -160,14 +160,15 @@ def friction_states(plant: Plant) -> Mapping[str, Plant]:
     Beside others a friction with bristles is in either state by itself: "NAME stuck" is where it sticks alone. The
     sliding plant is the first.
     """
-    curves = [name for name, friction in plant.friction.items() if friction.bristles is None]
-    groups = [*([curves] if curves else []), *([name] for name in plant.friction if name not in curves)]
+    bristled = _list_bristles(plant)
+    curves = [name for name in plant.friction if name not in bristled]
+    groups = [*([curves] if curves else []), *([name] for name in bristled)]
     states: dict[str, Plant] = {}
     for choice in product((False, True), repeat=len(groups)):
         sticking = tuple(name for group, sticks in zip(groups, choice, strict=True) if sticks for name in group)
         state = STUCK if all(choice) else f"{' and '.join(sticking)} {STUCK}" if any(choice) else SLIDING
         states[state] = _with_slopes(plant, state, sticking)
-    return states | {STUCK: states.pop(STUCK)} if STUCK in states else states
+    return states
 
 
 def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()) -> dict[str, Plant]:
@@ -210,7 +211,11 @@ def can_hold(plant: Plant) -> bool:
 
 def remembers(plant: Plant) -> bool:
     """Tell whether a plant has a friction with bristles, whose force depends on what was before."""
-    return any(friction.bristles is not None for friction in plant.friction.values())
+    return bool(_list_bristles(plant))
+
+
+def _list_bristles(plant: Plant) -> dict[str, Bristles]:
+    return {name: friction.bristles for name, friction in plant.friction.items() if friction.bristles is not None}
 
 
 def list_smoothing(plant: Plant) -> tuple[str, ...]:
@@ -242,12 +247,12 @@ def let_stick(plant: Plant) -> Plant:
     237
 
     """
+    if not can_stick(plant) and remembers(plant):
+        raise PlantError(
+            f"plant {plant.name} has friction with bristles (part lugre), which sticks by itself; leave out "
+            "sticks = true, or the part"
+        )
     if not can_stick(plant):
-        if remembers(plant):
-            raise PlantError(
-                f"plant {plant.name} has friction with bristles (part lugre), which sticks by itself; leave out "
-                "sticks = true, or the part"
-            )
         raise PlantError(
             f"plant {plant.name} has no friction that sticks; declare its jump where the plant is made: "
             "friction={NAME: Friction(..., jump=lambda speed, p: ...)}"
@@ -268,8 +273,8 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
 def find_bristle_stiffness(plant: Plant, params: ParameterSet) -> list[float]:
     """Return the stiffness of each friction's bristles, zero without any."""
     p = plant.complete(params).by_attribute
-    bristles = [friction.bristles for friction in plant.friction.values()]
-    return [0.0 if each is None else float(each.stiffness(p)) for each in bristles]
+    bristles = _list_bristles(plant)
+    return [float(bristles[name].stiffness(p)) if name in bristles else 0.0 for name in plant.friction]
 
 
 @memo
@@ -298,9 +303,7 @@ def _friction_parameters(plant: Plant) -> frozenset[str]:
     p = name_parameters(plant, plant.p)
     bounds = [bound_slopes(friction, p) for friction in plant.friction.values()]
     spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]
-    spans += [
-        ca.SX(friction.bristles.stiffness(p)) for friction in plant.friction.values() if friction.bristles is not None
-    ]
+    spans += [ca.SX(bristles.stiffness(p)) for bristles in _list_bristles(plant).values()]
     return frozenset(_list_parameters(plant, ca.vertcat(*spans)))
 
 
@@ -327,7 +330,7 @@ def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:
 
 def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
     """Return the plant with viscous friction in the place of each curve, and springs for bristles that stick."""
-    bristled = {name: friction.bristles for name, friction in plant.friction.items() if friction.bristles is not None}
+    bristled = _list_bristles(plant)
 
     def choose_slope(name: str, friction: Friction, p: Any) -> Any:
         if name not in sticking:
@@ -335,12 +338,10 @@ def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
         return bristled[name].damping(p) if name in bristled else bound_slopes(friction, p)[1]
 
     def hold(x: Any, u: Any, p: Any) -> Any:
-        forces = {
-            name: bristles.stiffness(p) * bristles.coordinate(x, p)
-            for name, bristles in bristled.items()
-            if name in sticking
-        }
-        return with_values(u, {name: getattr(u, name) + force for name, force in forces.items()})
+        stuck = {name: bristles for name, bristles in bristled.items() if name in sticking}
+        return with_values(
+            u, {name: getattr(u, name) + each.stiffness(p) * each.coordinate(x, p) for name, each in stuck.items()}
+        )
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         rates = {
@@ -421,15 +422,13 @@ def rest_jacobians(plant: Plant) -> Any:
         return jacobians(plant)
     equations = separate_friction(plant)
     x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
-    stuck, rates, forces = friction_states(plant)[STUCK], ca.SX(equations.f), list[Any]()
+    stuck, rates = friction_states(plant)[STUCK], ca.SX(equations.f)
     velocities = dict(zip(plant.friction, ca.vertsplit(equations.velocities), strict=True))
-    for name, friction in plant.friction.items():
-        force = stuck.friction[name].force(velocities[name], p)
-        bristles = friction.bristles
-        if bristles is not None:
-            force += bristles.stiffness(p) * bristles.coordinate(x, p)
-            rates[list(plant.states).index(bristles.state)] = velocities[name] - FORGETTING * getattr(x, bristles.state)
-        forces.append(force)
+    bend = dict.fromkeys(plant.friction, ca.SX(0))
+    for name, bristles in _list_bristles(plant).items():
+        bend[name] = bristles.stiffness(p) * bristles.coordinate(x, p)
+        rates[list(plant.states).index(bristles.state)] = velocities[name] - FORGETTING * getattr(x, bristles.state)
+    forces = [stuck.friction[name].force(velocities[name], p) + bend[name] for name in plant.friction]
     by_state = ca.jacobian(ca.vertcat(*forces), plant.x)
     blocks: list[Any] = []
     for block in (rates, equations.h):

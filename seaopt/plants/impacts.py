@@ -1,4 +1,4 @@
-r"""What happens in no time: a blow on a link, and a link that is caught.
+r"""Impacts: a blow on a link, and a link that is caught.
 
 Between a moment before and one after, positions stay and finite forces do nothing. With the kinetic energy
 :math:`T = \tfrac12 \dot y^\top H(y) \dot y` Lagrange's equations integrate over that moment to

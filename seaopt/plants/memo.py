@@ -14,11 +14,11 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, runtime_check
 
 @runtime_checkable
 class Remembering(Protocol):
-    """What has a memory, such as a plant."""
+    """An object with a memory, such as a plant."""
 
     @property
     def memory(self) -> dict[Any, Any]:
-        """What is kept."""
+        """Results by function and arguments."""
         ...
 
 

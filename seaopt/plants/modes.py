@@ -89,8 +89,8 @@ def modes(
     Examples
     --------
     >>> from seaopt.plants import high_impedance, thor
-    >>> found = modes(high_impedance(), thor())
-    >>> round(found.resonances[0].frequency_hz, 2), round(found.dc_gain["F1", "I"], 1)
+    >>> swinging = modes(high_impedance(), thor())
+    >>> round(swinging.resonances[0].frequency_hz, 2), round(swinging.dc_gain["F1", "I"], 1)
     (7.5, 240.3)
 
     """

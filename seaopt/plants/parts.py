@@ -1,4 +1,4 @@
-r"""What real actuators have besides: optional parts that compose, each with its own parameters.
+r"""Effects of real actuators: optional parts that compose, each with its own parameters.
 
 Inside the actuator, a screw's (`two_link` and its special cases; v is the nut's speed, dq/dt) or a gear's (`rotary`; v
 is the motor's, and the units are N m and rad):

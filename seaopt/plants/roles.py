@@ -1,4 +1,4 @@
-"""What the parts of a plant are for: what a controller commands, what is measured, where the world touches it.
+"""Roles of the parts of a plant: what a controller commands, what is measured, where the world touches it.
 
 A plant states its roles when it is made, so that tuning, certificates and simulation never guess them from names.
 Expressions of a role are functions of the plant's namespaces, as `f` and `h` are; names are those of its own states,
@@ -30,7 +30,7 @@ def _one(p: Any) -> float:
 
 @record(eq=False)
 class Actuation:
-    """What a controller commands.
+    """The input that a controller commands, and the effort that it makes.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class SeriesSpring:
 
 @record(eq=False)
 class Bristles:
-    r"""What gives before a friction slides, so that at rest it is a spring: a friction that remembers.
+    r"""Bristles, which give before a friction slides, so that at rest it is a spring: a friction that remembers.
 
     The bristles' deflection z is a state of the plant, whose rate stands in `f`, and the force is
     :math:`\\sigma_0 z + \\sigma_1 \\dot z`. While they hold, z follows the coordinate whose rate the velocity is.

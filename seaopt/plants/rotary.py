@@ -63,7 +63,7 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
     ),
     "load_friction": PARTS["load_friction"],
     "load_stribeck": PARTS["load_stribeck"],
-    "load_square": tuple(replace(item, unit="1/(N m)") for item in PARTS["load_square"]),
+    "load_square": tuple(replace(parameter, unit="1/(N m)") for parameter in PARTS["load_square"]),
     "lugre": (
         declare("f_c", 0.02, "N m", 1e-12, "Coulomb friction at the motor", (0, 1000)),
         declare("sigma_0", 5.0, "N m/rad", 0.0, "stiffness of the bristles, at the motor"),
@@ -79,7 +79,7 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
     ),
     "hardening": (declare("k_3", 0.0, "N m/rad^3", 0.0, "cubic stiffness"),),
     "spring_damping": (),  # c_s is there without it
-    "deflection_sensor": tuple(replace(item, unit="N m/rad") for item in PARTS["deflection_sensor"]),
+    "deflection_sensor": tuple(replace(parameter, unit="N m/rad") for parameter in PARTS["deflection_sensor"]),
 }
 
 _GEAR = Transmission(
@@ -127,7 +127,7 @@ _PAYLOAD = {"free": ("J_l",), "pendulum": ("J_l", "m"), "bare": ("J_l",)}
 
 def rotary_parameters() -> tuple[Parameter, ...]:
     """Return the parameters that some `rotary` has, with their defaults."""
-    return (*(item for items in _PARTS.values() for item in items), *_DRIVE, _HOUSING, *_LINK, *_PENDULUM)
+    return (*(parameter for added in _PARTS.values() for parameter in added), *_DRIVE, _HOUSING, *_LINK, *_PENDULUM)
 
 
 def rotary(

@@ -79,7 +79,7 @@ SCREW = Transmission(
 
 @record
 class _Build:
-    """What kind of actuator is built: its links with the endings of their names, and whether forces act on them."""
+    """The choices of which an actuator is built: links, the endings of their names, and whether forces act on them."""
 
     links: tuple[LinkKind, LinkKind]
     suffixes: tuple[str, str]
@@ -105,17 +105,17 @@ def _make_link(kind: LinkKind, number: int, suffix: str) -> Link:
         )
     phi, phid = f"phi{suffix}", f"phid{suffix}"
 
-    def own(p: Any, name: str) -> Any:
+    def read(p: Any, name: str) -> Any:
         return getattr(p, name + suffix)
 
     return Link(
         coordinate=phi,
         rate=phid,
         unit="rad",
-        place=lambda x, p: own(p, "L_a") * ca.sin(getattr(x, phi)),
-        kinetic=lambda x, p: 0.5 * own(p, "I_p") * getattr(x, phid) ** 2,
-        potential=lambda x, p: own(p, "m") * p.g * own(p, "L") * (1 - ca.cos(getattr(x, phi))),
-        damping=lambda x, p: own(p, "d") * getattr(x, phid),
+        place=lambda x, p: read(p, "L_a") * ca.sin(getattr(x, phi)),
+        kinetic=lambda x, p: 0.5 * read(p, "I_p") * getattr(x, phid) ** 2,
+        potential=lambda x, p: read(p, "m") * p.g * read(p, "L") * (1 - ca.cos(getattr(x, phi))),
+        damping=lambda x, p: read(p, "d") * getattr(x, phid),
         effort=f"Fe{number}",
         parameters=tuple(pendulum(suffix)),
     )

@@ -1,4 +1,4 @@
-"""What every format reader returns: the fields of a file without their data, and the data of chosen fields."""
+"""The source that every format reader returns: the fields of a file, and the data of chosen fields."""
 
 from __future__ import annotations
 
@@ -136,11 +136,11 @@ def keep_rows(source: Source, where: Where) -> Source:
 
     """
     rows = ", ".join(f"{name} = {value}" for name, value in where.items())
-    known = {one.name: one for one in source.fields}
+    listed = {field.name: field for field in source.fields}
     for name, value in where.items():
-        if name not in known:
-            raise LogError(f'{source.path}: no column "{name}" for where; {suggestion(name, known)}')
-        if source.load_where is None and (isinstance(value, str) or not known[name].numeric):
+        if name not in listed:
+            raise LogError(f'{source.path}: no column "{name}" for where; {suggestion(name, listed)}')
+        if source.load_where is None and (isinstance(value, str) or not listed[name].numeric):
             raise LogError(
                 f'{source.path}: where {name} = "{value}" compares text, which {source.format} files do not allow; '
                 "save the table as CSV"
@@ -157,7 +157,7 @@ def keep_rows(source: Source, where: Where) -> Source:
             raise LogError(f"{source.path}: no row has {rows}; check the value, or window_s")
         return columns
 
-    fields = tuple(replace(one, length=None) for one in source.fields)
+    fields = tuple(replace(field, length=None) for field in source.fields)
     return replace(source, fields=fields, load=load, load_where=None, rows=rows)
 
 

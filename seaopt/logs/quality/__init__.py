@@ -1,1 +1,1 @@
-"""What is wrong with the data of a log, and what they can tell."""
+"""Faults in the data of a log, and which parameters the data can identify."""

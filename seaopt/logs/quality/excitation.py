@@ -1,4 +1,4 @@
-"""What an input excites: third-octave bands, which of them an output answers to, and what can be identified there."""
+"""Excitation of an input by third-octave bands, those to which an output responds, and what they can identify."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class InputExcitation:
 
     @property
     def sentence(self) -> str:
-        """What can and cannot be identified with this input."""
+        """The verdict: what can and cannot be identified with this input."""
         usable = self.usable_hz
         if usable is None:
             return (

@@ -56,7 +56,7 @@ class Quality(Result, Worded):
     inputs : tuple of str
         Channels that were taken as inputs.
     pairs : tuple of ChannelPair
-        Each input with each other channel, and the others with one another where they share a unit.
+        Each input with each other channel, and the moving with one another where they share a unit.
     excitation : mapping of input to InputExcitation
     spectra : Spectra or None
         From which hum, pairs and excitation come; None where no segment is long enough.
@@ -137,7 +137,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     data : Log or Table
         `log.quality` is this with its defaults.
     inputs : sequence of str, optional
-        Channels that drive the others, and may hold a value. Left out: those named I, V, duty, goal, Fe1, Fe2 or u (a v
+        Channels that drive the moving, and may hold a value. Left out: those named I, V, duty, goal, Fe1, Fe2 or u (a v
         only in V), or else those in A or V.
     progress : callable, optional
         Called before each channel (`seaopt.progress.Progress`).
@@ -153,7 +153,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     >>> t = np.arange(4000) / 400
     >>> rng = np.random.default_rng(0)
     >>> log = so.Log.from_arrays(time=t, I=rng.normal(size=4000), F1=np.clip(rng.normal(size=4000), -1, 1))
-    >>> [(item.kind, item.channel) for item in log.quality.findings if item.severity == "warning"][:2]
+    >>> [(finding.kind, finding.channel) for finding in log.quality.findings if finding.severity == "warning"][:2]
     [('clipping', 'F1'), ('clipping', 'F1')]
 
     """
@@ -219,17 +219,17 @@ def _drop_beyond(values: Float[np.ndarray, " n"], channel: ChannelQuality) -> Fl
 
 def _find_stuck_runs(channel: ChannelQuality, channels: Mapping[str, ChannelQuality], data: Recording) -> RowRanges:
     """Return the runs of a channel's equal samples during which another channel moves; all where there is no other."""
-    others = [
+    moving = [
         (data.signals[name].values, other.std)
         for name, other in channels.items()
         if other.varies and other is not channel
     ]
     runs = channel.stuck
-    if not others:
+    if not moving:
         return runs
 
     def moves(start: int, stop: int) -> bool:
-        segments = [(values[start:stop], std) for values, std in others]
+        segments = [(values[start:stop], std) for values, std in moving]
         return any(np.nanstd(part) > MOVING_STD * std for part, std in segments if np.any(np.isfinite(part)))
 
     pairs = zip(runs.start.tolist(), runs.stop.tolist(), strict=True)

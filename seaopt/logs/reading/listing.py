@@ -1,4 +1,4 @@
-"""What is in a file: the first question to ask of a raw log."""
+"""The contents of a file: columns, lengths and units, without the data."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def _read_files(
     notes = [*chosen.notes, *notes]
     signals = {}
     for name, channel in chosen.channels.items():
-        digest_of_file = hashes[channel.found.source.path]
+        digest_of_file = hashes[channel.file_column.source.path]
         signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, digest_of_file)
         notes += _remark_on(signals[name])
     table = Table(time=clock, signals=signals, source=", ".join(map(str, files)), notes=tuple(notes))
@@ -249,7 +249,7 @@ def _read_channels(
         for name, channel in group.items():
             if channel.rule is None:
                 raise LogError(f"{where}: has other instants than the log's clock; {HOW_TO_ALIGN}")
-            arrays[name] = channel.rule(clock, time, columns[channel.found.field.name])
+            arrays[name] = channel.rule(clock, time, columns[channel.file_column.field.name])
             outside = int(np.sum(~((clock >= time[0]) & (clock <= time[-1]))))
             note = f'{name}: brought from clock "{other.name}" by {channel.rule}'
             if outside:
@@ -260,7 +260,7 @@ def _read_channels(
 
 
 def _name_fields(group: Mapping[str, SelectedChannel]) -> list[str]:
-    return [channel.found.field.name for channel in group.values()]
+    return [channel.file_column.field.name for channel in group.values()]
 
 
 def _read_clock(
@@ -325,15 +325,15 @@ def _widen_window(
 def _build_signal(
     name: str, channel: SelectedChannel, values: Float[np.ndarray, " n"], clock: ClockColumn, digest: str
 ) -> Signal:
-    found, unit = channel.found, channel.unit
-    path = str(found.source.path)
-    steps = [found.column.describe_conversion(unit), "" if channel.clock == clock else str(channel.rule)]
+    file_column, unit = channel.file_column, channel.unit
+    path = str(file_column.source.path)
+    steps = [file_column.column.describe_conversion(unit), "" if channel.clock == clock else str(channel.rule)]
     conversion = ", then ".join(filter(None, steps))
     return Signal(
         name=name,
-        values=found.column.to_si(values, unit, path),
+        values=file_column.column.to_si(values, unit, path),
         unit=si_unit(unit),
-        origin=Origin(file=path, sha256=digest, column=found.field.name, conversion=conversion),
+        origin=Origin(file=path, sha256=digest, column=file_column.field.name, conversion=conversion),
     )
 
 

@@ -56,7 +56,7 @@ class ClockColumn:
 
 
 @record
-class FoundColumn:
+class FileColumn:
     """A column as it is declared, the file that has it, and its field there."""
 
     column: Column
@@ -83,7 +83,7 @@ class FoundColumn:
 class SelectedChannel:
     """A channel before it is read; `unit` is its column's, `constant` its value where that stands in a header."""
 
-    found: FoundColumn
+    file_column: FileColumn
     unit: str
     clock: ClockColumn
     rule: Rule | None = None
@@ -92,7 +92,7 @@ class SelectedChannel:
 
 @record
 class Selection:
-    """What is to be read."""
+    """The log's clock, its channels before they are read, and notes on both."""
 
     clock: ClockColumn
     channels: Mapping[str, SelectedChannel]
@@ -123,11 +123,11 @@ def select(
         notes += more
     if counter is not None:
         find_column([clock.source], "the counter", Column(column=counter.column))
-    selected = {name: _select_channel(clock, found, align) for name, found in columns.items()}
+    selected = {name: _select_channel(clock, file_column, align) for name, file_column in columns.items()}
     origins = {
-        name: (str(found.source.path), f"{found.field.name} {found.source.rows}".strip())
-        for name, found in columns.items()
-        if not found.column.shared
+        name: (str(file_column.source.path), f"{file_column.field.name} {file_column.source.rows}".strip())
+        for name, file_column in columns.items()
+        if not file_column.column.shared
     }
     notes += check_distinct({name: (origin, si_unit(selected[name].unit)) for name, origin in origins.items()})
     for name, column in declared.items():
@@ -137,30 +137,31 @@ def select(
     return Selection(clock=clock, channels=ordered, notes=tuple(notes))
 
 
-def _select_channel(clock: ClockColumn, found: FoundColumn, align: Rule | None) -> SelectedChannel:
+def _select_channel(clock: ClockColumn, file_column: FileColumn, align: Rule | None) -> SelectedChannel:
     """Return a channel with its clock, and the rule that brings it to the log's."""
-    channel_clock = _find_channel_clock(clock, found)
+    channel_clock = _find_channel_clock(clock, file_column)
     if channel_clock == clock:
-        return SelectedChannel(found=found, unit=found.unit, clock=clock)
-    rule, source = found.column.align or align, found.source
+        return SelectedChannel(file_column=file_column, unit=file_column.unit, clock=clock)
+    rule, source = file_column.column.align or align, file_column.source
     # Rows of one table may be at the same instants; whether they are is seen on reading.
     if rule is None and not (source.rows and clock.rows and source.path == clock.path):
         raise LogError(
-            f'{source.path}: "{found.field.name}" is on the clock "{channel_clock.name}", the log on "{clock.name}" of '
-            f"{clock.path.name}; {HOW_TO_ALIGN}"
+            f'{source.path}: "{file_column.field.name}" is on the clock "{channel_clock.name}", the log on '
+            f'"{clock.name}" of {clock.path.name}; {HOW_TO_ALIGN}'
         )
-    return SelectedChannel(found=found, unit=found.unit, clock=channel_clock, rule=rule)
+    return SelectedChannel(file_column=file_column, unit=file_column.unit, clock=channel_clock, rule=rule)
 
 
-def _find_columns(sources: Sequence[Source], columns: Mapping[str, Column]) -> dict[str, FoundColumn]:
+def _find_columns(sources: Sequence[Source], columns: Mapping[str, Column]) -> dict[str, FileColumn]:
     """Return the columns that are no constants; those of the same rows share a source, and so a clock."""
-    found = {name: find_column(sources, name, column) for name, column in columns.items() if not column.from_header}
+    read = [(name, column) for name, column in columns.items() if not column.from_header]
+    file_columns = {name: find_column(sources, name, column) for name, column in read}
     kept: dict[tuple[str, str], Source] = {}
-    for name, column in found.items():
-        if column.column.where:
-            rows = keep_rows(column.source, column.column.where)
-            found[name] = replace(column, source=kept.setdefault((str(rows.path), rows.rows), rows))
-    return found
+    for name, column in read:
+        if column.where:
+            rows = keep_rows(file_columns[name].source, column.where)
+            file_columns[name] = replace(file_columns[name], source=kept.setdefault((str(rows.path), rows.rows), rows))
+    return file_columns
 
 
 def _select_constant(sources: Sequence[Source], clock: ClockColumn, name: str, column: Column) -> SelectedChannel:
@@ -175,8 +176,8 @@ def _select_constant(sources: Sequence[Source], clock: ClockColumn, name: str, c
         )
     value, unit = stated[constant].constants[constant]
     field = Field(name=constant, kind="float64", length=None, unit=unit)
-    found = FoundColumn(column=column, source=stated[constant], field=field)
-    return SelectedChannel(found=found, unit=found.unit, clock=clock, constant=value)
+    file_column = FileColumn(column=column, source=stated[constant], field=field)
+    return SelectedChannel(file_column=file_column, unit=file_column.unit, clock=clock, constant=value)
 
 
 def as_column(column: str | int | Column) -> Column:
@@ -184,7 +185,7 @@ def as_column(column: str | int | Column) -> Column:
     return column if isinstance(column, Column) else Column(column=column)
 
 
-def find_column(sources: Sequence[Source], name: str, column: Column) -> FoundColumn:
+def find_column(sources: Sequence[Source], name: str, column: Column) -> FileColumn:
     """Return where a column is."""
     places = [source for source in sources if column.file is None or source.path == Path(column.file)]
     if not places:
@@ -203,7 +204,7 @@ def find_column(sources: Sequence[Source], name: str, column: Column) -> FoundCo
     source, field = hits[0]
     if not field.numeric and source.format != "CSV":  # a text file names the cell, on reading
         raise LogError(f'{source.path}: "{field.name}" holds {field.kind}, not numbers; {field.remedy}')
-    return FoundColumn(column=column, source=source, field=field)
+    return FileColumn(column=column, source=source, field=field)
 
 
 def _match_fields(source: Source, column: str | int) -> list[Field]:
@@ -244,24 +245,26 @@ def _list_paths(sources: Sequence[Source]) -> str:
     return ", ".join(str(source.path) for source in sources)
 
 
-def _make_clock(found: FoundColumn) -> ClockColumn:
-    column, source, name = found.column, found.source, found.field.name
-    if column.unit is None and found.field.unit is None:
+def _make_clock(file_column: FileColumn) -> ClockColumn:
+    column, source, name = file_column.column, file_column.source, file_column.field.name
+    if column.unit is None and file_column.field.unit is None:
         raise ClockError(
             f'{source.path}: column "{name}" has no unit, and is the time; give it, in seconds if it is: '
             f"time with {spell_column(column=column.column, unit='s')} (--unit time=s)",
             column=name,
         )
-    if not same_dimension(found.unit, "s"):
-        raise UnitError(f'{source.path}: column "{name}" is in {found.unit}, not a unit of time; {advise_time(source)}')
-    clock = ClockColumn(source=source, path=source.path, name=name, unit=found.unit, rows=source.rows)
+    if not same_dimension(file_column.unit, "s"):
+        raise UnitError(
+            f'{source.path}: column "{name}" is in {file_column.unit}, not a unit of time; {advise_time(source)}'
+        )
+    clock = ClockColumn(source=source, path=source.path, name=name, unit=file_column.unit, rows=source.rows)
     return clock.shift(column)
 
 
 def _find_log_clock(
     sources: Sequence[Source],
     time: str | int | Column | None,
-    channels: list[FoundColumn] | None,
+    channels: list[FileColumn] | None,
     rate_hz: float | None,
 ) -> ClockColumn:
     """Return the log's clock: as given, else the one that all channels share."""
@@ -273,12 +276,14 @@ def _find_log_clock(
         # A header that several files have, or rows, is the clock of the first channel's.
         if first and not column.where and ((len(sources) > 1 and column.file is None) or first.rows):
             sources = [first] if _match_fields(first, column.column) else sources
-        found = find_column(sources, "time", column)
-        return _make_clock(replace(found, source=keep_rows(found.source, column.where)) if column.where else found)
+        file_column = find_column(sources, "time", column)
+        return _make_clock(
+            replace(file_column, source=keep_rows(file_column.source, column.where)) if column.where else file_column
+        )
     if channels is None:
         places = [(source, field) for source in sources for field in source.fields if field.numeric]
     else:
-        places = [(found.source, found.field) for found in channels]
+        places = [(file_column.source, file_column.field) for file_column in channels]
     files = list(dict.fromkeys(str(source.path) for source, _ in places))
     if len(files) > 1:
         raise LogError(f"{', '.join(files)}: several files have several clocks; name the log's with time= (--time)")
@@ -300,7 +305,7 @@ def _find_log_clock(
 
 
 def _make_rate_clock(
-    sources: Sequence[Source], time: object, channels: list[FoundColumn] | None, rate_hz: float
+    sources: Sequence[Source], time: object, channels: list[FileColumn] | None, rate_hz: float
 ) -> ClockColumn:
     """Return a clock of a stated rate, for a file that has none."""
     if time is not None:
@@ -308,7 +313,7 @@ def _make_rate_clock(
     if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float) or not 0.0 < rate_hz < 1e12:
         raise LogError(f"rate_hz = {rate_hz!r} is not a sample rate; give samples per second")
     source = channels[0].source if channels else sources[0]
-    if len(sources) > 1 or any(found.source is not source for found in channels or []):
+    if len(sources) > 1 or any(file_column.source is not source for file_column in channels or []):
         raise LogError(f"{_list_paths(sources)}: rate_hz is the clock of one table; read one file, without where")
     return ClockColumn(source=source, path=source.path, name=f"{rate_hz:g} Hz", unit="s", rate_hz=float(rate_hz))
 
@@ -349,9 +354,9 @@ def is_time_name(name: str) -> bool:
     return re.split(r"[./]", bare_name(name))[-1].casefold() in _TIME_NAMES
 
 
-def _find_channel_clock(clock: ClockColumn, found: FoundColumn) -> ClockColumn:
+def _find_channel_clock(clock: ClockColumn, file_column: FileColumn) -> ClockColumn:
     """Return the clock a channel is on: its own, the log's, the format's, or in another file one of the same name."""
-    column, source, field = found.column, found.source, found.field
+    column, source, field = file_column.column, file_column.source, file_column.field
     reference = clock.field
     if column.time is not None:
         time = as_column(column.time)
@@ -380,7 +385,7 @@ def _is_as_long(field: Field, other: Field) -> bool:
 
 def _select_every_channel(
     sources: Sequence[Source], clock: ClockColumn, align: Rule | None
-) -> tuple[dict[str, FoundColumn], list[str]]:
+) -> tuple[dict[str, FileColumn], list[str]]:
     """Return every column of numbers on the clock; with a rule for all, those on other clocks too."""
     reference = clock.field
 
@@ -414,12 +419,12 @@ def _select_every_channel(
     units, remarks = _find_units(chosen)
     bare = [bare_name(field.name) if unit else field.name for unit, (_, field) in zip(units, chosen, strict=True)]
     counts = Counts(bare)
-    columns: dict[str, FoundColumn] = {}
+    columns: dict[str, FileColumn] = {}
     for name, unit, (source, field) in zip(bare, units, chosen, strict=True):
         key = name if counts[name] == 1 and name != "time" else field.name
         key = key if key not in columns else f"{source.path.name}:{field.name}"
         column = Column(column=field.name, unit=unit, file=source.path)
-        columns[key] = FoundColumn(column=column, source=source, field=field)
+        columns[key] = FileColumn(column=column, source=source, field=field)
     return columns, notes + remarks
 
 
@@ -452,7 +457,7 @@ def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str
 def _check_bracket(source: Source, field: Field) -> None:
     """Refuse brackets that hold no unit, with the command that gives one."""
     try:
-        si_unit(FoundColumn(column=Column(column=field.name), source=source, field=field).unit)
+        si_unit(FileColumn(column=Column(column=field.name), source=source, field=field).unit)
     except SeaoptError as error:
         bare = bare_name(field.name)
         name = bare if bare.isidentifier() else "F1"

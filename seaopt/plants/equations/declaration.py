@@ -1,4 +1,4 @@
-"""What a declared plant is checked for when it is made: names and units, equations, roles, bristles, structure."""
+"""The checks of a plant when it is made: names and units, equations, roles, bristles, structure."""
 
 from __future__ import annotations
 
@@ -79,9 +79,9 @@ def check_loads(plant: Plant, name: str, friction: Friction, spaces: list[Simple
     """Refuse loads of a friction that are not rated, or that have a parameter's name."""
     loads = list(friction.loads(*spaces)) if friction.loads is not None else []
     if sorted(loads) != sorted(friction.rated):
-        given = ", ".join(friction.rated) or "none"
+        rated = ", ".join(friction.rated) or "none"
         raise PlantError(
-            f"plant {plant.name}: friction {name} has the loads {', '.join(loads) or 'none'}, and rated has {given}; "
+            f"plant {plant.name}: friction {name} has the loads {', '.join(loads) or 'none'}, and rated has {rated}; "
             "give the largest size of each load in rated"
         )
     taken = [load for load in loads if load in plant.parameters]

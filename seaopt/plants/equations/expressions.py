@@ -132,8 +132,8 @@ def list_names(text: str) -> list[str]:
     ['k', 'x', 'sin', 'y']
 
     """
-    found = (match["name"] for match in _TOKEN.finditer(text[:MAX_LENGTH]))
-    return list(dict.fromkeys(name for name in found if name is not None))
+    names = (match["name"] for match in _TOKEN.finditer(text[:MAX_LENGTH]))
+    return list(dict.fromkeys(name for name in names if name is not None))
 
 
 class _Parser:

@@ -51,17 +51,17 @@ def store_function(function: Callable[..., Any], *arguments: Iterable[str] | str
 
     """
     symbols: dict[tuple[int, str | None], Any] = {}
-    given: list[Any] = []
+    symbolic: list[Any] = []
     for index, names in enumerate(arguments):
         if isinstance(names, str):
             symbols[index, None] = ca.SX.sym(names)
-            given.append(symbols[index, None])
+            symbolic.append(symbols[index, None])
         else:
             attributes = {name: ca.SX.sym(name) for name in names}
             symbols |= {(index, name): symbol for name, symbol in attributes.items()}
-            given.append(SimpleNamespace(**attributes))
+            symbolic.append(SimpleNamespace(**attributes))
     leaves: list[Any] = []
-    layout = _take_leaves(function(*given), leaves)
+    layout = _take_leaves(function(*symbolic), leaves)
     # What the expressions do not depend on need not be there when they are evaluated.
     used = {origin: symbol for origin, symbol in symbols.items() if any(ca.depends_on(leaf, symbol) for leaf in leaves)}
     return StoredFunction(
@@ -100,16 +100,16 @@ _ARGUMENTS = {
 
 
 def store_plant(plant: Any) -> dict[str, Any]:
-    """Return what a `Plant` is made of, with every function of its own as a `StoredFunction`."""
+    """Return what a `Plant` is made of, with every function of its names_of as a `StoredFunction`."""
     spaces: dict[str, Any] = {"t": "t", "v": "velocity", "z": "z", "x": tuple(plant.states)}
     spaces |= {"u": (*plant.inputs, *plant.friction), "p": tuple(plant.parameters)}
 
     def store(owner: Any, loads: Iterable[str] = ()) -> dict[str, Any]:
         """Return the functions of a plant or a role that do not pickle as they are, stored."""
-        own = spaces | {"l": (*spaces["p"], *loads)}
+        names_of = spaces | {"l": (*spaces["p"], *loads)}
         functions = {name: getattr(owner, name, None) for name in _ARGUMENTS}
         return {
-            name: store_function(function, *(own[letter] for letter in _ARGUMENTS[name]))
+            name: store_function(function, *(names_of[letter] for letter in _ARGUMENTS[name]))
             for name, function in functions.items()
             if callable(function) and not _has_name(function)
         }

@@ -1,1 +1,1 @@
-"""What drives an actuator: its motor, as it warms up."""
+"""The motor as it warms up, and the guard that keeps it cool."""

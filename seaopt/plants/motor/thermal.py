@@ -1,4 +1,4 @@
-r"""What the current heats: a winding in a case, for any plant whose motor is commanded a current inside.
+r"""Heat of the current: a winding in a case, for any plant whose motor is commanded a current inside.
 
 Two masses of heat, the winding on the case on the ambient air; their temperatures are counted from the ambient's, so
 that a motor at rest is at zero:
@@ -61,12 +61,12 @@ PARAMETERS = (
 NETWORK = ("R", "R_wc", "R_ca", "C_w", "C_c")  # these and T_max differ from motor to motor
 
 
-def list_guessed_heat(plant: Plant, given: Collection[str]) -> list[str]:
-    """Return what of a motor's winding is not among the given names, so that its default is a guess."""
+def list_guessed_heat(plant: Plant, stated: Collection[str]) -> list[str]:
+    """Return what of a motor's winding is not among the stated names, so that its default is a guess."""
     if not set(RISES) <= set(plant.states):
         return []
     network_alone = plant.winding is None  # the kind "winding", which has no largest temperature to keep
-    return [name for name in (*NETWORK, *(() if network_alone else ("T_max",))) if name not in given]
+    return [name for name in (*NETWORK, *(() if network_alone else ("T_max",))) if name not in stated]
 
 
 def find_resistance(winding: Winding | None, x: Any, p: Any) -> Any:
@@ -111,7 +111,7 @@ def winding() -> Plant:
         states=dict.fromkeys(RISES, "K"),
         inputs={"I": "A"},
         outputs=dict.fromkeys(TEMPERATURES, "degC"),
-        parameters={item.name: item for item in PARAMETERS},
+        parameters={parameter.name: parameter for parameter in PARAMETERS},
         f=lambda t, x, u, p: _warm(u.I, x, p),
         h=lambda t, x, u, p: _read_temperatures(x, p),
     )
@@ -128,7 +128,7 @@ def add_heat(plant: Plant) -> Plant:
             f'plant {plant.name}: part "thermal" needs the current that heats the winding; give the role '
             "actuation = Actuation(input, effort) with an input in A"
         )
-    refuse_clash(plant, "thermal", (*RISES, *TEMPERATURES, *(item.name for item in PARAMETERS)))
+    refuse_clash(plant, "thermal", (*RISES, *TEMPERATURES, *(parameter.name for parameter in PARAMETERS)))
     source = actuation.input
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def add_heat(plant: Plant) -> Plant:
         winding=Winding(rises=RISES, temperatures=TEMPERATURES, effort=actuation.effort, unit=actuation.unit),
         states={**plant.states, **dict.fromkeys(RISES, "K")},
         outputs={**plant.outputs, **dict.fromkeys(TEMPERATURES, "degC")},
-        parameters={**plant.parameters, **{item.name: item for item in PARAMETERS}},
+        parameters={**plant.parameters, **{parameter.name: parameter for parameter in PARAMETERS}},
         ports=change_ports(plant.ports, add_heat),
     )
 
@@ -190,7 +190,7 @@ def freeze_heat(plant: Plant) -> Plant:
 
 @record
 class MotorRating:
-    """What a motor can do without overheating, in numbers: its network of heat, and the effort of an ampere.
+    """Continuous and peak effort of a motor that does not overheat: its network of heat, and the effort of an ampere.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What sensors make of a plant's motion: torque from deflection, speed by difference."""
+"""Sensors that compute their reading: torque from deflection, speed by difference."""

@@ -92,8 +92,8 @@ def keep_weights(plant: Plant) -> Sensing | None:
     sensing = plant.sensing
     if sensing is None or not sensing.from_encoders:
         return sensing
-    found = {output: partial(_weigh_inside, plant, output) for output in sensing.from_encoders}
-    return replace(sensing, weights={**found, **sensing.weights})
+    inside = {output: partial(_weigh_inside, plant, output) for output in sensing.from_encoders}
+    return replace(sensing, weights={**inside, **sensing.weights})
 
 
 def _weigh_inside(plant: Plant, output: str, p: Any) -> dict[str, Any]:

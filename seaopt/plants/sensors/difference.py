@@ -8,7 +8,7 @@ f_c. This is not the speed: it is the mean speed of the last n periods, n T/2 la
 sample rate where n = 1. The model differences its own position. To do so it holds the last n positions, and
 :math:`s_{k-1}`, in states that stand still between samples and are set at each (`Sampling`). Which positions came
 before the first sample is not in the log, so that these states are unknown where the initial state is, and the first n
-differences of each stretch then tell nothing but them.
+differences of each segment then tell nothing but them.
 """
 
 from __future__ import annotations
