@@ -23,6 +23,7 @@ STICKS_OUT = 0.8  # of its distance: how far an outlier lies beyond the second o
 NEIGHBOURS = 5  # samples each side of an outlier that it is compared with
 HOLDS = 0.4  # share of still samples from which a channel may be one that is held
 REGULAR = 0.8  # share of a counter's, or a held channel's, steps that must be alike
+LARGEST_COUNT = 2.0**53  # below which a float is every whole number
 FEWEST_SAMPLES = 16  # samples below which nothing is judged
 
 
@@ -253,7 +254,7 @@ def find_counter_losses(values: Float[np.ndarray, " n"]) -> CounterLosses | None
     """
     if values.size < FEWEST_SAMPLES or np.any(values[:STILLNESS_BLOCK] != np.round(values[:STILLNESS_BLOCK])):
         return None  # NaN is not equal to itself
-    if np.any(values != np.round(values)) or np.any(np.isinf(values)):
+    if not np.all((np.abs(values) < LARGEST_COUNT) & (values == np.round(values))):
         return None
     step = np.diff(values)
     changes = 1 + np.flatnonzero(step)

@@ -11,12 +11,11 @@ from jaxtyping import Float, Int
 
 from seaopt.errors import LogError
 from seaopt.formatting import format_count
+from seaopt.logs.quality.faults import LARGEST_COUNT
 from seaopt.options import option
 from seaopt.records import record
 
-LARGEST = 2**53  # below which a float is every whole number
 MOST_PER_COUNT = 1_000_000
-PROBE_SAMPLES = 1000  # samples that must look like a counter before all are looked at
 
 
 @record
@@ -37,7 +36,7 @@ class Counter:
 
     def __post_init__(self) -> None:
         if not 1 <= self.samples_per_count <= MOST_PER_COUNT:
-            shown = self.samples_per_count if abs(self.samples_per_count) < LARGEST else "a number of many digits"
+            shown = self.samples_per_count if abs(self.samples_per_count) < LARGEST_COUNT else "a number of many digits"
             raise LogError(f"Counter: samples_per_count = {shown}; give a whole number from 1 to {MOST_PER_COUNT}")
 
     def open_gaps(
@@ -51,7 +50,8 @@ class Counter:
             The column is not a counter: not whole, or falling.
 
         """
-        if not _is_whole(values) or np.any(np.diff(values) < 0):
+        whole = np.all((np.abs(values) < LARGEST_COUNT) & (values == np.floor(values)))
+        if not whole or np.any(np.diff(values) < 0):
             raise LogError(
                 f'{place}: counter "{self.column}" is not a whole number that only rises; choose another column'
             )
@@ -68,26 +68,6 @@ class Counter:
             f'counter "{self.column}" shows {lost_samples}, the first before t = {first:.6g} s; later '
             "times were moved to open gaps"
         )
-
-    @staticmethod
-    def suspect(values: Float[np.ndarray, " n"]) -> int:
-        """Return how many samples a column seems to miss, if it looks like a counter; 0 otherwise."""
-        for part in (values[:PROBE_SAMPLES], values):
-            if part.size < 10 or not _is_whole(part) or np.any(np.diff(part) < 0):
-                return 0
-        runs = np.diff(np.flatnonzero(np.diff(values)))
-        if runs.size < 5:
-            return 0
-        usual = int(np.bincount(runs).argmax())
-        jumps = np.diff(values)[np.diff(values) > 0]
-        if np.mean(runs == usual) < 0.8 or np.mean(jumps == 1) < 0.8:
-            return 0
-        return int(_count_losses(values, usual)[1].sum())
-
-
-def _is_whole(values: Float[np.ndarray, " n"]) -> bool:
-    """Tell whether values are whole numbers that differences are exact of."""
-    return bool(np.all((np.abs(values) < LARGEST) & (values == np.floor(values))))
 
 
 def _count_losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:

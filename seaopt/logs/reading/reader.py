@@ -19,6 +19,7 @@ from seaopt.formatting import format_count
 from seaopt.logs.formats import Window, open_source
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule, check_increasing
 from seaopt.logs.log.log import Log
+from seaopt.logs.quality.faults import find_counter_losses
 from seaopt.logs.reading.column import Column, spell_column, suspect_wrap
 from seaopt.logs.reading.counter import Counter
 from seaopt.logs.reading.selection import HOW_TO_ALIGN, ClockColumn, SelectedChannel, Selection, advise_time, select
@@ -350,9 +351,11 @@ def _remark_on(signal: Signal) -> list[str]:
             f"{signal.name}: looks like signed numbers in an unsigned field of {bits} bits; if so, give "
             f"{spell_column(column=signal.origin.column, wrap_bits=bits)}"
         ]
-    if loss := Counter.suspect(signal.values):
+    losses = find_counter_losses(signal.values)
+    if losses is not None and losses.rows.size and np.all(np.diff(signal.values) >= 0.0):
+        lost = format_count(int(losses.lost.sum()), "sample")
         return [
-            f"{signal.name}: looks like a sample counter that misses {format_count(loss, 'sample')}; to open gaps "
+            f"{signal.name}: looks like a sample counter that misses {lost}; to open gaps "
             f"there, give it as counter: {spell_column(column=signal.origin.column, samples_per_count='...')}"
         ]
     return []
