@@ -20,6 +20,7 @@ A scheduling variable that is not finite, or beyond 1e15, is not used: the last 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -98,11 +99,6 @@ class RunnableSchedule:
             f"{table.unit} in {table.points.size} points, at {1.0 / table.sample_time_s:.6g} Hz, {limit}"
         )
 
-    def find_share(self, place: float) -> float:
-        """Return K at a value of the scheduling variable."""
-        i, t = self.table.find_stretch(place)
-        return float(self.anti_windup[i] + t * (self.anti_windup[i + 1] - self.anti_windup[i]))
-
     def reset(
         self, reference: float = 0.0, measurement: float = 0.0, place: float = math.nan, command: float = 0.0
     ) -> ScheduleState:
@@ -129,25 +125,18 @@ class RunnableSchedule:
         if not abs(command) <= self.limit:
             limit = show_command(self.limit, *self.command)
             raise ControlError(f"command = {command:g} is above the limit of {limit}; lower it")
-        known = is_number(place)
+        missing = not is_number(place)
         at_rest = ScheduleState(
             reference=reference,
             measurement=measurement,
-            place=place if known else self.fallback,
+            place=self.fallback if missing else place,
             command=command,
-            misplaced=0 if known else 1,
+            misplaced=int(missing),
         )
         if not self.table.integrates:
             return at_rest
-        effort = command / self.per_effort - self._find_effort(at_rest, reference, measurement, at_rest.place)[0]
-        return ScheduleState(
-            effort=effort,
-            reference=reference,
-            measurement=measurement,
-            place=at_rest.place,
-            command=command,
-            misplaced=at_rest.misplaced,
-        )
+        effort, _, _ = self._find_effort(at_rest, reference, measurement, at_rest.place)
+        return replace(at_rest, effort=command / self.per_effort - effort)
 
     def _find_effort(
         self, state: ScheduleState, reference: float, measurement: float, place: float
@@ -175,7 +164,10 @@ class RunnableSchedule:
             effort, half, alpha = self._find_effort(state, reference, measurement, at)
             most = self.limit / self.per_effort
             applied = min(max(effort, -most), most)
-            pull, turn = self.find_share(at) * (applied - effort), alpha * self.table.sample_time_s
+            pull, turn = (
+                self.table.draw_line(self.anti_windup, at) * (applied - effort),
+                alpha * self.table.sample_time_s,
+            )
             following = ScheduleState(
                 effort=state.effort + 2.0 * half + pull,
                 reference=state.reference + turn * (reference - state.reference),
@@ -185,15 +177,7 @@ class RunnableSchedule:
                 misplaced=misplaced,
             )
         if not all((is_number(reference), is_number(measurement), *map(math.isfinite, (effort, following.effort)))):
-            return state.command, ScheduleState(
-                effort=state.effort,
-                reference=state.reference,
-                measurement=state.measurement,
-                place=at,
-                command=state.command,
-                held=state.held + 1,
-                misplaced=misplaced,
-            )
+            return state.command, replace(state, place=at, held=state.held + 1, misplaced=misplaced)
         return following.command, following
 
 
@@ -232,13 +216,13 @@ def make_runnable(
     """
     each = [
         realise(
-            table.law(float(point)),
+            table.law(point),
             per_effort=per_effort,
             current_limit_A=limit,
             tracking_time_s=tracking_time_s,
             command=command,
         )
-        for point in table.points
+        for point in table.points.tolist()
     ]
     return RunnableSchedule(
         table=table,

@@ -19,6 +19,7 @@ from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
+from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.tuner import describe_law, make_task
 from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import format_count, join_words
@@ -110,19 +111,18 @@ class ScheduledController(Result, Worded):
     @property
     def broken(self) -> tuple[str, ...]:
         """The limits that are broken, each once with where: at the points, and between them."""
-        found = [
-            *((point, () if one.met else one.active_constraints) for point, one in self._pairs),
-            *((one.value, one.broken) for one in self.between),
-        ]
         places: dict[str, list[float]] = {}
-        for value, names in found:
-            for name in names:
-                places.setdefault(name, []).append(value)
-        return tuple(f"{name} at {self._list_places(sorted(values))}" for name, values in places.items())
-
-    def _list_places(self, values: Sequence[float]) -> str:
-        more = f" and {format_count(len(values) - 1, 'more value')}" if len(values) > 1 else ""
-        return f"{self.over} = {values[0]:g}{more}"
+        for point, controller in self._pairs:
+            for name in () if controller.met else controller.active_constraints:
+                places.setdefault(name, []).append(point)
+        for place in self.between:
+            for name in place.broken:
+                places.setdefault(name, []).append(place.value)
+        texts: list[str] = []
+        for name, values in places.items():
+            more = f" and {format_count(len(values) - 1, 'more value')}" if len(values) > 1 else ""
+            texts.append(f"{name} at {self.over} = {min(values):g}{more}")
+        return tuple(texts)
 
     @property
     def _pairs(self) -> list[tuple[float, Controller]]:
@@ -131,11 +131,10 @@ class ScheduledController(Result, Worded):
     @property
     def remedy(self) -> str:
         """What to change where a limit is broken; empty where none is."""
-        infeasible = [(point, one) for point, one in self._pairs if not one.met]
-        if infeasible:
-            point, one = infeasible[0]
-            return f"at {self.over} = {point:g}: {one.explanation}"
-        missed = [one.value for one in self.between if one.broken]
+        for point, controller in self._pairs:
+            if not controller.met:
+                return f"at {self.over} = {point:g}: {controller.explanation}"
+        missed = [place.value for place in self.between if place.broken]
         if not missed:
             return ""
         stretches = pairwise(self.points)
@@ -147,19 +146,10 @@ class ScheduledController(Result, Worded):
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
         shared = [note for note in self.controllers[0].notes if all(note in one.notes for one in self.controllers)]
-        return (*shared, *self._same_notes(), *self._step_notes())
-
-    def _same_notes(self) -> tuple[str, ...]:
-        """Say that one law would do, where no gain changes."""
-        rows = self.table.gains.values()
-        if any(np.ptp(row) > SAME_GAIN * np.max(np.abs(row)) for row in rows):
-            return ()
-        return (f"no gain changes over {self.over}: one law for all points does, without a schedule",)
-
-    def _step_notes(self) -> tuple[str, ...]:
-        """Name gains that more than double from a point to the next: another valley of the tuner, or too few points."""
-        notes: list[str] = []
-        for name, row in self.table.gains.items():
+        rows, notes = self.table.gains, list[str]()
+        if not any(np.ptp(row) > SAME_GAIN * np.max(np.abs(row)) for row in rows.values()):
+            notes.append(f"no gain changes over {self.over}: one law for all points does, without a schedule")
+        for name, row in rows.items():  # a gain that more than doubles: another valley of the tuner, or too few points
             low, high = np.abs(row[:-1]), np.abs(row[1:])
             smaller = np.maximum(np.minimum(low, high), 1e-3 * np.max(np.abs(row)) or 1.0)
             steps = np.abs(high - low) / smaller
@@ -169,7 +159,7 @@ class ScheduledController(Result, Worded):
                     f"{name} changes from {row[at]:.4g} to {row[at + 1]:.4g} between {self.over} = {self.points[at]:g} "
                     f"and {self.points[at + 1]:g}: a point between them would make the step smaller"
                 )
-        return tuple(notes)
+        return (*shared, *notes)
 
     def asked_hz(self, value: float) -> float:
         """Return the bandwidth asked at a value of the variable, between the points interpolated."""
@@ -192,14 +182,12 @@ class ScheduledController(Result, Worded):
             raise ControlError(f"{self.over} = {value:g} is outside the points; give {low:g} to {high:g}")
         if value in self.points:
             return self.controllers[self.points.index(value)]
-        return freeze(self.table, value, self._ask(value), self.design, self.others)
+        spec = replace(self.spec, bandwidth_hz=self.asked_hz(value))
+        return freeze(self.table, value, spec, self.design, self.others)
 
     def close_points(self, plant: Plant, params: ParameterSet) -> tuple[Loop, ...]:
         """Return a plant's loop at each point, with the variable standing still there."""
         return tuple(one.close(plant, place_variable(plant, params, self.over, point)) for point, one in self._pairs)
-
-    def _ask(self, value: float) -> ControllerSpec:
-        return replace(self.spec, bandwidth_hz=self.asked_hz(value))
 
     def with_places(self, parts: int = PARTS) -> ScheduledController:
         """Return the schedule judged at the inner ends of so many parts of every stretch between two points."""
@@ -208,13 +196,8 @@ class ScheduledController(Result, Worded):
     def _judge_place(self, value: float) -> PlaceFigures:
         """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
         frozen, asked = self.at(value), self.asked_hz(value)
-        worst = [
-            frozen.achieved,
-            *(
-                frozen.close(plant, place_variable(plant, params, self.over, value)).figures()
-                for plant, params in self.others.values()
-            ),
-        ]
+        others = place_plants(self.others, self.over, value).values()
+        worst = [frozen.achieved, *(frozen.close(plant, params).figures() for plant, params in others)]
         band = frozen.achieved.bandwidth_hz
         broken = () if frozen.met else frozen.active_constraints
         if band is None or band < LEAST_BANDWIDTH * asked:
@@ -223,8 +206,8 @@ class ScheduledController(Result, Worded):
             value=value,
             bandwidth_hz=band,
             asked_hz=asked,
-            ms=max(one.ms for one in worst),
-            mt=max(one.mt for one in worst),
+            ms=max(figures.ms for figures in worst),
+            mt=max(figures.mt for figures in worst),
             broken=broken,
         )
 
@@ -334,11 +317,10 @@ def freeze(
     The limits that depend on the bandwidth, such as a droop up to a third of it, are those of the bandwidth it has.
     """
     plant, params = design[0], place_variable(*design, table.over, value)
-    robust_to = {name: (one, place_variable(one, own, table.over, value)) for name, (one, own) in others.items()}
-    task = make_task(plant, plant.complete(params), spec, robust_to)
+    task = make_task(plant, plant.complete(params), spec, place_plants(others, table.over, value))
     gains, law = table.interpolate(value), table.law(value)
 
-    def describe() -> Controller:
+    def describe(task: Task) -> Controller:
         loops = task.measure_law(
             law,
             filter_samples=gains["T_f"] / table.sample_time_s if gains["k_d"] else math.inf,
@@ -346,14 +328,13 @@ def freeze(
         )
         return describe_law(task, law, loops, (plant, params), gains=gains)
 
-    asked = describe()
-    band = asked.achieved.bandwidth_hz
+    frozen = describe(task)
+    band = frozen.achieved.bandwidth_hz
     if band is None or not math.isfinite(band):
-        return asked
+        return frozen
     low, high = spec.bandwidth_range_hz
-    own = replace(spec, bandwidth_hz=band, bandwidth_range_hz=(min(low, band), max(high, band)))
-    task = replace(task, spec=own)
-    return describe()
+    reached = replace(spec, bandwidth_hz=band, bandwidth_range_hz=(min(low, band), max(high, band)))
+    return describe(replace(task, spec=reached))
 
 
 def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) -> ParameterSet:
@@ -374,6 +355,11 @@ def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) 
         return given.with_parameters(replace(plant.complete(given)[over], value=value))
     known = conditions((plant,))
     return given.with_parameters(replace(known[over], value=value)) if over in plant.states else given
+
+
+def place_plants(plants: Plants, over: str, value: float) -> Plants:
+    """Return plants with their parameters, the scheduling variable at a value."""
+    return {name: (plant, place_variable(plant, params, over, value)) for name, (plant, params) in plants.items()}
 
 
 def find_unit(over: str, plants: Mapping[str, Plant]) -> str:

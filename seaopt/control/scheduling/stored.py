@@ -58,8 +58,8 @@ def read_schedule(content: Mapping[str, Any]) -> StoredSchedule:
     if table.fallback not in table.points:
         raise FileError(f"schedule.json: fallback = {table.fallback:g} is none of the points; {TUNE_AGAIN}")
     for name in LAW_GAINS:
-        own = [one.gains.get(name, np.nan) for one in table.controllers]
+        tuned = [controller.gains.get(name, np.nan) for controller in table.controllers]
         stated = table.gains.get(name, [])
-        if len(stated) != count or not np.allclose(stated, own, rtol=AGREES, atol=0.0):
+        if len(stated) != count or not np.allclose(stated, tuned, rtol=AGREES, atol=0.0):
             raise FileError(f"schedule.json: gains.{name} is not what the controllers have; {TUNE_AGAIN}")
     return table

@@ -30,6 +30,7 @@ from seaopt.control.scheduling.scheduled_controller import (
     ScheduledController,
     find_unit,
     make_table,
+    place_plants,
     place_variable,
 )
 from seaopt.control.tuning.convex_concave import improve
@@ -110,29 +111,27 @@ def tune_schedule(
     _check_structure(spec)
     places = np.asarray(points, dtype=float)
     check_points(over, places)
-    own = take_own_delays(spec, plant, robust_to or {}, params)
+    robust_to = take_own_delays(spec, plant, robust_to or {}, params)
     spec, values = settle_delays(spec, plant, params)
-    others = _pair_plants(own, values)
+    others = _pair_plants(robust_to, values)
     if over in DELAYS:
         raise ControlError(f'over = "{over}": a delay cannot be read as the law runs; give a state or a parameter')
     if any(over in draw for draw in draws):
         raise ControlError(f'draws have "{over}", which the schedule is over; take it out of the draws')
-    unit = find_unit(over, {"the design plant": plant, **{name: one for name, (one, _) in others.items()}})
-    specs = _specify(spec, places, bandwidths_hz)
-    tasks: list[Task] = []
-    for value, own in zip(places.tolist(), specs, strict=True):
-        here = place_variable(plant, values, over, value)
-        there = {name: (one, place_variable(one, given, over, value)) for name, (one, given) in others.items()}
-        tasks.append(make_task(plant, plant.complete(here), own, there, draws))
-    chain = _choose_chain(tasks, progress)
+    unit = find_unit(over, {"the design plant": plant, **{name: other for name, (other, _) in others.items()}})
+    placed = [
+        (place_variable(plant, values, over, value), place_plants(others, over, value)) for value in places.tolist()
+    ]
+    tasks = [
+        make_task(plant, plant.complete(at_point), point_spec, at_points, draws)
+        for (at_point, at_points), point_spec in zip(placed, _specify(spec, places, bandwidths_hz), strict=True)
+    ]
     controllers: list[Controller] = []
-    for value, task, (x, loops) in zip(places.tolist(), tasks, chain, strict=True):
-        here = place_variable(plant, values, over, value)
+    for (at_point, at_points), task, (x, loops) in zip(placed, tasks, _choose_chain(tasks, progress), strict=True):
         if _breaks_limits(task, loops):  # what blocks, and what is possible instead, is for the tuner to say
-            there = {name: (one, place_variable(one, given, over, value)) for name, (one, given) in others.items()}
-            controllers.append(tune(plant, here, task.spec, there, draws=draws))
+            controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws))
         else:
-            controllers.append(make_controller(task, x, loops, (plant, here)))
+            controllers.append(make_controller(task, x, loops, (plant, at_point)))
     make_table(over, unit, places.tolist(), controllers)  # refuses gains that cannot be interpolated
     schedule = ScheduledController(
         over=over,
@@ -165,16 +164,15 @@ def _check_structure(spec: ControllerSpec) -> None:
 
 def _pair_plants(robust_to: Mapping[str, Any], values: ParameterSet) -> Plants:
     """Return the plants of robust_to with their parameters."""
-    out: dict[str, tuple[Plant, ParameterSet]] = {}
-    for name, one in robust_to.items():
-        if isinstance(one, MeasuredResponse):
+    pairs: dict[str, tuple[Plant, ParameterSet]] = {}
+    for name, plant in robust_to.items():
+        if isinstance(plant, MeasuredResponse):
             raise ControlError(
                 f"robust_to: {name} is a measured response, which stands at one value of the variable; name a plant"
             )
-        pair = one if isinstance(one, tuple) else (one, values)
-        require_plant(pair[0], f"robust_to: {name}", ControlError)
-        out[str(name)] = pair
-    return out
+        pairs[str(name)] = plant if isinstance(plant, tuple) else (plant, values)
+        require_plant(pairs[str(name)][0], f"robust_to: {name}", ControlError)
+    return pairs
 
 
 def _specify(spec: ControllerSpec, points: Any, bandwidths_hz: Sequence[float] | None) -> list[ControllerSpec]:
@@ -192,16 +190,12 @@ def _choose_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
     """Return the numbers of every point with their loops, of the better of the chains from either end."""
     forward, backward = divide(progress, 1.0, 1.0)
     chains = [_tune_chain(tasks, forward), _tune_chain(tasks[::-1], backward)[::-1]]
-    values = np.array(
-        [
-            [task.rank(task.grid(place_frequencies(task)), x)[1] for task, (x, _) in zip(tasks, chain, strict=True)]
-            for chain in chains
-        ]
-    )
+    values, broken = np.zeros((2, len(tasks))), [0, 0]
+    for k, chain in enumerate(chains):
+        for point, (task, (x, loops)) in enumerate(zip(tasks, chain, strict=True)):
+            values[k, point] = task.rank(task.grid(place_frequencies(task)), x)[1]
+            broken[k] += _breaks_limits(task, loops)
     losses = np.max(values / np.min(values, axis=0), axis=1)
-    broken = [
-        sum(_breaks_limits(task, loops) for task, (_, loops) in zip(tasks, chain, strict=True)) for chain in chains
-    ]
     return chains[min(range(2), key=lambda k: (broken[k], losses[k]))]
 
 
@@ -232,15 +226,7 @@ def _follow(task: Task, x: LawNumbers) -> LawNumbers:
 
 def _choose_fallback(schedule: ScheduledController) -> float:
     """Return the point whose law has the least Ms on the worst plant of all points."""
-
-    def find_worst(controller: Controller) -> float:
-        plant, params = schedule.design
-        plants = [(plant, params), *schedule.others.values()]
-        return max(
-            controller.close(one, place_variable(one, own, schedule.over, value)).figures().ms
-            for value in schedule.points
-            for one, own in plants
-        )
-
-    worst = [find_worst(one) for one in schedule.controllers]
+    plants = {"": schedule.design, **schedule.others}
+    cases = [pair for value in schedule.points for pair in place_plants(plants, schedule.over, value).values()]
+    worst = [max(law.close(*case).figures().ms for case in cases) for law in schedule.controllers]
     return schedule.points[int(np.argmin(worst))]
