@@ -51,10 +51,11 @@ class Sensors:
 
     def refuse_negative(self, names: Collection[str], error: type[SeaoptError]) -> None:
         """Refuse what cannot be negative, of these."""
-        for what in ("noise_std", "quantisation", "saturation"):
+        for kind in ("noise_std", "quantisation", "saturation"):
             for name in names:
-                if not getattr(self, what).get(name, 0.0) >= 0.0:
-                    raise error(f"{what} of {name} is negative; give zero or more")
+                value = getattr(self, kind).get(name, 0.0)
+                if not value >= 0.0:
+                    raise error(f"{kind} of {name} = {value:g} is negative; give zero or more")
 
     def of(self, names: Collection[str]) -> Sensors:
         """Return the errors of these alone."""
@@ -140,12 +141,10 @@ def virtual_log(
 
     """
     devices = sensors if sensors is not None else Sensors()
-    for group in (devices.noise_std, devices.offset, devices.quantisation, devices.saturation):
-        for name, value in group.items():
-            if name not in plant.outputs:
-                raise SimulationError(f'sensor of "{name}": no such output; {suggestion(name, plant.outputs)}')
-            if group is not devices.offset and value < 0.0:
-                raise SimulationError(f"sensor of {name}: {value:g} is negative; give zero or more")
+    for name in devices.names:
+        if name not in plant.outputs:
+            raise SimulationError(f'sensor of "{name}": no such output; {suggestion(name, plant.outputs)}')
+    devices.refuse_negative(devices.names, SimulationError)
     excited = input_name if input_name is not None else next(iter(plant.inputs))
     if excited not in plant.inputs:
         raise SimulationError(f'input "{excited}" is not one of the plant; {suggestion(excited, plant.inputs)}')

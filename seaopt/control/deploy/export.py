@@ -138,11 +138,11 @@ def export(
             )
         law, stored = read_runnable(content, limit, tracking_time_s)
         templates, missed = SCHEDULE_TEMPLATES, "; ".join(content["broken"])
-        met, what, words = content["feasible"], "schedule", describe_schedule(content, law, stored, precision)
+        met, kind, words = content["feasible"], "schedule", describe_schedule(content, law, stored, precision)
         numbers: dict[str, dict[str, Any]] = {}
     else:
         stored, figures, heat = _read(content)
-        templates, missed, met, what = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"
+        templates, missed, met, kind = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"
         heat = derate if isinstance(derate, HeatGuard) else heat
         if derate and heat is None:
             raise ControlError(
@@ -164,7 +164,7 @@ def export(
         writers = {".m": repr, ".h": literal(precision), ".c": literal(precision)}
         numbers = {suffix: _numbers(stored, law, write, precision) for suffix, write in writers.items()}
     if not met and not allow_infeasible:
-        raise ControlError(f"the {what} misses {missed}; tune one that does not, or allow an infeasible one")
+        raise ControlError(f"the {kind} misses {missed}; tune one that does not, or allow an infeasible one")
     context = words | {
         "name": prefix,
         "NAME": prefix.upper(),

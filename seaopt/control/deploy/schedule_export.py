@@ -52,11 +52,10 @@ def read_runnable(
     from seaopt.control.scheduling.stored import read_schedule
 
     table = read_schedule(content)
-    first, *_ = controllers = [read_controller(one) for one in content["controllers"]]
+    first, *_ = controllers = [read_controller(stored) for stored in content["controllers"]]
     command = first["command"]
-    for point, one in zip(table.points, controllers, strict=True):
-        same = one["command"] == command and one["sample_time_s"] == first["sample_time_s"]
-        if not same or one["structure"] != first["structure"]:
+    for point, controller in zip(table.points, controllers, strict=True):
+        if any(controller[key] != first[key] for key in ("command", "sample_time_s", "structure")):
             raise FileError(
                 f"schedule.json: the controller at {table.over} = {point:g} has another command, rate or structure "
                 "than the first; tune again"
@@ -101,7 +100,7 @@ def describe_schedule(
         "rate_hz": f"{1.0 / table.sample_time_s:.10g}",
         **describe_timing(first),
         "feasible": content["feasible"],
-        "broken": [strip_markup(one) for one in content["broken"]],
+        "broken": [strip_markup(limit) for limit in content["broken"]],
         "limited": math.isfinite(law.limit),
         "integrates": table.integrates,
         "over": strip_markup(table.over),

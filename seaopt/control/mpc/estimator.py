@@ -324,15 +324,15 @@ def estimator(
     (True, 'm/s')
 
     """
-    given = params.parameters if isinstance(params, Fit) else params
-    values = plant.complete(given)
+    parameters = params.parameters if isinstance(params, Fit) else params
+    values = plant.complete(parameters)
     chosen = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     _check(plant, values, noise, chosen, sample_time_s, delay_samples)
     a, b, c, d = state_space(plant, values)
     nx, nu = b.shape
     block = np.zeros((nx + nu, nx + nu))
     block[:nx, :nx], block[:nx, nx:] = a, b
-    waits, rest_s = whole_samples(float(find_delay(plant, read_conditions(plant, given))), sample_time_s)
+    waits, rest_s = whole_samples(float(find_delay(plant, read_conditions(plant, parameters))), sample_time_s)
     whole, part = (
         expm_with_derivatives(block * seconds, np.zeros((0, nx + nu, nx + nu)))[0]
         for seconds in (sample_time_s, sample_time_s - rest_s)

@@ -17,7 +17,6 @@ from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
 from seaopt.control.mpc.quadratic_program import PENALTY, WIDE, factor_program, stack_hessian
-from seaopt.errors import FileError
 from seaopt.files import plain, write_text
 from seaopt.records import record
 
@@ -69,10 +68,6 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
 def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = False) -> Path:
     """Write a controller's C code, as `export_mpc`."""
     target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
     for name in SOURCES:
         write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
     write_text(target / "force_mpc_data.h", _format_data(code, single_precision))

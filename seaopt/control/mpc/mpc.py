@@ -351,16 +351,16 @@ class ForceMPC(LoopDelays, Result, Worded):
         high = np.concatenate([(1.0 - u_s / limit) * ones, slopes + 1.0, over])
         return q, low, high
 
-    def _read_references(self, given: float | Float[np.ndarray, " r"]) -> Float[np.ndarray, " p"]:
+    def _read_references(self, references_N: float | Float[np.ndarray, " r"]) -> Float[np.ndarray, " p"]:
         """Return the references of this sample and of all that may be known, the last held."""
-        references, count = np.atleast_1d(np.asarray(given, dtype=float)), 1 + self.spec.preview_samples
+        references, count = np.atleast_1d(np.asarray(references_N, dtype=float)), 1 + self.spec.preview_samples
         if not (references.ndim == 1 and 1 <= references.size <= count):
             raise ControlError(
                 f"reference_N has the shape {references.shape}, and preview_samples = {count - 1} takes up to {count}; "
                 f"give preview_samples = {references.size - 1} in the specification"
             )
         if not all(map(is_number, references)):
-            raise ControlError(f"reference_N = {given}: not a force; hold the last one instead")
+            raise ControlError(f"reference_N = {references_N}: not a force; hold the last one instead")
         return np.concatenate([references, np.full(count - references.size, references[-1])])
 
     def _observe(

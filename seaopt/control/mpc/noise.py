@@ -48,15 +48,15 @@ class NoiseModel:
     )
 
     def __post_init__(self) -> None:
-        for what in ("sensor_std", "input_noise", "input_drift", "offset"):
-            levels = getattr(self, what)
+        for field in ("sensor_std", "input_noise", "input_drift", "offset"):
+            levels = getattr(self, field)
             if not isinstance(levels, Mapping):
-                raise ControlError(f"noise: {what} = {levels!r}; give a mapping of name to value")
+                raise ControlError(f"noise: {field} = {levels!r}; give a mapping of name to value")
             for name, value in levels.items():
                 if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                    raise ControlError(f"noise: {what} of {name} = {value!r} is not a number; give one")
-                if what != "offset" and value < 0.0:
-                    raise ControlError(f"noise: {what} of {name} = {value:g} is negative; give zero or more")
+                    raise ControlError(f"noise: {field} of {name} = {value!r} is not a number; give one")
+                if field != "offset" and value < 0.0:
+                    raise ControlError(f"noise: {field} of {name} = {value:g} is negative; give zero or more")
         for name, value in self.sensor_std.items():
             if value == 0.0:
                 raise ControlError(f"noise: sensor_std of {name} = 0; every sensor has some, give its resolution")
@@ -102,15 +102,15 @@ class NoiseModel:
 
     def check(self, plant: Plant, outputs: tuple[str, ...]) -> None:
         """Refuse names that the plant lacks, and a measured output without a sensor."""
-        for what, names in (
+        for field, names in (
             ("sensor_std", plant.outputs),
             ("offset", plant.outputs),
             ("input_noise", plant.inputs),
             ("input_drift", plant.inputs),
         ):
-            for name in getattr(self, what):
+            for name in getattr(self, field):
                 if name not in names:
-                    raise ControlError(f'noise: {what} names "{name}"; {suggestion(name, names)}')
+                    raise ControlError(f'noise: {field} names "{name}"; {suggestion(name, names)}')
         for name in outputs:
             if name not in self.sensor_std:
                 raise ControlError(f"noise: sensor_std has nothing for the measured output {name}; give its noise")

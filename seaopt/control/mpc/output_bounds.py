@@ -57,15 +57,15 @@ class OutputBounds:
         return np.block([[self.forced, -slack], [self.forced, slack], [np.zeros((k, n)), np.eye(k)]])
 
     def limits(
-        self, start: Float[np.ndarray, " nx1"], rest: float, wide: float
+        self, start: Float[np.ndarray, " nx1"], at_rest: float, wide: float
     ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
         """Return lower and upper ends of these rows.
 
-        `start`: the state's distance from its target, and the last command's. `rest`: the command that reaches the
+        `start`: the state's distance from its target, and the last command's. `at_rest`: the command that reaches the
         plant at rest, with its disturbance.
         """
         k = len(self.names)
-        base = np.repeat(self.static * rest - self.middle / self.half, self.samples) + self.free @ start
+        base = np.repeat(self.static * at_rest - self.middle / self.half, self.samples) + self.free @ start
         none = np.full(base.size, wide)
         return (
             np.concatenate([-none, -1.0 - base, np.zeros(k)]),

@@ -91,13 +91,13 @@ def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
     from scipy.optimize import brentq  # deferred: scipy is slow to load
 
     A, b = plant.add_command()
-    rest = np.linalg.solve(np.eye(plant.b.size) - plant.a, plant.b + plant.late) / plant.gain  # x_s per newton
+    resting = np.linalg.solve(np.eye(plant.b.size) - plant.a, plant.b + plant.late) / plant.gain  # x_s per newton
     below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
 
     def tracking(candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
         z = np.exp(2j * np.pi * f * plant.sample_time_s)[:, None, None]
-        drive = (b * (candidate.K_x @ rest + candidate.K_u / plant.gain)).astype(complex)[:, None]
+        drive = (b * (candidate.K_x @ resting + candidate.K_u / plant.gain)).astype(complex)[:, None]
         closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))
         return np.abs(np.linalg.solve(z * np.eye(b.size) - closed, drive)[:, :, 0] @ np.append(plant.c, 0.0))
 
@@ -130,13 +130,13 @@ def condense(
     knots: Int[np.ndarray, " n"],
     limit: float,
     slew_per_sample: float,
-    known: int,
+    previewed: int,
     outputs: OutputBounds,
 ) -> HorizonProgram:
     """Return the quadratic program of a horizon.
 
-    `limit` and `slew_per_sample` are in A, the latter infinite if there is none; references are known at `known`
-    samples besides the last.
+    `limit` and `slew_per_sample` are in A, the latter infinite if there is none; references are known at
+    `previewed` samples besides the last.
     """
     W = interpolate_knots(knots)
     N, n, size = len(W), knots.size, plant.b.size + 1
@@ -148,7 +148,7 @@ def condense(
     hessian = rows.T @ rows + regulator.rho * step.T @ step + end.T @ regulator.Pi @ end
     cross = rows.T @ starts + end.T @ regulator.Pi @ begin
     cross[0, -1] -= regulator.rho
-    H, F, R = limit**2 * W.T @ hessian @ W, limit * W.T @ cross, -limit * W.T @ rows.T[:, :known] / plant.gain
+    H, F, R = limit**2 * W.T @ hessian @ W, limit * W.T @ cross, -limit * W.T @ rows.T[:, :previewed] / plant.gain
     scale = n / float(np.trace(H))
     slopes = np.zeros((0, n))
     if np.isfinite(slew_per_sample):

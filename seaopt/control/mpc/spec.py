@@ -35,13 +35,13 @@ MPC_LIMITS = (  # of the table of limits, those of a loop without gains
     ),
 )  # fmt: skip
 
-CONTROLLER_OPTIONS = {one.name: one for one in list_options(ControllerSpec)}
+CONTROLLER_OPTIONS = {each.name: each for each in list_options(ControllerSpec)}
 
 
 def _shared(name: str) -> Any:
     """Return an option that a plan has in common with gains."""
-    one = CONTROLLER_OPTIONS[name]
-    return option(one.option.text, default=one.default, unit=one.option.unit)
+    shared = CONTROLLER_OPTIONS[name]
+    return option(shared.option.text, default=shared.default, unit=shared.option.unit)
 
 
 @record(keywords=True)

@@ -10,16 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.realisation import Reading, RunnableLaw
 from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.running.loop_kernel import observe_function
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.memo import memo
 from seaopt.plants.plant import name_input
 from seaopt.records import record
 from seaopt.units import LINEAR, show_command
@@ -69,7 +68,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
 
     """
     law, plant = loop.law, loop.plant
-    observe = _observe(plant)
+    observe = observe_function(plant, sticks=False)
     names, rows = list(plant.outputs), [find_rest(plant, values) for values in params]
     figures = np.zeros((len(params), 4))
     z = np.zeros((len(params), loop.law_states + loop.waiting))
@@ -77,7 +76,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
         ripple = None if law.compensation is None else law.compensation.ripple
         if not (np.any(x) or np.any(u)) and ripple is None:
             continue
-        y = np.array(observe(x, u, values.vector)).ravel()
+        y = np.array(observe(0.0, x, u, values.vector)).ravel()
         read = y[[names.index(name) for name in loop.fed_back]]
         force = float(read[0])
         added = 0.0 if ripple is None else law.per_effort * ripple.effort(float(y[names.index(ripple.reads)]))
@@ -89,7 +88,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
             reference -= gravity.effort(float(y[names.index(gravity.reads)])) if gravity.reads in names else 0.0
         forgotten = np.zeros(loop.law_states - inner.size)
         z[run] = np.concatenate([inner, forgotten, np.full(loop.waiting, u[0])])
-        figures[run] = reference, force, u[0], y[-1]
+        figures[run] = reference, force, u[0], 0.0 if plant.energy is None else y[-1]
     reference, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
     unit = plant.outputs[loop.regulated]
@@ -124,11 +123,3 @@ def _law_at_rest(
             "reference path is blocked at 0 Hz"
         )
     return solution[:-1], float(solution[-1])
-
-
-@memo
-def _observe(plant: Plant) -> ca.Function:
-    """Return the CasADi function (x, u, p) -> outputs, and the energy behind them."""
-    energy = plant.stored_energy() if plant.energy is not None else ca.SX(0)
-    both = ca.substitute(ca.densify(ca.vertcat(plant.output, energy)), plant.t, 0.0)
-    return ca.Function("observe", [plant.x, plant.u, plant.p], [both])

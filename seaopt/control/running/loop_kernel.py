@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -64,7 +66,6 @@ class LoopArrays:
     y: Float[np.ndarray, "runs n ny"]
     applied: Rows
     states: Float[np.ndarray, "runs n nx"]
-    wall_s: float = 0.0
 
 
 @record
@@ -139,7 +140,7 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     numbers = ca.SX.sym("c", n * n + (3 + fed_back) * n + 5 + fed_back)
     added = ca.SX.sym("added", structure.compensation.size)
     c = ca.vertcat(numbers, ca.vec(devices), added)
-    observe = _observe(plant, structure.sticks)
+    observe = observe_function(plant, structure.sticks)
     lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[kept:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
     waiting = ca.densify(ca.mtimes(ca.reshape(first[1:], queue, 1).T, behind))
@@ -191,7 +192,9 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     )
 
 
-def _observe(plant: Plant, sticks: bool) -> Any:
+@memo
+def observe_function(plant: Plant, sticks: bool) -> Any:
+    """Return the CasADi function (t, x, u, p) -> outputs, and the energy where the plant declares it."""
     output = sticking_output(plant)(plant.t, plant.x, plant.u, plant.p) if sticks else plant.output
     rows = [output] + ([plant.stored_energy()] if plant.energy is not None else [])
     return ca.Function("observe", [plant.t, plant.x, plant.u, plant.p], [ca.densify(ca.vertcat(*rows))])
@@ -211,7 +214,7 @@ def _advance_function(plant: Plant, sticks: bool) -> Any:
     peak = ca.SX.sym("peak", len(channel_names(plant)))
     step = sticking_step(plant) if sticks else runge_kutta(plant)
     after = step(t, x, u, p, h)
-    top = ca.fmax(peak, ca.fabs(_observe(plant, sticks)(t + h, after, u, p)))
+    top = ca.fmax(peak, ca.fabs(observe_function(plant, sticks)(t + h, after, u, p)))
     return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([after, ca.densify(top)]))
 
 
@@ -225,13 +228,9 @@ def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | Non
 def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
     """Return what runs a job: compiled code or, without a compiler, CasADi's virtual machine."""
     native, constants = _kernel(loop.plant, _structure_of(loop))[2], _constants(loop)
-
-    def execute(job: Job, substeps: int) -> LoopArrays:
-        if native is not None:
-            return _run_compiled(loop, job, substeps, constants, native)
-        return _run_interpreted(loop, job, substeps, constants)
-
-    return execute
+    if native is None:
+        return partial(_run_interpreted, loop, constants)
+    return partial(_run_compiled, loop, constants, native)
 
 
 def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: ca.Function) -> str:
@@ -273,16 +272,15 @@ _ARGUMENTS = np.dtype(
 )
 
 
-def _run_compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], native: Kernel) -> LoopArrays:
+def _run_compiled(loop: SampledLoop, c: Float[np.ndarray, " m"], native: Kernel, job: Job, substeps: int) -> LoopArrays:
     arrays = _allocate(loop, job)
     runs, n = job.reference.shape
     arguments = np.zeros(runs, dtype=_ARGUMENTS)
     arguments["n"], arguments["substeps"] = n, substeps
     arguments["t0"], arguments["period"] = job.start_s, loop.law.sample_time_s
     arguments["late_s"] = job.late_s
-    rows = {"p": job.p, "lag": job.lag, "r": job.reference, "w": job.noise} | {
-        name: getattr(arrays, name) for name in ("x", "z", "peak", "error", "size", "y", "applied", "states")
-    }
+    results = {field.name: getattr(arrays, field.name) for field in fields(arrays)}
+    rows = {"p": job.p, "lag": job.lag, "r": job.reference, "w": job.noise, **results}
     for name, array in rows.items():
         arguments[name] = row_addresses(array)
     arguments["c"], arguments["e"] = c.ctypes.data, job.external.ctypes.data
@@ -290,7 +288,7 @@ def _run_compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarra
     return arrays
 
 
-def _run_interpreted(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"]) -> LoopArrays:
+def _run_interpreted(loop: SampledLoop, c: Float[np.ndarray, " m"], job: Job, substeps: int) -> LoopArrays:
     """Run in CasADi's virtual machine: the same two functions, chained in a third."""
     arrays = _allocate(loop, job)
     runs, n = job.reference.shape

@@ -89,9 +89,9 @@ class SampledLoop:
             raise SimulationError(
                 f"sticks = True, but {plant.name} has no friction that jumps at rest; give its Friction a jump"
             )
-        for what in ("current_step_A", "longest_delay_s"):
-            if not getattr(self, what) >= 0.0:
-                raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")
+        for name in ("current_step_A", "longest_delay_s"):
+            if not getattr(self, name) >= 0.0:
+                raise SimulationError(f"{name} = {getattr(self, name):g} is negative; give zero or more")
         self.sensors.refuse_negative((*self.signals, *self.encoders), SimulationError)
         if self.current_step_A and not self.most_A:
             limit = show_command(self.law.current_limit_A, *self.law.command)

@@ -101,12 +101,14 @@ class ScheduledController(Result, Worded):
     @property
     def bandwidths_hz(self) -> tuple[float, ...]:
         """The bandwidths asked at the points."""
-        return tuple(one.spec.bandwidth_hz for one in self.controllers)
+        return tuple(controller.spec.bandwidth_hz for controller in self.controllers)
 
     @property
     def met(self) -> bool:
         """Whether every limit is met at the points, and where it was looked between them."""
-        return all(one.met for one in self.controllers) and not any(place.broken for place in self.between)
+        return all(controller.met for controller in self.controllers) and not any(
+            place.broken for place in self.between
+        )
 
     @property
     def broken(self) -> tuple[str, ...]:
@@ -145,7 +147,7 @@ class ScheduledController(Result, Worded):
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
-        shared = [note for note in self.controllers[0].notes if all(note in one.notes for one in self.controllers)]
+        shared = [note for note in self.controllers[0].notes if all(note in each.notes for each in self.controllers)]
         rows, notes = self.table.gains, list[str]()
         if not any(np.ptp(row) > SAME_GAIN * np.max(np.abs(row)) for row in rows.values()):
             notes.append(f"no gain changes over {self.over}: one law for all points does, without a schedule")
@@ -187,7 +189,7 @@ class ScheduledController(Result, Worded):
 
     def close_points(self, plant: Plant, params: ParameterSet) -> tuple[Loop, ...]:
         """Return a plant's loop at each point, with the variable standing still there."""
-        return tuple(one.close(plant, place_variable(plant, params, self.over, point)) for point, one in self._pairs)
+        return tuple(law.close(plant, place_variable(plant, params, self.over, point)) for point, law in self._pairs)
 
     def with_places(self, parts: int = PARTS) -> ScheduledController:
         """Return the schedule judged at the inner ends of so many parts of every stretch between two points."""
@@ -246,7 +248,7 @@ class ScheduledController(Result, Worded):
             "gains": {name: row.tolist() for name, row in self.table.gains.items()},
             "anti_windup": self.runnable().anti_windup.tolist(),
             "between": to_content(self.between),
-            "controllers": [one.to_dict() for one in self.controllers],
+            "controllers": [controller.to_dict() for controller in self.controllers],
         }
 
     @classmethod
@@ -265,8 +267,8 @@ class ScheduledController(Result, Worded):
 
         stored = read_schedule(content)
         controllers = tuple(
-            Controller.from_dict(one, plant, place_variable(plant, params, stored.over, point))
-            for point, one in zip(stored.points, content["controllers"], strict=True)
+            Controller.from_dict(tuned, plant, place_variable(plant, params, stored.over, point))
+            for point, tuned in zip(stored.points, content["controllers"], strict=True)
         )
         return cls(
             over=stored.over,
@@ -285,25 +287,25 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
     differently.
     """
     first = controllers[0]
-    for point, one in zip(points, controllers, strict=True):
-        own = set(one.gains) == set(LAW_GAINS) and Gains.from_names(one.gains).makes(one.law, one.spec.structure)
-        if not own:
+    for point, controller in zip(points, controllers, strict=True):
+        gains = controller.gains
+        if set(gains) != set(LAW_GAINS) or not Gains.from_names(gains).makes(controller.law, controller.spec.structure):
             raise ControlError(
                 f"the controller at {over} = {point:g} is more than k_p, k_i, k_d, T_f, k_r and c, which are what can "
                 'be interpolated; use structure = "pid" or "pd" without a notch or other parts'
             )
-        if one.sample_time_s != first.sample_time_s or not math.isclose(
-            one.command.per_effort, first.command.per_effort, rel_tol=1e-9
+        if controller.sample_time_s != first.sample_time_s or not math.isclose(
+            controller.command.per_effort, first.command.per_effort, rel_tol=1e-9
         ):
             raise ControlError(
                 f"the controller at {over} = {point:g} runs at another rate, or commands its effort by another factor, "
-                f"than that at {points[0]:g}; a schedule has one of each"
+                f"than that at {points[0]:g}; a schedule has controller of each"
             )
     return GainTable(
         over=over,
         unit=unit,
         points=np.array(points, dtype=float),
-        gains={name: np.array([one.gains[name] for one in controllers]) for name in LAW_GAINS},
+        gains={name: np.array([controller.gains[name] for controller in controllers]) for name in LAW_GAINS},
         structure=first.spec.structure,
         sample_time_s=first.sample_time_s,
     )
@@ -350,11 +352,12 @@ def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) 
     2.0
 
     """
-    given = params.given if isinstance(params, CompletedParameters) else params
+    chosen = params.given if isinstance(params, CompletedParameters) else params
     if over in plant.parameters:
-        return given.with_parameters(replace(plant.complete(given)[over], value=value))
-    known = conditions((plant,))
-    return given.with_parameters(replace(known[over], value=value)) if over in plant.states else given
+        return chosen.with_parameters(replace(plant.complete(chosen)[over], value=value))
+    if over in plant.states:
+        return chosen.with_parameters(replace(conditions((plant,))[over], value=value))
+    return chosen
 
 
 def place_plants(plants: Plants, over: str, value: float) -> Plants:
@@ -369,9 +372,9 @@ def find_unit(over: str, plants: Mapping[str, Plant]) -> str:
             return plant.parameter_unit(over)
         if over in plant.states:
             return plant.states[over]
-    known = dict.fromkeys(name for plant in plants.values() for name in (*plant.parameters, *plant.states))
+    names = dict.fromkeys(name for plant in plants.values() for name in (*plant.parameters, *plant.states))
     raise ControlError(
-        f'over = "{over}" is no state and no parameter of {join_words(list(plants))}; {suggestion(over, known)}'
+        f'over = "{over}" is no state and no parameter of {join_words(list(plants))}; {suggestion(over, names)}'
     )
 
 

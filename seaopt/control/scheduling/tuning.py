@@ -153,9 +153,9 @@ def _check_structure(spec: ControllerSpec) -> None:
         )
     parts = {"a notch": spec.notch, "a prefilter": spec.prefilter}
     if spec.structure not in STRUCTURES or any(part is not None for part in parts.values()):
-        what = next((name for name, part in parts.items() if part is not None), f'structure = "{spec.structure}"')
+        part = next((name for name, part in parts.items() if part is not None), f'structure = "{spec.structure}"')
         raise ControlError(
-            f'{what} cannot be scheduled: its states change their meaning from point to point; use structure = "pid" '
+            f'{part} cannot be scheduled: its states change their meaning from point to point; use structure = "pid" '
             'or "pd" without it'
         )
     if not isinstance(spec.measured, str):
