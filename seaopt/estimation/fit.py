@@ -14,8 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from seaopt.errors import EstimationError, require_type
 from seaopt.estimation.judgement.judge import CAUSES, TESTS, judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
@@ -197,16 +195,14 @@ def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     for index, experiment in enumerate(experiments):
         require_type(experiment, Experiment, f"experiments[{index}]", "give an Experiment", EstimationError)
         require_plant(experiment.plant, f"experiments[{index}]", EstimationError)
-    seen: set[str] = set()
-    out: list[Experiment] = []
+    named: dict[str, Experiment] = {}
     for experiment in experiments:
         name, number = experiment.name, 1
-        while name in seen:
+        while name in named:
             number += 1
             name = f"{experiment.name}{number}"
-        seen.add(name)
-        out.append(experiment if name == experiment.name else experiment.rename(name))
-    return tuple(out)
+        named[name] = experiment if number == 1 else replace(experiment, name=name)
+    return tuple(named.values())
 
 
 def _check_motion(experiments: tuple[Experiment, ...]) -> None:
@@ -283,8 +279,7 @@ def _check_samples(problem: FitProblem) -> None:
     """Refuse outputs of which no sample counts, and segments and shots that are too short."""
     for experiment in problem.experiments:
         settle, data = experiment.weights.settle, experiment.data
-        counts = np.sum([segment.count_weighted() for segment in experiment.segments], axis=0)
-        for name, count in zip(data.outputs, counts, strict=True):
+        for name, count in zip(data.outputs, experiment.count_weighted(), strict=True):
             if not count:
                 raise EstimationError(
                     f"experiment {experiment.name}: output {name} has no sample that counts; "

@@ -27,7 +27,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import to_content
 from seaopt.errors import EstimationError
@@ -42,6 +41,7 @@ from seaopt.estimation.problem.correlation import autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
+from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import format_table, html_list, html_table
 from seaopt.records import PlotAccessor, record
@@ -376,7 +376,7 @@ def _compute_octaves(places: Sequence[FitOutput], residuals: Mapping[str, Residu
     return rows[::-1]
 
 
-def _compute_spectrum(r: Float[np.ndarray, " n"], count: int, period: float) -> tuple[Any, Any]:
+def _compute_spectrum(r: Signal, count: int, period: float) -> tuple[Any, Any]:
     """Return frequencies, and the mean square of the samples that counted which each line carries (Parseval)."""
     from scipy.fft import rfft  # deferred: scipy is slow to load
 

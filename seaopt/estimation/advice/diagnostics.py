@@ -35,6 +35,7 @@ from seaopt.estimation.problem.residual_statistics import (
     ResidualsByExperiment,
     compute_statistics,
 )
+from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import describe_outputs
@@ -312,7 +313,7 @@ def _advise_on_inputs(
     return sentences
 
 
-def _find_centre_hz(residual: Float[np.ndarray, " n"], period: float) -> float:
+def _find_centre_hz(residual: Signal, period: float) -> float:
     """Return the frequency that halves the power of a residual."""
     power = np.cumsum(np.abs(np.fft.rfft(residual)) ** 2)
     return float(np.searchsorted(power, 0.5 * power[-1]) / (residual.size * period))

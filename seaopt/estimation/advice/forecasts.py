@@ -19,6 +19,7 @@ from seaopt.estimation.problem.residual_statistics import (
     compute_experiment_residuals,
     compute_residuals,
 )
+from seaopt.estimation.problem.shapes import Parts, Signal
 from seaopt.estimation.problem.unknowns import Slot
 from seaopt.estimation.result.fit_result import Minimum
 from seaopt.estimation.solver.prediction import add_predictors
@@ -60,7 +61,7 @@ def compute_percent(output: FitOutput, residuals: ResidualsByExperiment) -> Perc
     return Percent(used=percent(used), held_out=percent(held_out) if np.any(held_out) else None)
 
 
-def filter_to_band(experiment: FitExperiment, rows: list[Float[np.ndarray, "..."]]) -> Float[np.ndarray, " n"]:
+def filter_to_band(experiment: FitExperiment, rows: Parts) -> Signal:
     """Return one signal of all segments, filtered to the fit's band where it has one; missing samples count as zero."""
     signals = [np.where(np.isfinite(row), row, 0.0) for row in rows]
     sections = experiment.weights.sections

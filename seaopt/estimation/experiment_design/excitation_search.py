@@ -26,6 +26,7 @@ from seaopt.estimation.experiment_design.spectrum import (
     optimal_powers,
     schroeder_phases,
 )
+from seaopt.estimation.problem.shapes import ParameterMatrix
 from seaopt.records import record
 
 POWER_ROUNDS = 4  # of powers, phases, and the peaks that they give
@@ -116,10 +117,10 @@ class Chirps:
 class Measure:
     """A criterion: log of trace(W C), or of det C, and the power of the amplitude that it falls with."""
 
-    weight: Float[np.ndarray, "p p"] | None
+    weight: ParameterMatrix | None
     order: float
 
-    def __call__(self, covariance: Float[np.ndarray, "p p"]) -> float:
+    def __call__(self, covariance: ParameterMatrix) -> float:
         """Return the criterion of a covariance; infinite where something cannot be identified."""
         if not np.all(np.isfinite(covariance)):
             return np.inf

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from seaopt.bench import Excitation, excite
 from seaopt.errors import EstimationError, require_seed, suggestion
 from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal
 from seaopt.estimation.result.covariance import mark_unseen
 from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, STEP_ERROR_SIGMA
 from seaopt.parameters import ParameterSet
@@ -28,7 +29,7 @@ from seaopt.simulation import Clock, Model, Pass, Point, Segment, make_model, ru
 class Trial:
     """What a simulated log identifies and what it takes."""
 
-    covariance: Float[np.ndarray, "p p"]  # expected of the free parameters; infinite where they cannot be identified
+    covariance: ParameterMatrix  # expected of the free parameters; infinite where they cannot be identified
     rms: float  # of the input
     peaks: Mapping[str, float]  # largest magnitude of the input and of each watched signal
 
@@ -40,8 +41,8 @@ class Bench:
     plant: Plant  # plant, params: the actuator and every parameter of it
     params: ParameterSet
     model: Model  # the plant in its free parameters; the measured outputs come first
-    theta: Float[np.ndarray, " p"]  # theta, prior: free parameters, and what is known of them beforehand: 1/std^2
-    prior: Float[np.ndarray, " p"]
+    theta: ParameterVector  # theta, prior: free parameters, and what is known of them beforehand: 1/std^2
+    prior: ParameterVector
     sigma: Float[np.ndarray, " nm"]  # noise of the measured outputs
     input_name: str  # the input that is excited
     watched: tuple[str, ...]  # outputs and states whose peaks are wanted
@@ -60,13 +61,13 @@ class Bench:
         """Return where a signal stands among outputs, then states."""
         return [*self.model.outputs, *self.plant.states].index(name)
 
-    def samples(self, excitation: Excitation, seed: int = 0) -> Float[np.ndarray, " n"]:
+    def samples(self, excitation: Excitation, seed: int = 0) -> Signal:
         """Return an excitation on the bench's clock."""
         rate = 1.0 / self.clock.period
         rng = np.random.default_rng(require_seed(seed, EstimationError))
         return excite(excitation, duration_s=self.n / rate, rate_hz=rate, rng=rng)[1]
 
-    def run(self, u: Float[np.ndarray, " n"]) -> Trial:
+    def run(self, u: Signal) -> Trial:
         """Simulate the excitation `u` from rest."""
         result = self._pass(u, self.substeps)
         assert result.outputs is not None and result.states is not None
@@ -78,7 +79,7 @@ class Bench:
             peaks={self.input_name: float(np.max(np.abs(u))), **peaks},
         )
 
-    def refine_steps(self, u: Float[np.ndarray, " n"]) -> Bench:
+    def refine_steps(self, u: Signal) -> Bench:
         """Return the bench with integration steps that are fine enough for `u`.
 
         Raises EstimationError: no step is.
@@ -100,7 +101,7 @@ class Bench:
                 )
         return replace(self, substeps=substeps)
 
-    def _pass(self, u: Float[np.ndarray, " n"], substeps: int) -> Pass:
+    def _pass(self, u: Signal, substeps: int) -> Pass:
         still = np.zeros(u.size)
         inputs = tuple(u if i == self.channel else still for i in range(self.model.nu))
         # A residual is needed to be counted: nothing measured is all zeros.
@@ -115,7 +116,7 @@ class Bench:
         )
         return run_passes(self.model, segment, point, np.zeros(self.model.nx), outputs=True, states=True)
 
-    def _covariance(self, result: Pass) -> Float[np.ndarray, "p p"]:
+    def _covariance(self, result: Pass) -> ParameterMatrix:
         p, nx, m = self.theta.size, self.model.nx, self.sigma.size
         size = p + nx * self.initial + m * self.offset
         total = np.zeros((size, size))

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import EstimationError
+from seaopt.estimation.problem.shapes import ParameterMatrix
 from seaopt.executors import solve_ipopt
 from seaopt.records import record
 from seaopt.simulation import Clock, Model, linearise, transition
@@ -112,8 +113,8 @@ def optimal_powers(
     information: Float[np.ndarray, "K p p"],
     budget: Float[np.ndarray, "m K"],
     *,
-    weight: Float[np.ndarray, "p p"] | None,
-    prior: Float[np.ndarray, "p p"] | None = None,
+    weight: ParameterMatrix | None,
+    prior: ParameterMatrix | None = None,
 ) -> Float[np.ndarray, " K"]:
     """Return the powers that minimise trace(W F^-1), or -log det F, within linear limits.
 
@@ -149,7 +150,7 @@ def optimal_powers(
     return np.maximum(np.array(solution["x"]).ravel(), 0.0) * even
 
 
-def _cost(total: Any, weight: Float[np.ndarray, "p p"] | None, p: int) -> Any:
+def _cost(total: Any, weight: ParameterMatrix | None, p: int) -> Any:
     """Return the criterion of an information matrix as an expression, near 1 at the start."""
     upper = ca.chol(0.5 * (total + total.T))
     if weight is None:
@@ -170,7 +171,7 @@ def _substitute_forward(upper: Any, right: Any, p: int) -> Any:
     return ca.vertcat(*rows)
 
 
-def _inverse_root(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+def _inverse_root(matrix: ParameterMatrix) -> ParameterMatrix:
     """Return S with S' M S = 1.
 
     Raises EstimationError: M is singular.

@@ -1,23 +1,24 @@
-"""What may be wrong where a fit does not explain its logs: other values, delays, channels, units, parts and plants.
+"""Changes that may explain logs which a fit does not: other values, delays, channels, units, parts and plants.
 
-Each candidate is one change of the problem, with the words for what comes of it; `causes` refits and weighs them.
+Each candidate is one change of the problem, with the words for what its refit shows; `causes` refits and weighs them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
+from functools import partial
 from itertools import combinations, zip_longest
 from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, free_more, run_score_tests
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
+from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
@@ -31,6 +32,7 @@ from seaopt.units import ROTARY, mechanics_of, unit_after
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
 SAME_EFFECT = 1e-3  # of a test's figures, by which parameters that act alike may differ
 LOAD, LOAD_SHARE = "load_at_motor", "share_of_load"  # of friction that is tried
+POLE = "load_cell_hz"  # of the part that reads an output through a pole
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
 LIKELY_GAINS = (0.05, 20.0)  # of sensors that are not of another unit
@@ -41,28 +43,29 @@ CLIPPED_SAMPLES = 20  # that have to be beyond a level
 CLIPPED_POWER = 0.2  # of a residual's
 
 V = TypeVar("V")
+Values = Mapping[str, float]  # of unknowns, or their standard deviations, by name
+Describe = Callable[[Values, Values], str | None]
 
 
 @record(eq=False)
 class Candidate:
-    """A change to be refitted, and how to say what came of it: nothing where it came to nothing.
-
-    `delays` are unknowns whose refit starts from the best of `FIRST_DELAYS`, all alike, `gains` unknowns that start
-    from how a simulation compares with its output. `frees` are those whose values are worth stating, and what is to be
-    taken off them. Where `certain`, nothing but a mistake explains a gain. `kept` are
-    the fit's own experiments with the samples that the change leaves, where it leaves out some: residuals of other
-    samples tell a gain of many units by chance.
-    """
+    """A change to be refitted, and what it says: a text, or one made of the refit's values and stds (None: nothing)."""
 
     where: str
     experiments: tuple[Experiment, ...]
     params: ParameterSet
-    describe: Callable[[Mapping[str, float], Mapping[str, float]], str | None]  # of the unknowns, and their stds
-    certain: bool = False
-    delays: tuple[str, ...] = ()
-    gains: tuple[str, ...] = ()
+    says: str | Describe
+    certain: bool = False  # nothing but a mistake explains a gain
+    delays: tuple[str, ...] = ()  # unknowns whose refit starts from the best of `FIRST_DELAYS`, all alike
+    gains: tuple[str, ...] = ()  # unknowns that start from how a simulation compares with its output
+    # The fit's own experiments with the samples that the change leaves, where it leaves out some: residuals of other
+    # samples show a gain of many units by chance.
     kept: tuple[Experiment, ...] = ()
-    frees: Mapping[str, float] = field(default_factory=dict[str, float])
+    frees: Mapping[str, float] = field(default_factory=dict[str, float])  # whose values to state, less these offsets
+
+    def describe(self, values: Values, stds: Values) -> str | None:
+        """Return what the refit shows; None where it shows nothing."""
+        return self.says if isinstance(self.says, str) else self.says(values, stds)
 
 
 def list_candidates(
@@ -75,23 +78,23 @@ def list_candidates(
     poor: bool,
 ) -> Iterator[Candidate]:
     """Yield the changes to try."""
-    first = minimum.problem.params
-    values = first if poor else fit.parameters
-    yield from _swap_channels(fit.experiments, values, poor=poor)
+    problem, experiments = minimum.problem, fit.experiments
+    values = problem.params if poor else fit.parameters
+    yield from _swap_channels(experiments, values, poor=poor)
     if poor:
         for plant in alternatives:  # the right one is soon found, and the wrong one takes long to refit
-            yield from _change_plant(fit.experiments, first, plant)
-        yield from _free_gains(fit.experiments, first)
-    yield from _read_deflections(fit.experiments, values)
-    yield from _free_delays(fit.experiments, values)
+            yield from _change_plant(experiments, problem.params, plant)
+        yield _free_gains(experiments, problem.params)
+    yield from _read_deflections(experiments, values)
+    yield from _free_delays(problem, values)
     yield from _free_parameters(fit, minimum, suspects)
-    yield from _load_friction(fit.experiments, values)
-    yield from _clip_outputs(minimum.problem, residuals, values)
-    yield from _filter_outputs(fit.experiments, values)
+    yield from _load_friction(experiments, values)
+    yield from _clip_outputs(problem, residuals, values)
+    yield from _filter_outputs(experiments, values)
 
 
 def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTest]) -> Iterator[Candidate]:
-    """Yield the fixed parameters that are at odds with the logs, and what would make a linear plant nonlinear.
+    """Yield the fixed parameters that are at odds with the logs, and those that would make a linear plant nonlinear.
 
     One of each group that acts alike, such as a screw's lead and its gear, is tried before the second of any.
     """
@@ -103,17 +106,50 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
     groups = _group_alike({name: test for name, test in tests.items() if name in plain})
     in_turn = [name for rank in zip_longest(*groups) for name in rank if name is not None]
     for name in [*in_turn[:MOST_REFITTED], *(name for name in tests if name in bending)]:
-        parameter, test = fit.parameters[name], tests[name]
-        if name in bending and not parameter.min < test.preferred < parameter.max:
-            continue
-        start = test.preferred if name in bending else parameter.value
-        params = free_more(fit, (name,)).update(**{name: start})
+        parameter, start = fit.parameters[name], fit.parameters[name].value
+        if name in bending:
+            start = tests[name].preferred
+            if not parameter.min < start < parameter.max:
+                continue
+        yield Candidate(
+            where=name,
+            experiments=fit.experiments,
+            params=free_more(fit, (name,)).update(**{name: start}),
+            says=partial(_state_value, parameter, name in speeds),
+            frees={name: 0.0},
+        )
 
-        def describe(values: Mapping[str, float], stds: Mapping[str, float], parameter: Parameter = parameter) -> str:
-            name = parameter.name
-            return _say_value(parameter, values[name], stds[name] if name in speeds else 0.0)
 
-        yield Candidate(where=name, experiments=fit.experiments, params=params, describe=describe, frees={name: 0.0})
+def _state_value(parameter: Parameter, smooths: bool, values: Values, stds: Values) -> str:
+    """Return what a parameter should have been; `smooths`: it is a speed over which friction is smoothed."""
+    name, unit, value = parameter.name, unit_after(parameter.unit), values[parameter.name]
+    instead = f"in place of {parameter.value:.4g}{unit}"
+    if smooths and value < 2.0 * stds[name]:
+        return (
+            f"friction that jumps at rest more sharply than the logs resolve: {name} = {value:.1g}{unit} or "
+            f"less {instead}; let it jump, with sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"
+        )
+    if value in (parameter.min, parameter.max):
+        way = "smaller" if value < parameter.value else "larger"
+        return f"{name} is much {way} {instead}, as far as its bounds allow; correct it, or widen its bounds"
+    return f"{name} = {value:.4g}{unit} {instead}; free it, or correct it"
+
+
+def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
+    """Return the names in groups of the same test: what no residual distinguishes near the fit."""
+
+    def are_alike(test: ScoreTest, first: ScoreTest) -> bool:
+        pairs = ((test.fall, first.fall), (test.chi2, first.chi2))
+        return all(abs(one - other) < SAME_EFFECT * other for one, other in pairs)
+
+    groups: list[list[str]] = []
+    for name, test in tests.items():
+        group = next((group for group in groups if are_alike(test, tests[group[0]])), None)
+        if group is None:
+            groups.append([name])
+        else:
+            group.append(name)
+    return groups
 
 
 def _read_deflections(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
@@ -130,20 +166,14 @@ def _read_deflections(experiments: tuple[Experiment, ...], params: ParameterSet)
         def h(t: Any, x: Any, u: Any, p: Any, output: str = output) -> Mapping[str, Any]:
             return {**first.h(t, x, u, p), output: getattr(p, stiffness) * deflection(x, p)}
 
-        def describe(values: Mapping[str, float], stds: Mapping[str, float], output: str = output) -> str | None:
-            unit = first.outputs[output]
-            name = "tau_d" if unit == ROTARY.unit else "F_d"
-            return (
-                f"{output} is the {mechanics_of(unit).word} from deflection, a stiffness times what two "
-                f"encoders read, without what else acts at the spring; add part deflection_sensor, and name it {name}"
-            )
-
-        plant = replace(first, h=h)
+        plant, unit = replace(first, h=h), first.outputs[output]
         yield Candidate(
             where=output,
             experiments=tuple(replace(e, plant=plant) for e in experiments),
             params=params,
-            describe=describe,
+            says=f"{output} is the {mechanics_of(unit).word} from deflection, a stiffness times what two encoders "
+            "read, without what else acts at the spring; add part deflection_sensor, and name it "
+            f"{'tau_d' if unit == ROTARY.unit else 'F_d'}",
         )
 
 
@@ -160,20 +190,18 @@ def _adds_damping(plant: Plant, output: str, stiffness: str) -> bool:
 
 
 def _load_friction(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
-    """Yield friction that grows with the motor's effort, where the plant's own does not."""
+    """Yield friction that grows with the motor's effort, where no plant's own does."""
     loaded = {plant: _grow_with_load(plant) for plant in dict.fromkeys(e.plant for e in experiments)}
-    if None in loaded.values():
+    changed = tuple(replace(e, plant=plant) for e in experiments if (plant := loaded[e.plant]) is not None)
+    if len(changed) < len(experiments):
         return
-    changed = tuple(replace(e, plant=loaded[e.plant] or e.plant) for e in experiments)
 
-    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
+    def describe(values: Values, stds: Values) -> str | None:
         share = values[LOAD_SHARE]
         return None if share < 1e-3 else f"friction grows with the load, by {share:.3g} of it; add part load_friction"
 
     share = Parameter(name=LOAD_SHARE, value=0.05, unit="-", free=True, min=0.0, max=1.0)
-    yield Candidate(
-        where=experiments[0].name, experiments=changed, params=params.with_parameters(share), describe=describe
-    )
+    yield Candidate(where=experiments[0].name, experiments=changed, params=params.with_parameters(share), says=describe)
 
 
 def _grow_with_load(plant: Plant) -> Plant | None:
@@ -198,149 +226,104 @@ def _grow_with_load(plant: Plant) -> Plant | None:
     return replace(plant, friction={**plant.friction, name: grown}, parameters={**plant.parameters, LOAD_SHARE: share})
 
 
-def _say_value(parameter: Parameter, value: float, unresolved: float) -> str:
-    """Return what a parameter should have been; `unresolved` is the std of a speed that smooths friction."""
-    unit = unit_after(parameter.unit)
-    instead = f"in place of {parameter.value:.4g}{unit}"
-    if value < 2.0 * unresolved:
-        return (
-            f"friction that jumps at rest more sharply than the logs resolve: {parameter.name} = {value:.1g}{unit} or "
-            f"less {instead}; let it jump, with sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"
-        )
-    if value in (parameter.min, parameter.max):
-        way = "smaller" if value < parameter.value else "larger"
-        return f"{parameter.name} is much {way} {instead}, as far as its bounds allow; correct it, or widen its bounds"
-    return f"{parameter.name} = {value:.4g}{unit} {instead}; free it, or correct it"
-
-
-def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
-    """Return the names in groups of the same test: what no residual distinguishes near the fit."""
-    groups: list[list[str]] = []
-    for name, test in tests.items():
-        for group in groups:
-            first = tests[group[0]]
-            same = (
-                abs(test.fall - first.fall) < SAME_EFFECT * first.fall
-                and abs(test.chi2 - first.chi2) < SAME_EFFECT * first.chi2
-            )
-            if same:
-                group.append(name)
-                break
-        else:
-            groups.append([name])
-    return groups
-
-
-def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
+def _free_delays(problem: FitProblem, params: ParameterSet) -> Iterator[Candidate]:
     """Yield a delay of the inputs, and one for each output; negative where signals can be shifted."""
+    experiments = [e.data for e in problem.experiments]
+    given = [e.slots.delay.value for e in problem.experiments]
+    if any(e.slots.delay.index is not None for e in problem.experiments):
+        return
     leads = [LEAD if len(e.log_segments) == 1 and len(e.log) > 4 * LEAD else 0 for e in experiments]
-    delays = [e.delay_s.value if isinstance(e.delay_s, Parameter) else e.delay_s for e in experiments]
-    if any(isinstance(e.delay_s, Parameter) and e.delay_s.free for e in experiments):
-        return
-    shifted = tuple(
-        free_delay(_lead(e, lead), value + lead * e.log.period)
-        for e, lead, value in zip(experiments, leads, delays, strict=True)
-    )
-
-    def describe_common(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
-        words: list[str] = []
-        for e, lead, value in zip(experiments, leads, delays, strict=True):
-            late = values[f"{e.name}.delay_s"] - lead * e.log.period - value
-            if abs(late) > 0.05 * e.log.period:
-                words.append(_say_late(e.name if len(experiments) > 1 else "", late, value))
-        return join_words(words) if words else None
-
+    shifts = [lead * e.log.period for e, lead in zip(experiments, leads, strict=True)]
     names = tuple(f"{e.name}.delay_s" for e in experiments)
+    trials = list(zip(experiments, names, shifts, given, strict=True))
+    shifted = tuple(
+        free_delay(_lead(e, lead), value + shift) for (e, _, shift, value), lead in zip(trials, leads, strict=True)
+    )
     kept = tuple(_cut_ends(e, lead) for e, lead in zip(experiments, leads, strict=True))
-    yield Candidate(
-        where=experiments[0].name,
-        experiments=shifted,
-        params=params,
-        describe=describe_common,
-        delays=names,
-        kept=kept,
-        frees={name: lead * e.log.period for name, e, lead in zip(names, experiments, leads, strict=True)},
-    )
-    if all(len(e.outputs) == 1 for e in experiments):
-        return
-    apart = tuple(
-        replace(
-            e,
-            outputs=(o,),
-            name=f"{e.name}-{o}",
-            sigma=_only(e.sigma, o),
-            gain=_only(e.gain, o),
-            saturation=_only(e.saturation, o),
-            offset=_only(e.offset, o) if isinstance(e.offset, Mapping) else e.offset,
-        )
-        for e in shifted
-        for o in e.outputs
-    )
 
-    def describe_each(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
+    def describe_common(values: Values, stds: Values) -> str | None:
         words: list[str] = []
-        for e, lead, value in zip(experiments, leads, delays, strict=True):
-            late = {o: values[f"{e.name}-{o}.delay_s"] - lead * e.log.period - value for o in e.outputs}
-            if np.ptp(list(late.values())) < 0.3 * e.log.period:
-                continue
+        for e, name, shift, value in trials:
+            late = values[name] - shift - value
+            if abs(late) > 0.05 * e.log.period:
+                words.append(_state_delay(f" of {e.name}" if len(experiments) > 1 else "", late, value))
+        return join_words(words) or None
+
+    def describe_each(values: Values, stds: Values) -> str | None:
+        words: list[str] = []
+        for e, _, shift, value in trials:
+            late = {o: values[f"{e.name}-{o}.delay_s"] - shift - value for o in e.outputs}
+            least = 0.3 * e.log.period
             words += [
-                f"{o} is {1e3 * abs(shift):.4g} ms {'late' if shift > 0.0 else 'early'}"
-                for o, shift in late.items()
-                if abs(shift) > 0.3 * e.log.period
+                f"{o} is {1e3 * abs(seconds):.4g} ms {'late' if seconds > 0.0 else 'early'}"
+                for o, seconds in late.items()
+                if np.ptp(list(late.values())) >= least < abs(seconds)
             ]
         return f"{join_words(words)}: correct the channels' stamps" if words else None
 
+    where = experiments[0].name
     yield Candidate(
-        where=experiments[0].name,
-        experiments=apart,
+        where=where,
+        experiments=shifted,
         params=params,
-        describe=describe_each,
-        delays=tuple(f"{e.name}.delay_s" for e in apart),
+        says=describe_common,
+        delays=names,
         kept=kept,
+        frees=dict(zip(names, shifts, strict=True)),
     )
+    if any(len(e.outputs) > 1 for e in experiments):
+        apart = tuple(_take_output(e, output) for e in shifted for output in e.outputs)
+        delays = tuple(f"{e.name}.delay_s" for e in apart)
+        yield Candidate(where=where, experiments=apart, params=params, says=describe_each, delays=delays, kept=kept)
 
 
-def _say_late(where: str, late: float, value: float) -> str:
-    of = f" of {where}" if where else ""
+def _state_delay(of: str, late: float, value: float) -> str:
     if late > 0.0:
         return f"a delay{of} of {1e3 * (value + late):.4g} ms; give delay_s, or free it"
     return f"inputs{of} that are stamped {-1e3 * late:.4g} ms late; shift their channels"
 
 
-def _only(values: Mapping[str, V], name: str) -> dict[str, V]:
-    return {name: values[name]} if name in values else {}
+def _take_output(experiment: Experiment, output: str) -> Experiment:
+    """Return an experiment of one of its outputs alone, EXPERIMENT-OUTPUT."""
+
+    def pick(values: Mapping[str, V]) -> dict[str, V]:
+        return {output: values[output]} if output in values else {}
+
+    return replace(
+        experiment,
+        name=f"{experiment.name}-{output}",
+        outputs=(output,),
+        sigma=pick(experiment.sigma),
+        gain=pick(experiment.gain),
+        saturation=pick(experiment.saturation),
+        offset=pick(experiment.offset) if isinstance(experiment.offset, Mapping) else experiment.offset,
+    )
 
 
-def free_delay(experiment: Experiment, value: float, longest: float = np.inf) -> Experiment:
+def free_delay(experiment: Experiment, value: float) -> Experiment:
     """Return the experiment with a free delay that starts at a value."""
-    delay = Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0, max=longest)
-    return replace(experiment, delay_s=delay)
+    return replace(experiment, delay_s=Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0))
 
 
 def _lead(experiment: Experiment, samples: int) -> Experiment:
     """Return the experiment with its inputs so many samples early, without the outputs whose inputs are not known."""
-    if not samples:
-        return experiment
-    cut = _cut_ends(experiment, samples)
-    signals = dict(cut.log.signals)
-    for name in experiment.plant.inputs:
-        if name in signals:
-            values = signals[name].values
-            led = np.concatenate([values[samples:], np.repeat(values[-1:], samples)])
-            signals[name] = replace(signals[name], values=led)
-    return replace(cut, log=replace(cut.log, signals=signals))
+    cut, names = _cut_ends(experiment, samples), [n for n in experiment.plant.inputs if n in experiment.log.signals]
+    led = {name: np.append(cut.log[name][samples:], np.repeat(cut.log[name][-1:], samples)) for name in names}
+    return _with_channels(cut, led)
 
 
 def _cut_ends(experiment: Experiment, samples: int) -> Experiment:
     """Return the experiment without the outputs of so many samples at either end."""
-    if not samples:
-        return experiment
-    signals = dict(experiment.log.signals)
-    for name in experiment.outputs:
-        values = signals[name].values.copy()
-        values[:samples] = values[-samples:] = np.nan
-        signals[name] = replace(signals[name], values=values)
-    return replace(experiment, log=replace(experiment.log, signals=signals))
+    inside = np.arange(len(experiment.log))
+    inside = (inside >= samples) & (inside < inside.size - samples)
+    return _with_channels(experiment, {o: np.where(inside, experiment.log[o], np.nan) for o in experiment.outputs})
+
+
+def _with_channels(experiment: Experiment, values: Mapping[str, Signal], **changes: Any) -> Experiment:
+    """Return the experiment with other samples of some channels of its log."""
+    log = experiment.log
+    signals = {name: replace(log.signals[name], values=samples) for name, samples in values.items()}
+    return replace(experiment, log=replace(log, signals={**log.signals, **signals}), **changes)
 
 
 def _swap_channels(experiments: tuple[Experiment, ...], params: ParameterSet, *, poor: bool) -> Iterator[Candidate]:
@@ -348,61 +331,49 @@ def _swap_channels(experiments: tuple[Experiment, ...], params: ParameterSet, *,
     first = experiments[0]
     inputs = [name for name in first.plant.inputs if name in first.log.signals] if poor else []
     for channel, other in combinations([*inputs, *first.outputs], 2):
-        if channel in inputs and other in inputs:
+        pair = {channel, other}
+        if pair <= set(inputs) or not all(pair <= set(e.log.signals) for e in experiments):
             continue
-        swapped = tuple(_swap(e, channel, other) for e in experiments if {channel, other} <= set(e.log.signals))
-        if len(swapped) < len(experiments):
-            continue
-
-        def describe(
-            values: Mapping[str, float], stds: Mapping[str, float], channel: str = channel, other: str = other
-        ) -> str | None:
-            return f"the columns of {channel} and {other} are swapped"
-
-        yield Candidate(
-            where=f"{channel}, {other}", experiments=swapped, params=params, describe=describe, certain=True
+        swapped = tuple(
+            _with_channels(
+                e,
+                {channel: e.log[other], other: e.log[channel]},
+                sigma={name: value for name, value in e.sigma.items() if name not in pair},
+            )
+            for e in experiments
         )
-
-
-def _swap(experiment: Experiment, channel: str, other: str) -> Experiment:
-    """Return the experiment with the values of two channels swapped."""
-    signals = dict(experiment.log.signals)
-    signals[channel] = replace(signals[channel], values=experiment.log[other])
-    signals[other] = replace(signals[other], values=experiment.log[channel])
-    sigma = {name: value for name, value in experiment.sigma.items() if name not in (channel, other)}
-    return replace(experiment, log=replace(experiment.log, signals=signals), sigma=sigma)
+        yield Candidate(
+            where=f"{channel}, {other}",
+            experiments=swapped,
+            params=params,
+            says=f"the columns of {channel} and {other} are swapped",
+            certain=True,
+        )
 
 
 def _clip_outputs(problem: FitProblem, residuals: ResidualsByExperiment, params: ParameterSet) -> Iterator[Candidate]:
     """Yield the outputs as clipped by their amplifier, where a clipped model is nearer to what was measured."""
-    clipped = {e.name: {} for e in problem.experiments}
+    clipped = {e.name: dict[str, tuple[float, float]]() for e in problem.experiments}
+    words: list[str] = []
     for output in problem.outputs:
         measured = np.concatenate(output.measured)
         model = measured + np.concatenate(residuals[output.experiment.name].raw_of(output.name))
         ends = find_clipping(model, measured)
         if ends is not None and output.name not in output.experiment.data.saturation:
-            clipped[output.experiment.name][output.name] = ends
-    if not any(clipped.values()):
-        return
-    experiments = tuple(
-        replace(e.data, saturation={**e.data.saturation, **{o: ends[:2] for o, ends in clipped[e.name].items()}})
-        for e in problem.experiments
-    )
-    words = [
-        f"{o} is clipped at {ends[2]:.4g} and {ends[3]:.4g}{unit_after(e.data.plant.outputs[o])}"
-        for e in problem.experiments
-        for o, ends in clipped[e.name].items()
-    ]
-
-    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
-        return f"{join_words(words)}, ahead of its noise; declare saturation"
-
-    yield Candidate(where=problem.experiments[0].name, experiments=experiments, params=params, describe=describe)
+            clipped[output.experiment.name][output.name] = ends[:2]
+            words.append(f"{output.name} is clipped at {ends[2]:.4g} and {ends[3]:.4g}{unit_after(output.unit)}")
+    if words:
+        yield Candidate(
+            where=problem.experiments[0].name,
+            experiments=tuple(
+                replace(e.data, saturation={**e.data.saturation, **clipped[e.name]}) for e in problem.experiments
+            ),
+            params=params,
+            says=f"{join_words(words)}, ahead of its noise; declare saturation",
+        )
 
 
-def find_clipping(
-    model: Float[np.ndarray, " n"], measured: Float[np.ndarray, " n"]
-) -> tuple[float, float, float, float] | None:
+def find_clipping(model: Signal, measured: Signal) -> tuple[float, float, float, float] | None:
     """Return the range inside which nothing is clipped, and the ends at which a model would have to be, if any.
 
     The model's outermost samples are cut at each of some levels; the level that leaves the least is taken where it
@@ -433,56 +404,55 @@ def find_clipping(
 def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
     """Yield the outputs as read through a pole, all of them or one."""
     first = experiments[0]
+    if POLE in first.plant.parameters or any(e.plant is not first.plant for e in experiments):
+        return
     regulated = () if first.plant.sensing is None else first.plant.sensing.regulated
     read = [name for name in first.outputs if name in regulated]
-    if "load_cell_hz" in first.plant.parameters or any(e.plant is not first.plant for e in experiments):
-        return
-    nyquist = 0.5 / first.log.period
-    groups = [tuple(read), *((name,) for name in read if len(read) > 1)] if read else []
-    for group in groups:
-        plant = wrapped(first.plant, ("load_cell",), outputs=group)
-        default = plant.complete(params)["load_cell_hz"]
-        # The faster a pole, the more integration steps it takes: its range ends soon after what is said of it.
-        pole = replace(default, value=0.3 * nyquist, free=True, max=2.0 * FASTEST_POLE * nyquist)
+    fastest = FASTEST_POLE * 0.5 / first.log.period
+    for group in [read, *([name] for name in read if len(read) > 1)] if read else []:
+        plant, names = wrapped(first.plant, ("load_cell",), outputs=group), join_words(group)
 
-        def describe(
-            values: Mapping[str, float], stds: Mapping[str, float], group: tuple[str, ...] = group
-        ) -> str | None:
-            cut = values["load_cell_hz"]
-            if cut > FASTEST_POLE * nyquist:
+        def describe(values: Values, stds: Values, names: str = names) -> str | None:
+            cut = values[POLE]
+            if cut > fastest:
                 return None
-            names = join_words([*group])
             return f"{names} passed a low-pass of {cut:.3g} Hz; log it unfiltered, or add the part load_cell"
 
-        changed = tuple(replace(e, plant=plant) for e in experiments)
+        # The faster a pole, the more integration steps it takes: its range ends soon after what is said of it.
+        default = plant.complete(params)[POLE]
+        pole = replace(default, value=0.3 * fastest / FASTEST_POLE, free=True, max=2.0 * fastest)
         yield Candidate(
-            where=join_words([*group]), experiments=changed, params=params.with_parameters(pole), describe=describe
+            where=names,
+            experiments=tuple(replace(e, plant=plant) for e in experiments),
+            params=params.with_parameters(pole),
+            says=describe,
         )
 
 
-def _free_gains(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
-    """Yield a gain for each output: of wrong sign, or of another unit; one gain for all is the input's."""
+def _free_gains(experiments: tuple[Experiment, ...], params: ParameterSet) -> Candidate:
+    """Return a gain for each output: of wrong sign, or of another unit; one gain for all is the input's."""
     free = Parameter(name="gain", value=1.0, unit="-", free=True)
-    changed = tuple(replace(e, gain=dict.fromkeys(e.outputs, free)) for e in experiments)
     names = {f"{e.name}.gain.{o}": o for e in experiments for o in e.outputs}
 
-    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
+    def describe(values: Values, stds: Values) -> str | None:
         gains = [values[name] for name in names]
         common = float(np.median(gains))
         if len(gains) > 1 and all(abs(gain - common) < SNAP * abs(common) for gain in gains):
-            words = _say_gain(1.0 / common)
-            return (
-                words and f"{join_words([*experiments[0].plant.inputs])} {words}, or every output does by the inverse"
-            )
-        words = [f"{o} {said}" for name, o in names.items() if (said := _say_gain(values[name]))]
-        return join_words(list(dict.fromkeys(words))) if words else None
+            words, inputs = _state_gain(1.0 / common), join_words([*experiments[0].plant.inputs])
+            return words and f"{inputs} {words}, or every output does by the inverse"
+        words = [f"{o} {fault}" for name, o in names.items() if (fault := _state_gain(values[name]))]
+        return join_words(list(dict.fromkeys(words))) or None
 
-    yield Candidate(
-        where=experiments[0].name, experiments=changed, params=params, describe=describe, gains=tuple(names)
+    return Candidate(
+        where=experiments[0].name,
+        experiments=tuple(replace(e, gain=dict.fromkeys(e.outputs, free)) for e in experiments),
+        params=params,
+        says=describe,
+        gains=tuple(names),
     )
 
 
-def _say_gain(gain: float) -> str | None:
+def _state_gain(gain: float) -> str | None:
     """Return what is wrong with a channel that reads so many times what it should; None of what is no sensor's gain."""
     if abs(gain + 1.0) < SNAP:
         return "has the wrong sign"
@@ -494,17 +464,18 @@ def _say_gain(gain: float) -> str | None:
 
 
 def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, plant: Plant) -> Iterator[Candidate]:
-    """Yield another plant in place of the experiments' own."""
-    if any(e.plant.name == plant.name for e in experiments):
-        return
-    if any(not set(e.outputs) - set(e.differences) <= set(plant.outputs) for e in experiments):
-        return
-    if any(difference.of not in plant.states for e in experiments for difference in e.differences.values()):
-        return
-    if any(not set(plant.inputs) <= {*e.log.signals, *plant.optional_inputs} for e in experiments):
-        return
+    """Yield another plant in place of the experiments' own, where it has their channels and some free parameter."""
+
+    def suits(e: Experiment) -> bool:
+        return (
+            e.plant.name != plant.name
+            and set(e.outputs) - set(e.differences) <= set(plant.outputs)
+            and all(difference.of in plant.states for difference in e.differences.values())
+            and set(plant.inputs) <= {*e.log.signals, *plant.optional_inputs}
+        )
+
     free = [name for name in params.free_names if name in plant.parameters]
-    if not free:
+    if not free or not all(map(suits, experiments)):
         return
     changed = tuple(
         replace(
@@ -519,15 +490,11 @@ def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, pla
         )
         for e in experiments
     )
-    local = [local for e in changed for local in e.list_own().values()]
+    local = [parameter for e in changed for parameter in e.list_own().values()]
     values = plant.complete(changed[0].apply_own(params.fix())).values()
-
-    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
-        return f"the log is of the plant {plant.name}, not {experiments[0].plant.name}"
-
     yield Candidate(
         where=experiments[0].name,
         experiments=changed,
         params=ParameterSet([*values, *local]).free(*free),
-        describe=describe,
+        says=f"the log is of the plant {plant.name}, not {experiments[0].plant.name}",
     )

@@ -1,4 +1,4 @@
-"""What would explain the logs better than a fit: each candidate is refitted, and weighed by what it gains.
+"""Explanations of the logs that are better than a fit's: each candidate is refitted, and weighed by what it gains.
 
 What a candidate gains is the logarithm of its likelihood over the fit's, at each one's own residuals. The gain counts
 only beyond what chance gives a residual of this colour.
@@ -20,6 +20,7 @@ from seaopt.estimation.problem.fit_experiment import measure_spread
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_problem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.settle import ROUGH_ITERATIONS, Solved, settle_roughly, sharpen
 from seaopt.plants import Plant
@@ -37,13 +38,12 @@ FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free de
 class Cause:
     """Another explanation of the logs."""
 
-    text: str  # text, where: what it is, and of what
+    text: str  # with what it does to the residuals and the estimates
     where: str
     gain: float  # logarithm of its likelihood over the fit's
     solved: bool  # whether it leaves hardly anything of the residual of any output
     material: bool  # whether it takes half of a residual's power away, or moves an estimate beyond what the fit says
-    consequence: str  # what it does to the residuals and the estimates
-    preferred: Mapping[str, tuple[float, float]]  # what the refit gives the parameter or the delays that it frees
+    preferred: Mapping[str, tuple[float, float]]  # value and std that the refit gives what it frees
     unknowns: int  # how many its refit had
 
 
@@ -85,14 +85,12 @@ def find_causes(
 
 def _measure_powers(evaluation: Evaluation, problem: FitProblem) -> Float[np.ndarray, "outputs 2"]:
     """Return, output by output, the residual's mean square over the measured one's, and how many samples count."""
-    rows = [
-        (squares / max(count, 1.0) / max(spread**2, 1e-300), count)
-        for e in problem.experiments
-        for squares, count, spread in zip(
-            evaluation.power[e.name].squares, evaluation.power[e.name].counts, e.spread, strict=True
-        )
-    ]
-    return np.maximum(np.array(rows, dtype=float), 1e-24)
+    rows: list[Float[np.ndarray, "_ 2"]] = []
+    for e in problem.experiments:
+        power = evaluation.power[e.name]
+        shares = power.squares / np.maximum(power.counts, 1.0) / np.maximum(e.spread**2, 1e-300)
+        rows.append(np.column_stack([shares, power.counts]))
+    return np.maximum(np.concatenate(rows), 1e-24)
 
 
 def _measure_kept(fit: Fit, minimum: Minimum, kept: Sequence[Experiment]) -> Float[np.ndarray, "outputs 2"]:
@@ -138,25 +136,25 @@ def _refit(minimum: Minimum, candidate: Candidate) -> Solved | None:
         for name in candidate.delays:
             i = names.index(name)
             other[i] = np.clip(z[i] + samples * problem.experiments[0].period, problem.unknowns.low[i], None)
-        there = problem.evaluate(other)
-        start = there if there.cost < start.cost else start
+        start = min(start, problem.evaluate(other), key=lambda evaluation: evaluation.cost)
     # Only the freed parameter's friction is sharpened: what the fit found out already needs no other search.
     solved = settle_roughly(problem, start) if old.find_smoothing() else sharpen(problem, start, settle_roughly)
     return solved if np.isfinite(solved.misfit) else None
 
 
-def _compare_gains(problem: FitProblem, z: Float[np.ndarray, " n"], gains: Sequence[str]) -> Float[np.ndarray, " n"]:
+def _compare_gains(problem: FitProblem, z: Vector, gains: Sequence[str]) -> Vector:
     """Return the unknowns with each gain as a simulation compares with its output."""
     z, residuals = z.copy(), compute_residuals(problem, z)
     for output in problem.outputs:
+        name = f"{output.experiment.name}.gain.{output.name}"
+        if name not in gains:
+            continue
         measured = np.concatenate(output.measured)
         model = measured + np.concatenate(residuals[output.experiment.name].raw_of(output.name))
         good = np.isfinite(model)
         model, measured = model[good] - np.mean(model[good]), measured[good] - np.mean(measured[good])
-        name = f"{output.experiment.name}.gain.{output.name}"
-        if name in gains:
-            size = float(model @ model)
-            z[problem.unknowns.names.index(name)] = float(model @ measured) / size if size > 0.0 else 1.0
+        size = float(model @ model)
+        z[problem.unknowns.names.index(name)] = float(model @ measured) / size if size > 0.0 else 1.0
     return z
 
 
@@ -182,24 +180,21 @@ def _weigh(
     text = candidate.describe(values, stds) if gain > ENOUGH and not (poor and left > HALVED) else None
     if text is None:
         return None
-    moved = [
-        (abs(values[name] - old.value) / max(abs(old.value), 1e-300), name)
-        for name, old in fit.parameters.items()
-        if name in fit.covariance.names
-        and name in values
-        and abs(values[name] - old.value) > max(MOVED_STDS * (old.std or 0.0), MOVED_SHARE * abs(old.value))
-    ]
+    moved: list[tuple[float, str]] = []
+    for name in fit.covariance.names:
+        old = fit.parameters[name]
+        away = abs(values.get(name, old.value) - old.value)
+        if away > max(MOVED_STDS * (old.std or 0.0), MOVED_SHARE * abs(old.value)):
+            moved.append((away / max(abs(old.value), 1e-300), name))
     effects = [f"takes {100.0 * (1.0 - left):.3g} % of a residual's power away"] if left < 1.0 - 1e-3 else []
     if moved:
-        name = max(moved)[1]
+        _, name = max(moved)
         effects.append(f"moves {name} from {fit.parameters[name].value:.4g} to {values[name]:.4g}")
-    consequence = f" ({' and '.join(effects)})" if effects else ""
     return Cause(
-        text=text,
+        text=f"{text} ({' and '.join(effects)})" if effects else text,
         where=candidate.where,
         gain=gain,
         solved=bool(np.all(after[:, 0] < SOLVED * before[:, 0])),
-        consequence=consequence,
         preferred={name: (values[name] - shift, stds[name]) for name, shift in candidate.frees.items()},
         material=bool(moved) or left < HALVED or candidate.certain,
         unknowns=len(values),

@@ -1,4 +1,4 @@
-r"""What the inputs account for, of each output and of its residual, line by line of their spectra and without a model.
+r"""How much of each output and of its residual the inputs account for, line by line of their spectra, without a model.
 
 With the spectra U (stretches by inputs) and Y (stretches) of K Hann-windowed stretches that overlap by half, what the
 inputs account for at one line is the projection of Y on U's columns, and
@@ -16,6 +16,7 @@ A lightly damped mode rings longer than any stretch: there the coherence is a lo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -37,7 +38,7 @@ ALIKE = 1e-10  # of the power of inputs that differ by less there is nothing lef
 
 @record(eq=False)
 class CoherentShare:
-    """What the inputs account for, of one output and of its residual."""
+    """How much the inputs account for, of one output and of its residual."""
 
     output: float  # share of the output's energy that they account for
     residual: float  # the same of the residual
@@ -51,9 +52,9 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
     from scipy.fft import prev_fast_len  # deferred: scipy is slow to load
 
     inputs, outputs = _gather(experiment, residuals)
-    if not inputs:
-        return {}
     shares: dict[str, CoherentShare] = {}
+    if not inputs:
+        return shares
     total = sum(len(rows) for rows in inputs)
     # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
     longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
@@ -65,14 +66,8 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
         rows = [spectrum.compare(o, len(lengths)) for spectrum in spectra]
         if not rows or not experiment.spread[o] > 0.0:
             continue
-        best = min(rows, key=lambda row: row.p)
-        shares[name] = CoherentShare(
-            output=max(row.output for row in rows),
-            residual=max(row.residual for row in rows),
-            p=best.p,
-            band_hz=best.band_hz,
-            power=max(row.power for row in rows),
-        )
+        largest = {field: max(getattr(row, field) for row in rows) for field in ("output", "residual", "power")}
+        shares[name] = replace(min(rows, key=lambda row: row.p), **largest)
     return shares
 
 
@@ -88,14 +83,13 @@ def _gather(
     delay = round(experiment.slots.delay.value / experiment.period)
     for segment, left in zip(experiment.segments, residuals.segments, strict=True):
         samples = segment.samples
-        u = np.stack([np.asarray(channel)[samples.lead :] for channel in samples.u], axis=1)
+        u = np.stack(samples.inputs, axis=1)
         if delay:
             u = np.concatenate([np.repeat(u[:1], min(delay, len(u)), axis=0), u[: max(len(u) - delay, 0)]])
         used = segment.mark_counted(0)
         last = max((row.size - int(np.argmax(row[::-1])) for row in used.T if row.any()), default=0)
-        error = np.where(used, -left.raw, 0.0)
-        error = np.where(np.isfinite(error), error, 0.0)
-        measured = np.stack([np.asarray(channel) for channel in samples.y], axis=1)
+        error = np.where(used & np.isfinite(left.raw), -left.raw, 0.0)
+        measured = np.stack(samples.y, axis=1)
         measured = np.where(used, measured, measured + left.raw)
         if last > 1 and np.all(np.isfinite(measured[:last])):
             moving.append(u[:last])
@@ -120,17 +114,6 @@ def _tame(error: Float[np.ndarray, "n ny"], used: Bool[np.ndarray, "n ny"]) -> F
 
 
 @record(eq=False)
-class _Row:
-    """What one length of stretch tells of one output."""
-
-    output: float
-    residual: float
-    p: float
-    band_hz: tuple[float, float]
-    power: float
-
-
-@record(eq=False)
 class _Spectra:
     """Power of each signal at each line, the part that the inputs account for, and how many averages they are of."""
 
@@ -140,8 +123,8 @@ class _Spectra:
     averages: float
     inputs: int
 
-    def compare(self, o: int, trials: int) -> _Row:
-        """Return what the inputs account for of an output and of its residual; so many lengths are tried."""
+    def compare(self, o: int, trials: int) -> CoherentShare:
+        """Return what the inputs account for of an output and of its residual; `trials`: lengths that are tried."""
         by_chance = self.inputs / self.averages
         ny = self.power.shape[1] // 2
         unbiased = np.clip((self.coherent - by_chance * self.power) / (1.0 - by_chance), None, self.power)
@@ -150,7 +133,7 @@ class _Spectra:
         )
         left = max(float(np.sum(unbiased[:, ny + o])), 0.0) / max(float(np.sum(unbiased[:, o])), 1e-300)
         p, band = self._test(ny + o, trials)
-        return _Row(output=max(of_output, 0.0), residual=max(of_residual, 0.0), p=p, band_hz=band, power=left)
+        return CoherentShare(output=max(of_output, 0.0), residual=max(of_residual, 0.0), p=p, band_hz=band, power=left)
 
     def _test(self, s: int, trials: int) -> tuple[float, tuple[float, float]]:
         """Return the least p of the octaves, and its octave."""
@@ -163,17 +146,16 @@ class _Spectra:
         mean = float(digamma(k) - digamma(k - m))
         variance = float(polygamma(1, k - m) - polygamma(1, k))
         octave = np.floor(np.log2(f[-1] / f)).astype(int)
-        best, band, count = 1.0, (float(f[0]), float(f[-1])), 0
-        for number in np.unique(octave)[:OCTAVES]:
+        best, band, numbers = 1.0, (float(f[0]), float(f[-1])), np.unique(octave)[:OCTAVES]
+        for number in numbers:
             rows = octave == number
-            count += 1
             # Neighbouring lines of a Hann window share two thirds of their amplitude: two lines tell as much as one.
             n = max(0.5 * np.count_nonzero(rows), 1.0)
             shape, scale = n * mean**2 / variance, variance / mean
             p = float(gammaincc(shape, n * float(np.mean(statistic[rows])) / scale))
             if p < best:
                 best, band = p, (float(f[rows][0]), float(f[rows][-1]))
-        return min(best * count * trials, 1.0), band
+        return min(best * numbers.size * trials, 1.0), band
 
 
 def _make_spectra(

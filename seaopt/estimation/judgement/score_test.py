@@ -129,7 +129,7 @@ def _compute_scores(
     kept = np.flatnonzero(~apart)
     hessian = evaluation.hessian
     if not trial.loss.quadratic:
-        hessian = compute_bread(trial, z) + np.diag(unknowns.precision)
+        hessian = compute_bread(trial, z)
     across = solve_seen(hessian[kept][:, kept], hessian[kept][:, places], 1e-12)
     score = evaluation.gradient[places] - across.T @ evaluation.gradient[kept]
     information = np.diag(hessian)[places] - np.sum(hessian[kept][:, places] * across, axis=0)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.estimation.problem.shapes import Parts, Signal
 from seaopt.records import record
 
 INPUT_LAGS = 25
@@ -28,8 +29,10 @@ QUANTILE = 2.5758293  # of the standard normal, 99 % two-sided
 class CrossCorrelation:
     """The correlation of a residual with an input."""
 
-    lags: Float[np.ndarray, " n"]  # the residual is compared with the input so many samples before
-    values: Float[np.ndarray, " n"]  # correlation, -1 to 1
+    json_keys = ("lags", "values", "bound", "p", "worst_lag", "outside")
+
+    lags: Signal  # the residual is compared with the input so many samples before
+    values: Signal  # correlation, -1 to 1
     bound: float  # what chance exceeds at one lag with a probability of 1 %
     p: float  # probability that chance exceeds the largest value at some lag (Bonferroni's bound)
 
@@ -49,16 +52,16 @@ class CrossCorrelation:
         return self.worst > 1.0
 
 
-def load_transforms() -> tuple[Any, Any, Any]:
-    """Return SciPy's irfft, next_fast_len and rfft."""
+def load_fft() -> Any:
+    """Return SciPy's Fourier transforms."""
     from scipy import fft  # deferred: scipy is slow to load
 
-    return fft.irfft, fft.next_fast_len, fft.rfft
+    return fft
 
 
 def choose_transform_size(samples: int, lags: int) -> int:
-    """Return a length at which transforms of so many samples tell their products at so many lags, and are quick."""
-    return int(load_transforms()[1](samples + lags, real=True))
+    """Return a length at which transforms of so many samples give their products at so many lags, and are quick."""
+    return int(load_fft().next_fast_len(samples + lags, real=True))
 
 
 class LaggedSums:
@@ -72,20 +75,20 @@ class LaggedSums:
 
     def add(self, x: Float[np.ndarray, "rows n"]) -> None:
         """Add a part."""
-        spectrum = np.asarray(load_transforms()[2](x, self.size))
+        spectrum = load_fft().rfft(x, self.size)
         self.own += np.square(spectrum.view(float))
         for (a, b), total in self.cross.items():
             total += spectrum[a] * np.conj(spectrum[b])
 
     def sums(self) -> Float[np.ndarray, "lags1 rows rows"]:
         """Return the sums by lag."""
-        irfft, rows, count = load_transforms()[0], len(self.own), self.lags + 1
+        irfft, rows, count = load_fft().irfft, len(self.own), self.lags + 1
         sums = np.empty((count, rows, rows))
         power = np.sum(self.own.reshape(rows, -1, 2), axis=2)
-        for a, auto in enumerate(np.asarray(irfft(power, self.size))):
+        for a, auto in enumerate(irfft(power, self.size)):
             sums[:, a, a] = auto[:count]
         for (a, b), total in self.cross.items():
-            both = np.asarray(irfft(total, self.size))
+            both = irfft(total, self.size)
             sums[:, a, b] = both[:count]
             sums[0, b, a], sums[1:, b, a] = both[0], both[:-count:-1]
         return sums
@@ -97,19 +100,16 @@ def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
     return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
 
 
-def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " lags1"]:
+def autocorrelation(r: Signal, lags: int) -> Float[np.ndarray, " lags1"]:
     """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
-    irfft, next_fast_len, rfft = load_transforms()
     used = r != 0.0
-    centred = np.where(used, r - (r[used].mean() if np.any(used) else 0.0), 0.0)
-    size = next_fast_len(len(r) + lags + 1, real=True)
-    sums = np.asarray(irfft(np.abs(np.asarray(rfft(centred, size))) ** 2, size))[: lags + 1]
-    return sums / sums[0] if sums[0] > 0.0 else np.zeros(lags + 1)
+    mean, sums = r[used].mean() if np.any(used) else 0.0, LaggedSums(1, r.size, lags)
+    sums.add(np.where(used, r - mean, 0.0)[None])
+    products = sums.sums()[:, 0, 0]
+    return products / products[0] if products[0] > 0.0 else np.zeros(lags + 1)
 
 
-def cross_correlation(
-    residuals: list[Float[np.ndarray, "..."]], inputs: list[Float[np.ndarray, "..."]], lags: int = INPUT_LAGS
-) -> CrossCorrelation | None:
+def cross_correlation(residuals: Parts, inputs: Parts, lags: int = INPUT_LAGS) -> CrossCorrelation | None:
     """Return the correlation of a residual with an input over some segments; None if either does not move.
 
     A residual of exactly zero is one that does not count.
@@ -122,36 +122,28 @@ def cross_correlation(
         return None
     mean_e = sum(float(np.sum(r)) for r in residuals) / count
     mean_u = float(np.mean(np.concatenate([u[mask] for u, mask in zip(inputs, used, strict=True)])))
-    span = np.arange(-lags, lags + 1)
     longest = max(len(r) for r in residuals)
     long = int(min(max(32, 4 * np.sqrt(longest)), longest - 1))
-    cross, own_e, own_u = np.zeros(span.size), np.zeros(long + 1), np.zeros(long + 1)
+    sums = LaggedSums(3, longest, max(long, lags))
     for r, u, mask in zip(residuals, inputs, used, strict=True):
-        e, v = np.where(mask, r - mean_e, 0.0), u - mean_u
-        cross += _products(e, v, lags) / count
-        own_e += _products(e, e, long)[long:] / count
-        own_u += _products(v * mask, v * mask, long)[long:] / count
+        v = u - mean_u
+        sums.add(np.array([np.where(mask, r - mean_e, 0.0), v, v * mask]))
+    products = sums.sums() / count
+    cross = np.concatenate([products[lags:0:-1, 1, 0], products[: lags + 1, 0, 1]])
+    own_e, own_u = products[: long + 1, 0, 0], products[: long + 1, 2, 2]
     if own_e[0] <= 0.0 or own_u[0] <= 1e-24 * max(mean_u**2, 1e-300):
         return None
-    own_e *= parzen(long)
+    own_e = own_e * parzen(long)
     variance = (own_e[0] * own_u[0] + 2.0 * float(own_e[1:] @ own_u[1:])) / count
     size = float(np.sqrt(own_e[0] * own_u[0]))
     deviation = float(np.sqrt(max(variance, 1e-12 * own_e[0] * own_u[0] / count)))
     worst = float(np.max(np.abs(cross))) / deviation
     return CrossCorrelation(
-        lags=span.astype(float),
+        lags=np.arange(-lags, lags + 1.0),
         values=cross / size,
         bound=QUANTILE * deviation / size,
-        p=min(span.size * float(erfc(worst / np.sqrt(2.0))), 1.0),
+        p=min(cross.size * float(erfc(worst / np.sqrt(2.0))), 1.0),
     )
-
-
-def _products(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " m"]:
-    """Return the sums over t of a(t) b(t - k), k = -lags..lags."""
-    irfft, next_fast_len, rfft = load_transforms()
-    size = next_fast_len(len(a) + lags + 1, real=True)
-    whole = np.asarray(irfft(np.asarray(rfft(a, size)) * np.conj(np.asarray(rfft(b, size))), size))
-    return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]
 
 
 def ljung_box(rho: Float[np.ndarray, " lags"], n: float) -> float:

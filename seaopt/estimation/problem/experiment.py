@@ -1,4 +1,4 @@
-"""An experiment: a plant, its log, and what is known about sensors, delay and initial state."""
+"""An experiment: a plant, its log, and the known facts about sensors, delay and initial state."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from itertools import combinations, pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from seaopt.errors import EstimationError, require_number, require_type, suggestion
+from seaopt.estimation.problem.shapes import Signal
 from seaopt.formatting import format_count
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
@@ -29,7 +30,7 @@ MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
 Mask = Literal["auto", "declared", "none"]
-# What a setting may be, and how to say so.
+# The values of a setting, and how to name them.
 CHOICES = {
     "hold": (("zero", "first"), '"zero" or "first"'),
     "gaps": (("split", "error"), '"split" or "error"'),
@@ -134,30 +135,21 @@ class Experiment:
         self._add_differences()
         chosen = tuple(self.outputs) or tuple(name for name in self.plant.outputs if name in self.log.signals)
         if not chosen:
-            raise EstimationError(
-                f"experiment {self.name}: the log has none of the outputs of {self.plant.name} "
-                f"({', '.join(self.plant.outputs)}); name a channel after each measured output"
+            raise self._refuse(
+                f"the log has none of the outputs of {self.plant.name} ({', '.join(self.plant.outputs)}); name a "
+                "channel after each measured output"
             )
         object.__setattr__(self, "outputs", chosen)
-        for name in chosen:
-            require_type(name, str, f"experiment {self.name}: outputs", "give a name each", EstimationError)
-            if chosen.count(name) > 1:
-                raise EstimationError(f"experiment {self.name}: outputs names {name} twice; keep one")
-            if name not in self.plant.outputs:
-                raise EstimationError(
-                    f'experiment {self.name}: output "{name}" is not one of {self.plant.name}; '
-                    f"{suggestion(name, self.plant.outputs)}"
-                )
-            if not np.any(np.isfinite(self.log[name])):
-                raise EstimationError(
-                    f"experiment {self.name}: output {name} has no finite sample; leave it out of outputs"
-                )
+        object.__setattr__(self, "log_segments", tuple(self.log.segments))
+        self._check_outputs()
         self._check_units()
         self._check_parameters()
-        object.__setattr__(self, "log_segments", tuple(self.log.segments))
         self._check_settings()
         self._mask()
         self._check_sizes()
+
+    def _refuse(self, text: str) -> EstimationError:
+        return EstimationError(f"experiment {self.name}: {text}")
 
     def list_own(self) -> dict[str, Parameter]:
         """Return the parameters of this log alone that are free, by their names in the plant."""
@@ -169,8 +161,8 @@ class Experiment:
         if not self.parameters:
             return params
         local: list[Parameter] = []
-        for name, given in self.parameters.items():
-            value = params.get(f"{self.name}.{name}", given)
+        for name, stated in self.parameters.items():
+            value = params.get(f"{self.name}.{name}", stated)
             value = value.value if isinstance(value, Parameter) else float(value)
             local.append(Parameter(name=name, value=value, unit=self.plant.parameter_unit(name)))
         return params.with_parameters(*local)
@@ -184,8 +176,8 @@ class Experiment:
         for name, difference in self.differences.items():
             require_type(difference, Difference, f"{where}: {name}", "give a Difference", EstimationError)
             if made.get(name, difference) != difference:
-                raise EstimationError(
-                    f"{where}: {name} = {difference}, but {plant.name} has it made already, as {made[name]}; "
+                raise self._refuse(
+                    f"differences: {name} = {difference}, but {plant.name} has it made already, as {made[name]}; "
                     "give the plant without differences"
                 )
             if name not in made:
@@ -197,6 +189,28 @@ class Experiment:
         object.__setattr__(self, "plant", plant)
         object.__setattr__(self, "initial_state", initial)
 
+    def _check_outputs(self) -> None:
+        for name in self.outputs:
+            require_type(name, str, f"experiment {self.name}: outputs", "give a name each", EstimationError)
+            if self.outputs.count(name) > 1:
+                raise self._refuse(f"outputs names {name} twice; keep one")
+            if name not in self.plant.outputs:
+                raise self._refuse(
+                    f'output "{name}" is not one of {self.plant.name}; {suggestion(name, self.plant.outputs)}'
+                )
+            if not np.any(np.isfinite(self.log[name])):
+                raise self._refuse(f"output {name} has no finite sample; leave it out of outputs")
+
+    def _check_units(self) -> None:
+        for kind, names in (("input", self.plant.inputs), ("output", self.plant.outputs)):
+            for name, unit in names.items():
+                logged = self.log.signals[name].unit if name in self.log.signals else ""
+                if logged and logged != unit and not same_dimension(logged, unit):
+                    raise self._refuse(
+                        f"channel {name} is in {logged}, but the {kind} of {self.plant.name} is in "
+                        f"{unit or 'no unit'}; correct the column's unit"
+                    )
+
     def _check_parameters(self) -> None:
         require_type(self.parameters, Mapping, f"experiment {self.name}: parameters", "give a mapping", EstimationError)
         self._check_names("parameters", self.parameters, self.plant.parameters, f"one of {self.plant.name}")
@@ -205,37 +219,76 @@ class Experiment:
             if not isinstance(value, Parameter):
                 number = require_number(value, f"experiment {self.name}: parameters: {name}", EstimationError)
                 if not np.isfinite(number):
-                    raise EstimationError(f"experiment {self.name}: parameters: {name} = {number} is not finite")
+                    raise self._refuse(f"parameters: {name} = {number} is not finite")
             elif value.unit != unit and not (same_dimension(value.unit, unit) and factor(value.unit, unit) == 1.0):
-                raise EstimationError(
-                    f"experiment {self.name}: parameters: {name} is in {value.unit}, but {self.plant.name} has it in "
-                    f"{unit or 'no unit'}; convert it"
+                raise self._refuse(
+                    f"parameters: {name} is in {value.unit}, but {self.plant.name} has it in {unit or 'no unit'}; "
+                    "convert it"
                 )
 
-    def _check_names(self, what: str, names: Collection[str], known: Collection[str], kind: str) -> None:
+    def _check_names(self, what: str, names: Collection[str], choices: Collection[str], kind: str) -> None:
         for name in names:
-            if name not in known:
-                raise EstimationError(
-                    f'experiment {self.name}: {what} names "{name}", which is not {kind}; {suggestion(name, known)}'
-                )
+            if name not in choices:
+                raise self._refuse(f'{what} names "{name}", which is not {kind}; {suggestion(name, choices)}')
+
+    def _check_settings(self) -> None:
+        label = f"experiment {self.name}:"
+        self._check_each_output()
+        if isinstance(self.initial_state, Mapping):
+            self._check_names("initial_state", self.initial_state, self.plant.states, f"a state of {self.plant.name}")
+        for what, (choices, use) in CHOICES.items():
+            value = getattr(self, what)
+            if what == "initial_state" and isinstance(value, Mapping):
+                continue
+            require_type(value, str, f"{label} {what}", f"give {use}", EstimationError)
+            if value not in choices:
+                raise self._refuse(f'{what} = "{value}" is not known; use {use}')
+        if isinstance(self.drift, bool) or not isinstance(self.drift, int) or not 0 <= self.drift <= MAX_DRIFT:
+            raise self._refuse(f"drift = {self.drift!r} is not the order of a polynomial; give 0 (none) to {MAX_DRIFT}")
+        delay = self.delay_s.value if isinstance(self.delay_s, Parameter) else self.delay_s
+        if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
+            raise self._refuse(f"delay_s = {delay!r} is not a time; give seconds, 0 or more")
+        if delay > self.log.duration_s:
+            raise self._refuse(
+                f"delay_s = {delay:g} is longer than its log of {self.log.duration_s:.4g} s; give fewer seconds"
+            )
+        if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
+            raise self._refuse(f"shots = {self.shots!r}; give 1 or more")
+        if self.gaps == "error" and len(self.log_segments) > 1:
+            raise self._refuse(
+                f'the log has {format_count(len(self.log_segments) - 1, "gap")} and gaps = "error"; use '
+                'gaps = "split", or slice_s to choose a stretch'
+            )
+
+    def _check_each_output(self) -> None:
+        """Check the settings that have a value for each output."""
+        require_type(self.offset, (bool, Mapping), f"experiment {self.name}: offset", "give a mapping", EstimationError)
+        offset = {} if isinstance(self.offset, bool) else self.offset
+        settings = {"sigma": self.sigma, "gain": self.gain, "offset": offset, "saturation": self.saturation}
+        for what, values in settings.items():
+            if not isinstance(values, Mapping):
+                raise self._refuse(f"{what} = {values!r}; give a mapping of output to value")
+            for name, value in values.items():
+                ends = value if what == "saturation" and isinstance(value, tuple | list) else (value,)
+                for number in ends:
+                    if not isinstance(number, Parameter):
+                        require_number(number, f"experiment {self.name}: {what} of {name}", EstimationError)
+            self._check_names(what, values, self.outputs, "a measured output")
+        for name, value in self.sigma.items():
+            if not 0.0 < value < np.inf:
+                raise self._refuse(f"sigma of {name} = {value:g} is not positive; leave it out to estimate it")
+        for name, ends in self.saturation.items():
+            if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
+                raise self._refuse(f"saturation of {name} = {ends} is not a range; give [low, high]")
 
     def _mask(self) -> None:
         """Make saturated samples missing in the experiment's own log."""
-        for name, ends in self.saturation.items():
-            for end in ends if isinstance(ends, tuple | list) else ():
-                require_number(end, f"experiment {self.name}: saturation of {name}", EstimationError)
-            if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
-                raise EstimationError(
-                    f"experiment {self.name}: saturation of {name} = {ends} is not a range; give [low, high]"
-                )
         if self.mask == "none":
             return
         log = mask_saturated(self.log, self.outputs, ranges=self.saturation, search=self.mask == "auto")
         for name in self.outputs:
             if not np.any(np.isfinite(log[name])):
-                raise EstimationError(
-                    f"experiment {self.name}: every sample of {name} is saturated; correct saturation, or leave it out"
-                )
+                raise self._refuse(f"every sample of {name} is saturated; correct saturation, or leave it out")
         object.__setattr__(self, "log", log)
 
     def _check_sizes(self) -> None:
@@ -243,75 +296,11 @@ class Experiment:
         for name in {*self.outputs, *self.plant.inputs} & set(self.log.signals):
             rows = np.flatnonzero(np.abs(self.log[name]) > BEYOND)
             if rows.size:
-                raise EstimationError(
-                    f"experiment {self.name}: {format_count(rows.size, 'sample')} of channel {name} beyond any sensor "
+                raise self._refuse(
+                    f"{format_count(rows.size, 'sample')} of channel {name} beyond any sensor "
                     f"({self.log[name][rows[0]]:.3g} at {self.log.time[rows[0]]:.6g} s); set such samples to NaN, or "
                     "correct unit or scale"
                 )
-
-    def _check_units(self) -> None:
-        for kind, names in (("input", self.plant.inputs), ("output", self.plant.outputs)):
-            for name, unit in names.items():
-                logged = self.log.signals[name].unit if name in self.log.signals else ""
-                if logged and logged != unit and not same_dimension(logged, unit):
-                    raise EstimationError(
-                        f"experiment {self.name}: channel {name} is in {logged}, but the {kind} of {self.plant.name} "
-                        f"is in {unit or 'no unit'}; correct the column's unit"
-                    )
-
-    def _check_settings(self) -> None:
-        for what, values in (("sigma", self.sigma), ("gain", self.gain), ("saturation", self.saturation)):
-            if not isinstance(values, Mapping):
-                raise EstimationError(f"experiment {self.name}: {what} = {values!r}; give a mapping of output to value")
-        for what, values in (("sigma", self.sigma), ("offset", self.offset), ("gain", self.gain)):
-            for name, value in values.items() if isinstance(values, Mapping) else ():
-                if not isinstance(value, Parameter):
-                    require_number(value, f"experiment {self.name}: {what} of {name}", EstimationError)
-        require_type(self.offset, (bool, Mapping), f"experiment {self.name}: offset", "give a mapping", EstimationError)
-        require_type(
-            self.initial_state,
-            (str, Mapping),
-            f"experiment {self.name}: initial_state",
-            "give a mapping of state to value",
-            EstimationError,
-        )
-        require_type(self.drift, int, f"experiment {self.name}: drift", "give an order", EstimationError)
-        offset = self.offset if isinstance(self.offset, Mapping) else {}
-        named = {"sigma": self.sigma, "gain": self.gain, "offset": offset, "saturation": self.saturation}
-        for what, names in named.items():
-            self._check_names(what, names, self.outputs, "a measured output")
-        for name, value in self.sigma.items():
-            if not 0.0 < value < np.inf:
-                raise EstimationError(
-                    f"experiment {self.name}: sigma of {name} = {value:g} is not positive; leave it out to estimate it"
-                )
-        if isinstance(self.drift, bool) or not 0 <= self.drift <= MAX_DRIFT:
-            raise EstimationError(
-                f"experiment {self.name}: drift = {self.drift!r} is not the order of a polynomial; "
-                f"give 0 (none) to {MAX_DRIFT}"
-            )
-        if not isinstance(self.initial_state, str):
-            self._check_names("initial_state", self.initial_state, self.plant.states, f"a state of {self.plant.name}")
-        for what, (choices, use) in CHOICES.items():
-            value = getattr(self, what)
-            if value not in choices and not (what == "initial_state" and isinstance(value, Mapping)):
-                raise EstimationError(f'experiment {self.name}: {what} = "{value}" is not known; use {use}')
-        delay = self.delay_s.value if isinstance(self.delay_s, Parameter) else self.delay_s
-        if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
-            raise EstimationError(f"experiment {self.name}: delay_s = {delay!r} is not a time; give seconds, 0 or more")
-        if delay > self.log.duration_s:
-            raise EstimationError(
-                f"experiment {self.name}: delay_s = {delay:g} is longer than its log of {self.log.duration_s:.4g} s; "
-                "give fewer seconds"
-            )
-        if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
-            raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
-        if self.gaps == "error" and len(self.log_segments) > 1:
-            count = format_count(len(self.log_segments) - 1, "gap")
-            raise EstimationError(
-                f'experiment {self.name}: the log has {count} and gaps = "error"; '
-                'use gaps = "split", or slice_s to choose a stretch'
-            )
 
     def __repr__(self) -> str:
         count = format_count(len(self.log_segments), "segment")
@@ -319,7 +308,7 @@ class Experiment:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was done to the log, and which of its samples have no weight, one sentence each."""
+        """How the log was changed, and which of its samples have no weight, one sentence each."""
         log, segments = self.log, self.log_segments
         notes = list(log.notes)
         if segments != (slice(0, len(log)),):
@@ -336,22 +325,17 @@ class Experiment:
             if name in log.signals and is_constant(log[name]):
                 text = f"{name}: is constant at {np.fmax.reduce(log[name]):.6g} {log.signal(name).unit}".rstrip()
                 notes += [text] if text not in notes else []  # reading a file says it already
-        return (*notes, *self._note_same_columns())
-
-    def _note_same_columns(self) -> list[str]:
-        """Return what to know of channels with the same samples."""
-        named = [name for name in (*self.plant.inputs, *self.outputs) if name in self.log.signals]
-        pairs = [(a, b) for a, b in combinations(named, 2) if _are_same(self.log[a], self.log[b])]
-        pairs = [(a, b) for a, b in pairs if b in self.outputs and not is_constant(self.log[b])]
-        return [
-            f"{a} and {b} are the same samples: "
-            + (
-                "their noise is one, and the stds count it once"
-                if a in self.outputs
-                else "as an input it is taken for exact, noise included; name another column if that is not what drives"
-            )
-            for a, b in pairs
-        ]
+        named = [name for name in (*self.plant.inputs, *self.outputs) if name in log.signals]
+        for a, b in combinations(named, 2):
+            if b in self.outputs and not is_constant(log[b]) and _are_same(log[a], log[b]):
+                text = (
+                    "their noise is one, and the stds count it once"
+                    if a in self.outputs
+                    else "as an input it is taken for exact, noise included; name another column if that is not what "
+                    "drives"
+                )
+                notes.append(f"{a} and {b} are the same samples: {text}")
+        return tuple(notes)
 
     def segments(self, holdout: float = 0.0) -> list[Segment]:
         """Return the segments that are simulated; the last fraction `holdout` of the time gets no weight."""
@@ -382,17 +366,13 @@ class Experiment:
         """Return the rows at which a segment of the log is cut into shots, its ends included."""
         return (whole.start + cut_into_shots(whole.stop - whole.start, self.shots)).tolist()
 
-    def rename(self, name: str) -> Experiment:
-        """Return the experiment under another name."""
-        return replace(self, name=name)
 
-
-def is_constant(values: Float[np.ndarray, " n"]) -> bool:
+def is_constant(values: Signal) -> bool:
     """Tell whether all samples are the same, as far as they are there."""
     return bool(np.fmin.reduce(values) == np.fmax.reduce(values))
 
 
-def _are_same(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> bool:
+def _are_same(first: Signal, second: Signal) -> bool:
     """Tell whether two channels are the same samples; of most that are not, the beginning tells."""
     return all(np.array_equal(first[:end], second[:end], equal_nan=True) for end in (BEGINNING, None))
 

@@ -13,6 +13,7 @@ from seaopt.estimation.problem.band import design_filter, sees_level
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.normal_equations import add_gram
+from seaopt.estimation.problem.shapes import Parts, PerOutput, Signal, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.problem.unknowns import Slot, Slots, find_places
 from seaopt.records import record
@@ -34,7 +35,7 @@ class FitSegment:
     columns: tuple[Int[np.ndarray, " nc"], ...]
     predictor_columns: tuple[Int[np.ndarray, " nd"], ...]
 
-    def start(self, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nx"]:
+    def start(self, z: Vector) -> Float[np.ndarray, " nx"]:
         """Return the state at the first sample."""
         return np.array([slot.at(z) for slot in self.initial])
 
@@ -47,13 +48,6 @@ class FitSegment:
         present[: max(settle - chosen.start, 0)] = False
         return present
 
-    def count_weighted(self) -> Int[np.ndarray, " ny"]:
-        """Return how many samples of each output are there and have a weight."""
-        present = [np.isfinite(channel) for channel in self.samples.y]
-        if self.samples.keep:
-            present = [there & (mask > 0) for there, mask in zip(present, self.samples.keep, strict=True)]
-        return np.array([np.count_nonzero(there) for there in present])
-
     @property
     def has_start(self) -> bool:
         """Whether the data show the initial state: not where all samples are held out."""
@@ -64,11 +58,11 @@ class FitSegment:
 class ResidualPower:
     """Weighted sum of squares and count of each output's residuals."""
 
-    squares: Float[np.ndarray, " ny"]
-    counts: Float[np.ndarray, " ny"]
+    squares: PerOutput
+    counts: PerOutput
 
     @property
-    def rms(self) -> Float[np.ndarray, " ny"]:
+    def rms(self) -> PerOutput:
         """The root of the mean square of each output."""
         return np.sqrt(self.squares / np.maximum(self.counts, 1.0))
 
@@ -82,8 +76,8 @@ class FitExperiment:
     model: Model  # the plant, in its own free parameters
     theta: Int[np.ndarray, " np"]  # where those stand among the unknowns
     slots: Slots  # its other unknowns
-    sigma: Float[np.ndarray, " ny"]  # of the filtered residual of each output
-    spread: Float[np.ndarray, " ny"]  # standard deviation of each measured output
+    sigma: PerOutput  # of the filtered residual of each output
+    spread: PerOutput  # standard deviation of each measured output
     loss: Loss  # applied to residuals in sigma
     band_hz: tuple[float, float] | None = None  # residuals are filtered to this band
     holdout: float = 0.0  # last fraction of the log that gets no weight
@@ -110,6 +104,10 @@ class FitExperiment:
         """Samples of the longest segment."""
         return max(segment.samples.n for segment in self.segments)
 
+    def count_weighted(self) -> Int[np.ndarray, " ny"]:
+        """Return how many samples of each output are there and have a weight."""
+        return np.sum([np.count_nonzero(segment.mark_counted(0), axis=0) for segment in self.segments], axis=0)
+
     @property
     def weights(self) -> Weights:
         """The filter and the loss."""
@@ -122,20 +120,20 @@ class FitExperiment:
         """Whether offsets are wanted that the band does not show: they are then what is left over on average."""
         return self.data.offset is True and not sees_level(self.band_hz)
 
-    def count_steps(self, z: Float[np.ndarray, " n"]) -> int:
+    def count_steps(self, z: Vector) -> int:
         """Return the integration steps per sample: more than asked for where fewer would be unstable."""
         stable = self.count_stable_steps(z)
         return self.substeps if stable > MAX_SUBSTEPS else max(self.substeps, int(stable))
 
-    def is_too_stiff(self, z: Float[np.ndarray, " n"]) -> bool:
+    def is_too_stiff(self, z: Vector) -> bool:
         """Whether rates near rest, as sharp friction's, ask for finer steps than `MAX_SUBSTEPS` in a sample."""
         return self.count_stable_steps(z) > MAX_SUBSTEPS
 
-    def count_stable_steps(self, z: Float[np.ndarray, " n"]) -> float:
+    def count_stable_steps(self, z: Vector) -> float:
         """Return how many integration steps per sample are stable, whatever `substeps`."""
         return 1.0 if self.model.linear else count_stable_steps(self.model, z[self.theta], self.period)
 
-    def point(self, z: Float[np.ndarray, " n"]) -> Point:
+    def point(self, z: Vector) -> Point:
         """Return where the passes are made."""
         slots = self.slots
         point = Point(
@@ -160,11 +158,11 @@ class FitExperiment:
         """Return, for each output, the unknown of each derivative column of a pass; -1 where that is known."""
         return segment.columns if self.predictor is None else segment.predictor_columns
 
-    def run(self, segment: FitSegment, z: Float[np.ndarray, " n"], **keep: Any) -> Pass:
+    def run(self, segment: FitSegment, z: Vector, **keep: Any) -> Pass:
         """Run the pass of one segment."""
         return run_passes(self.model, segment.samples, self.point(z), segment.start(z), self.weights, **keep)
 
-    def run_all(self, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
+    def run_all(self, z: Vector) -> tuple[Pass, ...]:
         """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples."""
         point, weights = self.point(z), self.weights
         rows = 0 if self.model.linear else FIRST_SAMPLES
@@ -176,7 +174,7 @@ class FitExperiment:
         )
 
     def stream(
-        self, segment: FitSegment, z: Float[np.ndarray, " n"], point: Point, *, columns: bool, chunk: int
+        self, segment: FitSegment, z: Vector, point: Point, *, columns: bool, chunk: int
     ) -> Iterator[tuple[slice, Pass]]:
         """Yield rows of a segment and their part of a pass, chunk by chunk."""
         first = 0
@@ -200,7 +198,7 @@ class FitExperiment:
         """Return the loss of the passes of every segment, in sigma."""
         return sum(float(np.sum(sums.loss / self.sigma**2)) for sums in passes)
 
-    def power(self, passes: Sequence[Pass], moved: Float[np.ndarray, " n"]) -> ResidualPower:
+    def power(self, passes: Sequence[Pass], moved: Vector) -> ResidualPower:
         """Return the power of the residuals after unknowns in which they are straight have moved."""
         squares, counts = np.zeros(len(self.sigma)), np.zeros(len(self.sigma))
         for segment, sums in zip(self.segments, passes, strict=True):
@@ -240,7 +238,7 @@ class FitOutput:
         return float(self.experiment.spread[self.index])
 
     @property
-    def measured(self) -> list[Float[np.ndarray, "..."]]:
+    def measured(self) -> Parts:
         """The samples of each segment."""
         return [segment.samples.y[self.index] for segment in self.experiment.segments]
 
@@ -301,7 +299,7 @@ def _indices(slots: Sequence[Slot]) -> list[int]:
     return [-1 if slot.index is None else slot.index for slot in slots]
 
 
-def measure_spread(values: Float[np.ndarray, " n"]) -> float:
+def measure_spread(values: Signal) -> float:
     """Return the standard deviation of the samples that are there, in the memory of a chunk."""
     first = float(values[np.argmax(np.isfinite(values))])
     count, total, square = 0, 0.0, 0.0

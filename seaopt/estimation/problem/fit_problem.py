@@ -40,6 +40,7 @@ from seaopt.estimation.problem.fit_experiment import (
 )
 from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.normal_equations import QuadraticModel, solve_seen
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.problem.unknowns import Unknowns, collect, find_places
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import list_smoothing
@@ -56,7 +57,7 @@ T = TypeVar("T")
 class PassSet:
     """The passes of every experiment's segments, by its name, and the unknowns at which they were made."""
 
-    z: Float[np.ndarray, " n"]
+    z: Vector
     by_experiment: Mapping[str, tuple[Pass, ...]]
 
 
@@ -131,7 +132,7 @@ class FitProblem:
             return [call(experiment) for experiment in self.experiments]
         return list(threads().map(call, self.experiments))
 
-    def evaluate(self, z: Float[np.ndarray, " n"]) -> Evaluation:
+    def evaluate(self, z: Vector) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
         passes = self.map(lambda experiment: experiment.run_all(z))
         names = (experiment.name for experiment in self.experiments)
@@ -158,7 +159,7 @@ class FitProblem:
         return [i for i, (name, std) in pairs if i >= unknowns.shared and ".initial" in name and np.isfinite(std)]
 
     @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which callers check
-    def assemble(self, passes: PassSet, to: Float[np.ndarray, " n"] | None = None) -> Evaluation:
+    def assemble(self, passes: PassSet, to: Vector | None = None) -> Evaluation:
         """Return the evaluation that passes give: other sigmas need no other passes.
 
         It is that of `to`, if given, as far as residuals are straight to there.
@@ -196,7 +197,7 @@ class FitProblem:
             passes=passes,
         )
 
-    def follow(self, evaluation: Evaluation, z: Float[np.ndarray, " n"]) -> Evaluation:
+    def follow(self, evaluation: Evaluation, z: Vector) -> Evaluation:
         """Return what an evaluation says of a `z` nearby, as far as residuals are straight to there."""
         return self.assemble(evaluation.passes, z)
 
@@ -211,7 +212,7 @@ class FitProblem:
         return self.loss.quadratic and (not self.predicts or self.all_linear)
 
     def rebuild(
-        self, params: ParameterSet, z: Float[np.ndarray, " n"], data: Mapping[str, Experiment] | None = None
+        self, params: ParameterSet, z: Vector, data: Mapping[str, Experiment] | None = None
     ) -> tuple[FitProblem, Float[np.ndarray, " m"]]:
         """Return the problem with other parameters free, and `z` in its unknowns; new ones are at their start.
 

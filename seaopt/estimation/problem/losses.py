@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.records import record
 from seaopt.simulation import RobustLoss
 
@@ -24,7 +25,7 @@ class Squares:
         """Return the loss's derivative at each residual, in sigma."""
         return r
 
-    def curvature(self, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def curvature(self, r: Vector) -> Vector:
         """Return the loss's second derivative at each residual, in sigma."""
         return np.ones_like(r)
 
@@ -51,7 +52,7 @@ class Huber:
         """Return the loss's derivative at each residual, in sigma."""
         return np.clip(r, -self.threshold, self.threshold)
 
-    def curvature(self, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def curvature(self, r: Vector) -> Vector:
         """Return the loss's second derivative at each residual, in sigma."""
         return (np.abs(r) <= self.threshold).astype(float)
 
@@ -78,7 +79,7 @@ class SoftL1:
         """Return the loss's derivative at each residual, in sigma."""
         return r / np.sqrt(1.0 + (r / self.threshold) ** 2)
 
-    def curvature(self, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def curvature(self, r: Vector) -> Vector:
         """Return the loss's second derivative at each residual, in sigma."""
         return (1.0 + (r / self.threshold) ** 2) ** -1.5
 

@@ -19,6 +19,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from seaopt.estimation.problem.shapes import Matrix, ParameterMatrix, Parts, Vector
 from seaopt.records import record
 
 FEWEST = 100  # unknowns from which the blocks of an arrow are eliminated one by one
@@ -33,10 +34,10 @@ class QuadraticModel:
     `linear` marks the unknowns in which residuals are affine: a step may change those at will.
     """
 
-    z: Float[np.ndarray, " n"]
+    z: Vector
     cost: float
-    gradient: Float[np.ndarray, " n"]
-    hessian: Float[np.ndarray, "n n"]
+    gradient: Vector
+    hessian: Matrix
     linear: Bool[np.ndarray, " n"]
 
     def distance_squared(self, free: Bool[np.ndarray, " n"]) -> float:
@@ -61,17 +62,13 @@ def add_gram(
     normal[..., to[:, None], to] += gram[..., of[:, None], of]
 
 
-def invert(
-    matrix: Float[np.ndarray, "n n"], cut: float = RANK
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+def invert(matrix: Matrix, cut: float = RANK) -> tuple[Matrix, Vector]:
     """Return the inverse over what is seen, and how much of each unknown is not (0 to 1, squared)."""
     scale, factors = _factor(matrix, cut)
     return factors.invert() / np.outer(scale, scale), factors.unseen()
 
 
-def solve_seen(
-    matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n ..."], cut: float
-) -> Float[np.ndarray, "n ..."]:
+def solve_seen(matrix: Matrix, right: Float[np.ndarray, "n ..."], cut: float) -> Float[np.ndarray, "n ..."]:
     """Return matrix^-1 right over what is seen; the rest stays where it is."""
     scale, factors = _factor(matrix, cut)
     if not right.size:
@@ -80,19 +77,19 @@ def solve_seen(
     return (factors.solve(columns) / scale[:, None]).reshape(right.shape)
 
 
-def measure_decrement(matrix: Float[np.ndarray, "n n"], gradient: Float[np.ndarray, " n"], cut: float) -> float:
+def measure_decrement(matrix: Matrix, gradient: Vector, cut: float) -> float:
     """Return the Newton decrement gradient' matrix^-1 gradient over what is seen."""
     return float(gradient @ solve_seen(matrix, gradient, cut))
 
 
-def eliminate(matrix: Float[np.ndarray, "n n"], p: int, cut: float = 1e-12) -> Float[np.ndarray, "p p"]:
+def eliminate(matrix: Matrix, p: int, cut: float = 1e-12) -> ParameterMatrix:
     """Return the Schur complement of all but the first p unknowns."""
     if len(matrix) == p:
         return matrix.copy()
     return matrix[:p, :p] - matrix[:p, p:] @ solve_seen(matrix[p:, p:], matrix[p:, :p], cut)
 
 
-def _factor(matrix: Float[np.ndarray, "n n"], cut: float) -> tuple[Float[np.ndarray, " n"], _Spectrum | _Arrow]:
+def _factor(matrix: Matrix, cut: float) -> tuple[Vector, _Spectrum | _Arrow]:
     """Return the scale of the unknowns, and the factors of the matrix scaled to a unit diagonal."""
     scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
     shape, scaled = find_arrow(matrix), matrix / (scale[:, None] * scale)
@@ -135,7 +132,7 @@ class ArrowShape:
     blocks: tuple[Int[np.ndarray, "..."], ...]
 
 
-def find_arrow(matrix: Float[np.ndarray, "n n"]) -> ArrowShape | None:
+def find_arrow(matrix: Matrix) -> ArrowShape | None:
     """Return the shape of a matrix that is an arrow of many small blocks; None where that would save nothing.
 
     Unknowns that meet far more others than the usual one does are the shaft; what is left falls apart into blocks.
@@ -180,11 +177,11 @@ class _Arrow:
     rest: _Spectrum
 
     @classmethod
-    def of(cls, matrix: Float[np.ndarray, "n n"], shape: ArrowShape, cut: float) -> _Arrow:
+    def of(cls, matrix: Matrix, shape: ArrowShape, cut: float) -> _Arrow:
         shaft = matrix[shape.shaft][:, shape.shaft]
         reduced = shaft.copy()
         blocks: list[_Spectrum] = []
-        across: list[Float[np.ndarray, "..."]] = []
+        across: Parts = []
         for rows in shape.blocks:
             beside = matrix[rows[:, :, None], shape.shaft]
             blocks.append(_Spectrum.of(matrix[rows[:, :, None], rows[:, None, :]], cut))
@@ -203,14 +200,14 @@ class _Arrow:
             solution[rows] = block.solve(right[rows]) - across @ shaft
         return solution
 
-    def invert(self) -> Float[np.ndarray, "n n"]:
+    def invert(self) -> Matrix:
         every = self._extend(np.eye(self.shape.shaft.size))
         inverse = every @ self.rest.solve(every.T)
         for rows, block in zip(self.shape.blocks, self.blocks, strict=True):
             inverse[rows[:, :, None], rows[:, None, :]] += block.invert()
         return inverse
 
-    def unseen(self) -> Float[np.ndarray, " n"]:
+    def unseen(self) -> Vector:
         null = self._extend(self.rest.vectors[:, ~self.rest.seen])
         unseen = np.sum(null**2 / np.maximum(np.sum(null**2, axis=0), 1e-300), axis=1)
         for rows, block in zip(self.shape.blocks, self.blocks, strict=True):

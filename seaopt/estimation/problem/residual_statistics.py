@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from seaopt.estimation.problem.correlation import LaggedSums, ljung_box
 from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.problem.shapes import Parts, PerOutput, Vector
 from seaopt.records import record
 from seaopt.simulation import Point
 
@@ -40,11 +41,11 @@ class ExperimentResiduals:
         """Model minus measured of all segments; NaN where missing."""
         return np.concatenate([segment.raw for segment in self.segments])
 
-    def weighted_of(self, output: str) -> list[Float[np.ndarray, "..."]]:
+    def weighted_of(self, output: str) -> Parts:
         """Return the weighted residuals of one output, segment by segment."""
         return [segment.weighted[:, self.outputs.index(output)] for segment in self.segments]
 
-    def raw_of(self, output: str) -> list[Float[np.ndarray, "..."]]:
+    def raw_of(self, output: str) -> Parts:
         """Return model minus measured of one output, segment by segment."""
         return [segment.raw[:, self.outputs.index(output)] for segment in self.segments]
 
@@ -52,12 +53,12 @@ class ExperimentResiduals:
 ResidualsByExperiment = Mapping[str, ExperimentResiduals]
 
 
-def compute_residuals(problem: FitProblem, z: Float[np.ndarray, " n"]) -> dict[str, ExperimentResiduals]:
+def compute_residuals(problem: FitProblem, z: Vector) -> dict[str, ExperimentResiduals]:
     """Return the residuals of every experiment, by its name."""
     return {experiment.name: compute_experiment_residuals(experiment, z) for experiment in problem.experiments}
 
 
-def compute_experiment_residuals(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> ExperimentResiduals:
+def compute_experiment_residuals(experiment: FitExperiment, z: Vector) -> ExperimentResiduals:
     """Return the residuals of one experiment."""
     rows: list[SegmentResiduals] = []
     for segment in experiment.segments:
@@ -87,7 +88,7 @@ class _Chunk:
 
 
 def _stream_residuals(
-    experiment: FitExperiment, segment: FitSegment, z: Float[np.ndarray, " n"], chunk: int = CACHED_SAMPLES
+    experiment: FitExperiment, segment: FitSegment, z: Vector, chunk: int = CACHED_SAMPLES
 ) -> Iterator[_Chunk]:
     """Yield the residuals of a segment, chunk by chunk."""
     point, weights, samples = experiment.point(z), experiment.weights, segment.samples
@@ -142,8 +143,8 @@ class ResidualStatistics:
     outputs: tuple[str, ...]  # in the order of the arrays
     # sums of r_a(t) r_b(t - k), r what the loss makes of the weighted residuals
     correlation: Float[np.ndarray, "lags1 ny ny"]
-    mean: Float[np.ndarray, " ny"]  # mean, count: of r, over the samples that count
-    count: Float[np.ndarray, " ny"]
+    mean: PerOutput  # mean, count: of r, over the samples that count
+    count: PerOutput
     # used, held_out: over the samples that count, those in which the filter settles included, and over those held out
     used: Mapping[str, MisfitSums]
     held_out: Mapping[str, MisfitSums]
@@ -168,7 +169,7 @@ class ResidualStatistics:
 StatisticsByExperiment = Mapping[str, ResidualStatistics]
 
 
-def compute_statistics(problem: FitProblem, z: Float[np.ndarray, " n"]) -> dict[str, ResidualStatistics]:
+def compute_statistics(problem: FitProblem, z: Vector) -> dict[str, ResidualStatistics]:
     """Return what the residuals of every experiment come to, by its name."""
     return {experiment.name: _compute_statistics(experiment, z) for experiment in problem.experiments}
 
@@ -198,7 +199,7 @@ class _Sums:
         return with_tail[:, max(with_tail.shape[1] - self.lags, 0) :]
 
 
-def _compute_statistics(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> ResidualStatistics:
+def _compute_statistics(experiment: FitExperiment, z: Vector) -> ResidualStatistics:
     names, sums = experiment.data.outputs, _Sums(experiment)
     banded = bool(len(experiment.weights.sections))
     misfits = np.zeros((2 + banded, len(names), 5))  # used, held out, in the band; see _sum_misfits
@@ -266,7 +267,7 @@ def _make_sums(n: float, power: float, level: float, square: float, misfit: floa
 
 
 def stream_columns(
-    experiment: FitExperiment, segment: FitSegment, z: Float[np.ndarray, " n"], chunk: int = CACHED_SAMPLES
+    experiment: FitExperiment, segment: FitSegment, z: Vector, chunk: int = CACHED_SAMPLES
 ) -> Iterator[tuple[slice, Float[np.ndarray, "m ny nc"], Bool[np.ndarray, "m ny"]]]:
     """Yield rows, their columns, and which samples count, chunk by chunk."""
     settle = experiment.weights.settle

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.estimation.problem.shapes import PerOutput
 from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.simulation import Model, Point, transition
@@ -35,9 +36,9 @@ class SteadyStateFilter:
     """What the gain of one experiment's filter follows from, besides parameters and noise."""
 
     size: Float[np.ndarray, " nx"]  # size of each state; its process noise over one sample is exp(noise) times that
-    sensors: Float[np.ndarray, " ny"]  # standard deviation of the measurement noise, in output units
+    sensors: PerOutput  # standard deviation of the measurement noise, in output units
     places: Float[np.ndarray, "m w"]  # states and inputs over which a nonlinear plant is linearised
-    gain: Float[np.ndarray, " ny"]  # of the sensors, as it is at the start: the filter's gain does not follow it
+    gain: PerOutput  # of the sensors, as it is at the start: the filter's gain does not follow it
     follows: bool = True  # whether the gain's derivatives are wanted; False: a gain that stands still
 
     def correction(self, model: Model, point: Point, noise: Float[np.ndarray, " q"]) -> Float[np.ndarray, "ns1 nx ny"]:
@@ -104,7 +105,7 @@ def kalman_gain(
     a: Float[np.ndarray, "t nx nx"],
     c: Float[np.ndarray, "t ny nx"],
     q: Float[np.ndarray, "t nx"],
-    r: Float[np.ndarray, " ny"],
+    r: PerOutput,
 ) -> Float[np.ndarray, "t nx ny"]:
     """Return the predictor's steady-state gain of each plant; not finite where there is none.
 
@@ -157,7 +158,7 @@ def _solve_riccati(
     a: Float[np.ndarray, "t m m"],
     c: Float[np.ndarray, "t ny m"],
     q: Float[np.ndarray, "t m m"],
-    r: Float[np.ndarray, " ny"],
+    r: PerOutput,
 ) -> Float[np.ndarray, "t m ny"]:
     identity = np.eye(a.shape[1])
     x, g, h = (1.0 - LEAK) * a.transpose(0, 2, 1), c.transpose(0, 2, 1) @ (c / r[:, None]), q

@@ -31,7 +31,7 @@ from jaxtyping import Bool, Complex, Float
 
 from seaopt.codec import NullIs
 from seaopt.errors import EstimationError
-from seaopt.estimation.problem.correlation import choose_transform_size, load_transforms, parzen
+from seaopt.estimation.problem.correlation import choose_transform_size, load_fft, parzen
 from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import add_gram
@@ -40,6 +40,7 @@ from seaopt.estimation.problem.residual_statistics import (
     StatisticsByExperiment,
     stream_columns,
 )
+from seaopt.estimation.problem.shapes import Matrix, ParameterMatrix, ParameterVector, Vector
 from seaopt.records import record
 from seaopt.simulation import double_sum
 
@@ -55,7 +56,7 @@ class Covariance:
     """A covariance with names: ``matrix[i, j]`` belongs to ``names[i]``, ``names[j]``, in SI."""
 
     names: tuple[str, ...]
-    matrix: Annotated[Float[np.ndarray, "p p"], NullIs(value=math.inf)]
+    matrix: Annotated[ParameterMatrix, NullIs(value=math.inf)]
 
     @classmethod
     def _from_json(cls, content: Mapping[str, Any]) -> Covariance:
@@ -76,7 +77,7 @@ class Covariance:
         return float(np.sqrt(max(self.matrix[i, i], 0.0)))
 
 
-def take_root(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+def take_root(covariance: ParameterMatrix) -> ParameterMatrix:
     """Return a factor of a covariance, R R^T, for draws: standard deviations times the correlation's root.
 
     The root is taken of the correlation, whose entries are of one size: the eigenvalues of a covariance in m, N/m
@@ -88,14 +89,13 @@ def take_root(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def compute_bread(problem: FitProblem, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """Return J^T J with the loss's second derivative as weight."""
-    return _sum_weighted(problem, z, lambda experiment, o, r: problem.loss.curvature(r))
+def compute_bread(problem: FitProblem, z: Vector) -> Matrix:
+    """Return J^T J with the loss's second derivative as weight, and the priors."""
+    bread = _sum_weighted(problem, z, lambda experiment, o, r: problem.loss.curvature(r))
+    return bread + np.diag(problem.unknowns.precision)
 
 
-def compute_white_meat(
-    problem: FitProblem, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
-) -> Float[np.ndarray, "n n"]:
+def compute_white_meat(problem: FitProblem, z: Vector, statistics: StatisticsByExperiment) -> Matrix:
     """Return B for white residuals: J^T J with the mean square of what the loss makes of each output's residuals."""
     power = {name: np.diagonal(sums.correlation[0]) / np.maximum(sums.count, 1.0) for name, sums in statistics.items()}
     return _sum_weighted(problem, z, lambda experiment, o, r: np.full(r.size, power[experiment.name][o]))
@@ -103,9 +103,9 @@ def compute_white_meat(
 
 def _sum_weighted(
     problem: FitProblem,
-    z: Float[np.ndarray, " n"],
+    z: Vector,
     weigh: Callable[[FitExperiment, int, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
-) -> Float[np.ndarray, "n n"]:
+) -> Matrix:
     """Return J^T J with weights that come of the residuals, in sigma, of an experiment's output."""
     normal = np.zeros((1 + z.size, 1 + z.size))
     for experiment in problem.experiments:
@@ -120,10 +120,10 @@ def _sum_weighted(
 
 def compute_meat(
     problem: FitProblem,
-    z: Float[np.ndarray, " n"],
+    z: Vector,
     inverse: Float[np.ndarray, "n p"],
     statistics: StatisticsByExperiment,
-) -> Float[np.ndarray, "p p"]:
+) -> ParameterMatrix:
     """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E: B for residuals of any colour."""
     p = inverse.shape[1]
     total = np.zeros((p, p))
@@ -137,7 +137,7 @@ def compute_meat(
 
 def _sum_twice(
     experiment: FitExperiment,
-    z: Float[np.ndarray, " n"],
+    z: Vector,
     inverse: Float[np.ndarray, "n p"],
     r: Float[np.ndarray, "lags1 ny ny"],
 ) -> Float[np.ndarray, "2 p p"]:
@@ -153,8 +153,8 @@ def _sum_twice(
         ]
         if all(part is not None for part in sums):
             return np.sum(np.array(sums), axis=0)
-    longest = reach + min(chunk, experiment.longest)
-    whole, twice, together = (_Form.make(kept, n) for kept, n in ((r, longest), (r, reach), (r[:1], chunk)))
+    whole = _Form.make(r, reach + min(chunk, experiment.longest))
+    twice, together = _Form.make(r, reach), _Form.make(r[:1], chunk)
     for segment, into in pairs:
         tail = np.zeros((*into.shape[:2], 0))
         for _, columns, used in stream_columns(experiment, segment, z, chunk):
@@ -165,7 +165,7 @@ def _sum_twice(
     return total
 
 
-def _at_least(matrix: Float[np.ndarray, "p p"], floor: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+def _at_least(matrix: ParameterMatrix, floor: ParameterMatrix) -> ParameterMatrix:
     """Return the floor, and of what lies beside it only the directions in which it is more."""
     scale = np.sqrt(np.maximum(np.diag(floor), 1e-300))
     values, vectors = np.linalg.eigh((matrix - floor) / np.outer(scale, scale))
@@ -208,20 +208,19 @@ class _Form:
         kernel = np.zeros((*r.shape[1:], size))
         kernel[:, :, : reach + 1] = r.transpose(1, 2, 0)
         kernel[:, :, size - reach :] = r[:0:-1].transpose(2, 1, 0)  # R(-k) = R(k)'
-        density = np.asarray(load_transforms()[2](kernel)) * (2.0 / size)
+        density = load_fft().rfft(kernel) * (2.0 / size)
         density[:, :, 0] *= 0.5
         if size % 2 == 0:
             density[:, :, -1] *= 0.5
         return cls(size=size, density=density)
 
-    def __call__(self, a: Float[np.ndarray, "ny p n"]) -> Float[np.ndarray, "p p"]:
+    def __call__(self, a: Float[np.ndarray, "ny p n"]) -> ParameterMatrix:
         """Return the sum."""
         ny, p, n = a.shape
         if not n:
             return np.zeros((p, p))
-        spectrum = np.asarray(load_transforms()[2](a, self.size))
-        density = self.density[:, :, None]
-        total = np.zeros((p, p))
+        spectrum = load_fft().rfft(a, self.size)
+        density, total = self.density[:, :, None], np.zeros((p, p))
         for o in range(ny):
             filtered: Complex[np.ndarray, "p f"] = np.zeros_like(spectrum[o])
             for b in range(ny):
@@ -254,7 +253,7 @@ def _find_last_lag(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
     return int(before[quiet[0]]) + 1
 
 
-def mark_unseen(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
+def mark_unseen(matrix: ParameterMatrix, unseen: ParameterVector) -> ParameterMatrix:
     """Return a covariance in which what is not seen has infinite variance."""
     lost = unseen > 1e-6
     marked = 0.5 * (matrix + matrix.T)

@@ -7,9 +7,9 @@ from dataclasses import field
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import OrInfinite, OrMinusInfinite, OrNaN
+from seaopt.estimation.problem.shapes import Signal
 from seaopt.records import PlotAccessor, Worded, record
 
 Severity = Literal["error", "warning", "note"]
@@ -57,6 +57,11 @@ def find_guesses(guessed: Sequence[str]) -> tuple[FitFinding, ...]:
         "take its name out of guessed = [...]"
     )
     return (FitFinding(severity="warning", kind=GUESS, where=state_guesses(guessed), text=text),)
+
+
+def find_energy(fit_percent: float) -> float:
+    """Return the share of an output's energy that a fit percent stands for."""
+    return max(1.0 - (1.0 - fit_percent / 100.0) ** 2, 0.0)
 
 
 @record
@@ -155,10 +160,10 @@ class ModelledOutputs(Worded):
 
     plot = PlotAccessor()
 
-    time: Float[np.ndarray, " n"]
-    inputs: dict[str, Float[np.ndarray, " n"]]
-    measured: dict[str, Float[np.ndarray, " n"]]
-    model: dict[str, Float[np.ndarray, " n"]]
+    time: Signal
+    inputs: dict[str, Signal]
+    measured: dict[str, Signal]
+    model: dict[str, Signal]
     name: str
     own: Nuisance
     band_fit_percent: dict[str, float | None]

@@ -8,13 +8,13 @@ from dataclasses import field
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import Key, OrInfinite, OrNaN, check_agrees, read_fields, to_content
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import GUESS, DerivedFigure, FitFinding, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
@@ -37,7 +37,7 @@ class Minimum:
     """The problem that was solved, with its sigma and steps, the unknowns where its cost is least, and the method."""
 
     problem: FitProblem
-    z: Float[np.ndarray, " n"]
+    z: Vector
     method: Method
 
     def residuals(self) -> dict[str, ExperimentResiduals]:

@@ -13,11 +13,11 @@ from collections.abc import Container, Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import OrInfinite
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import RANK, eliminate
+from seaopt.estimation.problem.shapes import Matrix, ParameterVector, Vector
 from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters
@@ -79,9 +79,7 @@ class Identifiability:
         return True
 
 
-def assess_identifiability(
-    hessian: Float[np.ndarray, "n n"], names: tuple[str, ...], values: Float[np.ndarray, " p"]
-) -> Identifiability:
+def assess_identifiability(hessian: Matrix, names: tuple[str, ...], values: ParameterVector) -> Identifiability:
     """Return what the normalised Hessian says of the first ``len(names)`` unknowns, the others eliminated.
 
     `values` are those of the unknowns, to which changes along an unseen direction are relative.
@@ -96,7 +94,7 @@ def assess_identifiability(
     smallest = max(float(eigenvalues[0]), 0.0)
     relative = size * np.where(values != 0.0, np.abs(values), 1.0)
 
-    def directions(chosen: Float[np.ndarray, " p"], cut: float) -> tuple[dict[str, float], ...]:
+    def directions(chosen: ParameterVector, cut: float) -> tuple[dict[str, float], ...]:
         weighted: list[dict[str, float]] = []
         for k in np.flatnonzero(chosen):
             weights = vectors[:, k] / relative
@@ -114,7 +112,7 @@ def assess_identifiability(
     )
 
 
-def compute_structural_rank(problem: FitProblem, z: Float[np.ndarray, " n"]) -> int:
+def compute_structural_rank(problem: FitProblem, z: Vector) -> int:
     """Return how many directions of the parameters a rich input would show on the outputs that were measured.
 
     The input is white noise of the log's own size on every input that the log excites, from rest and without noise.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.findings import Nuisance
 from seaopt.estimation.solver.settle import settle
 from seaopt.parameters import ParameterSet
@@ -51,9 +51,9 @@ def take_sensors(experiment: Experiment, fitted: Nuisance | None) -> Experiment:
 
 def describe_nuisance(
     experiment: FitExperiment,
-    z: Float[np.ndarray, " n"],
+    z: Vector,
     statistics: StatisticsByExperiment | None,
-    variance: Float[np.ndarray, " n"],
+    variance: Vector,
 ) -> Nuisance:
     """Return an experiment's own unknowns; offsets that the fit did not see are what is left over on average."""
     slots, outputs, states = experiment.slots, experiment.data.outputs, experiment.data.plant.states

@@ -17,6 +17,7 @@ from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
+from seaopt.estimation.problem.shapes import Matrix, ParameterMatrix, ParameterVector, Vector
 from seaopt.estimation.result.covariance import (
     Covariance,
     compute_bread,
@@ -169,11 +170,11 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 def _compute_covariances(
     problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
 ) -> tuple[
-    Float[np.ndarray, "p p"],
-    Float[np.ndarray, "p p"],
+    ParameterMatrix,
+    ParameterMatrix,
     Float[np.ndarray, "q q"],
-    Float[np.ndarray, " p"],
-    Float[np.ndarray, " n"],
+    ParameterVector,
+    Vector,
 ]:
     """Return the parameters' covariance for white residuals, for those that there are, and what is unseen.
 
@@ -182,7 +183,7 @@ def _compute_covariances(
     gains for the residuals that there are, of others for white ones.
     """
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
-    bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z) + np.diag(prior)
+    bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z)
     inverse, unseen = invert(bread)
     variance = np.diag(inverse).copy()
     delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
@@ -246,7 +247,7 @@ def _find_beyond(fitted: ParameterSet, direction: Mapping[str, float]) -> list[s
 def _find_status(
     solution: Solution[Evaluation],
     identifiability: Identifiability,
-    hessian: Float[np.ndarray, "n n"],
+    hessian: Matrix,
     names: tuple[str, ...],
     step: StepError,
 ) -> tuple[FitStatus, str]:
@@ -312,7 +313,7 @@ def _derive_figures(
 
 
 def describe_outputs(
-    problem: FitProblem, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
+    problem: FitProblem, z: Vector, statistics: StatisticsByExperiment
 ) -> dict[str, dict[str, OutputFit]]:
     """Return how well each output is explained, on the samples used and on those held out."""
     simulated = compute_statistics(problem.with_each(predictor=None), z) if problem.predicts else statistics

@@ -19,10 +19,10 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.settle import Solved, settle
 
@@ -57,7 +57,7 @@ def _search_further(solved: Solved, max_iterations: int, callback: Callback | No
     return solved
 
 
-def _find_best_shift(experiment: FitExperiment, z: Float[np.ndarray, " n"], low: float, high: float) -> float:
+def _find_best_shift(experiment: FitExperiment, z: Vector, low: float, high: float) -> float:
     """Return by how many seconds, in whole samples, a simulation is to be shifted to lie nearest to the log."""
     period, delay = experiment.period, experiment.slots.delay.at(z)
     reach = min(FURTHEST, experiment.longest // 4)

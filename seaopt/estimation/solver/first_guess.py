@@ -17,6 +17,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.errors import LogError
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.problem.shapes import ParameterVector, Vector
 from seaopt.frequency.response import FrequencyResponse, responses
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import remove_friction
@@ -48,7 +49,7 @@ class _Target:
     weight: Float[np.ndarray, "m ny"]
 
 
-def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple[list[Float[np.ndarray, " n"]], bool]:
+def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple[list[Vector], bool]:
     """Return unknowns with shared parameters that match the frequency responses, the best first, and whether it does.
 
     None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
@@ -147,7 +148,7 @@ def _space_by_logarithm(f: Float[np.ndarray, " m"], good: Any) -> Any:
     return candidates[np.unique(nearest)]
 
 
-def _misfits(targets: list[_Target], candidates: list[Float[np.ndarray, " p"]]) -> Float[np.ndarray, " k"]:
+def _misfits(targets: list[_Target], candidates: list[ParameterVector]) -> Float[np.ndarray, " k"]:
     """Return half the squared misfit of each candidate, of all at once."""
     costs = np.zeros(len(candidates))
     for target in targets:
@@ -180,9 +181,7 @@ def _mismatch(
     return target.weight * wrapped, response, x, back
 
 
-def _misfit(
-    targets: list[_Target], theta: Float[np.ndarray, " p"], derivatives: bool = False
-) -> tuple[float, Any, Any]:
+def _misfit(targets: list[_Target], theta: ParameterVector, derivatives: bool = False) -> tuple[float, Any, Any]:
     """Return half the squared misfit, and its gradient and Gauss-Newton Hessian if asked."""
     cost, gradient, hessian = 0.0, np.zeros(theta.size), np.zeros((theta.size, theta.size))
     for target in targets:
@@ -207,8 +206,8 @@ def _misfit(
 
 
 def _refine(
-    targets: list[_Target], theta: Float[np.ndarray, " p"], low: Any, high: Any, spread: Any
-) -> tuple[float, Float[np.ndarray, " p"]]:
+    targets: list[_Target], theta: ParameterVector, low: Any, high: Any, spread: Any
+) -> tuple[float, ParameterVector]:
     """Gauss-Newton in the logarithms of the parameters, damped."""
     damping = 1e-2
     cost, gradient, hessian = _misfit(targets, theta, derivatives=True)

@@ -19,9 +19,10 @@ from collections.abc import Callable
 from typing import Generic, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from seaopt.estimation.problem.normal_equations import M, QuadraticModel, find_arrow, solve_seen
+from seaopt.estimation.problem.shapes import Matrix, Vector
 from seaopt.records import record
 
 Status = Literal["converged", "max_iterations", "stalled"]
@@ -30,7 +31,7 @@ STILL_MOVING = (
     "larger max_iterations"
 )
 Callback = Callable[[int, float], None]
-DampedSolver = Callable[[float, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]  # (lambda, b) -> (H + lambda)^-1 b
+DampedSolver = Callable[[float, Vector], Vector]  # (lambda, b) -> (H + lambda)^-1 b
 
 DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE_DECREMENT = 1e-12  # of the cost
@@ -45,7 +46,7 @@ STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a f
 class Objective(Protocol[M]):
     """A sum of squares that can be minimised."""
 
-    def evaluate(self, z: Float[np.ndarray, " n"]) -> M:
+    def evaluate(self, z: Vector) -> M:
         """Return its quadratic model at z."""
         ...
 
@@ -54,7 +55,7 @@ class Objective(Protocol[M]):
 class Solution(Generic[M]):
     """Where the search ended, and the distance, squared, from which its last step was made if that was a whole one."""
 
-    z: Float[np.ndarray, " n"]
+    z: Vector
     evaluation: M
     status: Status
     message: str
@@ -64,15 +65,15 @@ class Solution(Generic[M]):
 
 def minimise(
     objective: Objective[M],
-    start: Float[np.ndarray, " n"] | M,
-    low: Float[np.ndarray, " n"],
-    high: Float[np.ndarray, " n"],
+    start: Vector | M,
+    low: Vector,
+    high: Vector,
     *,
     first_radius: float = FIRST_RADIUS,
     decrement: float = DECREMENT,
     max_iterations: int = 50,
     callback: Callback | None = None,
-    follow: Callable[[M, Float[np.ndarray, " n"]], M] | None = None,
+    follow: Callable[[M, Vector], M] | None = None,
     before: float = 0.0,
 ) -> Solution[M]:
     """Minimise a sum of squares from `start`, inside the bounds.
@@ -164,22 +165,18 @@ def _is_straight(distance: float, before: float, allowed: float) -> bool:
     return distance * ratio <= ROUNDING_DECREMENT and distance * ratio**2 <= 0.01 * allowed
 
 
-def _column_norms(model: QuadraticModel) -> Float[np.ndarray, " n"]:
+def _column_norms(model: QuadraticModel) -> Vector:
     """Return the norms of the Jacobian's columns."""
     return np.sqrt(np.maximum(np.diag(model.hessian), 1e-300))
 
 
-def find_blocked(
-    model: QuadraticModel, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def find_blocked(model: QuadraticModel, low: Vector, high: Vector) -> Bool[np.ndarray, " n"]:
     """Return which unknowns lie on a bound, to a ten-thousandth of a standard deviation, that descent would cross."""
     near = 1e-4 / _column_norms(model)
     return ((model.z - low <= near) & (model.gradient > 0.0)) | ((high - model.z <= near) & (model.gradient < 0.0))
 
 
-def _step(
-    model: QuadraticModel, blocked: Bool[np.ndarray, " n"], scale: Float[np.ndarray, " n"], radius: float
-) -> tuple[Float[np.ndarray, " n"], float]:
+def _step(model: QuadraticModel, blocked: Bool[np.ndarray, " n"], scale: Vector, radius: float) -> tuple[Vector, float]:
     """Return the step within the radius and its lambda; the linear unknowns follow the others."""
     bound, follow = ~blocked & ~model.linear, ~blocked & model.linear
     h, g = model.hessian, model.gradient
@@ -199,7 +196,7 @@ def _step(
     return step, multiplier
 
 
-def _make_damped_solver(matrix: Float[np.ndarray, "n n"]) -> tuple[DampedSolver, float]:
+def _make_damped_solver(matrix: Matrix) -> tuple[DampedSolver, float]:
     """Return (lambda, b) -> (matrix + lambda)^-1 b over what is seen, and a bound on the largest eigenvalue."""
     if find_arrow(matrix) is not None:
         identity = np.eye(len(matrix))
@@ -209,16 +206,14 @@ def _make_damped_solver(matrix: Float[np.ndarray, "n n"]) -> tuple[DampedSolver,
     values = np.maximum(values, 0.0)
     largest = float(np.max(values, initial=0.0))
 
-    def solve(damping: float, right: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def solve(damping: float, right: Vector) -> Vector:
         seen = values + damping > UNSEEN * max(largest, 1e-300)
         return vectors @ np.where(seen, (vectors.T @ right) / np.where(seen, values + damping, 1.0), 0.0)
 
     return solve, largest
 
 
-def _shorten(
-    solve: DampedSolver, largest: float, g: Float[np.ndarray, " n"], radius: float
-) -> tuple[Float[np.ndarray, " n"], float]:
+def _shorten(solve: DampedSolver, largest: float, g: Vector, radius: float) -> tuple[Vector, float]:
     """Return the step -(H + lambda)^-1 g, no longer than the radius, with the smallest such lambda >= 0."""
     newton = -solve(0.0, g)
     if float(np.linalg.norm(newton)) <= radius:

@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import EstimationError, require_seed
 from seaopt.estimation.problem.experiment import check_shots
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
@@ -144,7 +144,7 @@ class MultipleShooting(Method):
         apart = self._settle_apart(problem, first, callback)
         return solved if _explains_as_much(solved, apart) else apart
 
-    def _settle_apart(self, problem: FitProblem, z: Float[np.ndarray, " n"], callback: Callback | None) -> Solved:
+    def _settle_apart(self, problem: FitProblem, z: Vector, callback: Callback | None) -> Solved:
         """Settle on shots that keep initial states of their own, for a plant that runs away in one go."""
         shots, values = cut_problem(problem, z, self.segments)
         for experiment in shots.experiments:
@@ -203,9 +203,7 @@ class PredictionError(Method):
                 solved = self._settle_predicting(problem, simulated.solution.z, callback) or solved
         return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
 
-    def _settle_predicting(
-        self, problem: FitProblem, start: Float[np.ndarray, " n"], callback: Callback | None
-    ) -> Solved | None:
+    def _settle_predicting(self, problem: FitProblem, start: Vector, callback: Callback | None) -> Solved | None:
         """Return the minimum of the errors of prediction near a start; None where no filter is found."""
         predicting = add_predictors(problem, start, follows=True)
         if predicting is None:
@@ -217,7 +215,7 @@ class PredictionError(Method):
         return solved
 
 
-def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
+def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Vector]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses.
 
     A guess that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode
@@ -281,7 +279,7 @@ def _simulates_badly(solved: Solved) -> bool:
     return explains_little(simulating, power)
 
 
-def _is_doubtful(solved: Solved, guesses: list[Float[np.ndarray, " n"]]) -> bool:
+def _is_doubtful(solved: Solved, guesses: list[Vector]) -> bool:
     """Tell whether another start is worth trying: it did not converge, or a nonlinear plant explains little."""
     evaluation = solved.solution.evaluation
     if solved.solution.status != "converged" or not np.isfinite(evaluation.cost):
@@ -305,9 +303,7 @@ def _is_hopeless(rough: Solved, best: Solved) -> bool:
     )
 
 
-def _further_starts(
-    problem: FitProblem, best: Evaluation, guesses: list[Float[np.ndarray, " n"]], method: Method
-) -> Iterator[Float[np.ndarray, " n"]]:
+def _further_starts(problem: FitProblem, best: Evaluation, guesses: list[Vector], method: Method) -> Iterator[Vector]:
     """Yield further starts: predicting from the given values and from the best, then the other guesses."""
     for start in (problem.unknowns.start, best.z):
         predicting = find_predicting_start(problem, start, method.max_iterations)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.problem.shapes import PerOutput, Signal, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.solver.settle import estimate_sigma
@@ -24,9 +25,7 @@ PREDICTION_RADIUS = 100.0  # a plant that is held to the log may be moved far at
 LINEARISED_AT = 48  # over which a nonlinear plant is linearised for its filter
 
 
-def find_predicting_start(
-    problem: FitProblem, start: Float[np.ndarray, " n"], iterations: int
-) -> Float[np.ndarray, " n"] | None:
+def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -> Vector | None:
     """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log.
 
     The filter does not trust the plant, so that a plant that is far off predicts badly but cannot run away; its gain
@@ -49,7 +48,7 @@ def find_predicting_start(
     return z
 
 
-def add_predictors(problem: FitProblem, z: Float[np.ndarray, " n"], *, follows: bool) -> FitProblem | None:
+def add_predictors(problem: FitProblem, z: Vector, *, follows: bool) -> FitProblem | None:
     """Return the problem whose residuals are errors of prediction; None where the filter finds no finite state."""
     predictors: dict[str, SteadyStateFilter] = {}
     for experiment in problem.experiments:
@@ -60,7 +59,7 @@ def add_predictors(problem: FitProblem, z: Float[np.ndarray, " n"], *, follows: 
     return problem.with_values("predictor", predictors)
 
 
-def _estimate_noise(experiment: FitExperiment) -> Float[np.ndarray, " ny"]:
+def _estimate_noise(experiment: FitExperiment) -> PerOutput:
     """Return the standard deviation of white noise on each output, from its first samples that are not held out."""
     samples, noise = experiment.segments[0].samples, []
     for o, spread in enumerate(experiment.spread):
@@ -69,7 +68,7 @@ def _estimate_noise(experiment: FitExperiment) -> Float[np.ndarray, " ny"]:
     return np.array(noise)
 
 
-def measure_noise(y: Float[np.ndarray, " n"], spread: float) -> float:
+def measure_noise(y: Signal, spread: float) -> float:
     """Return the standard deviation of white noise on a smooth signal: the median third difference, over sqrt(20)."""
     third = np.abs(np.diff(y[np.isfinite(y)], 3))
     noise = 1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0
@@ -77,7 +76,7 @@ def measure_noise(y: Float[np.ndarray, " n"], spread: float) -> float:
 
 
 @np.errstate(all="ignore")
-def _make_predictor(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> SteadyStateFilter | None:
+def _make_predictor(experiment: FitExperiment, z: Vector) -> SteadyStateFilter | None:
     """Return a filter whose sizes and places come from its own estimates of the state, after a few rounds."""
     model, samples, point = experiment.model, experiment.segments[0].samples, experiment.point(z)
     places = np.zeros((LINEARISED_AT, model.nx + model.nu))

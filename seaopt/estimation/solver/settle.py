@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, ResidualPower
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
+from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.solver.least_squares import DECREMENT, STILL_MOVING, Callback, Solution, minimise
 from seaopt.estimation.solver.step_size import (
     Checks,
@@ -118,7 +118,7 @@ def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem,
     return replace(solved, problem=replace(solved.problem, unknowns=unknowns))
 
 
-def _measure_stiffness(problem: FitProblem, z: Float[np.ndarray, " n"]) -> float:
+def _measure_stiffness(problem: FitProblem, z: Vector) -> float:
     """Return the stable integration steps over those that a search may take."""
     return max(e.count_stable_steps(z) for e in problem.experiments) / (HALF * MAX_SUBSTEPS)
 
@@ -202,11 +202,9 @@ def explains_little(problem: FitProblem, power: Mapping[str, ResidualPower]) -> 
     return not all(np.all(power[e.name].rms <= UNEXPLAINED * e.spread) for e in problem.experiments)
 
 
-def estimate_sigma(
-    problem: FitProblem, power: Mapping[str, ResidualPower], z: Float[np.ndarray, " n"]
-) -> dict[str, Float[np.ndarray, " ny"]]:
+def estimate_sigma(problem: FitProblem, power: Mapping[str, ResidualPower], z: Vector) -> dict[str, PerOutput]:
     """Return the rms of each residual where sigma is not given; never less than rounding of the signal."""
-    sigma: dict[str, Float[np.ndarray, " ny"]] = {}
+    sigma: dict[str, PerOutput] = {}
     for experiment in problem.experiments:
         rms = power[experiment.name].rms
         if not problem.loss.quadratic:  # the standard deviation of Gaussian noise under outliers

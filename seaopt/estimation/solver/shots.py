@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.problem.shapes import ParameterVector, Vector
 from seaopt.estimation.solver.least_squares import Callback, minimise
 from seaopt.estimation.solver.prediction import add_predictors
 from seaopt.estimation.solver.settle import estimate_sigma
@@ -28,7 +29,7 @@ ROUNDS, ITERATIONS = 2, 25  # of each length; sigma is estimated before each rou
 NEAR = 1.0  # squared standard deviations to the minimum, near enough to go on from
 
 
-def find_start_on_shots(problem: FitProblem, start: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"] | None:
+def find_start_on_shots(problem: FitProblem, start: Vector) -> Vector | None:
     """Return the unknowns of a linear plant with shared parameters that follow longer and longer shots of the logs.
 
     None where the logs are too short to be cut, or where the plant runs away even so.
@@ -47,8 +48,8 @@ def find_start_on_shots(problem: FitProblem, start: Float[np.ndarray, " n"]) -> 
 
 
 def grow_shots(
-    problem: FitProblem, start: Float[np.ndarray, " n"], count: int, callback: Callback | None = None
-) -> Iterator[Float[np.ndarray, " p"] | None]:
+    problem: FitProblem, start: Vector, count: int, callback: Callback | None = None
+) -> Iterator[ParameterVector | None]:
     """Yield the shared parameters that follow `count` shots per segment, then longer ones; None where they run away."""
     whole = problem.with_each(band_hz=None, loss=Squares())  # a band filter takes longer to settle than a shot
     shared, z = problem.unknowns.shared, start.copy()
@@ -74,9 +75,7 @@ def grow_shots(
         count //= GROWTH
 
 
-def cut_problem(
-    problem: FitProblem, z: Float[np.ndarray, " n"], count: int
-) -> tuple[FitProblem, Float[np.ndarray, " m"]]:
+def cut_problem(problem: FitProblem, z: Vector, count: int) -> tuple[FitProblem, Float[np.ndarray, " m"]]:
     """Return the problem with `count` shots in place of each, and its unknowns.
 
     Shots of a nonlinear plant start where a filter that hardly trusts the plant sees the state. Those of a linear one

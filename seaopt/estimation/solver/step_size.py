@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, MAX_SUBSTEPS, FitExperiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.plants.friction import remembers
 from seaopt.records import record
 from seaopt.simulation import Pass
@@ -45,7 +45,7 @@ class Check:
     """The step error of an experiment, where it was found, and with which steps."""
 
     error: StepError
-    z: Float[np.ndarray, " n"]
+    z: Vector
     substeps: int
 
 
@@ -135,7 +135,7 @@ def check_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> 
 
 
 @np.errstate(all="ignore")
-def _lies_near(evaluation: Evaluation, z: Float[np.ndarray, " n"]) -> bool:
+def _lies_near(evaluation: Evaluation, z: Vector) -> bool:
     """Tell whether the step error at z holds here, too; it does not where derivatives are not finite."""
     moved = evaluation.z - z
     distance = moved @ evaluation.hessian @ moved
@@ -187,7 +187,7 @@ def measure_step_error(problem: FitProblem, experiment: FitExperiment, evaluatio
     return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
 
 
-def _halve_steps(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> FitExperiment:
+def _halve_steps(experiment: FitExperiment, z: Vector) -> FitExperiment:
     return replace(experiment, substeps=2 * experiment.count_steps(z))
 
 
@@ -196,14 +196,12 @@ def _whole_error(experiment: FitExperiment) -> float:
     return 2.0**experiment.model.order / (2.0**experiment.model.order - 1.0)
 
 
-def _floored_sigma(experiment: FitExperiment) -> Float[np.ndarray, " ny"]:
+def _floored_sigma(experiment: FitExperiment) -> PerOutput:
     return np.maximum(experiment.sigma, EXACT * experiment.spread)
 
 
 @np.errstate(all="ignore")
-def _measure_output_error(
-    experiment: FitExperiment, z: Float[np.ndarray, " n"], coarse: Sequence[Pass], fine: Sequence[Pass]
-) -> float:
+def _measure_output_error(experiment: FitExperiment, z: Vector, coarse: Sequence[Pass], fine: Sequence[Pass]) -> float:
     """Return the largest integration error in an output of an experiment, in sigma; see `measure_step_error`."""
     scale = experiment.point(z).gain / _floored_sigma(experiment)
     worst = 0.0

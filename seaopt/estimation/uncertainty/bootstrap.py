@@ -33,6 +33,7 @@ from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
+from seaopt.estimation.problem.shapes import ParameterVector, Vector
 from seaopt.estimation.result.covariance import Covariance, compute_bread, compute_influence, map_to_influence
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
@@ -67,7 +68,7 @@ class Bootstrap:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    estimates: Float[np.ndarray, " p"]
+    estimates: ParameterVector
     draws: Float[np.ndarray, "n p"]
     blocks: Mapping[str, int]
     refit: bool
@@ -280,7 +281,7 @@ def _draw_steps(
     p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-1.0
     hessian = problem.evaluate(z).hessian
     if not problem.loss.quadratic:
-        hessian = compute_bread(problem, z) + np.diag(prior**2)
+        hessian = compute_bread(problem, z)
     inverse = invert(hessian)[0][:, :p]
     pools = {
         name: _make_pool(
@@ -323,7 +324,7 @@ def _draw_refits(
     }
     blocks = _draw_blocks(problem, lengths, pools, draws, rng)
 
-    def make_trials() -> Iterator[tuple[FitProblem, Float[np.ndarray, " n"]]]:
+    def make_trials() -> Iterator[tuple[FitProblem, Vector]]:
         for d in range(draws):
             experiments = tuple(
                 _with_drawn(experiment, residuals[experiment.name], blocks[experiment.name], d)
@@ -332,7 +333,7 @@ def _draw_refits(
             shift = np.where(np.isfinite(unknowns.prior_std), unknowns.prior_std, 0.0) * rng.normal(size=z.size)
             yield replace(problem, experiments=experiments, unknowns=replace(unknowns, start=z + shift)), z
 
-    values: list[Float[np.ndarray, " p"]] = []
+    values: list[ParameterVector] = []
     for d, (cost, found) in enumerate(map_ordered(_refit, make_trials(), executor)):
         if not np.isfinite(cost):
             raise EstimationError(f"bootstrap: draw {d} overflows the simulation; use refit = False")
@@ -340,7 +341,7 @@ def _draw_refits(
     return np.array(values)
 
 
-def _refit(trial: tuple[FitProblem, Float[np.ndarray, " n"]]) -> tuple[float, Float[np.ndarray, " n"]]:
+def _refit(trial: tuple[FitProblem, Vector]) -> tuple[float, Vector]:
     """Return the least cost of a problem, searched from a point, and where it is."""
     problem, z = trial
     solution = minimise(problem, z, problem.unknowns.low, problem.unknowns.high)

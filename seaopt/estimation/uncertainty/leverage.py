@@ -13,10 +13,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.normal_equations import eliminate, invert
+from seaopt.estimation.problem.shapes import ParameterMatrix
 from seaopt.estimation.result.fit_result import Minimum
 from seaopt.records import record
 
@@ -51,7 +51,7 @@ def measure_leverage(minimum: Minimum) -> dict[str, Leverage]:
     return leverage
 
 
-def _compute_information(minimum: Minimum, experiment: FitExperiment) -> Float[np.ndarray, "p p"]:
+def _compute_information(minimum: Minimum, experiment: FitExperiment) -> ParameterMatrix:
     """Return an experiment's information on the plants' parameters, its own unknowns eliminated."""
     unknowns, z = minimum.problem.unknowns, minimum.z
     hessian = experiment.normal(experiment.run_all(z), z.size)[1:, 1:]

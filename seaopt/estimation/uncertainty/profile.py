@@ -19,11 +19,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import to_content
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.problem.normal_equations import invert, solve_seen
+from seaopt.estimation.problem.shapes import Matrix, Vector
 from seaopt.estimation.result.covariance import compute_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
@@ -77,14 +77,14 @@ class Profile:
     interval: tuple[float, float]
     closed: tuple[bool, bool]
     wald: tuple[float, float]
-    values: Float[np.ndarray, " n"]
-    rises: Float[np.ndarray, " n"]
+    values: Vector
+    rises: Vector
     scale: float
     refits: int
     message: str = ""
 
     @property
-    def tau(self) -> Float[np.ndarray, " n"]:
+    def tau(self) -> Vector:
         """The signed root of the likelihood ratio at `values`."""
         return np.sign(self.values - self.estimate) * np.sqrt(2.0 * np.maximum(self.rises, 0.0))
 
@@ -183,7 +183,7 @@ def _measure_scale(fit: Fit, minimum: Minimum, name: str, coloured: bool) -> tup
     std = (fit.covariance if coloured else fit.white_covariance).std(name)
     curved, problem = fit.white_covariance.std(name), minimum.problem
     if not problem.loss.quadratic:
-        bread = compute_bread(problem, minimum.z) + np.diag(problem.unknowns.precision)
+        bread = compute_bread(problem, minimum.z)
         curved = float(np.sqrt(invert(bread)[0][(problem.unknowns.names.index(name),) * 2]))
     finite = np.isfinite(curved) and np.isfinite(std) and curved > 0.0 and std > 0.0
     return (std / curved) ** 2 if finite else 1.0, std
@@ -270,7 +270,7 @@ class _ProfileCurve:
         return ""
 
 
-def _find_direction(hessian: Float[np.ndarray, "n n"], index: int) -> Float[np.ndarray, " n"]:
+def _find_direction(hessian: Matrix, index: int) -> Vector:
     """Return how the others follow when one unknown moves by one: to first order, their best values."""
     remaining = np.arange(len(hessian)) != index
     step = np.ones(len(hessian))

@@ -206,7 +206,7 @@ def test_an_output_that_a_constant_explains_better_is_an_error():
     result = fit(bench())
     worse = replace(result.outputs["log"]["F2"], fit_percent=-3.4, explained=0.0, explainable=0.0)
     told = replace(result, outputs={"log": result.outputs["log"] | {"F2": worse}})
-    findings = list(_find_unexplained(told, {"log": {}}, {"log": {"F1": 1.0, "F2": 1.0}}))
+    findings = list(_find_unexplained(told, {}, {"log.F1": 1.0, "log.F2": 1.0}))
     assert [(one.severity, one.kind, one.where) for one in findings] == [("error", "explained", "log.F2")]
 
 
