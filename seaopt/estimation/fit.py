@@ -27,7 +27,7 @@ from seaopt.estimation.solver.delay_cells import search_delays
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.estimation.solver.step_size import hold_bristles
-from seaopt.parameters import Parameter, ParameterSet
+from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, list_smoothing
 from seaopt.plants.motor.thermal import list_guessed_heat
@@ -116,7 +116,7 @@ def fit(
     _check_motion(named)
     problem = pose_problem(
         named,
-        complete_parameters(named, params),
+        params,
         loss=loss if loss is not None else Squares(),
         band_hz=band,
         holdout=holdout,
@@ -201,7 +201,7 @@ def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
         while name in named:
             number += 1
             name = f"{experiment.name}{number}"
-        named[name] = experiment if number == 1 else replace(experiment, name=name)
+        named[name] = experiment if number == 1 else experiment.rename(name)
     return tuple(named.values())
 
 
@@ -227,19 +227,6 @@ def _check_motion(experiments: tuple[Experiment, ...]) -> None:
             f"{where}: {' and '.join(first.plant.inputs)} constant throughout, nothing drives the plant; choose "
             'another column, or say where it starts: initial_state = "rest", or a mapping'
         )
-
-
-def complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSet) -> ParameterSet:
-    """Return every parameter of the plants, in order, and the free ones that no plant has (an error later)."""
-    parameters: dict[str, Parameter] = {}
-    for experiment in experiments:
-        for name, parameter in experiment.plant.complete(experiment.apply_own(params)).items():
-            parameters.setdefault(name, params.get(name, parameter) if name in experiment.parameters else parameter)
-        for local in experiment.list_own().values():
-            parameters.setdefault(local.name, params.get(local.name, local))
-    for name in params.free_names:
-        parameters.setdefault(name, params[name])
-    return ParameterSet(parameters.values())
 
 
 def _advise_sticking(problem: FitProblem) -> Iterator[str]:

@@ -222,22 +222,19 @@ def _choose_discs(estimates: Sequence[FrequencyResponse], confidence: float, hig
     for _ in range(2):  # of all lines, then of those in the bands alone
         discs = [_place_discs(estimate, (1.0 - confidence) / max(lines, 1), highest_hz) for estimate in estimates]
         lines = sum(f.size for f, *_ in discs)
-    discs = [disc for disc in discs if disc[0].size]
-    parts: list[Discs] = []
+    parts = [_select(discs[0], slice(0, 0))]
     for low, high in pairwise(highest_hz * 2.0 ** (-np.arange(PARTS * OCTAVES, -1, -1) / PARTS)):
-        inside = [(f >= low) & (f < high) for f, *_ in discs]
-        candidates = [
-            (at[chosen], centre[chosen], radius[chosen], averages[chosen])
-            for (at, centre, radius, averages), chosen in zip(discs, inside, strict=True)
-            if chosen.any()
-        ]
+        inside = [_select(each, (each[0] >= low) & (each[0] < high)) for each in discs]
+        candidates = [each for each in inside if each[0].size]
         if candidates:
             parts.append(min(candidates, key=lambda part: float(np.mean(np.log(part[2] / np.abs(part[1]))))))
-    if not parts:
-        none = np.zeros(0)
-        return none, none.astype(complex), none, none.astype(int)
     f, response, radius, averages = (np.concatenate(column) for column in zip(*parts, strict=True))
     return f, response, radius, averages
+
+
+def _select(discs: Discs, chosen: Any) -> Discs:
+    f, response, radius, averages = discs
+    return f[chosen], response[chosen], radius[chosen], averages[chosen]
 
 
 def _place_discs(estimate: FrequencyResponse, alpha: float, highest_hz: float) -> Discs:
@@ -257,5 +254,4 @@ def _place_discs(estimate: FrequencyResponse, alpha: float, highest_hz: float) -
     inside = (f < highest_hz) & (np.arange(f.size) > 1)  # beside the mean, which is taken out, lines are off
     size = np.maximum(np.abs(response), 1e-300)
     sharp = inside & (median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC)
-    band = find_band(f, sharp)
-    return f[band], response[band], radius[band], np.full(f[band].size, estimate.averages)
+    return _select((f, response, radius, np.full(f.size, estimate.averages)), find_band(f, sharp))

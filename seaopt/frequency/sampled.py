@@ -26,21 +26,24 @@ def sampled_response(
     `f`: frequencies in Hz. `source`: number of the input. Returned: with respect to theta, then to the delay where
     ``clock.delay_free``.
     """
-    blocks = transition(model, theta, clock)
-    nx, nu = model.nx, model.nu
+    outputs = sampled_signals(model, theta, clock, f, source)[:, :, model.nx :]
+    return outputs[0], outputs[1:]
+
+
+def sampled_signals(
+    model: Model, theta: Float[np.ndarray, " np"], clock: Clock, f: Float[np.ndarray, " m"], source: int
+) -> Complex[np.ndarray, "nd1 m nxy"]:
+    """Return the responses of the states and then of the outputs; behind them, their derivatives."""
+    blocks, nx = transition(model, theta, clock), model.nx
     z = np.exp(2j * np.pi * f * clock.period)
     drives = np.zeros((len(blocks), z.size, nx + model.ny), dtype=complex)
     for i, lag in enumerate(clock.lags):
-        drives += z[:, None] ** -float(lag) * blocks[:, None, :, nx + i * nu + source]
+        drives += z[:, None] ** -float(lag) * blocks[:, None, :, nx + i * model.nu + source]
+    a, c = blocks[:, :nx, :nx].transpose(0, 2, 1), blocks[:, nx:, :nx].transpose(0, 2, 1)
     inner = z[:, None, None] * np.eye(nx) - blocks[0, :nx, :nx]
     state = np.linalg.solve(inner, drives[0, :, :nx, None])[:, :, 0]
-    c = blocks[0, nx:, :nx]
-    observed = np.linalg.solve(inner.transpose(0, 2, 1), np.broadcast_to(c.T, (z.size, nx, model.ny)))
-    slopes = [
-        state @ block[nx:, :nx].T
-        + drive[:, nx:]
-        + np.einsum("mxy,mx->my", observed, state @ block[:nx, :nx].T + drive[:, :nx])
-        for block, drive in zip(blocks[1:], drives[1:], strict=True)
-    ]
-    shape = (len(slopes), z.size, model.ny)
-    return state @ c.T + drives[0, :, nx:], np.array(slopes, dtype=complex).reshape(shape)
+    moved = np.linalg.solve(inner, (state @ a[1:] + drives[1:, :, :nx]).transpose(1, 2, 0)).transpose(2, 0, 1)
+    states = np.concatenate([state[None], moved])
+    outputs = states @ c[0] + drives[:, :, nx:]
+    outputs[1:] += state @ c[1:]
+    return np.concatenate([states, outputs], axis=2)

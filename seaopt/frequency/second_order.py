@@ -1,4 +1,4 @@
-r"""Second-order form of a measured frequency response, and what the source paper extracts from it.
+r"""Second-order form of a measured frequency response, and the parameters that the source paper extracts from it.
 
 Orekhov et al. (IROS 2015) fit the H1 estimate of F1/F_m on the stand with
 
@@ -101,6 +101,11 @@ class SecondOrder:
         Root mean square of the residual in standard deviations of the estimate: 1 where the form explains the log.
 
     """
+
+    json_keys = (
+        *("K", "a", "b", "delay_s", "static_gain", "natural_frequency_hz", "damping_ratio"),
+        *("band_hz", "lines", "misfit"),
+    )
 
     values: Float[np.ndarray, "4"]
     covariance: Float[np.ndarray, "4 4"]
@@ -253,10 +258,9 @@ def second_order(
     sigma = np.maximum(estimate.relative_std[chosen], 1e-9) * np.abs(measured)
     start = _start(f, measured, sigma, clock)
     values, slopes, residual = _refine(estimate, chosen, sigma, clock, start)
-    degrees = max(residual.size - slopes.shape[1], 1)
-    misfit = float(np.sqrt(residual @ residual / degrees))
-    covariance = np.zeros((4, 4))
     count = slopes.shape[1]
+    misfit = float(np.sqrt(residual @ residual / max(residual.size - count, 1)))
+    covariance = np.zeros((4, 4))
     covariance[:count, :count] = _invert(slopes.T @ slopes) * HANN_LINES * max(1.0, misfit) ** 2
     return SecondOrder(
         values=values,
@@ -345,21 +349,20 @@ def _refine(
     from scipy.optimize import least_squares  # deferred: 0.3 s
 
     solve: Any = least_squares
-
     count = 4 if clock.delay_free else 3
 
     @lru_cache(maxsize=1)
     def evaluate(*x: float) -> Complex[np.ndarray, "m n"]:
-        """Return residuals and derivatives, in standard deviations; asked for one after the other at the same point."""
+        """Return residuals and derivatives, in standard deviations; the solver takes them one after the other."""
         moved = replace(clock, delay_s=x[3]) if clock.delay_free else clock
 
         def both(f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "m n"]:
             response, slopes = sampled_response(_form(), np.array(x[:3]), moved, f)
             return np.column_stack([response[:, 0], slopes[:, :, 0].T])
 
-        found = estimate.expected(both)[chosen]
-        found[:, 0] -= estimate.response[chosen]
-        return found / sigma[:, None]
+        columns = estimate.expected(both)[chosen]
+        columns[:, 0] -= estimate.response[chosen]
+        return columns / sigma[:, None]
 
     size = np.append(np.abs(start[:3]), clock.period)[:count]
     low = np.append(np.full(3, -np.inf), 0.0)[:count]

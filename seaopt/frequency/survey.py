@@ -7,13 +7,14 @@ the source paper reads (16) where the plant says so: two poles, no zero, b = k/m
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from seaopt.codec import to_content
 from seaopt.errors import LogError
 from seaopt.frequency.response import FrequencyResponse, find_band, h1
 from seaopt.frequency.sampled import sampled_response
@@ -27,7 +28,7 @@ from seaopt.frequency.second_order import (
 )
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant, SeriesSpring
+from seaopt.plants import CompletedParameters, Plant, SeriesSpring
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import evaluate
 from seaopt.records import record
@@ -148,20 +149,15 @@ class Survey:
         None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output, a force or a
         torque.
         """
-        values, actuation, spring = self.plant.complete(self.adapt(params)), self.plant.actuation, self.plant.spring
+        plant, values = self.plant, self.plant.complete(self.adapt(params))
+        actuation, spring, sensing = plant.actuation, plant.spring, plant.sensing
         if pair.second_order is None or actuation is None or spring is None or spring.stiffness is None:
             return None
-        sensing = self.plant.sensing
-        if (sensing is not None and pair.output not in sensing.regulated) or not _is_form(
-            self.plant, spring, values, pair
-        ):
+        if (sensing is not None and pair.output not in sensing.regulated) or not _is_form(plant, spring, values, pair):
             return None
-        k = values[spring.stiffness]
-        lossless = (
-            values
-            if actuation.efficiency is None
-            else self.plant.complete(values.update(**{actuation.efficiency: 1.0}))
-        )
+        k, lossless = values[spring.stiffness], values
+        if actuation.efficiency is not None:
+            lossless = plant.complete(values.update(**{actuation.efficiency: 1.0}))
         per_input = evaluate(actuation.effort, lossless) * self.gain.get(pair.output, 1.0)
         return pair.second_order.drive(
             k.value, per_input, k_std=k.std or k.prior_std or 0.0, called=mechanics_of(actuation.unit)
@@ -219,20 +215,15 @@ def survey(
 
     """
     names = tuple(outputs) or tuple(name for name in plant.outputs if name in log.signals)
-    sources = _excited_inputs(plant, log)
+    present = [name for name in plant.inputs if name in log.signals]
+    sources = [name for name in present if np.ptp(log[name]) != 0.0]
+    if not sources:
+        what = ", ".join(present) or "an input"
+        raise LogError(f"{log.source}: {what} is constant or absent; a frequency response needs excitation")
     check_record(log, (*sources, *names))
     chosen = clock if clock is not None else Clock(period=log.period)
     pairs = [_pair(plant, log, chosen, source, name, stretch_s) for source in sources for name in names]
     return Survey(plant=plant, clock=chosen, gain=dict(gain or {}), pairs=tuple(pairs))
-
-
-def _excited_inputs(plant: Plant, log: Log) -> list[str]:
-    present = [name for name in plant.inputs if name in log.signals]
-    excited = [name for name in present if np.ptp(log[name]) != 0.0]
-    if not excited:
-        what = ", ".join(present) or "an input"
-        raise LogError(f"{log.source}: {what} is constant or absent; a frequency response needs excitation")
-    return excited
 
 
 def check_record(log: Log, names: Sequence[str]) -> None:
@@ -257,12 +248,16 @@ def check_record(log: Log, names: Sequence[str]) -> None:
 
 
 def _pair(plant: Plant, log: Log, clock: Clock, source: str, output: str, stretch_s: float | None) -> Pair:
+    from scipy.ndimage import median_filter  # deferred: 0.2 s
+
     estimate = h1(log[source], log[output], log.period, stretch_s=stretch_s)
     divisor = plant.inputs[source]
     unit = f"{plant.outputs[output]}/" + (f"({divisor})" if " " in divisor or "/" in divisor else divisor)
     used = coherent_lines(estimate)
     form = second_order(estimate, clock, unit=unit, use=used) if np.count_nonzero(used) >= MIN_LINES else None
-    band = _good_band(estimate)
+    good = median_filter(estimate.coherence, SMOOTH, mode="nearest") > MIN_COHERENCE  # a line that strays ends no band
+    lines = estimate.frequency_hz[find_band(estimate.frequency_hz, good)]
+    band = (float(lines[0]), float(lines[-1])) if lines.size else None
     return Pair(
         source=source,
         output=output,
@@ -272,15 +267,6 @@ def _pair(plant: Plant, log: Log, clock: Clock, source: str, output: str, stretc
         peak=_peak(estimate, band),
         second_order=form,
     )
-
-
-def _good_band(estimate: FrequencyResponse) -> tuple[float, float] | None:
-    """Return the widest run of good coherence; a line alone that strays, as estimates do, ends none."""
-    from scipy.ndimage import median_filter  # deferred: 0.2 s
-
-    good = median_filter(estimate.coherence, SMOOTH, mode="nearest") > MIN_COHERENCE
-    band = estimate.frequency_hz[find_band(estimate.frequency_hz, good)]
-    return (float(band[0]), float(band[-1])) if band.size else None
 
 
 def _peak(estimate: FrequencyResponse, band: tuple[float, float] | None) -> Peak | None:
@@ -306,48 +292,36 @@ def _peak(estimate: FrequencyResponse, band: tuple[float, float] | None) -> Peak
     return Peak(frequency_hz=at, magnitude=height, std=float(std[inside[top]]) * height)
 
 
-def _is_form(plant: Plant, spring: SeriesSpring, values: ParameterSet, pair: Pair) -> bool:
+def _is_form(plant: Plant, spring: SeriesSpring, values: CompletedParameters, pair: Pair) -> bool:
     """Tell whether the plant at rest has two poles, no zero from input to output, and b = k/m_k."""
     if len(plant.states) != 2 or spring.mass is None or spring.stiffness is None:
         return False
-    model = linearise(make_model(plant, values, (), (pair.output,)))
-    g, _ = model.matrices(np.zeros(0))
-    a, b, source = g[:2, :2], g[:2, 2 + list(plant.inputs).index(pair.source)], g[2]
-    through = source[2 + list(plant.inputs).index(pair.source)]
+    g, _ = linearise(make_model(plant, values, (), (pair.output,))).matrices(np.zeros(0))
+    column = 2 + list(plant.inputs).index(pair.source)
+    a, b, c, through = g[:2, :2], g[:2, column], g[2, :2], g[2, column]
     mass, _ = plant.derived_values()[spring.mass]
-    point = [parameter.value for parameter in values.values()]
-    stiff = values[spring.stiffness].value / float(ca.Function("mass", [plant.p], [mass])(point))
+    stiff = values[spring.stiffness].value / float(ca.Function("mass", [plant.p], [mass])(values.vector))
     if not np.isclose(np.linalg.det(a), stiff, rtol=1e-6):
         return False
-    static = float(source[:2] @ np.linalg.solve(a, b))
-    return bool(through == 0.0 and abs(source[:2] @ b) <= 1e-9 * abs(static) * np.sqrt(stiff))
+    static = float(c @ np.linalg.solve(a, b))
+    return bool(through == 0.0 and abs(c @ b) <= 1e-9 * abs(static) * np.sqrt(stiff))
 
 
 def _pair_dict(measured: Survey, pair: Pair, params: ParameterSet) -> dict[str, Any]:
-    estimate, drive = pair.estimate, measured.drive(pair, params)
+    estimate = pair.estimate
     return {
         "input": pair.source,
         "output": pair.output,
         "unit": pair.unit,
         "averages": estimate.averages,
         "good_band_hz": pair.good_band_hz,
-        "peak": asdict(pair.peak) if pair.peak is not None else None,
-        "second_order": _form_dict(pair.second_order) if pair.second_order is not None else None,
-        "actuator": asdict(drive) if drive is not None else None,
+        "peak": to_content(pair.peak),
+        "second_order": to_content(pair.second_order),
+        "actuator": to_content(measured.drive(pair, params)),
         "model_misfit": pair.misfit(measured.model(pair, params)),
         "frequency_hz": estimate.frequency_hz,
         "real": np.real(estimate.response),
         "imag": np.imag(estimate.response),
         "relative_std": estimate.relative_std,
         "coherence": estimate.coherence,
-    }
-
-
-def _form_dict(form: SecondOrder) -> dict[str, Any]:
-    names = ("K", "a", "b", "delay_s", "static_gain", "natural_frequency_hz", "damping_ratio")
-    return {
-        **{name: asdict(getattr(form, name)) for name in names},
-        "band_hz": form.band_hz,
-        "lines": form.lines,
-        "misfit": form.misfit,
     }

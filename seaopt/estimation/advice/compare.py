@@ -23,12 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from seaopt.codec import to_content
+from seaopt.codec import Key, to_content
 from seaopt.errors import EstimationError
 from seaopt.estimation.advice.forecasts import (
     Percent,
@@ -70,12 +71,19 @@ class Ranked:
 class OctavePower:
     """Power of the residuals in one octave of one output: mean squares by fit, in the output's unit squared."""
 
+    json_keys = ("experiment", "output", "low_hz", "high_hz", Key(field="power_unit", name="unit"), "power")
+
     experiment: str
     output: str
     unit: str
     low_hz: float
     high_hz: float
     power: Mapping[str, float]
+
+    @property
+    def power_unit(self) -> str:
+        """The unit of the power."""
+        return f"({self.unit})^2"
 
 
 _HEAD = ("", "effective BIC", "BIC", "AIC", "unknowns", "free run (held out) [%]")
@@ -129,17 +137,7 @@ class Ranking:
             "effective_samples": self.effective_samples,
             "sentences": list(self.sentences),
             "ranking": to_content(self.rows),
-            "bands": [
-                {
-                    "experiment": band.experiment,
-                    "output": band.output,
-                    "low_hz": band.low_hz,
-                    "high_hz": band.high_hz,
-                    "unit": f"({band.unit})^2",
-                    "power": dict(band.power),
-                }
-                for band in self.bands
-            ],
+            "bands": to_content(self.bands),
         }
 
     def __repr__(self) -> str:
@@ -220,7 +218,7 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
             bic=named[name].bic,
             effective_bic=bic[name],
             unknowns=named[name].all_unknowns,
-            free_run=_compute_percents(problems[name], free[name]),
+            free_run=problems[name].map_outputs(partial(compute_percent, residuals=free[name])),
             held_out_ratio=_compare_held_out(shared, free[name], free[order[0]]),
         )
         for name in order
@@ -318,13 +316,6 @@ def _compute_bic(
         power = float(np.sum(r**2)) / max(np.count_nonzero(r), 1)
         total += effective[output.label] * float(np.log(max(power, 1e-300)))
     return total + fit.all_unknowns * float(np.log(max(sum(effective.values()), 1.0)))
-
-
-def _compute_percents(problem: FitProblem, residuals: ResidualsByExperiment) -> dict[str, dict[str, Percent]]:
-    return {
-        experiment.name: {output.name: compute_percent(output, residuals) for output in experiment.outputs}
-        for experiment in problem.experiments
-    }
 
 
 def _compare_held_out(problem: FitProblem, other: ResidualsByExperiment, best: ResidualsByExperiment) -> float | None:

@@ -1,19 +1,20 @@
-"""What is wrong with a fit, and what to do about it: tests of its residuals, of its predictions, and of its data.
+"""Diagnostics of a fit, with remedies: tests of its residuals, of its predictions, and of its data.
 
-What is wrong with the model is the fit's own judgement (see `judge`): its findings come first. Tests of the residuals
-that need more than the verdict does have modules of their own: `correlation`, `forecasts`, `leverage`, and `score_test`
-for parameters that were fixed. What they found is put into plain sentences here.
+The fit's own judgement (see `judge`) names faults of the model: its findings come first. Tests of the residuals that
+need more than the verdict does have modules of their own: `correlation`, `forecasts`, `leverage`, and `score_test` for
+parameters that were fixed. Their results are put into sentences here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import to_content
 from seaopt.estimation.advice.forecasts import (
     Percent,
     compute_percent,
@@ -35,7 +36,6 @@ from seaopt.estimation.problem.residual_statistics import (
     ResidualsByExperiment,
     compute_statistics,
 )
-from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import describe_outputs
@@ -89,6 +89,7 @@ class Diagnostics:
     """
 
     plot = PlotAccessor()
+    json_keys = ("outputs", "leverage", "at_bound", "held", "aic", "bic", "sentences")
 
     outputs: Mapping[str, Mapping[str, OutputDiagnostics]]
     leverage: Mapping[str, Leverage]
@@ -107,28 +108,15 @@ class Diagnostics:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content as numbers, lists and text."""
-        return {
-            "outputs": {
-                name: {output: _output_dict(figures) for output, figures in row.items()}
-                for name, row in self.outputs.items()
-            },
-            "leverage": {
-                name: {"parameters": dict(source.parameters), "whole": source.whole}
-                for name, source in self.leverage.items()
-            },
-            "at_bound": list(self.at_bound),
-            "held": {name: asdict(test) for name, test in self.held.items()},
-            "aic": self.aic,
-            "bic": self.bic,
-            "sentences": list(self.sentences),
-        }
+        return to_content(self)
 
     def __repr__(self) -> str:
         lines = ["Diagnostics: " + ("no problem found" if self.ok else f"{len(self.sentences)} to look at")]
         lines += [f"  - {sentence}" for sentence in self.sentences]
         for name, row in self.outputs.items():
             for output, figures in row.items():
-                lines.append(f"  {name}.{output}: whiteness p {figures.whiteness_p:.2g}; {_percents(figures)}")
+                percents = f"simulated {figures.free_run}, one sample ahead {figures.one_step}"
+                lines.append(f"  {name}.{output}: whiteness p {figures.whiteness_p:.2g}; {percents}")
                 lines += [
                     f"    against {u}: {cross.worst:.2g} of the 99 % bound, at lag {cross.worst_lag}"
                     for u, cross in figures.inputs.items()
@@ -141,41 +129,12 @@ class Diagnostics:
         ]
         for name, source in self.leverage.items():
             shares = ", ".join(f"{parameter} {100 * share:.3g} %" for parameter, share in source.parameters.items())
-            lines.append(f"  {name} brings {100 * source.whole:.3g} % of what is known: {shares}")
+            lines.append(f"  {name} brings {100 * source.whole:.3g} % of the information: {shares}")
         lines.append(f"  AIC {self.aic:.6g}, BIC {self.bic:.6g}")
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         return html_text(self) + self.plot.to_html()
-
-
-def _output_dict(figures: OutputDiagnostics) -> dict[str, Any]:
-    return {
-        "whiteness_p": figures.whiteness_p,
-        "autocorrelation": figures.autocorrelation,
-        "autocorrelation_bound": figures.autocorrelation_bound,
-        "inputs": {
-            name: {
-                "lags": cross.lags,
-                "values": cross.values,
-                "bound": cross.bound,
-                "p": cross.p,
-                "worst_lag": cross.worst_lag,
-                "outside": cross.outside,
-            }
-            for name, cross in figures.inputs.items()
-        },
-        "free_run": {"used": figures.free_run.used, "held_out": figures.free_run.held_out},
-        "one_step": {"used": figures.one_step.used, "held_out": figures.one_step.held_out},
-    }
-
-
-def _percents(figures: OutputDiagnostics) -> str:
-    parts: list[str] = []
-    for what, percent in (("simulated", figures.free_run), ("one sample ahead", figures.one_step)):
-        held_out = "" if percent.held_out is None else f" (held out {percent.held_out:.2f} %)"
-        parts.append(f"{what} {percent.used:.2f} %{held_out}")
-    return ", ".join(parts)
 
 
 def diagnose(fit: Fit) -> Diagnostics:
@@ -221,10 +180,20 @@ def diagnose(fit: Fit) -> Diagnostics:
         fit = judge(replace(fit, outputs=describe_outputs(problem, minimum.z, compute_statistics(problem, minimum.z))))
     residuals = minimum.residuals()
     free, ahead = simulate_freely(minimum, residuals), predict_one_step(minimum)
-    outputs: dict[str, dict[str, OutputDiagnostics]] = {experiment.name: {} for experiment in problem.experiments}
-    for output in problem.outputs:
-        whiteness_p = fit.outputs[output.experiment.name][output.name].whiteness_p
-        outputs[output.experiment.name][output.name] = _diagnose_output(output, residuals, free, ahead, whiteness_p)
+
+    def test(output: FitOutput) -> OutputDiagnostics:
+        name = output.experiment.name
+        residual = np.concatenate(residuals[name].weighted_of(output.name))
+        return OutputDiagnostics(
+            whiteness_p=fit.outputs[name][output.name].whiteness_p,
+            autocorrelation=autocorrelation(residual, min(INPUT_LAGS, residual.size - 1)),
+            autocorrelation_bound=QUANTILE / float(np.sqrt(max(np.count_nonzero(residual), 1))),
+            inputs=_correlate_with_inputs(output, residuals),
+            free_run=compute_percent(output, free),
+            one_step=Percent(used=np.nan, held_out=None) if ahead is None else compute_percent(output, ahead),
+        )
+
+    outputs = problem.map_outputs(test)
     leverage, at_bound = measure_leverage(minimum), problem.unknowns.find_at_bound(minimum.z)
     sentences = [] if fit.status == "converged" else [f"the fit is {fit.status.replace('_', ' ')}: {fit.message}"]
     sentences += [f"{finding.where}: {finding.text}" if finding.where else finding.text for finding in fit.findings]
@@ -242,35 +211,15 @@ def diagnose(fit: Fit) -> Diagnostics:
     )
 
 
-def _diagnose_output(
-    output: FitOutput,
-    residuals: ResidualsByExperiment,
-    free: ResidualsByExperiment,
-    ahead: ResidualsByExperiment | None,
-    whiteness_p: float,
-) -> OutputDiagnostics:
-    residual = np.concatenate(residuals[output.experiment.name].weighted_of(output.name))
-    count = int(np.count_nonzero(residual))
-    return OutputDiagnostics(
-        whiteness_p=whiteness_p,
-        autocorrelation=autocorrelation(residual, min(INPUT_LAGS, residual.size - 1)),
-        autocorrelation_bound=QUANTILE / float(np.sqrt(max(count, 1))),
-        inputs=_correlate_with_inputs(output, residuals),
-        free_run=compute_percent(output, free),
-        one_step=Percent(used=np.nan, held_out=None) if ahead is None else compute_percent(output, ahead),
-    )
-
-
 def _correlate_with_inputs(output: FitOutput, residuals: ResidualsByExperiment) -> dict[str, CrossCorrelation]:
     """Return the correlation of an output's residual with each input that moves."""
     segments = output.experiment.segments
     weighted = residuals[output.experiment.name].weighted_of(output.name)
-    correlations: dict[str, CrossCorrelation] = {}
-    for i, name in enumerate(output.experiment.data.plant.inputs):
-        cross = cross_correlation(weighted, [segment.samples.inputs[i] for segment in segments])
-        if cross is not None:
-            correlations[name] = cross
-    return correlations
+    pairs = {
+        name: cross_correlation(weighted, [segment.samples.inputs[i] for segment in segments])
+        for i, name in enumerate(output.experiment.data.plant.inputs)
+    }
+    return {name: cross for name, cross in pairs.items() if cross is not None}
 
 
 def _advise_on_outputs(
@@ -304,19 +253,14 @@ def _advise_on_inputs(
             continue
         late = f" = {1e3 * lag * output.experiment.period:.3g} ms" if lag else ""
         residual = np.concatenate(residuals[output.experiment.name].weighted_of(output.name))
-        frequency = _find_centre_hz(residual, output.experiment.period)
+        power = np.cumsum(np.abs(np.fft.rfft(residual)) ** 2)
+        frequency = float(np.searchsorted(power, 0.5 * power[-1]) / (residual.size * output.experiment.period))
         remaining = "what no cause above explains is a missing pole" if explained else "a missing pole"
         sentences.append(
             f"{output.label}: the residual follows {name}, most around lag {lag}{late} {size}, half of its power is "
             f"below {frequency:.3g} Hz: {remaining}; compare() it with a plant that has one more part"
         )
     return sentences
-
-
-def _find_centre_hz(residual: Signal, period: float) -> float:
-    """Return the frequency that halves the power of a residual."""
-    power = np.cumsum(np.abs(np.fft.rfft(residual)) ** 2)
-    return float(np.searchsorted(power, 0.5 * power[-1]) / (residual.size * period))
 
 
 def _advise_on_colour(output: FitOutput, row: OutputDiagnostics, predicts: bool) -> list[str]:
@@ -339,14 +283,14 @@ def _advise_on_colour(output: FitOutput, row: OutputDiagnostics, predicts: bool)
 
 def _advise_on_leverage(leverage: Mapping[str, Leverage]) -> list[str]:
     """Return which experiment adds nothing, and which parameters are known from their priors alone."""
-    sentences: list[str] = []
-    for name, source in leverage.items():
-        if name != PRIORS and len(leverage) > 1 and source.whole < LITTLE:
-            sentences.append(f"{name} brings {100 * source.whole:.2g} % of what is known: it could be left out")
-        if name == PRIORS:
-            sentences += [
-                f"what is known of {parameter} is {100 * share:.0f} % prior: the logs hardly correct it"
-                for parameter, share in source.parameters.items()
-                if share > 1.0 - 10.0 * LITTLE
-            ]
-    return sentences
+    useless = [
+        f"{name} brings {100 * source.whole:.2g} % of the information: it could be left out"
+        for name, source in leverage.items()
+        if name != PRIORS and len(leverage) > 1 and source.whole < LITTLE
+    ]
+    priors = leverage[PRIORS].parameters if PRIORS in leverage else {}
+    return useless + [
+        f"{100 * share:.0f} % of the information on {parameter} is its prior: the logs hardly correct it"
+        for parameter, share in priors.items()
+        if share > 1.0 - 10.0 * LITTLE
+    ]

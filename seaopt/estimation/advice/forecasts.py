@@ -37,6 +37,9 @@ class Percent:
     used: float
     held_out: float | None
 
+    def __str__(self) -> str:
+        return f"{self.used:.2f} %" + ("" if self.held_out is None else f" (held out {self.held_out:.2f} %)")
+
 
 def split_samples(output: FitOutput) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Return which samples of an output took part in the fit, and which were held out but can be predicted."""

@@ -333,11 +333,11 @@ def _design(search: ExcitationSearch, candidate: Candidate, criterion: str) -> D
                 f"{name} cannot be distinguished from the other unknowns by any excitation that was tried; "
                 "fix one, give it a prior, or measure another output"
             )
-    figures = (replace(bench.params[name], std=covariance.std(name)) for name in names)
+    figures = (replace(bench.problem.params[name], std=covariance.std(name)) for name in names)
     return Design(
         excitation=final.excitation,
         criterion=criterion,
-        parameters=bench.params.with_parameters(*figures),
+        parameters=bench.problem.params.with_parameters(*figures),
         covariance=covariance,
         rms=final.trial.rms,
         peaks=final.trial.peaks,

@@ -1,4 +1,4 @@
-r"""Searches for an excitation: what the bench allows, what counts, and how multisines and chirps are found.
+r"""Searches for an excitation: the limits of the bench, the criterion, and the best multisines and chirps.
 
 A multisine is found in three steps: the powers of its lines, a convex problem for the linearised plant
 (`seaopt.estimation.experiment_design.spectrum`); phases for low peaks; and, where the plant is not linear, a search
@@ -8,7 +8,7 @@ multiple of the rms, guessed first and then taken from the signals that were fou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import field, replace
 
@@ -39,7 +39,7 @@ SCALING_MARGIN = 1e-9
 
 @record
 class Limits:
-    """What the bench allows.
+    """The limits of the bench.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class Chirps:
 
 @record(eq=False)
 class Measure:
-    """A criterion: log of trace(W C), or of det C, and the power of the amplitude that it falls with."""
+    """A criterion: log of trace(W C), or of det C without W; and the power of the amplitude that it falls with."""
 
     weight: ParameterMatrix | None
     order: float
@@ -138,8 +138,7 @@ def make_measure(bench: Bench, criterion: str) -> Measure:
     if criterion == "D":
         return Measure(weight=None, order=2.0 * len(names))
     if criterion in names:
-        chosen = np.array([float(name == criterion) for name in names])
-        return Measure(weight=np.diag(chosen), order=2.0)
+        return Measure(weight=np.diag([float(name == criterion) for name in names]), order=2.0)
     if criterion != "A":
         raise EstimationError(f'criterion = "{criterion}" is not known; {suggestion(criterion, ("A", "D", *names))}')
     for name, value in zip(names, bench.theta, strict=True):
@@ -153,7 +152,7 @@ def make_measure(bench: Bench, criterion: str) -> Measure:
 
 @record(eq=False)
 class Candidate:
-    """An excitation within the limits, what it identifies, and its criterion."""
+    """An excitation within the limits, the trial of it, and its criterion."""
 
     excitation: Excitation
     trial: Trial
@@ -162,7 +161,7 @@ class Candidate:
 
 @record(eq=False)
 class ExcitationSearch:
-    """What a search needs: the bench, the limits, the criterion."""
+    """The bench, the limits and the criterion of a search."""
 
     bench: Bench
     limits: Limits
@@ -209,6 +208,10 @@ class ExcitationSearch:
         return best
 
 
+def _choose_better(best: Candidate | None, candidate: Candidate) -> Candidate:
+    return candidate if best is None or candidate.value < best.value else best
+
+
 def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: Multisines) -> Candidate:
     """Return the best multisine within the limits.
 
@@ -252,14 +255,15 @@ def _best_start(search: ExcitationSearch, lines: Spectrum, spread: float) -> Can
             candidate = search.scale_to_limits(
                 _multisine(search.bench, _select_lines(lines, kept), powers[kept], schroeder_phases(powers[kept]))
             )
-            best = candidate if best is None or candidate.value < best.value else best
+            best = _choose_better(best, candidate)
     assert best is not None
     return best
 
 
 def _solve_convex(search: ExcitationSearch, lines: Spectrum, spread: float) -> Candidate:
     """Alternate powers, within peaks guessed as multiples of each rms, and phases, which give those multiples."""
-    limits = search.limits
+    limits, problem = search.limits, search.bench.problem
+    prior = np.diag(problem.unknowns.precision[: problem.unknowns.shared])
     share = (1.0 - spread) * np.eye(lines.harmonics.size) + spread / lines.harmonics.size
     information = np.einsum("jk,jab->kab", share, lines.information)
     caps = np.array([np.inf if limits.peak is None else limits.peak, *limits.peaks.values()])
@@ -270,9 +274,7 @@ def _solve_convex(search: ExcitationSearch, lines: Spectrum, spread: float) -> C
         rows = rows[np.isfinite(caps)]
         if limits.rms is not None:
             rows = np.vstack([rows, np.full(lines.harmonics.size, limits.rms**-2.0)])
-        powers = share @ optimal_powers(
-            information, rows @ share, weight=search.measure.weight, prior=np.diag(search.bench.prior)
-        )
+        powers = share @ optimal_powers(information, rows @ share, weight=search.measure.weight, prior=prior)
         kept = powers > FAINT * np.max(powers)
         candidate = search.scale_to_limits(_low_peaks(search, _select_lines(lines, kept), powers[kept], caps))
         if best is not None and candidate.value >= best.value:
@@ -333,10 +335,16 @@ def _refine(search: ExcitationSearch, start: Candidate) -> Candidate:
         a[free], phi[free] = np.exp(x[: free.size]), x[free.size :]
         return (replace(part, amplitudes=tuple(map(float, a)), phases_rad=tuple(map(float, phi))),)
 
-    x0 = np.concatenate([np.log(amplitudes[free]), phases[free]])
-    x = _descend(lambda x: _smooth_criterion(search, build(x)), x0)
-    candidate = search.scale_to_limits(build(x))
-    return candidate if candidate.value < best.value else best
+    from scipy.optimize import minimize  # deferred: 0.3 s
+
+    x = minimize(
+        lambda x: _smooth_criterion(search, build(x)),
+        np.concatenate([np.log(amplitudes[free]), phases[free]]),
+        method="L-BFGS-B",
+        jac="2-point",
+        options={"maxiter": 15, "eps": 1e-4, "maxfun": 300},
+    ).x
+    return _choose_better(best, search.scale_to_limits(build(np.asarray(x))))
 
 
 def _smooth_criterion(search: ExcitationSearch, excitation: Excitation) -> float:
@@ -349,13 +357,6 @@ def _smooth_criterion(search: ExcitationSearch, excitation: Excitation) -> float
     use = search.largest_use(second)
     value = search.measure(second.covariance)
     return value + search.measure.order * np.log(use) if np.isfinite(value) and np.isfinite(use) else 1e6
-
-
-def _descend(cost: Callable[[Float[np.ndarray, " m"]], float], x0: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    from scipy.optimize import minimize  # deferred: 0.3 s
-
-    solution = minimize(cost, x0, method="L-BFGS-B", jac="2-point", options={"maxiter": 15, "eps": 1e-4, "maxfun": 300})
-    return np.asarray(solution.x)
 
 
 def with_fine_steps(search: ExcitationSearch, band: tuple[float, float]) -> ExcitationSearch:
@@ -386,8 +387,7 @@ def best_chirp(search: ExcitationSearch, band: tuple[float, float]) -> Candidate
         return search.scale_to_limits(_chirp(x[0], x[1])).value
 
     x = np.asarray(minimize(cost, ends, method="Nelder-Mead", options={"maxfev": 80, "xatol": 1e-3}).x)
-    candidate = search.scale_to_limits(_chirp(x[0], x[1]))
-    return candidate if candidate.value < best.value else best
+    return _choose_better(best, search.scale_to_limits(_chirp(x[0], x[1])))
 
 
 def _chirp(low: float, high: float) -> Excitation:

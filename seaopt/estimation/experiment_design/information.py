@@ -1,28 +1,35 @@
 r"""The Fisher information of a log that has not been recorded yet.
 
-The plant is simulated from rest over the samples of an excitation, with its sensitivities. The information of the
-parameters theta, the initial state and the offsets is the sum of s s' / sigma^2 over samples and measured outputs;
-that of theta alone, the others being estimated too, is its Schur complement: the inverse of a block of the inverse.
+The plant is simulated from rest over the samples of an excitation, with its sensitivities: a `FitProblem` whose log has
+the excitation as input and zeros as measured outputs. Its Hessian at the guess is the information of the parameters
+theta, the initial state and the offsets; the inverse of that has the covariance of theta, the others being estimated
+too. An output that is watched and not measured has an infinite sigma.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.bench import Excitation, excite
 from seaopt.errors import EstimationError, require_seed, suggestion
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, FitExperiment
+from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
+from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.normal_equations import invert
-from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal
+from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, PerOutput, Signal
 from seaopt.estimation.result.covariance import mark_unseen
-from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, STEP_ERROR_SIGMA
+from seaopt.estimation.solver.step_size import STEP_ERROR_SIGMA
+from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import list_smoothing
 from seaopt.records import record
-from seaopt.simulation import Clock, Model, Pass, Point, Segment, make_model, run_passes
+from seaopt.simulation import Clock, Model, Pass, run_passes
 
 
 @record(eq=False)
@@ -38,19 +45,46 @@ class Trial:
 class Bench:
     """A plant with its guess and sensors, to be tried with one excitation after another."""
 
-    plant: Plant  # plant, params: the actuator and every parameter of it
-    params: ParameterSet
-    model: Model  # the plant in its free parameters; the measured outputs come first
-    theta: ParameterVector  # theta, prior: free parameters, and what is known of them beforehand: 1/std^2
-    prior: ParameterVector
-    sigma: Float[np.ndarray, " nm"]  # noise of the measured outputs
+    problem: FitProblem  # of one experiment, the measured outputs first
+    measured: int  # outputs
     input_name: str  # the input that is excited
     watched: tuple[str, ...]  # outputs and states whose peaks are wanted
-    clock: Clock  # period and hold
-    n: int  # samples
-    offset: bool  # offset, initial: whether those are estimated too
-    initial: bool
     substeps: int = 1  # integration steps per sample
+
+    @property
+    def experiment(self) -> FitExperiment:
+        """The experiment that is simulated."""
+        return self.problem.experiments[0]
+
+    @property
+    def plant(self) -> Plant:
+        """The actuator."""
+        return self.experiment.data.plant
+
+    @property
+    def model(self) -> Model:
+        """The plant in its free parameters."""
+        return self.experiment.model
+
+    @property
+    def theta(self) -> ParameterVector:
+        """The guess of the free parameters."""
+        return self.problem.unknowns.start[: self.model.np]
+
+    @property
+    def sigma(self) -> PerOutput:
+        """The noise of the measured outputs."""
+        return self.experiment.sigma[: self.measured]
+
+    @property
+    def clock(self) -> Clock:
+        """Period and hold."""
+        return self.experiment.point(self.problem.unknowns.start).clock
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.experiment.longest
 
     @property
     def channel(self) -> int:
@@ -88,49 +122,32 @@ class Bench:
         while not self.model.linear:
             coarse, fine = self._pass(u, substeps).outputs, self._pass(u, 2 * substeps).outputs
             assert coarse is not None and fine is not None
-            m = self.sigma.size
             with np.errstate(invalid="ignore"):
-                error = float(np.max(np.abs(coarse - fine)[:, :m] / self.sigma)) * 16.0 / 15.0
+                error = float(np.max(np.abs(coarse - fine)[:, : self.measured] / self.sigma)) * 16.0 / 15.0
             if error <= STEP_ERROR_SIGMA:
                 break
             substeps *= 2
             if substeps > MAX_SUBSTEPS:
+                speeds = ", ".join(list_smoothing(self.plant))
                 raise EstimationError(
                     f"steps of 1/{MAX_SUBSTEPS} sample still leave an error of {error:.2g} sigma in an output; "
-                    "raise rate_hz, or smooth the friction (v_s)"
+                    "raise rate_hz" + (f", or smooth the friction ({speeds})" if speeds else "")
                 )
         return replace(self, substeps=substeps)
 
     def _pass(self, u: Signal, substeps: int) -> Pass:
-        still = np.zeros(u.size)
-        inputs = tuple(u if i == self.channel else still for i in range(self.model.nu))
-        # A residual is needed to be counted: nothing measured is all zeros.
-        segment = Segment(u=inputs, y=(still,) * self.model.ny)
-        point = Point(
-            theta=self.theta,
-            offset=np.zeros(self.model.ny),
-            gain=np.ones(self.model.ny),
-            drift=np.zeros((self.model.ny, 0)),
-            clock=self.clock,
-            substeps=substeps,
-        )
-        return run_passes(self.model, segment, point, np.zeros(self.model.nx), outputs=True, states=True)
+        (segment,), z = self.experiment.segments, self.problem.unknowns.start
+        inputs = tuple(u if i == self.channel else still for i, still in enumerate(segment.samples.u))
+        point = replace(self.experiment.point(z), substeps=substeps)
+        samples = replace(segment.samples, u=inputs)
+        return run_passes(self.model, samples, point, segment.start(z), outputs=True, states=True)
 
     def _covariance(self, result: Pass) -> ParameterMatrix:
-        p, nx, m = self.theta.size, self.model.nx, self.sigma.size
-        size = p + nx * self.initial + m * self.offset
-        total = np.zeros((size, size))
-        for o, sigma in enumerate(self.sigma):
-            rows = [*range(1, 1 + p), *(range(1 + p, 1 + p + nx) if self.initial else ())]
-            columns = list(range(len(rows)))
-            if self.offset:
-                rows.append(1 + p + nx)
-                columns.append(p + nx * self.initial + o)
-            total[np.array(columns)[:, None], columns] += result.gram[o][rows][:, rows] / sigma**2
-        if not np.all(np.isfinite(total)):
+        p, n = self.model.np, self.problem.unknowns.start.size
+        information = self.experiment.normal([result], n)[1:, 1:] + np.diag(self.problem.unknowns.precision)
+        if not np.all(np.isfinite(information)):
             return np.full((p, p), np.inf)
-        total[np.arange(p), np.arange(p)] += self.prior
-        inverted, unseen = invert(total)
+        inverted, unseen = invert(information)
         return mark_unseen(inverted[:p, :p], unseen[:p])
 
 
@@ -142,7 +159,7 @@ def make_bench(
     duration_s: float,
     rate_hz: float,
     offset: bool,
-    initial_state: str,
+    initial_state: Literal["estimate", "rest"],
     input_name: str | None,
     watched: tuple[str, ...] = (),
 ) -> Bench:
@@ -152,44 +169,34 @@ def make_bench(
     """
     if not isinstance(sigma, Mapping) or not sigma:
         raise EstimationError(f"sigma = {sigma!r}; give a mapping of each measured output to its noise")
-    for name, value in sigma.items():
+    for name in sigma:
         if name not in plant.outputs:
             raise EstimationError(
                 f'sigma names "{name}", which is not an output of {plant.name}; {suggestion(name, plant.outputs)}'
             )
-        if not 0.0 < value < np.inf:
-            raise EstimationError(f"sigma of {name} = {value:g} is not positive; give the noise's standard deviation")
-    if initial_state not in ("estimate", "rest"):
-        raise EstimationError(f'initial_state = "{initial_state}" is not known; use "estimate" or "rest"')
     excited = input_name if input_name is not None else next(iter(plant.inputs), "")
     if excited not in plant.inputs:
         raise EstimationError(f'input "{excited}" is not one of {plant.name}; {suggestion(excited, plant.inputs)}')
-    complete = plant.complete(params)
-    free = _free_names(plant, params)
-    outputs = (*sigma, *(name for name in watched if name in plant.outputs and name not in sigma))
-    stds = [complete[name].prior_std for name in free]
-    return Bench(
-        plant=plant,
-        params=complete,
-        model=make_model(plant, complete, free, outputs),
-        theta=np.array(complete.values_of(free)),
-        prior=np.array([0.0 if std is None else std**-2.0 for std in stds]),
-        sigma=np.array([float(value) for value in sigma.values()]),
-        input_name=excited,
-        watched=watched,
-        clock=Clock(period=1.0 / rate_hz),
-        n=round(duration_s * rate_hz),
-        offset=offset,
-        initial=initial_state == "estimate",
-    )
-
-
-def _free_names(plant: Plant, params: ParameterSet) -> tuple[str, ...]:
     if not params.free_names:
         raise EstimationError("no parameter is free; free those of interest: params.free('J')")
-    for name in params.free_names:
-        if name not in plant.parameters:
-            raise EstimationError(
-                f"parameter {name} is free, but {plant.name} has none; {suggestion(name, plant.parameters)}"
-            )
-    return params.free_names
+    outputs = (*sigma, *(name for name in watched if name in plant.outputs and name not in sigma))
+    time = np.arange(round(duration_s * rate_hz)) / rate_hz
+    still: dict[str, Any] = dict.fromkeys((*plant.inputs, *outputs), np.zeros(time.size))
+    experiment = Experiment(
+        plant=plant,
+        log=Log.from_arrays(time=time, **still),
+        name="design",
+        outputs=outputs,
+        sigma=sigma,
+        offset=offset,
+        initial_state=initial_state,
+        mask="none",
+    )
+    problem = pose_problem((experiment,), params, loss=Squares())
+    noise = np.array([sigma.get(name, np.inf) for name in outputs])
+    return Bench(
+        problem=problem.with_values("sigma", {"design": noise}),
+        measured=len(sigma),
+        input_name=excited,
+        watched=watched,
+    )

@@ -28,8 +28,9 @@ from jaxtyping import Complex, Float, Int
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.shapes import ParameterMatrix
 from seaopt.executors import solve_ipopt
+from seaopt.frequency.sampled import sampled_signals
 from seaopt.records import record
-from seaopt.simulation import Clock, Model, linearise, transition
+from seaopt.simulation import Clock, Model, linearise
 
 ORDERS = (2, 8, 32)  # half the orders of the norms that become the peak
 SINGULAR = 1e-11  # eigenvalues of the normalised information below this part of the largest are zero
@@ -37,7 +38,7 @@ SINGULAR = 1e-11  # eigenvalues of the normalised information below this part of
 
 @record(eq=False)
 class Spectrum:
-    """What one ampere squared at each of K frequencies identifies, and what it moves."""
+    """The information and the motion that a unit mean square of the input brings at each of K frequencies."""
 
     harmonics: Int[np.ndarray, " K"]  # multiples of rate/n
     information: Float[np.ndarray, "K p p"]  # Fisher information of a unit mean square at each line
@@ -82,31 +83,12 @@ def make_spectrum(
     1/(n period); `n`: samples; `sigma`: noise of the first nm outputs, those that are measured; `channel`: the
     input that is excited; `signals`: limited signals: -1 is the input, then the outputs, then the states.
     """
-    linear = linearise(model)
-    blocks = transition(linear, theta, clock)
-    z = np.exp(2j * np.pi * multiples / n)
-    response = np.array([_response(blocks, linear.nx, linear.nu, channel, clock, zk) for zk in z])
-    slopes = response[:, 1:, linear.nx : linear.nx + sigma.size] / sigma
-    information = n * np.einsum("kio,kjo->kij", slopes, slopes.conj()).real
-    order = np.concatenate([response[:, 0, linear.nx :], response[:, 0, : linear.nx], np.ones((z.size, 1))], axis=1)
+    nx = model.nx
+    response = sampled_signals(linearise(model), theta, clock, multiples / (n * clock.period), channel)
+    slopes = response[1:, :, nx : nx + sigma.size] / sigma
+    information = n * np.einsum("iko,jko->kij", slopes, slopes.conj()).real
+    order = np.concatenate([response[0, :, nx:], response[0, :, :nx], np.ones((multiples.size, 1))], axis=1)
     return Spectrum(harmonics=multiples, information=information, gains=order[:, signals].T)
-
-
-def _response(
-    blocks: Float[np.ndarray, "nd r c"], nx: int, nu: int, channel: int, clock: Clock, z: complex
-) -> Complex[np.ndarray, "nd r"]:
-    """Return the responses of states and outputs to one input at z, and their derivatives."""
-    drive = np.zeros(blocks.shape[:2], dtype=complex)
-    for i, lag in enumerate(clock.lags):
-        drive += blocks[:, :, nx + i * nu + channel] * z ** -float(lag)
-    resolvent = np.linalg.inv(z * np.eye(nx) - blocks[0, :nx, :nx])
-    x = resolvent @ drive[0, :nx]
-    out = np.zeros(drive.shape, dtype=complex)
-    out[0, :nx], out[0, nx:] = x, blocks[0, nx:, :nx] @ x + drive[0, nx:]
-    for row, block, change in zip(out[1:], blocks[1:], drive[1:], strict=True):
-        row[:nx] = resolvent @ (block[:nx, :nx] @ x + change[:nx])
-        row[nx:] = block[nx:, :nx] @ x + blocks[0, nx:, :nx] @ row[:nx] + change[nx:]
-    return out
 
 
 def optimal_powers(

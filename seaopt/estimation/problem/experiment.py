@@ -306,6 +306,10 @@ class Experiment:
         count = format_count(len(self.log_segments), "segment")
         return f"Experiment {self.name}: {self.plant.name}, {', '.join(self.outputs)} from {self.log.source} ({count})"
 
+    def rename(self, name: str) -> Experiment:
+        """Return the experiment under another name."""
+        return replace(self, name=name)
+
     @property
     def notes(self) -> tuple[str, ...]:
         """How the log was changed, and which of its samples have no weight, one sentence each."""

@@ -1,9 +1,10 @@
-"""An experiment as a fit sees it: its data and model, the slots of its unknowns, and the weights of its residuals."""
+"""An experiment in a fit: its data and model, the slots of its unknowns, and the weights of its residuals."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,7 @@ class FitSegment:
 
     samples: Segment  # the data
     initial: tuple[Slot, ...]  # the state at the first sample
-    # columns, predictor_columns: which unknown each derivative column of a pass is, -1 for none: without and with a
-    # filter's correction
+    # The unknown of each derivative column of a pass, -1 for none: without and with a filter's correction.
     columns: tuple[Int[np.ndarray, " nc"], ...]
     predictor_columns: tuple[Int[np.ndarray, " nd"], ...]
 
@@ -253,16 +253,12 @@ def make_fit_experiment(
     band_hz: tuple[float, float] | None,
     holdout: float,
 ) -> FitExperiment:
-    """Return an experiment in the unknowns of these names; a sigma that is not given is the output's spread."""
-    theta = find_places(data, model, names)
+    """Return an experiment in the unknowns of these names; a sigma that is not stated is the output's spread."""
     spread = [measure_spread(data.log[name]) for name in data.outputs]
     sigma = [data.sigma.get(name, size or 1.0) for name, size in zip(data.outputs, spread, strict=True)]
     return FitExperiment(
         data=data,
-        segments=make_segments(data, slots, theta, holdout),
-        model=model,
-        theta=np.array(theta, dtype=int),
-        slots=slots,
+        **model_experiment(data, model, slots, names, holdout),
         sigma=np.array(sigma),
         spread=np.array(spread),
         loss=loss,
@@ -271,19 +267,19 @@ def make_fit_experiment(
     )
 
 
-def make_segments(data: Experiment, slots: Slots, theta: Sequence[int], holdout: float) -> tuple[FitSegment, ...]:
-    """Return the segments of an experiment, with the unknowns of their passes' columns."""
+def model_experiment(
+    data: Experiment, model: Model, slots: Slots, names: Sequence[str], holdout: float
+) -> dict[str, Any]:
+    """Return the fields of a `FitExperiment` that depend on what is unknown."""
+    theta = find_places(data, model, names)
     shared = [*theta, *_indices([slots.delay] if slots.delay.index is not None else [])]
-    noise = _indices([slot for slot in slots.noise if slot.index is not None])
-    sensors = [
-        _indices([offset, *drift, gain])
-        for offset, drift, gain in zip(slots.offset, slots.drift, slots.gain, strict=True)
-    ]
-    every = [index for row in sensors for index in row]
+    noise = _indices(slots.noise)
+    rows = zip(slots.offset, slots.drift, slots.gain, strict=True)
+    sensors = [_indices([offset, *drift, gain]) for offset, drift, gain in rows]
     segments: list[FitSegment] = []
     for samples, initial in zip(data.segments(holdout), slots.initial, strict=True):
         state = _indices(initial)
-        together = np.array([*shared, *noise, *state, *every], dtype=int)
+        together = np.array([*shared, *noise, *state, *chain.from_iterable(sensors)], dtype=int)
         segments.append(
             FitSegment(
                 samples=samples,
@@ -292,7 +288,7 @@ def make_segments(data: Experiment, slots: Slots, theta: Sequence[int], holdout:
                 columns=tuple(np.array([*shared, *state, *row], dtype=int) for row in sensors),
             )
         )
-    return tuple(segments)
+    return {"model": model, "slots": slots, "theta": np.array(theta, dtype=int), "segments": tuple(segments)}
 
 
 def _indices(slots: Sequence[Slot]) -> list[int]:

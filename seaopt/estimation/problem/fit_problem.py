@@ -36,13 +36,13 @@ from seaopt.estimation.problem.fit_experiment import (
     FitOutput,
     ResidualPower,
     make_fit_experiment,
-    make_segments,
+    model_experiment,
 )
 from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.normal_equations import QuadraticModel, solve_seen
 from seaopt.estimation.problem.shapes import Vector
-from seaopt.estimation.problem.unknowns import Unknowns, collect, find_places
-from seaopt.parameters import ParameterSet
+from seaopt.estimation.problem.unknowns import Unknowns, collect
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.friction import list_smoothing
 from seaopt.records import record
 from seaopt.simulation import Pass, threads
@@ -121,10 +121,6 @@ class FitProblem:
         experiments = (replace(e, **{field: values[e.name]}) if e.name in values else e for e in self.experiments)
         return replace(self, experiments=tuple(experiments))
 
-    def with_sigma(self, sigma: Mapping[str, Float[np.ndarray, " _"]]) -> FitProblem:
-        """Return the problem with other sigmas, by experiment."""
-        return self.with_values("sigma", sigma)
-
     def map(self, call: Callable[[FitExperiment], T]) -> list[T]:
         """Call for every experiment; in threads of their own where they are long enough."""
         samples = sum(segment.samples.n for experiment in self.experiments for segment in experiment.segments)
@@ -132,25 +128,32 @@ class FitProblem:
             return [call(experiment) for experiment in self.experiments]
         return list(threads().map(call, self.experiments))
 
+    def map_outputs(self, call: Callable[[FitOutput], T]) -> dict[str, dict[str, T]]:
+        """Call for every output, and return what comes of it by experiment and output."""
+        return {e.name: {output.name: call(output) for output in e.outputs} for e in self.experiments}
+
     def evaluate(self, z: Vector) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
-        passes = self.map(lambda experiment: experiment.run_all(z))
-        names = (experiment.name for experiment in self.experiments)
-        evaluation = self.assemble(PassSet(z=z, by_experiment=dict(zip(names, passes, strict=True))))
+        passes = self.map(lambda experiment: (experiment.name, experiment.run_all(z)))
+        evaluation = self.assemble(PassSet(z=z, by_experiment=dict(passes)))
         return replace(evaluation, cost=np.inf) if any(e.is_too_stiff(z) for e in self.experiments) else evaluation
+
+    @property
+    def shared_names(self) -> tuple[str, ...]:
+        """The free parameters of the plants, which come first among the unknowns."""
+        return self.unknowns.names[: self.unknowns.shared]
 
     def find_smoothing(self) -> list[int]:
         """Return the unknowns that are speeds over which some plant's friction is smoothed through zero."""
         plants = [experiment.data.plant for experiment in self.experiments if not experiment.model.sticks]
         names = {name for plant in plants for name in list_smoothing(plant)}
-        return [i for i, name in enumerate(self.unknowns.names[: self.unknowns.shared]) if name in names]
+        return [i for i, name in enumerate(self.shared_names) if name in names]
 
     @property
     def seeks_play(self) -> bool:
         """Whether a spring's play is among the unknowns: there are then minima in which it opens at other times."""
         springs = (experiment.data.plant.spring for experiment in self.experiments)
-        plays = {spring.play for spring in springs if spring is not None}
-        return any(name in plays for name in self.unknowns.names[: self.unknowns.shared])
+        return any(spring is not None and spring.play in self.shared_names for spring in springs)
 
     def find_stopped(self) -> list[int]:
         """Return the unknowns that are speeds at a start which friction that sticks can stop: those with a prior."""
@@ -226,12 +229,11 @@ class FitProblem:
             if name in unknowns.names:
                 index = unknowns.names.index(name)
                 start[index], values[index] = first, value
-        rebuilt: list[FitExperiment] = []
-        for old, new, (model, slots) in zip(self.experiments, experiments, modelled, strict=True):
-            theta = np.array(find_places(new, model, unknowns.names), dtype=int)
-            segments = make_segments(new, slots, theta.tolist(), old.holdout)
-            rebuilt.append(replace(old, data=new, segments=segments, model=model, theta=theta, slots=slots))
-        return FitProblem(experiments=tuple(rebuilt), unknowns=replace(unknowns, start=start), params=params), values
+        rebuilt = tuple(
+            replace(old, data=new, **model_experiment(new, model, slots, unknowns.names, old.holdout))
+            for old, new, (model, slots) in zip(self.experiments, experiments, modelled, strict=True)
+        )
+        return FitProblem(experiments=rebuilt, unknowns=replace(unknowns, start=start), params=params), values
 
 
 def pose_problem(
@@ -243,13 +245,30 @@ def pose_problem(
     holdout: float = 0.0,
     noise: bool = False,
 ) -> FitProblem:
-    """Return the problem of fitting the free ones of `params` to experiments; with `noise`, their process noise too."""
+    """Return the problem of fitting the free parameters to experiments; with `noise`, their process noise too.
+
+    Parameters that are left out have their plants' defaults.
+    """
     names = [experiment.name for experiment in experiments]
     if len(set(names)) < len(names):
         raise EstimationError(f"experiments are named {', '.join(names)}; give each a name of its own")
+    params = _complete_parameters(experiments, params)
     unknowns, modelled = collect(experiments, params, noise=noise, band_hz=band_hz)
     posed = tuple(
         make_fit_experiment(data, model, slots, unknowns.names, loss=loss, band_hz=band_hz, holdout=holdout)
         for data, (model, slots) in zip(experiments, modelled, strict=True)
     )
     return FitProblem(experiments=posed, unknowns=unknowns, params=params)
+
+
+def _complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSet) -> ParameterSet:
+    """Return every parameter of the plants, in order, and the free ones that no plant has (an error later)."""
+    parameters: dict[str, Parameter] = {}
+    for experiment in experiments:
+        for name, parameter in experiment.plant.complete(experiment.apply_own(params)).items():
+            parameters.setdefault(name, params.get(name, parameter) if name in experiment.parameters else parameter)
+        for local in experiment.list_own().values():
+            parameters.setdefault(local.name, params.get(local.name, local))
+    for name in params.free_names:
+        parameters.setdefault(name, params[name])
+    return ParameterSet(parameters.values())

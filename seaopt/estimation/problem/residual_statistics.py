@@ -1,4 +1,4 @@
-"""The residuals of each experiment, and sums over them that tell how well it is explained."""
+"""The residuals of each experiment, and sums over them that show how well it is explained."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ class MisfitSums:
 
 @record(eq=False)
 class ResidualStatistics:
-    """What an experiment's residuals come to, in the memory of a chunk."""
+    """Sums over an experiment's residuals, made in the memory of a chunk."""
 
     outputs: tuple[str, ...]  # in the order of the arrays
     # sums of r_a(t) r_b(t - k), r what the loss makes of the weighted residuals
@@ -170,45 +170,32 @@ StatisticsByExperiment = Mapping[str, ResidualStatistics]
 
 
 def compute_statistics(problem: FitProblem, z: Vector) -> dict[str, ResidualStatistics]:
-    """Return what the residuals of every experiment come to, by its name."""
+    """Return the sums over the residuals of every experiment, by its name."""
     return {experiment.name: _compute_statistics(experiment, z) for experiment in problem.experiments}
 
 
-class _Sums:
-    """Collects sums over an experiment's residuals chunk by chunk; lives only inside `compute_statistics`."""
-
-    def __init__(self, experiment: FitExperiment) -> None:
-        ny, longest = len(experiment.sigma), experiment.longest
-        self.lags = int(min(max(32, 4 * np.sqrt(longest)), longest // 4))
-        # Chunks are of even lengths: transforms are of the longest.
-        self.chunk = -(-longest // max(round(longest / max(CACHED_SAMPLES, 4 * self.lags)), 1))
-        self.whole = LaggedSums(ny, self.lags + self.chunk, self.lags)  # of the last chunk's tail and a chunk
-        self.twice = LaggedSums(ny, self.lags, self.lags)  # of the tails, which `whole` counts twice
-        self.total, self.count = np.zeros(ny), np.zeros(ny)
-
-    def add(
-        self, slopes: Float[np.ndarray, "ny m"], used: Bool[np.ndarray, "ny m"] | None, tail: Float[np.ndarray, "ny t"]
-    ) -> Float[np.ndarray, "ny next"]:
-        """Add what the loss makes of a chunk of a segment, and return the tail that the next one takes."""
-        with_tail = np.concatenate([tail, slopes], axis=1)
-        self.whole.add(with_tail)
-        if tail.size:
-            self.twice.add(tail)
-        self.total += np.sum(slopes, axis=1)
-        self.count += slopes.shape[1] if used is None else np.count_nonzero(used, axis=1)
-        return with_tail[:, max(with_tail.shape[1] - self.lags, 0) :]
-
-
 def _compute_statistics(experiment: FitExperiment, z: Vector) -> ResidualStatistics:
-    names, sums = experiment.data.outputs, _Sums(experiment)
-    banded = bool(len(experiment.weights.sections))
-    misfits = np.zeros((2 + banded, len(names), 5))  # used, held out, in the band; see _sum_misfits
+    names, longest = experiment.data.outputs, experiment.longest
+    ny, banded = len(names), bool(len(experiment.weights.sections))
+    lags = int(min(max(32, 4 * np.sqrt(longest)), longest // 4))
+    # Chunks are of even lengths: transforms are of the longest.
+    length = -(-longest // max(round(longest / max(CACHED_SAMPLES, 4 * lags)), 1))
+    whole = LaggedSums(ny, lags + length, lags)  # of the last chunk's tail and a chunk
+    twice = LaggedSums(ny, lags, lags)  # of the tails, which `whole` counts twice
+    total, count = np.zeros(ny), np.zeros(ny)
+    misfits = np.zeros((2 + banded, ny, 5))  # used, held out, in the band; see _sum_misfits
     for segment in experiment.segments:
-        tail = np.zeros((len(names), 0))
-        added = np.zeros_like(misfits)
+        tail, added = np.zeros((ny, 0)), np.zeros_like(misfits)
         origins = [float(channel[np.argmax(np.isfinite(channel))]) for channel in segment.samples.y]
-        for chunk in _stream_residuals(experiment, segment, z, sums.chunk):
-            tail = sums.add(chunk.where_used(experiment.loss.slope(chunk.weighted)), chunk.used, tail)
+        for chunk in _stream_residuals(experiment, segment, z, length):
+            slopes = chunk.where_used(experiment.loss.slope(chunk.weighted))
+            with_tail = np.concatenate([tail, slopes], axis=1)
+            whole.add(with_tail)
+            if tail.size:
+                twice.add(tail)
+            tail = with_tail[:, max(with_tail.shape[1] - lags, 0) :]
+            total += np.sum(slopes, axis=1)
+            count += slopes.shape[1] if chunk.used is None else np.count_nonzero(chunk.used, axis=1)
             _add_misfits(added, experiment, segment, chunk, origins)
         if banded:  # each segment's filter settles at a level of its own
             added[2, :, 3] -= added[2, :, 2] ** 2 / np.maximum(added[2, :, 0], 1.0)
@@ -219,9 +206,9 @@ def _compute_statistics(experiment: FitExperiment, z: Vector) -> ResidualStatist
     )
     return ResidualStatistics(
         outputs=names,
-        correlation=sums.whole.sums() - sums.twice.sums(),
-        mean=sums.total / np.maximum(sums.count, 1.0),
-        count=sums.count,
+        correlation=whole.sums() - twice.sums(),
+        mean=total / np.maximum(count, 1.0),
+        count=count,
         used=used,
         held_out=held_out,
         in_band=in_band[0] if in_band else {},
@@ -238,16 +225,13 @@ def _add_misfits(
     """Add a chunk's sums to those of the samples used, of those held out, and of those used in the band."""
     kept = None if chunk.used is None else segment.mark_counted(0, chunk.rows).T
     for o, channel in enumerate(segment.samples.y):
-        measured = channel[chunk.rows] - origins[o]
-        if chunk.used is None or kept is None:
-            added[0, o] += _sum_misfits(None, measured, chunk.raw[o])
-        else:
+        measured, used = channel[chunk.rows] - origins[o], None if chunk.used is None else chunk.used[o]
+        added[0, o] += _sum_misfits(None if kept is None else kept[o], measured, chunk.raw[o])
+        if kept is not None:
             held_out = ~kept[o] & np.isfinite(measured) & segment.has_start
-            added[0, o] += _sum_misfits(kept[o], measured, chunk.raw[o])
             added[1, o] += _sum_misfits(held_out, measured, chunk.raw[o])
         if chunk.in_band is not None:
-            residual = chunk.weighted[o] * experiment.sigma[o]
-            added[2, o] += _sum_misfits(None if chunk.used is None else chunk.used[o], chunk.in_band[o], residual)
+            added[2, o] += _sum_misfits(used, chunk.in_band[o], chunk.weighted[o] * experiment.sigma[o])
 
 
 def _sum_misfits(

@@ -1,4 +1,4 @@
-"""What a fit says besides its parameters: of each output, of each experiment, and figures that follow from them."""
+"""The parts of a fit besides its parameters: findings, outputs, figures, and the unknowns of each experiment."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from seaopt.records import PlotAccessor, Worded, record
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-GUESS = "guess"  # kind of the finding that names what nobody knew
+GUESS = "guess"  # kind of the finding that names unverified values
 
 
 @record
 class FitFinding:
-    """One thing that whoever uses a fit should know."""
+    """A fault of a fit, or a remark, for its user."""
 
-    severity: Severity  # the fit is not to be used; look at it; for information
-    # for programs: "explained", "residual", "cause", "bound", "range", "samples", "held_out", "guess", "status"
+    severity: Severity  # error: do not use the fit; warning: look at it; note: for information
+    # for programs: "bound", "cause", "delay", "explained", "fixed", "guess", "held_out", "noise", "range", "residual",
+    # "samples"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
-    text: str  # what it is and what to do
-    # what the logs would have in place of what was fixed, of a "cause"
+    text: str  # with the remedy
+    # value and std of what a "cause" frees, by name
     preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
 
 
 def state_guesses(guessed: Sequence[str]) -> str:
-    """Return what verdicts say of the guesses that a result rests on; "" where there are none.
+    """Return the guesses that a result rests on, in words; "" where there are none.
 
     Examples
     --------
@@ -49,12 +50,12 @@ def order_findings(findings: Iterable[FitFinding]) -> tuple[FitFinding, ...]:
 
 
 def find_guesses(guessed: Sequence[str]) -> tuple[FitFinding, ...]:
-    """Return the finding that a fit has where some of what it was given are guesses: a warning, or none."""
+    """Return a warning that names the guesses, or nothing where there are none."""
     if not guessed:
         return ()
     text = (
-        "no interval covers them, and what is fitted is only as right as they are; measure each, give its value, and "
-        "take its name out of guessed = [...]"
+        "the stated uncertainties exclude these values, and an error in them biases the fit; measure each, give its "
+        "value, and take its name out of guessed = [...]"
     )
     return (FitFinding(severity="warning", kind=GUESS, where=state_guesses(guessed), text=text),)
 
@@ -145,9 +146,12 @@ class Nuisance:
 
     @property
     def fitted(self) -> dict[str, DerivedFigure]:
-        """What was estimated of delay and gains, as `delay_s` and `gain.F1`, with its standard deviation."""
-        values = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (gain, "-") for name, gain in self.gain.items()}
-        return {key: DerivedFigure(value=values[key][0], unit=values[key][1], std=std) for key, std in self.std.items()}
+        """The estimated delay and gains, `delay_s` and `gain.F1`, with standard deviations."""
+        values = {"delay_s": self.delay_s, **{f"gain.{name}": gain for name, gain in self.gain.items()}}
+        return {
+            key: DerivedFigure(value=values[key], unit="s" if key == "delay_s" else "-", std=std)
+            for key, std in self.std.items()
+        }
 
 
 @record(eq=False, repr=False)

@@ -1,4 +1,4 @@
-"""An experiment's own unknowns: as a fit found them, and those of another log under parameters that are known."""
+"""An experiment's own unknowns: those of a fit, and those of another log under known parameters."""
 
 from __future__ import annotations
 
@@ -26,9 +26,7 @@ def estimate_nuisance(
 
     The second result is the fit percent of each output in the band; None without one.
     """
-    values = experiment.plant.complete(experiment.apply_own(params))
-    fixed = ParameterSet(values.values()).fix()
-    problem = pose_problem((replace(experiment, parameters={}),), fixed, loss=Squares(), band_hz=band_hz)
+    problem = pose_problem((experiment,), params.fix(), loss=Squares(), band_hz=band_hz)
     solved = settle(problem, problem.evaluate(problem.unknowns.start), ITERATIONS, None)
     problem, z = solved.problem, solved.solution.z
     statistics = compute_statistics(problem, z)
@@ -42,11 +40,10 @@ def take_sensors(experiment: Experiment, fitted: Nuisance | None) -> Experiment:
     """Return an experiment with the delay and gains that a fit estimated on the same plant, where it states none."""
     if fitted is None or not fitted.std:
         return experiment
-    gains = {
-        name: fitted.gain[name] for name in experiment.outputs if f"gain.{name}" in fitted.std and name in fitted.gain
-    }
-    changed = replace(experiment, gain=gains | dict(experiment.gain))
-    return replace(changed, delay_s=fitted.delay_s) if "delay_s" in fitted.std and not experiment.delay_s else changed
+    gains = {name: gain for name, gain in fitted.gain.items() if f"gain.{name}" in fitted.std}
+    gains = {name: gain for name, gain in gains.items() if name in experiment.outputs}
+    delay = fitted.delay_s if "delay_s" in fitted.std and not experiment.delay_s else experiment.delay_s
+    return replace(experiment, gain={**gains, **experiment.gain}, delay_s=delay)
 
 
 def describe_nuisance(
@@ -56,26 +53,25 @@ def describe_nuisance(
     variance: Vector,
 ) -> Nuisance:
     """Return an experiment's own unknowns; offsets that the fit did not see are what is left over on average."""
-    slots, outputs, states = experiment.slots, experiment.data.outputs, experiment.data.plant.states
-    offset = {name: slot.at(z) for name, slot in zip(outputs, slots.offset, strict=True)}
+    data, slots, point = experiment.data, experiment.slots, experiment.point(z)
+    offset = dict(zip(data.outputs, point.offset.tolist(), strict=True))
     if statistics is not None and experiment.level_unseen:
         used = statistics[experiment.name].used
         offset = {name: level - used[name].bias for name, level in offset.items()}
-    free = {"delay_s": slots.delay} | {f"gain.{name}": s for name, s in zip(outputs, slots.gain, strict=True)}
+    free = {"delay_s": slots.delay, **{f"gain.{name}": s for name, s in zip(data.outputs, slots.gain, strict=True)}}
     return Nuisance(
-        delay_s=slots.delay.at(z),
-        gain={name: slot.at(z) for name, slot in zip(outputs, slots.gain, strict=True)},
+        delay_s=point.clock.delay_s,
+        gain=dict(zip(data.outputs, point.gain.tolist(), strict=True)),
         offset=offset,
-        drift={name: tuple(slot.at(z) for slot in row) for name, row in zip(outputs, slots.drift, strict=True)},
+        drift={name: tuple(row) for name, row in zip(data.outputs, point.drift.tolist(), strict=True)},
         initial_state=tuple(
-            {name: slot.at(z) for name, slot in zip(states, segment.initial, strict=True)}
-            for segment in experiment.segments
+            dict(zip(data.plant.states, segment.start(z).tolist(), strict=True)) for segment in experiment.segments
         ),
-        noise={name: slot.at(z) for name, slot in zip(states, slots.noise, strict=False)},
+        noise={name: slot.at(z) for name, slot in zip(data.plant.states, slots.noise, strict=False)},
         std={
             key: float(np.sqrt(max(variance[slot.index], 0.0))) for key, slot in free.items() if slot.index is not None
         },
-        substeps=experiment.count_steps(z),
-        plant=experiment.data.plant.name,
-        hold=experiment.data.hold,
+        substeps=point.substeps,
+        plant=data.plant.name,
+        hold=data.hold,
     )

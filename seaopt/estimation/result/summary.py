@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
@@ -25,7 +26,7 @@ from seaopt.estimation.result.covariance import (
     compute_white_meat,
     mark_unseen,
 )
-from seaopt.estimation.result.findings import DerivedFigure, OutputFit
+from seaopt.estimation.result.findings import DerivedFigure, OutputFit, find_energy
 from seaopt.estimation.result.fit_result import Fit, FitStatus, Minimum, Provenance
 from seaopt.estimation.result.identifiability import (
     Identifiability,
@@ -77,9 +78,10 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     )
     sizes = _take_sizes(problem)
     status, message = _find_status(solution, identifiability, evaluation.hessian, names, solved.step_error)
-    if status == "converged":
-        fitted, message = _mark_vague(fitted, sizes, identifiability, message)
-        status = "converged" if all(fitted[name].identified for name in names) else "not_identifiable"
+    vague = _find_vague(fitted, sizes, identifiability) if status == "converged" else {}
+    if vague:
+        status, fitted = "not_identifiable", _mark_unidentified(fitted, vague)
+        message = f"the logs hardly show {', '.join(vague.values())}: excite more, fix it, or give it a prior"
     outputs = describe_outputs(problem, z, statistics) if statistics is not None else {}
     if statistics is not None and not _explains_something(problem, outputs, statistics):
         status = "not_identifiable"
@@ -129,20 +131,12 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
 
 def _take_sizes(problem: FitProblem) -> ParameterSet:
     """Return the parameters at their starts; a speed that smooths friction at its plant's own, for it may be tiny."""
-    names = {problem.unknowns.names[i] for i in problem.find_smoothing()}
-    owns = {
-        name: parameter
-        for e in problem.experiments
-        for name, parameter in e.data.plant.parameters.items()
-        if name in names
-    }
-    return problem.params.with_parameters(
-        *(
-            replace(problem.params[name], value=parameter.value)
-            for name, parameter in owns.items()
-            if isinstance(parameter, Parameter)
-        )
-    )
+    names, sizes = {problem.unknowns.names[i] for i in problem.find_smoothing()}, problem.params
+    for experiment in problem.experiments:
+        for name, parameter in experiment.data.plant.parameters.items():
+            if name in names and isinstance(parameter, Parameter):
+                sizes = sizes.with_parameters(replace(sizes[name], value=parameter.value))
+    return sizes
 
 
 def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evaluation) -> list[str]:
@@ -153,10 +147,10 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
         if not parameter.free or start * parameter.value <= 0.0:
             continue
         ratio = parameter.value / start
-        times, way = (ratio, "above") if ratio > 1.0 else (start / parameter.value, "below")
-        # What is not told from zero is small by chance: no unit explains it.
-        told = parameter.std is None or parameter.std < abs(parameter.value) / TOLD_STDS
-        if times > ANOTHER_SIZE and (ratio > 1.0 or told):
+        times, way = (ratio, "above") if ratio > 1.0 else (1.0 / ratio, "below")
+        # What does not differ from zero is small by chance: no unit explains it.
+        differs = parameter.std is None or parameter.std < abs(parameter.value) / TOLD_STDS
+        if times > ANOTHER_SIZE and (ratio > 1.0 or differs):
             odd.append(
                 f"{name} = {parameter.value:.3g} is {format_number(times)} times {way} its start of {start:.3g}: "
                 "check the units of time, inputs and outputs"
@@ -212,36 +206,25 @@ def _compute_log_likelihood(problem: FitProblem, evaluation: Evaluation) -> floa
     return total
 
 
-def _mark_unidentified(fitted: ParameterSet, names: Sequence[str]) -> ParameterSet:
-    """Return the parameters with `names` marked as not identified."""
+def _mark_unidentified(fitted: ParameterSet, names: Iterable[str]) -> ParameterSet:
     return fitted.with_parameters(*(replace(fitted[name], identified=False) for name in names))
 
 
-def _mark_vague(
-    fitted: ParameterSet, params: ParameterSet, identifiability: Identifiability, message: str
-) -> tuple[ParameterSet, str]:
-    """Mark those parameters as not identified that are less certain than their size: the log hardly shows them.
+def _find_vague(fitted: ParameterSet, params: ParameterSet, identifiability: Identifiability) -> dict[str, str]:
+    """Return the free parameters that are less certain than their size, in words: the log hardly shows them.
 
     Of several that hardly have an effect but together, a std beyond the value is enough: another start ends elsewhere.
     """
-    together = {name for direction in identifiability.weak for name in _find_beyond(fitted, direction)}
-    vague = {
+    beyond = {name for name, p in fitted.items() if (p.std or 0.0) > abs(p.value)}
+    weak = (beyond.intersection(direction) for direction in identifiability.weak)
+    together = {name for names in weak if len(names) > 1 for name in names}
+    return {
         name: f"{name} = {p.value:.3g} ± {p.std:.2g}{unit_after(p.unit)}"
         for name, p in fitted.items()
         if p.free
         and p.std is not None
         and (name in together or p.std > VAGUE * max(abs(p.value), abs(params[name].value)))
     }
-    if not vague:
-        return fitted, message
-    message = f"the logs hardly show {', '.join(vague.values())}: excite more, fix it, or give it a prior"
-    return _mark_unidentified(fitted, tuple(vague)), message
-
-
-def _find_beyond(fitted: ParameterSet, direction: Mapping[str, float]) -> list[str]:
-    """Return the parameters of a direction whose stds are beyond their values; nothing of one alone."""
-    beyond = [name for name in direction if (fitted[name].std or 0.0) > abs(fitted[name].value)]
-    return beyond if len(beyond) > 1 else []
 
 
 def _find_status(
@@ -317,14 +300,14 @@ def describe_outputs(
 ) -> dict[str, dict[str, OutputFit]]:
     """Return how well each output is explained, on the samples used and on those held out."""
     simulated = compute_statistics(problem.with_each(predictor=None), z) if problem.predicts else statistics
-    outputs: dict[str, dict[str, OutputFit]] = {experiment.name: {} for experiment in problem.experiments}
-    for output in problem.outputs:
+
+    def describe(output: FitOutput) -> OutputFit:
         experiment, name = output.experiment, output.name
         sums, weighted = simulated[experiment.name], statistics[experiment.name]
         used, held_out = sums.used[name], sums.held_out[name]
         if experiment.level_unseen:
             used, held_out = used.shift(used.bias), held_out.shift(used.bias)
-        outputs[experiment.name][name] = OutputFit(
+        return OutputFit(
             fit_percent=used.fit_percent if used.fit_percent is not None else np.nan,
             holdout_fit_percent=held_out.fit_percent,
             band_fit_percent=weighted.in_band[name].fit_percent if weighted.in_band else None,
@@ -334,18 +317,18 @@ def describe_outputs(
             unit=output.unit,
             whiteness_p=weighted.whiteness(name),
         )
-    return outputs
+
+    return problem.map_outputs(describe)
 
 
 def _explains_something(
-    problem: FitProblem, outputs: dict[str, dict[str, OutputFit]], statistics: StatisticsByExperiment
+    problem: FitProblem, outputs: Mapping[str, Mapping[str, OutputFit]], statistics: StatisticsByExperiment
 ) -> bool:
     """Tell whether some output is explained better than by chance: N R^2 of its band is far above its mean, 1."""
     for output in problem.outputs:
         row = outputs[output.experiment.name][output.name]
         percents = (row.fit_percent, row.band_fit_percent, row.one_step_fit_percent)
-        best = max(percent for percent in percents if percent is not None)
-        gain = 1.0 - (1.0 - max(best, 0.0) / 100.0) ** 2
+        gain = find_energy(max(0.0, *(percent for percent in percents if percent is not None)))
         if gain > 0.5 or gain * statistics[output.experiment.name].count_of(output.name) > CHANCE_POWER:
             return True
     return False

@@ -49,11 +49,9 @@ def _search_further(solved: Solved, max_iterations: int, callback: Callback | No
         for delay in (*delays, *([evaluation.z[index] + shift] if shift else [])):
             z = evaluation.z.copy()
             z[index] = np.clip(delay, unknowns.low[index], unknowns.high[index])
-            there = problem.evaluate(z)
-            best = there if there.cost < best.cost else best
+            best = min(best, problem.evaluate(z), key=lambda each: each.cost)
         if best is not evaluation:
-            other = settle(problem, best, max_iterations, callback)
-            solved = other if other.misfit < solved.misfit else solved
+            solved = min(solved, settle(problem, best, max_iterations, callback), key=lambda each: each.misfit)
     return solved
 
 
@@ -67,7 +65,7 @@ def _find_best_shift(experiment: FitExperiment, z: Vector, low: float, high: flo
     for output in experiment.outputs:
         for measured, raw in zip(output.measured, residuals.raw_of(output.name), strict=True):
             model = measured + raw
-            whole = bool(np.all(np.isfinite(model) & np.isfinite(measured)))
+            whole = bool(np.all(np.isfinite(model)))
             for i, s in enumerate(shifts):
                 apart = model[max(-s, 0) : model.size - max(s, 0)] - measured[max(s, 0) : measured.size - max(-s, 0)]
                 apart = apart if whole else apart[np.isfinite(apart)]
@@ -84,8 +82,7 @@ def _search_cells(solved: Solved, max_iterations: int, callback: Callback | None
             continue
         if solved.solution.status != "converged":  # steps to and fro across the end of a cell
             inside = _settle_beside(solved, experiment, 0, max_iterations, callback)
-            if inside is not None and inside.solution.status == "converged":
-                solved = inside
+            solved = inside if inside is not None and inside.solution.status == "converged" else solved
         for way in (-1, 1):
             for _ in range(MOST_MOVES):
                 other = _settle_beside(solved, experiment, way, max_iterations, callback)

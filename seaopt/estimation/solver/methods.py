@@ -66,20 +66,20 @@ class OutputError(Method):
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle from the best start that can be found."""
         best, guesses = find_start(problem, self)
-        solved = settle(problem, best, self.max_iterations, callback) if np.isfinite(best.cost) else None
-        if solved is not None and self.search:
-            solved = _bring_back(solved, self, callback)
-        if solved is not None and not (self.search and (problem.seeks_play or _is_doubtful(solved, guesses))):
+        solved = settle(problem, best, self.max_iterations, callback)
+        if not self.search:
             return solved
-        for start in _further_starts(problem, best, guesses, self) if self.search else ():
+        solved = _bring_back(solved, self, callback)
+        if not problem.seeks_play and not _is_doubtful(solved, guesses):
+            return solved
+        for start in _further_starts(problem, best, guesses, self):
             evaluation = problem.evaluate(start)
-            if solved is not None and _is_hopeless(settle_roughly(problem, evaluation), solved):
-                continue
-            other = settle(problem, evaluation, self.max_iterations, callback)
-            solved = other if solved is None or other.misfit < solved.misfit else solved
-            if not _is_doubtful(solved, guesses):
-                break
-        return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
+            if not _is_hopeless(problem, evaluation, solved):
+                other = settle(problem, evaluation, self.max_iterations, callback)
+                solved = min(solved, other, key=lambda each: each.misfit)
+                if not _is_doubtful(solved, guesses):
+                    break
+        return solved
 
 
 @record
@@ -192,9 +192,9 @@ class PredictionError(Method):
         for start in (*([best.z] if np.isfinite(best.cost) else []), problem.unknowns.start):
             # A plant that already simulates well would be led away: held to the log, it may do without its input.
             z = best.z if follows and start is best.z else find_predicting_start(problem, start, self.max_iterations)
-            found = None if z is None else self._settle_predicting(problem, z, callback)
-            if found is not None and (solved is None or found.misfit < solved.misfit):
-                solved = found
+            other = None if z is None else self._settle_predicting(problem, z, callback)
+            if other is not None and (solved is None or other.misfit < solved.misfit):
+                solved = other
             if solved is not None and solved.solution.status == "converged":
                 break
         if self.search and (solved is None or _simulates_badly(solved)):
@@ -238,8 +238,7 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
             if problem.all_linear
             else find_predicting_start(problem, guesses[0], method.max_iterations)
         )
-        other = None if z is None else problem.evaluate(z)
-        best = other if other is not None and other.cost < best.cost else best
+        best = best if z is None else min(best, problem.evaluate(z), key=lambda each: each.cost)
     return best, guesses
 
 
@@ -249,7 +248,7 @@ def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> So
     So friction's fall over a speed that becomes tiny: nothing brings it back, and the others have taken its place.
     """
     problem, evaluation, shared = solved.problem, solved.solution.evaluation, solved.problem.unknowns.shared
-    if not np.all(np.isfinite(evaluation.hessian)):
+    if not np.isfinite(evaluation.cost) or not np.all(np.isfinite(evaluation.hessian)):
         return solved
     start, z = problem.unknowns.start[:shared], solved.solution.z[:shared]
     variances = np.diag(invert(evaluation.hessian)[0])[:shared]
@@ -260,23 +259,21 @@ def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> So
     again = solved.solution.z.copy()
     again[lost] = start[lost]
     other = settle(problem, problem.evaluate(again), method.max_iterations, callback)
-    return other if other.misfit < solved.misfit else solved
+    return min(solved, other, key=lambda each: each.misfit)
 
 
 def _explains_as_much(solved: Solved, other: Solved) -> bool:
     """Tell whether a minimum has converged and leaves about as much of the logs as another: both see noise alone."""
-    power = other.solution.evaluation.power.items()
-    left = solved.solution.evaluation.power
+    power, least = solved.solution.evaluation.power, other.solution.evaluation.power
     return solved.solution.status == "converged" and all(
-        np.all(left[name].rms ** 2 < ANOTHER_FIT * there.rms**2) for name, there in power
+        np.all(power[name].rms ** 2 < ANOTHER_FIT * least[name].rms ** 2) for name in least
     )
 
 
 def _simulates_badly(solved: Solved) -> bool:
     """Tell whether a minimum explains little in free run, whatever it predicts one sample ahead."""
     simulating = solved.problem.with_each(predictor=None)
-    power = simulating.evaluate(solved.solution.z).power
-    return explains_little(simulating, power)
+    return explains_little(simulating, simulating.evaluate(solved.solution.z).power)
 
 
 def _is_doubtful(solved: Solved, guesses: list[Vector]) -> bool:
@@ -289,18 +286,18 @@ def _is_doubtful(solved: Solved, guesses: list[Vector]) -> bool:
     return explains_little(solved.problem, evaluation.power)
 
 
-def _is_hopeless(rough: Solved, best: Solved) -> bool:
-    """Tell whether what came of a start explains little and no more than the best: most that has gone astray stays so.
+def _is_hopeless(problem: FitProblem, start: Evaluation, best: Solved) -> bool:
+    """Tell whether a start, settled roughly, explains little and no more than the best: most that go astray stay so.
 
     To find its minimum all the same takes the longest: where nothing is explained the search creeps, and simulations
     that run away ask for ever finer steps.
     """
+    if not np.isfinite(best.misfit):
+        return False
+    rough = settle_roughly(problem, start)
     evaluation = rough.solution.evaluation
-    return bool(
-        np.isfinite(evaluation.cost)
-        and rough.misfit >= best.misfit
-        and explains_little(rough.problem, evaluation.power)
-    )
+    astray = np.isfinite(evaluation.cost) and rough.misfit >= best.misfit
+    return bool(astray) and explains_little(rough.problem, evaluation.power)
 
 
 def _further_starts(problem: FitProblem, best: Evaluation, guesses: list[Vector], method: Method) -> Iterator[Vector]:

@@ -42,7 +42,7 @@ def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -
         if not np.isfinite(solution.evaluation.cost):
             return None
         last, z = z, solution.z
-        problem = problem.with_sigma(estimate_sigma(predicting, solution.evaluation.power, z))
+        problem = problem.with_values("sigma", estimate_sigma(predicting, solution.evaluation.power, z))
         if np.allclose(z, last, rtol=1e-3, atol=0.0):
             break
     return z

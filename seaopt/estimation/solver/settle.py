@@ -135,7 +135,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
     checks: Checks = {}
     rough, before = problem.straight and not explains_little(problem, evaluation.power), 0.0
     if rough:  # so good a start gives sigmas good enough to come near the minimum, and there they are estimated well
-        problem = problem.with_sigma(estimate_sigma(problem, evaluation.power, evaluation.z))
+        problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
         evaluation = problem.assemble(evaluation.passes)
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
@@ -155,7 +155,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
             return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
         sigma = estimate_sigma(problem, evaluation.power, evaluation.z)
         settled = all(np.allclose(sigma[e.name], e.sigma, rtol=5e-3) for e in problem.experiments)
-        before_refining = problem = problem.with_sigma(sigma)
+        before_refining = problem = problem.with_values("sigma", sigma)
         if problem.loss.quadratic:
             evaluation = problem.assemble(evaluation.passes, evaluation.z)  # other sigmas need no other passes
         elif not settled:
@@ -181,7 +181,7 @@ def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
     problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
     unknowns, solution = problem.unknowns, None
     for _ in range(ROUGH_ROUNDS):
-        problem = problem.with_sigma(estimate_sigma(problem, evaluation.power, evaluation.z))
+        problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
         solution = minimise(
             problem,
             problem.evaluate(evaluation.z),

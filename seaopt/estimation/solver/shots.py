@@ -60,7 +60,7 @@ def grow_shots(
             if not np.isfinite(evaluation.cost):
                 yield None
                 return
-            shots = shots.with_sigma(estimate_sigma(shots, evaluation.power, evaluation.z))
+            shots = shots.with_values("sigma", estimate_sigma(shots, evaluation.power, evaluation.z))
             evaluation = minimise(
                 shots,
                 shots.evaluate(evaluation.z),

@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError, require_seed
 from seaopt.estimation.problem.correlation import autocorrelation
-from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
@@ -172,18 +172,22 @@ def bootstrap(
     _check(fit, problem, draws, refit, block)
     residuals = minimum.residuals()
     rng = np.random.default_rng(require_seed(seed, EstimationError))
-    names = problem.unknowns.names[: problem.unknowns.shared]
-    lengths = {name: _choose_length(residual, block) for name, residual in residuals.items()}
+    names = problem.shared_names
+    blocks: dict[str, _Blocks] = {}
+    for name, residual in residuals.items():
+        pool, length = _make_pool(residual, problem, refit), _choose_length(residual, block)
+        starts = rng.integers(0, len(pool), size=(draws, -(-len(residual.raw) // length)))
+        blocks[name] = _Blocks(pool=pool, length=length, starts=starts)
     if refit:
-        values = _draw_refits(minimum, residuals, lengths, draws, rng, executor)
+        values = _draw_refits(minimum, residuals, blocks, draws, rng, executor)
     else:
-        values = _draw_steps(minimum, residuals, lengths, draws, rng)
+        values = _draw_steps(minimum, blocks, draws, rng)
     return Bootstrap(
         names=names,
         units=tuple(fit.parameters[name].unit for name in names),
         estimates=minimum.z[: len(names)],
         draws=values,
-        blocks=lengths,
+        blocks={name: each.length for name, each in blocks.items()},
         refit=refit,
         reference=fit.covariance,
     )
@@ -203,15 +207,13 @@ def _check(fit: Fit, problem: FitProblem, draws: int, refit: bool, block: int | 
 
 
 def _choose_length(residuals: ExperimentResiduals, block: int | None) -> int:
-    rows = _find_used_rows(residuals)
-    used = [segment.weighted[r] for segment, r in zip(residuals.segments, rows, strict=True)]
-    length = estimate_block_length(np.concatenate(used))
-    return min(block or length, max(sum(int(np.sum(r)) for r in rows) // 2, 1))
+    used = residuals.weighted[_find_used_rows(residuals)]
+    return min(block or estimate_block_length(used), max(len(used) // 2, 1))
 
 
-def _find_used_rows(residuals: ExperimentResiduals) -> list[Bool[np.ndarray, "..."]]:
-    """Return which samples of each segment counted in some output."""
-    return [np.any(segment.weighted != 0.0, axis=1) for segment in residuals.segments]
+def _find_used_rows(residuals: ExperimentResiduals) -> Bool[np.ndarray, " n"]:
+    """Return which samples counted in some output."""
+    return np.any(residuals.weighted != 0.0, axis=1)
 
 
 def estimate_block_length(residual: Float[np.ndarray, "n ny"]) -> int:
@@ -234,9 +236,13 @@ def estimate_block_length(residual: Float[np.ndarray, "n ny"]) -> int:
     return int(min(np.ceil(longest), max(most, 1)))
 
 
-def _make_pool(values: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "m ny"]:
-    """Return residuals to draw from: without their mean, and without what is missing, which is made up for in size."""
-    whole = np.concatenate(values)
+def _make_pool(residuals: ExperimentResiduals, problem: FitProblem, raw: bool) -> Float[np.ndarray, "m ny"]:
+    """Return residuals to draw from: raw, or what the loss makes of the weighted ones.
+
+    They are without their mean, and without missing samples, which are made up for in size.
+    """
+    used = _find_used_rows(residuals)
+    whole = residuals.raw[used] if raw else problem.loss.slope(residuals.weighted[used])
     present = np.isfinite(whole) & (whole != 0.0)
     share = np.maximum(np.mean(present, axis=0), 1e-300)
     mean = np.sum(np.where(present, whole, 0.0), axis=0) / np.maximum(np.sum(present, axis=0), 1)
@@ -245,7 +251,7 @@ def _make_pool(values: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "m 
 
 @record(eq=False)
 class _Blocks:
-    """What an experiment's draws are made of: residuals to draw from, the length of blocks, and where they start."""
+    """The draws of an experiment: residuals to draw from, the length of blocks, and where they start."""
 
     pool: Float[np.ndarray, "m ny"]
     length: int
@@ -256,43 +262,14 @@ class _Blocks:
         return self.pool[(self.starts[d][rows // self.length] + rows % self.length) % len(self.pool)]
 
 
-def _draw_blocks(
-    problem: FitProblem,
-    lengths: Mapping[str, int],
-    pools: Mapping[str, Float[np.ndarray, "_ ny"]],
-    draws: int,
-    rng: np.random.Generator,
-) -> dict[str, _Blocks]:
-    """Return the blocks of each experiment."""
-    blocks: dict[str, _Blocks] = {}
-    for experiment in problem.experiments:
-        pool, length = pools[experiment.name], lengths[experiment.name]
-        total = sum(segment.samples.n for segment in experiment.segments)
-        starts = rng.integers(0, len(pool), size=(draws, -(-total // length)))
-        blocks[experiment.name] = _Blocks(pool=pool, length=length, starts=starts)
-    return blocks
-
-
 def _draw_steps(
-    minimum: Minimum, residuals: ResidualsByExperiment, lengths: Mapping[str, int], draws: int, rng: np.random.Generator
+    minimum: Minimum, blocks: Mapping[str, _Blocks], draws: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "draws p"]:
     """Return one Gauss-Newton step per draw."""
     problem, z = minimum.problem, minimum.z
     p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-1.0
-    hessian = problem.evaluate(z).hessian
-    if not problem.loss.quadratic:
-        hessian = compute_bread(problem, z)
+    hessian = problem.evaluate(z).hessian if problem.loss.quadratic else compute_bread(problem, z)
     inverse = invert(hessian)[0][:, :p]
-    pools = {
-        name: _make_pool(
-            [
-                problem.loss.slope(s.weighted)[r]
-                for s, r in zip(residual.segments, _find_used_rows(residual), strict=True)
-            ]
-        )
-        for name, residual in residuals.items()
-    }
-    blocks = _draw_blocks(problem, lengths, pools, draws, rng)
     moved = (rng.normal(size=(draws, z.size)) * prior) @ inverse
     for experiment in problem.experiments:
         first = 0
@@ -310,7 +287,7 @@ def _draw_steps(
 def _draw_refits(
     minimum: Minimum,
     residuals: ResidualsByExperiment,
-    lengths: Mapping[str, int],
+    blocks: Mapping[str, _Blocks],
     draws: int,
     rng: np.random.Generator,
     executor: Executor | None,
@@ -318,11 +295,7 @@ def _draw_refits(
     """Return one fit per draw, of the model's outputs with the drawn residuals, from the minimum."""
     problem, z = minimum.problem, minimum.z
     unknowns, p = problem.unknowns, problem.unknowns.shared
-    pools = {
-        name: _make_pool([s.raw[used] for s, used in zip(residual.segments, _find_used_rows(residual), strict=True)])
-        for name, residual in residuals.items()
-    }
-    blocks = _draw_blocks(problem, lengths, pools, draws, rng)
+    prior_std = np.where(np.isfinite(unknowns.prior_std), unknowns.prior_std, 0.0)
 
     def make_trials() -> Iterator[tuple[FitProblem, Vector]]:
         for d in range(draws):
@@ -330,14 +303,14 @@ def _draw_refits(
                 _with_drawn(experiment, residuals[experiment.name], blocks[experiment.name], d)
                 for experiment in problem.experiments
             )
-            shift = np.where(np.isfinite(unknowns.prior_std), unknowns.prior_std, 0.0) * rng.normal(size=z.size)
-            yield replace(problem, experiments=experiments, unknowns=replace(unknowns, start=z + shift)), z
+            start = z + prior_std * rng.normal(size=z.size)
+            yield replace(problem, experiments=experiments, unknowns=replace(unknowns, start=start)), z
 
     values: list[ParameterVector] = []
-    for d, (cost, found) in enumerate(map_ordered(_refit, make_trials(), executor)):
+    for d, (cost, best) in enumerate(map_ordered(_refit, make_trials(), executor)):
         if not np.isfinite(cost):
             raise EstimationError(f"bootstrap: draw {d} overflows the simulation; use refit = False")
-        values.append(found[:p])
+        values.append(best[:p])
     return np.array(values)
 
 
@@ -350,12 +323,11 @@ def _refit(trial: tuple[FitProblem, Vector]) -> tuple[float, Vector]:
 
 def _with_drawn(experiment: FitExperiment, residuals: ExperimentResiduals, blocks: _Blocks, d: int) -> FitExperiment:
     """Return the experiment as if the model's outputs with the residuals of a draw had been measured."""
-    total = sum(segment.samples.n for segment in experiment.segments)
-    drawn, first, segments = blocks.draw(d, np.arange(total)), 0, []
+    first, segments = 0, list[FitSegment]()
     for segment, row in zip(experiment.segments, residuals.segments, strict=True):
-        samples = segment.samples
-        y = np.column_stack(samples.y) + row.raw - drawn[first : first + samples.n]
+        rows = np.arange(first, first + segment.samples.n)
+        y = np.column_stack(segment.samples.y) + row.raw - blocks.draw(d, rows)
         measured = tuple(np.ascontiguousarray(column) for column in y.T)
-        segments.append(replace(segment, samples=replace(samples, y=measured)))
-        first += samples.n
+        segments.append(replace(segment, samples=replace(segment.samples, y=measured)))
+        first += rows.size
     return replace(experiment, segments=tuple(segments))

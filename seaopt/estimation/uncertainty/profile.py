@@ -40,7 +40,7 @@ CURVE_MARGIN = 0.15  # of the interval, that the curve shows on either side
 
 @record(eq=False, repr=False)
 class Profile:
-    """What `profile` returns; ``print(profile)`` is a summary.
+    """The profile of one parameter; ``print(profile)`` is a summary.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
 
     """
     minimum = fit.require_minimum("profile")
-    names = minimum.problem.unknowns.names[: minimum.problem.unknowns.shared]
+    names = minimum.problem.shared_names
     if name not in names:
         raise EstimationError(f'profile: "{name}" is not a free parameter of the plants; {suggestion(name, names)}')
     if not 0.0 < level < 1.0:

@@ -331,7 +331,7 @@ def test_bad_settings(options, words):
 def test_what_cannot_be_told_is_said():
     with pytest.raises(EstimationError, match="no parameter is free"):
         design(LAG, GUESS)
-    with pytest.raises(EstimationError, match="J is free, but lag has none"):
+    with pytest.raises(EstimationError, match="J is free, but no plant"):
         design(LAG, so.ParameterSet([*GUESS.values(), *so.plants.thor().free("J").subset(["J"]).values()]))
     product = so.Plant(
         name="product", states={"z": "N"}, inputs={"u": "A"}, outputs={"y": "N"}, parameters={"a": "-", "b": "-"},

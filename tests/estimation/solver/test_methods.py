@@ -16,7 +16,7 @@ from scipy.signal import cont2discrete, lfilter
 import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
-from seaopt.estimation.fit import check_choices, complete_parameters
+from seaopt.estimation.fit import check_choices
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.steady_state_filter import kalman_gain
@@ -305,7 +305,7 @@ def test_what_is_linear_is_eliminated_exactly(stand, thor):
     shifted = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + 30, F2=log["F2"] - 5)
     bench = experiment(stand, shifted, drift=2)
     free = thor.update(J=2e-6).free("J", "b_r")
-    problem = pose_problem((bench,), complete_parameters((bench,), free), loss=Squares())
+    problem = pose_problem((bench,), free, loss=Squares())
     unknowns, (one,) = problem.unknowns, problem.experiments
     (segment,) = one.segments
     found = problem.evaluate(unknowns.start)
@@ -331,7 +331,7 @@ def test_the_step_error_is_that_of_the_parameters(swing, thor):
     truth = thor.update(f_c=40.0, v_s=1e-3, d=0.1)
     bench = experiment(swing, noisy(swing, truth), offset=False, initial_state="rest", sigma={"F1": 2.0, "F2": 2.0})
     free = truth.free("J", "f_c")
-    problem = pose_problem((bench,), complete_parameters((bench,), free), loss=Squares())
+    problem = pose_problem((bench,), free, loss=Squares())
     unknowns = problem.unknowns
     from seaopt.estimation.solver.least_squares import minimise
 
@@ -550,7 +550,7 @@ def test_experiments_of_one_name_are_refused(stand, short_log, thor):
     """They are looked up by it; `fit` names them apart."""
     benches = (experiment(stand, short_log),) * 2
     with pytest.raises(EstimationError, match="name of its own"):
-        pose_problem(benches, complete_parameters(benches, thor.free("J")), loss=Squares())
+        pose_problem(benches, thor.free("J"), loss=Squares())
 
 
 @pytest.mark.parametrize("loss", [so.Huber, so.SoftL1])
