@@ -1,1 +1,1 @@
-"""What a fit says of itself: diagnostics, score tests of fixed parameters, comparison and ranking of models."""
+"""Advice on fits: diagnostics, score tests of fixed parameters, comparison and ranking of models."""

@@ -21,10 +21,10 @@ word: the preferred fit must not predict them worse, in free run, than one it be
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -91,7 +91,7 @@ _HEAD = ("", "effective BIC", "BIC", "AIC", "unknowns", "free run (held out) [%]
 
 @record(eq=False, repr=False)
 class Ranking:
-    """What `compare` returns; ``print(ranking)`` is a report.
+    """Fits ranked by how well they explain the same logs; ``print(ranking)`` is a report.
 
     Parameters
     ----------
@@ -223,11 +223,11 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
         )
         for name in order
     )
-    octaves = [
+    octaves = (
         _compute_octaves(places, {name: residuals[name] for name in order})
         for places in zip(*(problems[name].outputs for name in order), strict=True)
-    ]
-    bands = tuple(octave for row in octaves for octave in row)
+    )
+    bands = tuple(chain.from_iterable(octaves))
     evidence = _weigh_evidence(rows)
     return Ranking(
         rows=rows,
@@ -246,11 +246,11 @@ def _name_apart(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
     if isinstance(fits, Fit):
         raise EstimationError("compare takes two fits or more; put them in brackets, [one, other]")
     named: dict[str, Fit] = {}
-    for chosen, fit in fits.items() if isinstance(fits, Mapping) else ((None, fit) for fit in fits):
+    for label, fit in fits.items() if isinstance(fits, Mapping) else ((None, fit) for fit in fits):
         if not isinstance(fit, Fit):
             raise EstimationError(f"compare got a {type(fit).__name__}; give results of fit")
-        plants = dict.fromkeys(experiment.plant.name for experiment in fit.experiments)
-        label = chosen if chosen is not None else " + ".join(plants) or "fit"
+        if label is None:
+            label = " + ".join(dict.fromkeys(experiment.plant.name for experiment in fit.experiments)) or "fit"
         name, number = label, 1
         while name in named:
             number += 1
@@ -261,40 +261,38 @@ def _name_apart(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
     return named
 
 
-def _check(problems: dict[str, FitProblem]) -> None:
+def _check(problems: Mapping[str, FitProblem]) -> None:
     """Refuse fits to data that are not the same: their likelihoods are not of the same thing."""
     (first, reference), *further = problems.items()
     for name, other in further:
-        what = _find_difference(reference, other)
-        if what:
+        difference = next(_find_differences(reference, other), None)
+        if difference:
             raise EstimationError(
-                f'compare: "{name}" and "{first}" differ in {what}, and likelihoods of other data cannot be compared; '
-                "fit both to the same experiments with the same holdout, band_hz and loss"
+                f'compare: "{name}" and "{first}" differ in {difference}, and likelihoods of other data cannot be '
+                "compared; fit both to the same experiments with the same holdout, band_hz and loss"
             )
 
 
-def _find_difference(first: FitProblem, other: FitProblem) -> str:
-    """Return what differs in the data of two problems; empty if nothing does."""
-    names, other_names = [e.name for e in first.experiments], [e.name for e in other.experiments]
-    if names != other_names:
-        return f"their experiments ({', '.join(names)}; {', '.join(other_names)})"
-    if first.band_hz != other.band_hz:
-        return f"band_hz ({first.band_hz}; {other.band_hz})"
-    if first.loss != other.loss:
-        return f"their loss ({first.loss}; {other.loss})"
-    if first.holdout != other.holdout:
-        return f"holdout ({first.holdout:g}; {other.holdout:g})"
+def _find_differences(first: FitProblem, other: FitProblem) -> Iterator[str]:
+    """Yield what differs in the data of two problems."""
+    a_names, b_names = (", ".join(e.name for e in problem.experiments) for problem in (first, other))
+    settings: dict[str, tuple[Any, Any]] = {
+        "their experiments": (a_names, b_names),
+        "band_hz": (first.band_hz, other.band_hz),
+        "their loss": (first.loss, other.loss),
+        "holdout": (first.holdout, other.holdout),
+    }
+    yield from (f"{what} ({a}; {b})" for what, (a, b) in settings.items() if a != b)
     for a, b in zip((e.data for e in first.experiments), (e.data for e in other.experiments), strict=True):
         if a.outputs != b.outputs:
-            return f"the outputs of {a.name} ({', '.join(a.outputs)}; {', '.join(b.outputs)})"
+            yield f"the outputs of {a.name} ({', '.join(a.outputs)}; {', '.join(b.outputs)})"
         channels = [*a.outputs, *(u for u in a.plant.inputs if u in a.log.signals and u in b.plant.inputs)]
         same = a.log is b.log or (
             np.array_equal(a.log.time, b.log.time)
             and all(name in b.log.signals and np.array_equal(a.log[name], b.log[name], True) for name in channels)
         )
         if not same:
-            return f"the log of {a.name}"
-    return ""
+            yield f"the log of {a.name}"
 
 
 def _count_effective(output: FitOutput, residuals: ResidualsByExperiment) -> float:
@@ -336,35 +334,31 @@ def _compute_octaves(places: Sequence[FitOutput], residuals: Mapping[str, Residu
 
     `places` is the output in each fit's own problem.
     """
-    output, period = places[0], places[0].experiment.period
-    signals = {
-        name: np.concatenate(residual[fitted.experiment.name].weighted_of(fitted.name)) * fitted.sigma
-        for fitted, (name, residual) in zip(places, residuals.items(), strict=True)
-    }
-    counts = {name: max(int(np.count_nonzero(r)), 1) for name, r in signals.items()}
-    lowest = LOWEST_LINES / (max(counts.values()) * period)
+    output, period, most = places[0], places[0].experiment.period, 1
+    spectra: dict[str, tuple[Any, Any]] = {}
+    for fitted, (name, residual) in zip(places, residuals.items(), strict=True):
+        r = np.concatenate(residual[fitted.experiment.name].weighted_of(fitted.name)) * fitted.sigma
+        count = max(int(np.count_nonzero(r)), 1)
+        spectra[name], most = _compute_spectrum(r, count, period), max(most, count)
     edges = [0.5 / period]
-    while len(edges) <= OCTAVES and edges[-1] / 2.0 > lowest:
+    while len(edges) <= OCTAVES and edges[-1] / 2.0 > LOWEST_LINES / (most * period):
         edges.append(edges[-1] / 2.0)
     edges[-1] = 0.0
-    rows: list[OctavePower] = []
-    spectra = {name: _compute_spectrum(r, counts[name], period) for name, r in signals.items()}
-    for high, low in pairwise(edges):
-        power = {
-            name: float(np.sum(density[(f > low if low else f >= 0.0) & (f <= high)]))
-            for name, (f, density) in spectra.items()
-        }
-        rows.append(
-            OctavePower(
-                experiment=output.experiment.name,
-                output=output.name,
-                unit=output.unit,
-                low_hz=low,
-                high_hz=high,
-                power=power,
-            )
+    octaves = [
+        OctavePower(
+            experiment=output.experiment.name,
+            output=output.name,
+            unit=output.unit,
+            low_hz=low,
+            high_hz=high,
+            power={
+                name: float(np.sum(density[(f <= high) & ((f > low) | (low == 0.0))]))
+                for name, (f, density) in spectra.items()
+            },
         )
-    return rows[::-1]
+        for high, low in pairwise(edges)
+    ]
+    return octaves[::-1]
 
 
 def _compute_spectrum(r: Signal, count: int, period: float) -> tuple[Any, Any]:
@@ -396,15 +390,13 @@ def _explain(
     counted = f"BIC differs by {margin:.3g} with the effective number of samples, {whole:+.3g} with all"
     objections = [row.name for row in rows[1:] if _contradicts(row)]
     if objections:
-        sentences = [
-            f"undecided: the likelihood prefers {first.name} ({counted}), held-out samples {', '.join(objections)}"
-        ]
+        rivals = ", ".join(objections)
+        verdict = f"undecided: the likelihood prefers {first.name} ({counted}), held-out samples {rivals}"
     elif evidence == "undecided":
-        sentences = [
-            f"undecided between {first.name} and {second.name}: {counted}; excite or measure where they differ"
-        ]
+        verdict = f"undecided between {first.name} and {second.name}: {counted}; excite or measure where they differ"
     else:
-        sentences = [f"{first.name} is preferred, with {evidence} evidence against {second.name}: {counted}"]
+        verdict = f"{first.name} is preferred, with {evidence} evidence against {second.name}: {counted}"
+    sentences = [verdict]
     if first.held_out_ratio is None:
         sentences.append("no samples were held out: fit with holdout=0.2 to see whether the best repeats")
     sentences += [

@@ -46,7 +46,7 @@ from seaopt.units import unit_after
 
 SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
 LARGE = 0.05  # of an output's rms: a residual that is worth words for its colour alone
-LITTLE = 0.01  # share of what is known
+LITTLE = 0.01  # share of the information
 
 
 @record(eq=False)
@@ -65,7 +65,7 @@ class OutputDiagnostics:
 
 @record(eq=False, repr=False)
 class Diagnostics:
-    """What `diagnose` returns; ``print(diagnostics)`` is a report.
+    """Tests of a fit; ``print(diagnostics)`` is a report.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def diagnose(fit: Fit) -> Diagnostics:
     ...                   sensors=Sensors(noise_std={"F1": 2.0}))
     >>> late = so.Log.from_arrays(time=log.time[:-2], I=log["I"][2:], F1=log["F1"][:-2])
     >>> fit = so.fit([so.Experiment(plant=plant, log=late, name="late")], truth.free("J", "b_r"))
-    >>> cause = next(one for one in diagnose(fit).findings if one.kind == "cause")
+    >>> cause = next(finding for finding in diagnose(fit).findings if finding.kind == "cause")
     >>> print(cause.text)
     likely cause: a delay of 5... ms; give delay_s, or free it ...
     >>> value, std = cause.preferred["late.delay_s"]

@@ -1,4 +1,4 @@
-"""How well a fit predicts: in free run and one sample ahead, over the samples used and over those held out.
+"""The predictions of a fit: in free run and one sample ahead, over the samples used and over those held out.
 
 The prediction one sample ahead is a steady-state Kalman filter's (see `steady_state_filter`). A fit of errors of
 prediction has one; for any other the plant stays as fitted, and the process noise is the multiple of the states' size

@@ -1,1 +1,1 @@
-"""What to measure: excitations that tell most of the free parameters within limits."""
+"""Design of experiments: excitations that identify the free parameters best within limits."""

@@ -68,7 +68,7 @@ class Comparison:
 
 @record(eq=False, repr=False)
 class Design:
-    """What `design_experiment` returns; ``print(design)`` is a summary.
+    """An excitation and the standard deviations to expect of it; ``print(design)`` is a summary.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ from seaopt.simulation import Clock, Model, Pass, run_passes
 
 @record(eq=False)
 class Trial:
-    """What a simulated log identifies and what it takes."""
+    """A simulated log: the covariance to expect, and its size."""
 
     covariance: ParameterMatrix  # expected of the free parameters; infinite where they cannot be identified
     rms: float  # of the input

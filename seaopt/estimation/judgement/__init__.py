@@ -1,1 +1,1 @@
-"""What is wrong with a fit: findings, and which of them forbid to use it."""
+"""The judgement of a fit: its findings, and which of them forbid its use."""

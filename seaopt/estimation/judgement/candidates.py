@@ -140,7 +140,7 @@ def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
 
     def are_alike(test: ScoreTest, first: ScoreTest) -> bool:
         pairs = ((test.fall, first.fall), (test.chi2, first.chi2))
-        return all(abs(one - other) < SAME_EFFECT * other for one, other in pairs)
+        return all(abs(value - reference) < SAME_EFFECT * reference for value, reference in pairs)
 
     groups: list[list[str]] = []
     for name, test in tests.items():
@@ -229,13 +229,13 @@ def _grow_with_load(plant: Plant) -> Plant | None:
 def _free_delays(problem: FitProblem, params: ParameterSet) -> Iterator[Candidate]:
     """Yield a delay of the inputs, and one for each output; negative where signals can be shifted."""
     experiments = [e.data for e in problem.experiments]
-    given = [e.slots.delay.value for e in problem.experiments]
+    stated = [e.slots.delay.value for e in problem.experiments]
     if any(e.slots.delay.index is not None for e in problem.experiments):
         return
     leads = [LEAD if len(e.log_segments) == 1 and len(e.log) > 4 * LEAD else 0 for e in experiments]
     shifts = [lead * e.log.period for e, lead in zip(experiments, leads, strict=True)]
     names = tuple(f"{e.name}.delay_s" for e in experiments)
-    trials = list(zip(experiments, names, shifts, given, strict=True))
+    trials = list(zip(experiments, names, shifts, stated, strict=True))
     shifted = tuple(
         free_delay(_lead(e, lead), value + shift) for (e, _, shift, value), lead in zip(trials, leads, strict=True)
     )

@@ -267,14 +267,14 @@ def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:
         }
         best = min(fitted, key=lambda name: fitted[name][0].std, default="")
         for name, (delay, period) in fitted.items():
-            known = fitted[best][0]
-            if abs(delay.value - known.value) > max(APART_STDS * math.hypot(delay.std, known.std), APART * period):
+            other = fitted[best][0]
+            if abs(delay.value - other.value) > max(APART_STDS * math.hypot(delay.std, other.std), APART * period):
                 yield FitFinding(
                     severity="warning",
                     kind="delay",
                     where=f"{name}.delay_s",
                     text=f"a delay of {1e3 * delay.value:.4g} ± {1e3 * delay.std:.2g} ms contradicts that of "
-                    f"{best}, {1e3 * known.value:.4g} ± {1e3 * known.std:.2g} ms: a delay makes up for what the model "
+                    f"{best}, {1e3 * other.value:.4g} ± {1e3 * other.std:.2g} ms: a delay makes up for what the model "
                     "lacks in one of them, or they were recorded apart; look at both, or give delay_s",
                 )
 

@@ -1,4 +1,4 @@
-"""What a residual costs: its square, or less where it may be an outlier."""
+"""The cost of a residual: its square, or less where it may be an outlier."""
 
 from __future__ import annotations
 

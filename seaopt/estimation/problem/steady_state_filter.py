@@ -33,7 +33,7 @@ NEIGHBOUR = 1e-6  # relative step of the differences
 
 @record(eq=False)
 class SteadyStateFilter:
-    """What the gain of one experiment's filter follows from, besides parameters and noise."""
+    """The settings from which one experiment's filter gain follows, besides parameters and noise."""
 
     size: Float[np.ndarray, " nx"]  # size of each state; its process noise over one sample is exp(noise) times that
     sensors: PerOutput  # standard deviation of the measurement noise, in output units

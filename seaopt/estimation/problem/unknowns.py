@@ -71,6 +71,12 @@ class Unknowns:
         """The priors' information on each unknown: 1/std^2, zero where there is none."""
         return self.prior_std**-2.0
 
+    def bound(self, places: Any, low: Any, high: Any) -> Unknowns:
+        """Return the unknowns with other bounds at some places."""
+        lows, highs = self.low.copy(), self.high.copy()
+        lows[places], highs[places] = low, high
+        return replace(self, low=lows, high=highs)
+
     def find_at_bound(self, z: Vector) -> tuple[str, ...]:
         """Return the names of those that lie on a bound, to rounding."""
         width = 1e-9 * np.maximum(np.abs(z), 1e-300)
@@ -229,13 +235,13 @@ def _add_initial(
     Friction that sticks soon stops a joint whatever its speed was: where nothing else tells it, it started at rest.
     """
     plant, initial = experiment.plant, experiment.initial_state
-    known = fill_vector("state", plant.states, dict(initial) if isinstance(initial, Mapping) else None)
+    initial_values = fill_vector("state", plant.states, dict(initial) if isinstance(initial, Mapping) else None)
     starts = {rows.start for rows in experiment.log_segments}
     stopped = _scale_stopped_speeds(builder, experiment, model)
     initial_slots: list[tuple[Slot, ...]] = []
     for number, rows in enumerate(experiment.segment_rows):
         if forgotten or (initial != "estimate" and rows.start in starts):
-            initial_slots.append(tuple(Slot(value=float(v)) for v in known))
+            initial_slots.append(tuple(Slot(value=float(v)) for v in initial_values))
             continue
         label = f"{experiment.name}.initial{number + 1 if number else ''}"
         scales = stopped if rows.start in starts else {}  # a shot within a segment starts in the middle of a motion

@@ -67,7 +67,7 @@ def find_energy(fit_percent: float) -> float:
 
 @record
 class OutputFit:
-    """How well one output of one experiment is explained.
+    """Scores of one output of one experiment.
 
     Parameters
     ----------

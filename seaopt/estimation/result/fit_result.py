@@ -1,4 +1,4 @@
-"""The result of a fit: parameters with their uncertainty, what the data cannot tell, and how well it went."""
+"""The result of a fit: parameters with their uncertainty, what the data cannot identify, and a verdict."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class Minimum:
 
 @record
 class Provenance:
-    """What of a fit is of the clock: seconds from call to result."""
+    """The figures of a fit that differ from run to run: seconds from call to result."""
 
     wall_s: float
 
 
 @record(eq=False, repr=False)
 class Fit(Result, Worded):
-    """What `fit` returns; ``print(fit)`` is a report.
+    """The result of a fit; ``print(fit)`` is a report.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Fit(Result, Worded):
     iterations, samples : int
         Least-squares iterations; samples that counted, all outputs together.
     provenance : Provenance
-        What is of the clock and the machine, `wall_s`.
+        Figures that differ from run to run, `wall_s`.
     step_error_sigma, step_error_parameter : float
         Largest integration error in an output, in sigma, and in a parameter, in its standard deviations; zero for
         linear plants, which are discretised exactly.
@@ -90,9 +90,9 @@ class Fit(Result, Worded):
     method : str
         "output_error", "multiple_shooting" or "prediction_error".
     findings : tuple of FitFinding
-        What is wrong with it, errors first; empty without diagnostics.
+        Faults and remarks, errors first; empty without diagnostics.
     notes : tuple of str
-        What was done to the logs, and which samples had no weight, one sentence each.
+        Changes to the logs, and samples without weight, one sentence each.
     experiments : tuple of Experiment
         The data; empty when read from a file.
     minimum : Minimum or None
@@ -150,12 +150,12 @@ class Fit(Result, Worded):
 
     @property
     def guesses(self) -> str:
-        """What to say of the guesses that it rests on, "on 2 guesses: N_p, l"; empty where there are none."""
+        """The guesses that it rests on, in words: "on 2 guesses: N_p, l"; empty where there are none."""
         return next((finding.where for finding in self.findings if finding.kind == GUESS), "")
 
     @property
     def verdict(self) -> str:
-        """What to say of it in one line."""
+        """The result in one line."""
         if self.met:
             return f"{self.status} ({self.message})" + (f", {self.guesses}" if self.guesses else "")
         if self.status != "converged":
@@ -166,7 +166,7 @@ class Fit(Result, Worded):
 
     @property
     def caveat(self) -> str:
-        """What to say beside the standard deviations of a fit that is not met; empty of one that is."""
+        """A warning beside the standard deviations of a fit that is not met; empty for one that is."""
         if self.met:
             return ""
         return "standard deviations and intervals hold only if the model is right, and this fit is not met"

@@ -1,4 +1,4 @@
-r"""What the data tell of the parameters, and what they cannot: rank, condition, and the unseen directions in words.
+r"""Identifiability: rank, condition, and the directions of the parameters that the data do not show, in words.
 
 The Hessian of the parameters, everything else an experiment has of its own eliminated, is scaled to a unit diagonal. An
 eigenvalue that is zero to rounding is a direction in which the parameters can change together without any effect on
@@ -32,7 +32,7 @@ RICH = 600  # samples of made-up input
 
 @record
 class Identifiability:
-    """What the data can identify of the free parameters.
+    """The directions of the free parameters that the data identify, and those that they do not.
 
     Parameters
     ----------

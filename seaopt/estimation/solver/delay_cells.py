@@ -100,13 +100,12 @@ def _settle_beside(
     unknowns, index = problem.unknowns, experiment.slots.delay.index
     assert index is not None
     cell = np.ceil(z[index] / period - INSIDE) + way  # (cell - 1, cell] samples
-    low, high = unknowns.low.copy(), unknowns.high.copy()
-    low[index] = max(low[index], (cell - 1.0 + INSIDE) * period)
+    low = max(unknowns.low[index], (cell - 1.0 + INSIDE) * period)
     end = cell if experiment.data.hold == "zero" else cell - INSIDE
-    high[index] = min(high[index], end * period)
-    if not low[index] <= high[index]:
+    high = min(unknowns.high[index], end * period)
+    if not low <= high:
         return None
-    z[index] = np.clip(z[index], low[index], high[index])
-    inside = replace(problem, unknowns=replace(unknowns, low=low, high=high))
+    z[index] = np.clip(z[index], low, high)
+    inside = replace(problem, unknowns=unknowns.bound(index, low, high))
     other = settle(inside, inside.evaluate(z), max_iterations, callback)
     return replace(other, problem=replace(other.problem, unknowns=unknowns))

@@ -8,7 +8,6 @@ given values, screened, and the best are refined.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ REFINED_CANDIDATES = 8
 MATCHED_POINTS = 60
 EXPLAINED_MISFIT = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
 LONGEST_WINDOW = 1 << 14  # samples of a window: resolution enough for a guess
+QUICK_WINDOWS = [2**a * 3**b for a in range(15) for b in range(9)]
 
 
 @record(eq=False)
@@ -130,12 +130,10 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
     )
 
 
-@lru_cache(maxsize=64)
 def _choose_window(n: int) -> int:
     """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
     length = min(n // 16, LONGEST_WINDOW)
-    fast = [2**a * 3**b for a in range(15) for b in range(9) if 2**a * 3**b <= length]
-    return max(fast, default=16)
+    return max((size for size in QUICK_WINDOWS if size <= length), default=16)
 
 
 def _space_by_logarithm(f: Float[np.ndarray, " m"], good: Any) -> Any:

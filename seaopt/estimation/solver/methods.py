@@ -1,4 +1,4 @@
-"""How a plant is compared with a log: the methods of `fit`, as objects with their own options that solve a problem."""
+"""The methods of `fit`, which compare a plant with a log: objects with their own options that solve a problem."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FURTHER = 5  # guesses of the frequency responses that are tried at most
 
 @record
 class Method(ABC):
-    """What all methods have: a limit of iterations, a search for a start, and a way to solve a problem."""
+    """A method of `fit`: a limit of iterations, a search for a start, and a way to solve a problem."""
 
     key: ClassVar[str]
     models_noise: ClassVar[bool] = False  # with process noise among the unknowns, in place of a band

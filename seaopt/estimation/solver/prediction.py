@@ -14,7 +14,7 @@ from jaxtyping import Float
 from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Squares
-from seaopt.estimation.problem.shapes import PerOutput, Signal, Vector
+from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.solver.settle import estimate_sigma
@@ -60,28 +60,30 @@ def add_predictors(problem: FitProblem, z: Vector, *, follows: bool) -> FitProbl
 
 
 def _estimate_noise(experiment: FitExperiment) -> PerOutput:
-    """Return the standard deviation of white noise on each output, from its first samples that are not held out."""
-    samples, noise = experiment.segments[0].samples, []
-    for o, spread in enumerate(experiment.spread):
-        y = samples.y[o][:FIRST_SAMPLES]
-        noise.append(measure_noise(y[samples.keep[o][:FIRST_SAMPLES] > 0] if samples.keep else y, float(spread)))
-    return np.array(noise)
+    """Return the standard deviation of white noise on each output, from its first samples that are not held out.
 
-
-def measure_noise(y: Signal, spread: float) -> float:
-    """Return the standard deviation of white noise on a smooth signal: the median third difference, over sqrt(20)."""
-    third = np.abs(np.diff(y[np.isfinite(y)], 3))
-    noise = 1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0
-    return max(noise, EXACT * spread, 1e-300)
+    On a smooth signal that is the median third difference, over sqrt(20).
+    """
+    used, noise = experiment.segments[0].mark_counted(0, slice(0, FIRST_SAMPLES)), list[float]()
+    for o, channel in enumerate(experiment.segments[0].samples.y):
+        third = np.abs(np.diff(channel[:FIRST_SAMPLES][used[:, o]], 3))
+        noise.append(1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0)
+    return np.maximum(noise, np.maximum(EXACT * experiment.spread, 1e-300))
 
 
 @np.errstate(all="ignore")
 def _make_predictor(experiment: FitExperiment, z: Vector) -> SteadyStateFilter | None:
     """Return a filter whose sizes and places come from its own estimates of the state, after a few rounds."""
     model, samples, point = experiment.model, experiment.segments[0].samples, experiment.point(z)
-    places = np.zeros((LINEARISED_AT, model.nx + model.nu))
-    size, sensors = _guess_state_size(experiment, point), _estimate_noise(experiment)
-    predictor = SteadyStateFilter(size=size, sensors=sensors, places=places, gain=point.gain, follows=False)
+    predictor = SteadyStateFilter(
+        size=np.ones(model.nx),
+        sensors=_estimate_noise(experiment),
+        places=np.zeros((LINEARISED_AT, model.nx + model.nu)),
+        gain=point.gain,
+        follows=False,
+    )
+    size = _guess_state_size(experiment, predictor, point)
+    predictor = replace(predictor, size=size)
     rows = np.linspace(0, min(samples.n, FIRST_SAMPLES) - 1, LINEARISED_AT).astype(int)
     u, y, keep = (tuple(c[:FIRST_SAMPLES] for c in channels) for channels in (samples.inputs, samples.y, samples.keep))
     short = Segment(u=u, y=y, keep=keep, start_s=samples.start_s)
@@ -101,17 +103,12 @@ def _make_predictor(experiment: FitExperiment, z: Vector) -> SteadyStateFilter |
     return predictor
 
 
-def _guess_state_size(experiment: FitExperiment, point: Point) -> Float[np.ndarray, " nx"]:
+def _guess_state_size(
+    experiment: FitExperiment, predictor: SteadyStateFilter, point: Point
+) -> Float[np.ndarray, " nx"]:
     """Return the size of each state that would show as the outputs' spread within ten samples."""
-    model = experiment.model
-    unit = SteadyStateFilter(
-        size=np.ones(model.nx),
-        sensors=np.ones(model.ny),
-        places=np.zeros((1, model.nx + model.nu)),
-        gain=np.ones(model.ny),
-    )
-    a, c = unit.linearise(model, point, point.theta[None])
-    rows, power = [], np.eye(model.nx)
+    a, c = predictor.linearise(experiment.model, point, point.theta[None])
+    rows, power = [], np.eye(experiment.model.nx)
     for _ in range(10):
         rows.append(np.max(np.abs(c[0] @ power) / experiment.spread[:, None], axis=0))
         power = a[0] @ power

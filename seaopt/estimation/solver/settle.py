@@ -53,10 +53,10 @@ class Solved:
 
     @property
     def follows_log(self) -> bool:
-        """Whether the search has converged, and what it found explains the log."""
+        """Whether the search has converged, and its minimum explains the log."""
         evaluation = self.solution.evaluation
-        found = self.solution.status == "converged" and bool(np.isfinite(evaluation.cost))
-        return found and not explains_little(self.problem, evaluation.power)
+        converged = self.solution.status == "converged" and bool(np.isfinite(evaluation.cost))
+        return converged and not explains_little(self.problem, evaluation.power)
 
 
 def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
@@ -72,9 +72,7 @@ def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback
     places, unknowns = problem.find_stopped(), problem.unknowns
     if not places or np.any(start.z[places] != 0.0):
         return sharpen(problem, start, solve)
-    low, high = unknowns.low.copy(), unknowns.high.copy()
-    low[places] = high[places] = 0.0
-    resting = sharpen(replace(problem, unknowns=replace(unknowns, low=low, high=high)), start, solve)
+    resting = sharpen(replace(problem, unknowns=unknowns.bound(places, 0.0, 0.0)), start, solve)
     solved = sharpen(replace(resting.problem, unknowns=unknowns), resting.solution.evaluation, solve)
     iterations = resting.solution.iterations + solved.solution.iterations
     return replace(solved, solution=replace(solved.solution, iterations=iterations))
@@ -93,10 +91,9 @@ def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem,
         return solve(problem, start)
 
     def solve_stage(problem: FitProblem, evaluation: Evaluation) -> Solved:
-        low = unknowns.low.copy()
         fall = max(1.0 / FALL, _measure_stiffness(problem, evaluation.z))
-        low[places] = np.maximum(low[places], fall * evaluation.z[places])
-        return solve(replace(problem, unknowns=replace(unknowns, low=low)), evaluation)
+        low = np.maximum(unknowns.low[places], fall * evaluation.z[places])
+        return solve(replace(problem, unknowns=unknowns.bound(places, low, unknowns.high[places])), evaluation)
 
     stiffness = _measure_stiffness(problem, start.z)
     if stiffness > 1.0:  # too sharp to begin with
@@ -214,8 +211,6 @@ def estimate_sigma(problem: FitProblem, power: Mapping[str, ResidualPower], z: V
         # A constant output has no size of its own.
         floor = np.maximum(1e-9 * np.where(experiment.spread > 0.0, experiment.spread, 1.0), 1e-300)
         estimated = np.maximum(rms, floor)
-        given = experiment.data.sigma
-        sigma[experiment.name] = np.array(
-            [given.get(name, float(s)) for name, s in zip(experiment.data.outputs, estimated, strict=True)]
-        )
+        rows = zip(experiment.data.outputs, estimated.tolist(), strict=True)
+        sigma[experiment.name] = np.array([experiment.data.sigma.get(name, s) for name, s in rows])
     return sigma

@@ -1,4 +1,4 @@
-"""Starts found on short shots of a log, each from a state of its own, which then grow into the whole.
+"""Starts from short shots of a log, each with an initial state of its own, which then grow into the whole.
 
 A mode that is a little off is out of phase with its log after some periods: the cost of a long simulation has as many
 minima as the mode rings periods, and the frequency responses of a log shorter than that are blurred by leakage. Over a

@@ -47,7 +47,7 @@ FEWEST_DRAWS = 20  # draws, below which a covariance says nothing
 
 @record(eq=False, repr=False)
 class Bootstrap:
-    """What `bootstrap` returns; ``print(bootstrap)`` is a table.
+    """Parameters after draws of the residuals; ``print(bootstrap)`` is a table.
 
     Parameters
     ----------

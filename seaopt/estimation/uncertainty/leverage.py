@@ -1,4 +1,4 @@
-r"""Where what is known of the parameters comes from.
+r"""Leverage: the share of each experiment in the information on the parameters.
 
 The share of an experiment e in parameter i is that of its noise in the estimate's variance,
 
@@ -25,7 +25,7 @@ PRIORS = "priors"
 
 @record
 class Leverage:
-    """The share of one experiment, or of the priors, in what is known of each parameter, and in all of it."""
+    """The share of one experiment, or of the priors, in the information on each parameter, and in all of it."""
 
     parameters: Mapping[str, float]
     whole: float

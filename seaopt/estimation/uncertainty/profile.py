@@ -206,9 +206,8 @@ class _ProfileCurve:
         nearest = int(np.argmin(np.abs(np.array(self.values) - value)))
         start = self.points[nearest] + self.along * (value - self.values[nearest])
         start[self.index] = value
-        low, high = self.problem.unknowns.low.copy(), self.problem.unknowns.high.copy()
-        low[self.index] = high[self.index] = value
-        solution = minimise(self.problem, np.clip(start, low, high), low, high)
+        unknowns = self.problem.unknowns.bound(self.index, value, value)
+        solution = minimise(self.problem, np.clip(start, unknowns.low, unknowns.high), unknowns.low, unknowns.high)
         rise = (solution.evaluation.cost - self.cost) / self.scale
         if np.isfinite(rise):
             self.values.append(value)
@@ -271,7 +270,7 @@ class _ProfileCurve:
 
 
 def _find_direction(hessian: Matrix, index: int) -> Vector:
-    """Return how the others follow when one unknown moves by one: to first order, their best values."""
+    """Return how the other unknowns follow when one moves by one: to first order, their best values."""
     remaining = np.arange(len(hessian)) != index
     step = np.ones(len(hessian))
     step[remaining] = -solve_seen(hessian[remaining][:, remaining], hessian[remaining, index], 1e-12)
