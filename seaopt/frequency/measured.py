@@ -23,10 +23,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Int
 
 from seaopt.errors import LogError, require_number
-from seaopt.frequency.response import FrequencyResponse, find_band, h1
+from seaopt.frequency.response import ComplexLines, FrequencyResponse, Lines, find_band, h1
 from seaopt.frequency.survey import check_record
 from seaopt.logs import Log
 from seaopt.plants import Plant
@@ -87,9 +87,9 @@ class MeasuredResponse:
     source: str
     output: str
     clock: Clock
-    frequency_hz: Float[np.ndarray, " m"]
-    response: Complex[np.ndarray, " m"]
-    radius: Float[np.ndarray, " m"]
+    frequency_hz: Lines
+    response: ComplexLines
+    radius: Lines
     confidence: float
     averages: Int[np.ndarray, " m"]
 
@@ -201,7 +201,7 @@ def measure_response(
     )
 
 
-Discs = tuple[Float[np.ndarray, " m"], Complex[np.ndarray, " m"], Float[np.ndarray, " m"], Int[np.ndarray, " m"]]
+Discs = tuple[Lines, ComplexLines, Lines, Int[np.ndarray, " m"]]
 
 
 def _list_segments(samples: int, period: float) -> list[float]:

@@ -24,6 +24,8 @@ from seaopt.errors import LogError
 from seaopt.records import record
 
 BATCH = 1 << 20  # samples
+Lines = Float[np.ndarray, " m"]  # one number per frequency
+ComplexLines = Complex[np.ndarray, " m"]
 
 
 @record(eq=False)
@@ -43,13 +45,13 @@ class FrequencyResponse:
 
     """
 
-    frequency_hz: Float[np.ndarray, " m"]
-    response: Complex[np.ndarray, " m"]
-    coherence: Float[np.ndarray, " m"]
+    frequency_hz: Lines
+    response: ComplexLines
+    coherence: Lines
     averages: int
 
     @property
-    def relative_std(self) -> Float[np.ndarray, " m"]:
+    def relative_std(self) -> Lines:
         """Relative standard deviation of abs(H1)."""
         gamma = np.clip(self.coherence, 1e-6, 1.0)
         return np.sqrt((1.0 - gamma) / (2.0 * gamma * welch.count_averages(self.averages)))
@@ -66,7 +68,7 @@ class FrequencyResponse:
         return np.concatenate([centre[:1], centre[1:] / 1.5 + (below + above) / 6.0])
 
 
-def find_band(f: Float[np.ndarray, " m"], good: Bool[np.ndarray, " m"]) -> slice:
+def find_band(f: Lines, good: Bool[np.ndarray, " m"]) -> slice:
     """Return the lines of the widest run of good ones, on a logarithmic axis; an empty slice where there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]]))).reshape(-1, 2)
     low, high = max(edges.tolist(), key=lambda run: f[run[1] - 1] / f[run[0]], default=(0, 0))
@@ -156,6 +158,6 @@ def responses(
     ]
 
 
-def _power(spectra: Complex[np.ndarray, "d m"]) -> Float[np.ndarray, " m"]:
+def _power(spectra: Complex[np.ndarray, "d m"]) -> Lines:
     parts = spectra.view(np.real(spectra).dtype)  # real and imaginary, side by side
     return np.sum(np.einsum("dm,dm->m", parts, parts).reshape(-1, 2), axis=1)

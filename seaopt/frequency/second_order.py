@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.errors import LogError
-from seaopt.frequency.response import FrequencyResponse
+from seaopt.frequency.response import ComplexLines, FrequencyResponse, Lines
 from seaopt.frequency.sampled import sampled_response
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -150,7 +150,7 @@ class SecondOrder:
         """Damping ratio a/(2 sqrt(b)); NaN where b is negative."""
         return self._figure(lambda v: v[1] / (2 * np.sqrt(v[2])) if v[2] > 0.0 else np.nan, "-")
 
-    def response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def response(self, f: Lines) -> ComplexLines:
         """Return the response from input samples to output samples at frequencies in Hz."""
         return sampled_response(_form(), self.values[:3], self.clock, f)[0][:, 0]
 
@@ -295,9 +295,7 @@ def _form() -> Model:
     return make_model(plant, ParameterSet.of(K=(1.0, "-"), a=(1.0, "-"), b=(1.0, "-")), ("K", "a", "b"))
 
 
-def _start(
-    f: Float[np.ndarray, " m"], measured: Complex[np.ndarray, " m"], sigma: Float[np.ndarray, " m"], clock: Clock
-) -> Float[np.ndarray, "4"]:
+def _start(f: Lines, measured: ComplexLines, sigma: Lines, clock: Clock) -> Float[np.ndarray, "4"]:
     """Return K, a, b and the delay by linear least squares; the best of several delays where it is unknown."""
     s = 2j * np.pi * f
     delays = clock.delay_s + (0.5 * clock.period * np.arange(DELAYS) if clock.delay_free else np.zeros(1))
@@ -310,10 +308,10 @@ def _start(
 
 
 def _fit_linear(
-    s: Complex[np.ndarray, " m"],
-    measured: Complex[np.ndarray, " m"],
-    sigma: Float[np.ndarray, " m"],
-    hold: Complex[np.ndarray, " m"],
+    s: ComplexLines,
+    measured: ComplexLines,
+    sigma: Lines,
+    hold: ComplexLines,
 ) -> tuple[float, Float[np.ndarray, "3"]]:
     """Return the cost and K, a, b of the best step of K - a s G - b G = s^2 G, weighted by the step before it."""
     g, scatter = measured / hold, sigma / np.abs(hold)
@@ -341,7 +339,7 @@ def _stack(values: Complex[np.ndarray, "m ..."]) -> Float[np.ndarray, "n ..."]:
 def _refine(
     estimate: FrequencyResponse,
     chosen: Int[np.ndarray, " m"],
-    sigma: Float[np.ndarray, " m"],
+    sigma: Lines,
     clock: Clock,
     start: Float[np.ndarray, "4"],
 ) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "n c"], Float[np.ndarray, " n"]]:
@@ -356,7 +354,7 @@ def _refine(
         """Return residuals and derivatives, in standard deviations; the solver takes them one after the other."""
         moved = replace(clock, delay_s=x[3]) if clock.delay_free else clock
 
-        def both(f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "m n"]:
+        def both(f: Lines) -> Complex[np.ndarray, "m n"]:
             response, slopes = sampled_response(_form(), np.array(x[:3]), moved, f)
             return np.column_stack([response[:, 0], slopes[:, :, 0].T])
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool
 
 from seaopt.codec import to_content
 from seaopt.errors import LogError
-from seaopt.frequency.response import FrequencyResponse, find_band, h1
+from seaopt.frequency.response import ComplexLines, FrequencyResponse, Lines, find_band, h1
 from seaopt.frequency.sampled import sampled_response
 from seaopt.frequency.second_order import (
     MIN_COHERENCE,
@@ -138,7 +138,7 @@ class Survey:
         clock = replace(self.clock, delay_free=False)
         source, gain = list(self.plant.inputs).index(pair.source), self.gain.get(pair.output, 1.0)
 
-        def response(f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        def response(f: Lines) -> ComplexLines:
             return gain * sampled_response(model, np.zeros(0), clock, f, source)[0][:, 0]
 
         return response

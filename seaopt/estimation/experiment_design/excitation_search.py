@@ -13,12 +13,14 @@ from contextlib import suppress
 from dataclasses import field, replace
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 
 from seaopt.bench import Chirp, Excitation, Multisine, scale
 from seaopt.errors import EstimationError, require_memory, suggestion
 from seaopt.estimation.experiment_design.information import Bench, Trial
 from seaopt.estimation.experiment_design.spectrum import (
+    Lines,
+    Signals,
     Spectrum,
     choose_harmonics,
     low_peak_phases,
@@ -298,20 +300,16 @@ def _select_lines(lines: Spectrum, kept: Bool[np.ndarray, " K"]) -> Spectrum:
     )
 
 
-def _low_peaks(
-    search: ExcitationSearch, lines: Spectrum, powers: Float[np.ndarray, " K"], caps: Float[np.ndarray, " m"]
-) -> Excitation:
+def _low_peaks(search: ExcitationSearch, lines: Spectrum, powers: Lines, caps: Float[np.ndarray, " m"]) -> Excitation:
     """Return the multisine of given powers whose limited signals have the lowest peaks; the input's if none is."""
     sizes = np.where(np.isfinite(caps), caps, 1.0)
     kept = np.isfinite(caps) if np.any(np.isfinite(caps)) else np.arange(caps.size) == 0
-    signals: Complex[np.ndarray, "m K"] = (lines.gains * np.sqrt(2.0 * powers) / sizes[:, None])[kept]
+    signals: Signals = (lines.gains * np.sqrt(2.0 * powers) / sizes[:, None])[kept]
     phases = low_peak_phases(signals, lines.harmonics, search.bench.n, schroeder_phases(powers))
     return _multisine(search.bench, lines, powers, phases)
 
 
-def _multisine(
-    bench: Bench, lines: Spectrum, powers: Float[np.ndarray, " K"], phases: Float[np.ndarray, " K"]
-) -> Excitation:
+def _multisine(bench: Bench, lines: Spectrum, powers: Lines, phases: Lines) -> Excitation:
     base = 1.0 / (bench.n * bench.clock.period)
     part = Multisine(
         amplitudes=tuple(float(a) for a in np.sqrt(2.0 * powers)),

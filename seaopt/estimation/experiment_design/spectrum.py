@@ -34,18 +34,21 @@ from seaopt.simulation import Clock, Model, linearise
 
 ORDERS = (2, 8, 32)  # half the orders of the norms that become the peak
 SINGULAR = 1e-11  # eigenvalues of the normalised information below this part of the largest are zero
+Lines = Float[np.ndarray, " K"]  # one number per line of a spectrum
+Harmonics = Int[np.ndarray, " K"]  # multiples of rate/n
+Signals = Complex[np.ndarray, "m K"]  # the lines of m signals
 
 
 @record(eq=False)
 class Spectrum:
     """The information and the motion that a unit mean square of the input brings at each of K frequencies."""
 
-    harmonics: Int[np.ndarray, " K"]  # multiples of rate/n
+    harmonics: Harmonics  # multiples of rate/n
     information: Float[np.ndarray, "K p p"]  # Fisher information of a unit mean square at each line
-    gains: Complex[np.ndarray, "m K"]  # responses of the limited signals
+    gains: Signals  # responses of the limited signals
 
 
-def choose_harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Int[np.ndarray, " K"]:
+def choose_harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Harmonics:
     """Return at most `lines` log-spaced multiples of rate_hz/n in a band.
 
     Raises EstimationError: no multiple lies in the band.
@@ -70,7 +73,7 @@ def make_spectrum(
     model: Model,
     theta: Float[np.ndarray, " np"],
     clock: Clock,
-    multiples: Int[np.ndarray, " K"],
+    multiples: Harmonics,
     *,
     n: int,
     sigma: Float[np.ndarray, " nm"],
@@ -97,7 +100,7 @@ def optimal_powers(
     *,
     weight: ParameterMatrix | None,
     prior: ParameterMatrix | None = None,
-) -> Float[np.ndarray, " K"]:
+) -> Lines:
     """Return the powers that minimise trace(W F^-1), or -log det F, within linear limits.
 
     `information`: F = sum_k P_k information[k] + prior; `budget`: budget @ P <= 1; not negative, and no column
@@ -167,15 +170,13 @@ def _inverse_root(matrix: ParameterMatrix) -> ParameterMatrix:
     return vectors / np.sqrt(values) / size[:, None]
 
 
-def schroeder_phases(powers: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
+def schroeder_phases(powers: Lines) -> Lines:
     """Return Schroeder's phases, -2 pi sum_(j<k) (k - j) P_j / sum P: a line's delay grows with the power before it."""
     share = np.concatenate([[0.0], np.cumsum(powers)[:-1]]) / np.sum(powers)
     return -2.0 * np.pi * np.cumsum(share)
 
 
-def low_peak_phases(
-    lines: Complex[np.ndarray, "m K"], multiples: Int[np.ndarray, " K"], n: int, start: Float[np.ndarray, " K"]
-) -> Float[np.ndarray, " K"]:
+def low_peak_phases(lines: Signals, multiples: Harmonics, n: int, start: Lines) -> Lines:
     """Return phases that make the largest of m periodic signals over n samples small.
 
     `lines`: signal m is Im sum_k lines[m, k] exp(i (phase_k + 2 pi places_k t/n)); `multiples`: harmonics; `n`:
@@ -197,9 +198,7 @@ def low_peak_phases(
     return phases
 
 
-def _log_norm(
-    phases: Float[np.ndarray, " K"], lines: Complex[np.ndarray, "m K"], multiples: Int[np.ndarray, " K"], n: int, q: int
-) -> tuple[float, Float[np.ndarray, " K"]]:
+def _log_norm(phases: Lines, lines: Signals, multiples: Harmonics, n: int, q: int) -> tuple[float, Lines]:
     """Return log of the 2q-norm of all signals, and its gradient."""
     turned = lines * np.exp(1j * phases)
     y = periodic(turned, multiples, n)
@@ -210,7 +209,7 @@ def _log_norm(
     return np.log(peak) + np.log(total) / (2 * q), np.sum((turned * pull.conj()).real, axis=0)
 
 
-def periodic(lines: Complex[np.ndarray, "m K"], multiples: Int[np.ndarray, " K"], n: int) -> Float[np.ndarray, "m n"]:
+def periodic(lines: Signals, multiples: Harmonics, n: int) -> Float[np.ndarray, "m n"]:
     """Return the signals Im sum_k lines[m, k] exp(2 pi i places_k t/n) over one period of n samples."""
     bins = np.zeros((lines.shape[0], n), dtype=complex)
     bins[:, multiples] = lines
