@@ -153,6 +153,11 @@ def _list_outputs(fit: Fit) -> Iterator[tuple[str, OutputFit]]:
             yield f"{name}.{output}", fitted
 
 
+def _warn(kind: str, where: str, text: str, *, bad: bool = False) -> FitFinding:
+    """Return a warning, or an error where it is bad."""
+    return FitFinding(severity="error" if bad else "warning", kind=kind, where=where, text=text)
+
+
 def _find_unexplained(
     fit: Fit, shares: Mapping[str, CoherentShare], excess: Mapping[str, float]
 ) -> Iterator[FitFinding]:
@@ -166,7 +171,7 @@ def _find_unexplained(
         percents = (fitted.fit_percent, fitted.band_fit_percent, fitted.one_step_fit_percent)
         if explained is not None and max(percent for percent in percents if percent is not None) < WORSE:
             text = "the model explains it worse than a constant: look for jumps, such as a counter that wraps"
-            yield FitFinding(severity="error", kind="explained", where=where, text=text)
+            yield _warn("explained", where, text, bad=True)
             continue
         if explained is None or explainable is None or share is None:
             continue
@@ -176,17 +181,17 @@ def _find_unexplained(
                 f"the model explains {100 * explained:.3g} % of its energy, and the inputs account for "
                 f"{100 * explainable:.3g} %"
             )
-            yield FitFinding(severity="error" if ratio < HALF else "warning", kind="explained", where=where, text=text)
+            yield _warn("explained", where, text, bad=ratio < HALF)
         elif share.p < CHANCE and share.residual > 0.0 and share.power > SMALL:
             band = " to ".join(dict.fromkeys(f"{end:.3g}" for end in share.band_hz))
             bad = (share.residual > SYSTEMATIC and share.power > LARGE) or (
-                np.sqrt(share.residual) * excess[where] > FAR_ABOVE and share.power > VISIBLE
+                math.sqrt(share.residual) * excess[where] > FAR_ABOVE and share.power > VISIBLE
             )
             text = (
                 f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at "
                 f"{band} Hz: the model lacks something, and the stds allow for noise alone"
             )
-            yield FitFinding(severity="error" if bad else "warning", kind="residual", where=where, text=text)
+            yield _warn("residual", where, text, bad=bad)
 
 
 def _find_held_out(fit: Fit) -> Iterator[FitFinding]:
@@ -197,14 +202,12 @@ def _find_held_out(fit: Fit) -> Iterator[FitFinding]:
         held_out, used = find_energy(fitted.holdout_fit_percent), find_energy(fitted.fit_percent)
         worse = (1.0 - held_out) / max(1.0 - used, 1e-300)
         if worse >= WORSE_HELD_OUT**2 and held_out <= 0.99 * used:
-            yield FitFinding(
-                severity="error" if held_out < HELD_OUT * used else "warning",
-                kind="held_out",
-                where=where,
-                text=f"{100 * used:.4g} % is explained of the samples used and {100 * held_out:.4g} % of those held "
-                "out: the plant changed, is excited elsewhere, or the fit follows what does not repeat; log longer, or "
-                "fix parameters",
+            text = (
+                f"{100 * used:.4g} % is explained of the samples used and {100 * held_out:.4g} % of those held out: "
+                "the plant changed, is excited elsewhere, or the fit follows what does not repeat; log longer, or fix "
+                "parameters"
             )
+            yield _warn("held_out", where, text, bad=held_out < HELD_OUT * used)
 
 
 def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
@@ -247,14 +250,11 @@ def _find_implausible(fit: Fit) -> Iterator[FitFinding]:
         value = parameter.value
         if low <= value <= high or not parameter.identified:
             continue
-        far = value > FAR * high or value * FAR < low
-        yield FitFinding(
-            severity="error" if far else "warning",
-            kind="range",
-            where=name,
-            text=f"{name} = {value:.4g}{unit_after(parameter.unit)}; actuators of this kind have {low:g} to {high:g}: "
-            "check the units of inputs and outputs, such as mA read as A, and the fixed parameters",
+        text = (
+            f"{name} = {value:.4g}{unit_after(parameter.unit)}; actuators of this kind have {low:g} to {high:g}: check "
+            "the units of inputs and outputs, such as mA read as A, and the fixed parameters"
         )
+        yield _warn("range", name, text, bad=value > FAR * high or value * FAR < low)
 
 
 def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:
@@ -269,14 +269,12 @@ def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:
         for name, (delay, period) in fitted.items():
             other = fitted[best][0]
             if abs(delay.value - other.value) > max(APART_STDS * math.hypot(delay.std, other.std), APART * period):
-                yield FitFinding(
-                    severity="warning",
-                    kind="delay",
-                    where=f"{name}.delay_s",
-                    text=f"a delay of {1e3 * delay.value:.4g} ± {1e3 * delay.std:.2g} ms contradicts that of "
-                    f"{best}, {1e3 * other.value:.4g} ± {1e3 * other.std:.2g} ms: a delay makes up for what the model "
-                    "lacks in one of them, or they were recorded apart; look at both, or give delay_s",
+                text = (
+                    f"a delay of {1e3 * delay.value:.4g} ± {1e3 * delay.std:.2g} ms contradicts that of {best}, "
+                    f"{1e3 * other.value:.4g} ± {1e3 * other.std:.2g} ms: a delay makes up for what the model lacks in "
+                    "one of them, or they were recorded apart; look at both, or give delay_s"
                 )
+                yield _warn("delay", f"{name}.delay_s", text)
 
 
 def _find_few_samples(minimum: Minimum) -> Iterator[FitFinding]:
@@ -284,12 +282,8 @@ def _find_few_samples(minimum: Minimum) -> Iterator[FitFinding]:
     counts = [int(np.max(experiment.count_weighted())) for experiment in minimum.problem.experiments]
     samples, unknowns = sum(counts), minimum.z.size
     if max(counts) < FEWEST_SAMPLES or samples < SAMPLES_PER_UNKNOWN * unknowns:
-        yield FitFinding(
-            severity="error",
-            kind="samples",
-            where="",
-            text=f"{samples} samples are too few for {unknowns} unknowns: nothing tests the model; log longer",
-        )
+        text = f"{samples} samples are too few for {unknowns} unknowns: nothing tests the model; log longer"
+        yield _warn("samples", "", text, bad=True)
 
 
 def _find_noiseless(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
@@ -328,13 +322,12 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
     """Yield the explanation that is the most likely, and others that explain as much."""
     against = next((name for name, test in suspects.items() if test.p < CHANCE), None)
     if not causes and against is not None:
-        yield FitFinding(
-            severity="warning",
-            kind="fixed",
-            where=against,
-            text=f"{against} = {suspects[against].value:.4g} is fixed, and the logs are against it (chi-square "
-            f"{suspects[against].chi2:.3g} on one degree of freedom), but no other value alone explains them",
+        test = suspects[against]
+        text = (
+            f"{against} = {test.value:.4g} is fixed, and the logs are against it (chi-square {test.chi2:.3g} on one "
+            "degree of freedom), but no other value alone explains them"
         )
+        yield _warn("fixed", against, text)
     if not causes:
         return
     rivals = [cause for cause in causes if cause.gain > RIVAL_SHARE * causes[0].gain][:3]
@@ -343,10 +336,6 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
         text = f"likely cause: {text}"
     else:
         text = f"{len(rivals)} causes fit equally well, and the logs cannot separate them: {text}"
-    yield FitFinding(
-        severity="error" if any(cause.material for cause in rivals) else "warning",
-        kind="cause",
-        where=", ".join(dict.fromkeys(cause.where for cause in rivals)),
-        text=text,
-        preferred={name: value for cause in rivals for name, value in cause.preferred.items()},
-    )
+    where = ", ".join(dict.fromkeys(cause.where for cause in rivals))
+    finding = _warn("cause", where, text, bad=any(cause.material for cause in rivals))
+    yield replace(finding, preferred={name: value for cause in rivals for name, value in cause.preferred.items()})

@@ -100,6 +100,11 @@ class FitExperiment:
         return tuple(FitOutput(experiment=self, index=o, name=name) for o, name in enumerate(self.data.outputs))
 
     @property
+    def samples(self) -> int:
+        """Samples of all segments."""
+        return sum(segment.samples.n for segment in self.segments)
+
+    @property
     def longest(self) -> int:
         """Samples of the longest segment."""
         return max(segment.samples.n for segment in self.segments)

@@ -123,8 +123,7 @@ class FitProblem:
 
     def map(self, call: Callable[[FitExperiment], T]) -> list[T]:
         """Call for every experiment; in threads of their own where they are long enough."""
-        samples = sum(segment.samples.n for experiment in self.experiments for segment in experiment.segments)
-        if len(self.experiments) < 2 or samples < ALONE:
+        if len(self.experiments) < 2 or sum(experiment.samples for experiment in self.experiments) < ALONE:
             return [call(experiment) for experiment in self.experiments]
         return list(threads().map(call, self.experiments))
 
