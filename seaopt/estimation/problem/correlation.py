@@ -102,11 +102,11 @@ def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
 
 def autocorrelation(r: Signal, lags: int) -> Float[np.ndarray, " lags1"]:
     """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
+    fft, size = load_fft(), choose_transform_size(len(r), lags + 1)
     used = r != 0.0
-    mean, sums = r[used].mean() if np.any(used) else 0.0, LaggedSums(1, r.size, lags)
-    sums.add(np.where(used, r - mean, 0.0)[None])
-    products = sums.sums()[:, 0, 0]
-    return products / products[0] if products[0] > 0.0 else np.zeros(lags + 1)
+    centred = np.where(used, r - (r[used].mean() if np.any(used) else 0.0), 0.0)
+    sums = fft.irfft(np.abs(fft.rfft(centred, size)) ** 2, size)[: lags + 1]
+    return sums / sums[0] if sums[0] > 0.0 else np.zeros(lags + 1)
 
 
 def cross_correlation(residuals: Parts, inputs: Parts, lags: int = INPUT_LAGS) -> CrossCorrelation | None:
@@ -124,16 +124,15 @@ def cross_correlation(residuals: Parts, inputs: Parts, lags: int = INPUT_LAGS) -
     mean_u = float(np.mean(np.concatenate([u[mask] for u, mask in zip(inputs, used, strict=True)])))
     longest = max(len(r) for r in residuals)
     long = int(min(max(32, 4 * np.sqrt(longest)), longest - 1))
-    sums = LaggedSums(3, longest, max(long, lags))
+    cross, own_e, own_u = np.zeros(2 * lags + 1), np.zeros(long + 1), np.zeros(long + 1)
     for r, u, mask in zip(residuals, inputs, used, strict=True):
-        v = u - mean_u
-        sums.add(np.array([np.where(mask, r - mean_e, 0.0), v, v * mask]))
-    products = sums.sums() / count
-    cross = np.concatenate([products[lags:0:-1, 1, 0], products[: lags + 1, 0, 1]])
-    own_e, own_u = products[: long + 1, 0, 0], products[: long + 1, 2, 2]
+        e, v = np.where(mask, r - mean_e, 0.0), u - mean_u
+        cross += _products(e, v, lags) / count
+        own_e += _products(e, e, long)[long:] / count
+        own_u += _products(v * mask, v * mask, long)[long:] / count
     if own_e[0] <= 0.0 or own_u[0] <= 1e-24 * max(mean_u**2, 1e-300):
         return None
-    own_e = own_e * parzen(long)
+    own_e *= parzen(long)
     variance = (own_e[0] * own_u[0] + 2.0 * float(own_e[1:] @ own_u[1:])) / count
     size = float(np.sqrt(own_e[0] * own_u[0]))
     deviation = float(np.sqrt(max(variance, 1e-12 * own_e[0] * own_u[0] / count)))
@@ -144,6 +143,13 @@ def cross_correlation(residuals: Parts, inputs: Parts, lags: int = INPUT_LAGS) -
         bound=QUANTILE * deviation / size,
         p=min(cross.size * float(erfc(worst / np.sqrt(2.0))), 1.0),
     )
+
+
+def _products(a: Signal, b: Signal, lags: int) -> Float[np.ndarray, " m"]:
+    """Return the sums over t of a(t) b(t - k), k = -lags..lags."""
+    fft, size = load_fft(), choose_transform_size(len(a), lags + 1)
+    whole = fft.irfft(fft.rfft(a, size) * np.conj(fft.rfft(b, size)), size)
+    return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]
 
 
 def ljung_box(rho: Float[np.ndarray, " lags"], n: float) -> float:
