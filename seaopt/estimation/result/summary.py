@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -77,20 +77,22 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         )
     )
     sizes = _take_sizes(problem)
+    outputs = describe_outputs(problem, z, statistics) if statistics is not None else {}
     status, message = _find_status(solution, identifiability, evaluation.hessian, names, solved.step_error)
     vague = _find_vague(fitted, sizes, identifiability) if status == "converged" else {}
+    unidentified = [*vague]
     if vague:
-        status, fitted = "not_identifiable", _mark_unidentified(fitted, vague)
         message = f"the logs hardly show {', '.join(vague.values())}: excite more, fix it, or give it a prior"
-    outputs = describe_outputs(problem, z, statistics) if statistics is not None else {}
-    if statistics is not None and not _explains_something(problem, outputs, statistics):
+    if status == "converged" and (vague or not all(fitted[name].identified for name in names)):
         status = "not_identifiable"
-        fitted = _mark_unidentified(fitted, names)
+    if statistics is not None and not _explains_something(problem, outputs, statistics):
+        status, unidentified = "not_identifiable", names
         message = (
             f"the model explains nothing of any output; check the input's sign, the channels and units ({message})"
         )
     elif method.remedy and status != "converged" and explains_little(problem, evaluation.power):
         message = f"{message}; {method.remedy}"
+    fitted = fitted.with_parameters(*(replace(fitted[name], identified=False) for name in unidentified))
     bounded = [name for name, parameter in fitted.items() if parameter.free and parameter.at_bound]
     if bounded:
         message = (
@@ -204,10 +206,6 @@ def _compute_log_likelihood(problem: FitProblem, evaluation: Evaluation) -> floa
         variance = np.maximum(power.squares / np.maximum(power.counts, 1.0), (1e-12 * experiment.sigma) ** 2)
         total -= 0.5 * float(np.sum(power.counts * (np.log(2.0 * np.pi * variance) + 1.0)))
     return total
-
-
-def _mark_unidentified(fitted: ParameterSet, names: Iterable[str]) -> ParameterSet:
-    return fitted.with_parameters(*(replace(fitted[name], identified=False) for name in names))
 
 
 def _find_vague(fitted: ParameterSet, params: ParameterSet, identifiability: Identifiability) -> dict[str, str]:
