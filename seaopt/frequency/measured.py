@@ -6,12 +6,12 @@ and at one line (Goodman 1965; Bendat and Piersol, Random Data, 4th ed., ch. 9)
 .. math:: P\Big(|H - H_1|^2 > |H_1|^2\,\frac{1-\gamma^2}{\gamma^2}\,\big(\alpha^{-1/(n_d-1)} - 1\big)\Big) = \alpha .
 
 All discs together hold the truth with the confidence stated: :math:`\alpha = (1 - \text{confidence})/m` at each of m
-lines (Bonferroni), those of all lengths of segments that are compared. To the radius is added what the estimate
+lines (Bonferroni), those of all lengths of segments that are compared. The radius includes what the estimate
 cannot see: Hann's window takes the mean of three lines, which is off by :math:`|\Delta^2 H|/6`, and a straight line
 from one frequency to the next by :math:`|\Delta^2 H|/8`, with :math:`\Delta^2` the second difference over neighbouring
 lines. A resonance narrower than a line is not seen.
 
-What is assumed besides: the log was taken in open loop (under feedback H1 tends to -1/C), its input is known without
+Further assumptions: the log was taken in open loop (under feedback H1 tends to -1/C), its input is known without
 noise, and what disturbed it is as strong throughout.
 """
 
@@ -52,7 +52,7 @@ class MeasuredResponse:
     name : str
         Of the experiment.
     plant : Plant
-        What was on the bench: it says what its input and output are, not how they are related.
+        The plant on the bench, for the meaning of input and output; its dynamics are not used.
     source, output : str
         Names of input and output.
     clock : Clock
@@ -232,7 +232,7 @@ def _choose_discs(estimates: Sequence[FrequencyResponse], confidence: float, hig
     return f, response, radius, averages
 
 
-def _select(discs: Discs, chosen: Any) -> Discs:
+def _select(discs: Any, chosen: Any) -> Discs:  # whose lengths differ
     f, response, radius, averages = discs
     return f[chosen], response[chosen], radius[chosen], averages[chosen]
 

@@ -110,7 +110,7 @@ class Survey:
     Parameters
     ----------
     plant : Plant
-        What was on the bench.
+        The plant on the bench.
     clock : Clock
         Of the log.
     gain : mapping of output to float

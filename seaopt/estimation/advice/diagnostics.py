@@ -82,9 +82,9 @@ class Diagnostics:
     findings : tuple of FitFinding
         Of the fit; of one that was made without diagnostics, of its judgement here.
     sentences : tuple of str
-        What is wrong and what to do about it, the worst first; empty if no problem was found.
+        Faults with their remedies, the worst first; empty if no problem was found.
     residuals : mapping of experiment to ExperimentResiduals
-        What was tested.
+        The residuals that were tested.
 
     """
 

@@ -3,7 +3,7 @@ r"""Experiment design: the excitation, within the limits of the bench, after whi
 The expected covariance of a fit is the inverse of the Fisher information at the guess,
 :math:`F = \sum_t \sum_o \sigma_o^{-2} s_o(t) s_o(t)^T` with the sensitivities s of the outputs to the parameters, the
 offsets of the sensors and the initial state (Ljung, System Identification, 2nd ed., Sec. 13.3; Goodwin and Payne 1977).
-What is reported always comes from that sum over the samples of the excitation itself, simulated from rest.
+The reported figures always come from that sum over the samples of the excitation itself, simulated from rest.
 
 A design is as good as its guess: design, measure, fit, and design again.
 """
@@ -75,7 +75,7 @@ class Design:
     excitation : tuple of Multisine or Chirp
         Ready for `virtual_log`, or for the bench: ``excite(design.excitation, ...)`` gives its samples.
     criterion : str
-        What was minimised.
+        The criterion that was minimised.
     parameters : ParameterSet
         The guess; the free ones carry the std to be expected.
     covariance : Covariance

@@ -134,7 +134,7 @@ class Measure:
 def make_measure(bench: Bench, criterion: str) -> Measure:
     """Return the criterion of a name: "A", "D" or a free parameter's.
 
-    Raises EstimationError: the name is unknown, or a relative variance is asked of a parameter that is zero.
+    Raises EstimationError: the name is unknown, or a parameter whose relative variance counts is zero.
     """
     names = bench.model.free
     if criterion == "D":

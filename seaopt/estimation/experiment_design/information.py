@@ -48,7 +48,7 @@ class Bench:
     problem: FitProblem  # of one experiment, the measured outputs first
     measured: int  # outputs
     input_name: str  # the input that is excited
-    watched: tuple[str, ...]  # outputs and states whose peaks are wanted
+    watched: tuple[str, ...]  # outputs and states whose peaks are limited
     substeps: int = 1  # integration steps per sample
 
     @property

@@ -30,7 +30,7 @@ STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
 SHORTEST = 32  # samples of a stretch
 FEWEST, MOST = 6, 256  # stretches that are averaged
 TOGETHER = 16384  # samples of as many stretches as are transformed at once: they stay in the cache
-OUTLIER = 4.0  # robust standard deviations beyond which a residual tells nothing of its spectrum
+OUTLIER = 4.0  # robust standard deviations beyond which a residual is an outlier of its spectrum
 OCTAVES = 24  # below the Nyquist frequency, at most
 SILENT = 1e-9  # of an input's largest line
 ALIKE = 1e-10  # of the power of inputs that differ by less there is nothing left to rounding
@@ -76,7 +76,7 @@ def _gather(
 ) -> tuple[list[Float[np.ndarray, "n m"]], list[Float[np.ndarray, "n ny2"]]]:
     """Return the inputs that move and [measured, residual] of each output, of each segment's samples that count.
 
-    A sample that does not count is what the model says of it.
+    A sample that does not count is replaced by the model's.
     """
     moving: list[Float[np.ndarray, "n m"]] = []
     signals: list[Float[np.ndarray, "n ny2"]] = []

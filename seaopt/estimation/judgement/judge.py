@@ -226,7 +226,7 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
         away = parameter is not None and not parameter.at_bound
         bad = push > PUSH or away
         if away:
-            remedy = "which is as far as a fit searches: the logs do not hold it; fix it, or give it a bound or a prior"
+            remedy = "the farthest that a fit searches: the logs do not limit it; fix it, or give it a bound or a prior"
         elif bad:
             remedy = "the logs want it beyond: widen the bound, or look for what the model lacks"
         else:

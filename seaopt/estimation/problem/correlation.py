@@ -6,8 +6,8 @@ The residual of a right model follows no input. Its correlation with each is com
 .. math:: \hat R_{eu}(\tau) = \frac1N \sum_t e(t)\, u(t - \tau), \qquad
           \operatorname{var} \hat R_{eu}(\tau) = \frac1N \sum_k R_e(k)\, R_u(k),
 
-at any lag, for an input that is what it is and a residual of any colour. R_u is the input's own; R_e is estimated
-under a Parzen window. Lags above zero tell of what the model lacks, lags below of feedback, or of an input that was
+at any lag, for any input and a residual of any colour. R_u is the input's own; R_e is estimated
+under a Parzen window. Lags above zero show dynamics that the model lacks, lags below feedback, or of an input that was
 logged late.
 """
 

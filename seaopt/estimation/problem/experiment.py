@@ -389,9 +389,9 @@ def cut_into_shots(n: int, shots: int) -> Int[np.ndarray, " shots1"]:
 def check_shots(experiment: Experiment, longest: int, shots: int, setting: str) -> None:
     """Refuse shots too short for the states they start from.
 
-    So many samples of one output as there are states tell the state at a shot's start, where they tell it at all; with
-    no more than that, a shot would follow its log whatever the parameters are. Segments shorter than the longest are
-    cut into fewer.
+    As many samples of one output as there are states determine the state at a shot's start, where it can be determined;
+    with no more than that, a shot would follow its log whatever the parameters are. Segments shorter than the longest
+    are cut into fewer.
 
     Raises EstimationError: the longest segment does not have a sample more than the plant has states, and at least
     four, for each shot.

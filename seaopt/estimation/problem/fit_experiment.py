@@ -122,7 +122,7 @@ class FitExperiment:
 
     @property
     def level_unseen(self) -> bool:
-        """Whether offsets are wanted that the band does not show: they are then what is left over on average."""
+        """Whether offsets are to be estimated that the band does not show: they are then the mean residuals."""
         return self.data.offset is True and not sees_level(self.band_hz)
 
     def count_steps(self, z: Vector) -> int:

@@ -200,7 +200,7 @@ class FitProblem:
         )
 
     def follow(self, evaluation: Evaluation, z: Vector) -> Evaluation:
-        """Return what an evaluation says of a `z` nearby, as far as residuals are straight to there."""
+        """Return the evaluation at a `z` nearby, as far as residuals are straight to there."""
         return self.assemble(evaluation.passes, z)
 
     @property

@@ -39,7 +39,7 @@ class SteadyStateFilter:
     sensors: PerOutput  # standard deviation of the measurement noise, in output units
     places: Float[np.ndarray, "m w"]  # states and inputs over which a nonlinear plant is linearised
     gain: PerOutput  # of the sensors, as it is at the start: the filter's gain does not follow it
-    follows: bool = True  # whether the gain's derivatives are wanted; False: a gain that stands still
+    follows: bool = True  # whether to compute the gain's derivatives; False: a constant gain
 
     def correction(self, model: Model, point: Point, noise: Float[np.ndarray, " q"]) -> Float[np.ndarray, "ns1 nx ny"]:
         """Return the gain, then its derivatives in the order of `Layout`: theta, a free delay, the noise.
@@ -89,7 +89,7 @@ class SteadyStateFilter:
         rates, limit = np.array(f).reshape(nx, m, nx), RATE_LIMIT / period
         mean = rates.mean(axis=1)
         diagonal = np.clip(rates[np.arange(nx), :, np.arange(nx)], -limit, limit)
-        # What is to hold the plant to the log wherever it is must do so where it is damped least.
+        # The filter has to hold the plant to the log wherever it is, also where it is damped least.
         mean[np.diag_indices(nx)] = diagonal.mean(axis=1) if self.follows else diagonal.max(axis=1)
         return mean, np.array(h).reshape(model.ny, m, nx).mean(axis=1)
 

@@ -232,7 +232,7 @@ def _add_initial(
 ) -> tuple[tuple[Slot, ...], ...]:
     """Add the initial states: a known one is that of each segment of the log; shots within one start from unknown ones.
 
-    Friction that sticks soon stops a joint whatever its speed was: where nothing else tells it, it started at rest.
+    Friction that sticks soon stops a joint whatever its speed was: where no sample shows the speed, it started at rest.
     """
     plant, initial = experiment.plant, experiment.initial_state
     initial_values = fill_vector("state", plant.states, dict(initial) if isinstance(initial, Mapping) else None)

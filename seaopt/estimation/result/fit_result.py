@@ -189,7 +189,7 @@ class Fit(Result, Worded):
     def delay_s(self, plant: Plant) -> float:
         """Return the longest delay of the plant's experiments, fitted or given; of all, where it has none.
 
-        A fitted one that its log hardly tells does not count where another log tells its own ten times better.
+        A fitted one that its log determines ten times worse than another log does its own is not counted.
         """
         return max((nuisance.delay_s for nuisance in self.list_delayed(plant).values()), default=0.0)
 

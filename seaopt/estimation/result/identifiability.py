@@ -80,7 +80,7 @@ class Identifiability:
 
 
 def assess_identifiability(hessian: Matrix, names: tuple[str, ...], values: ParameterVector) -> Identifiability:
-    """Return what the normalised Hessian says of the first ``len(names)`` unknowns, the others eliminated.
+    """Return the identifiability of the first ``len(names)`` unknowns, the others eliminated from the Hessian.
 
     `values` are those of the unknowns, to which changes along an unseen direction are relative.
     """
@@ -167,7 +167,7 @@ def warn_unidentified(params: ParameterSet, used: Container[str] | None = None) 
     Parameters
     ----------
     params : ParameterSet
-        What is computed with.
+        The parameters of a computation.
     used : container of str, optional
         The names that matter; all if left out.
 

@@ -45,7 +45,7 @@ from seaopt.plants import Plant
 from seaopt.units import unit_after
 
 CHANCE_POWER = 200.0  # N R^2 below which a model explains nothing: some parameters' worth of chance, and noise's colour
-TOLD_STDS = 2.0  # standard deviations from which a value is told from zero
+NONZERO_STDS = 2.0  # standard deviations from which a value differs from zero
 ANOTHER_SIZE = 100.0  # times the start, which hints at a unit rather than at a bad guess
 # Samples below which intervals are too narrow: in 100 windows of the stand's log 90 to 96 % at 40, 92 % at 100.
 FEW_SAMPLES = 400
@@ -142,7 +142,7 @@ def _take_sizes(problem: FitProblem) -> ParameterSet:
 
 
 def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evaluation) -> list[str]:
-    """Return what a search does not mind, but a reader should: values of another size, and few samples."""
+    """Return remarks for a reader: values of another size than their start, and few samples."""
     odd: list[str] = []
     for name, parameter in fitted.items():
         start = params[name].value
@@ -151,7 +151,7 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
         ratio = parameter.value / start
         times, way = (ratio, "above") if ratio > 1.0 else (1.0 / ratio, "below")
         # What does not differ from zero is small by chance: no unit explains it.
-        differs = parameter.std is None or parameter.std < abs(parameter.value) / TOLD_STDS
+        differs = parameter.std is None or parameter.std < abs(parameter.value) / NONZERO_STDS
         if times > ANOTHER_SIZE and (ratio > 1.0 or differs):
             odd.append(
                 f"{name} = {parameter.value:.3g} is {format_number(times)} times {way} its start of {start:.3g}: "
@@ -172,11 +172,11 @@ def _compute_covariances(
     ParameterVector,
     Vector,
 ]:
-    """Return the parameters' covariance for white residuals, for those that there are, and what is unseen.
+    """Return the parameters' covariance for white residuals and for the actual ones, and how much is unseen.
 
     Both are over what is seen alone, and so is the third, of parameters and delays together; the fourth is how much of
     each parameter is not seen (0 to 1, squared). The last are the variances of all unknowns: of parameters, delays and
-    gains for the residuals that there are, of others for white ones.
+    gains for the actual residuals, of others for white ones.
     """
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
     bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z)

@@ -29,7 +29,7 @@ def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -
     """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log.
 
     The filter does not trust the plant, so that a plant that is far off predicts badly but cannot run away; its gain
-    is made anew from where the state has been, a few times. None where that finds nothing finite.
+    is recomputed from the states visited, a few times. None where no step is finite.
     """
     problem = problem.with_each(substeps=1, loss=Squares(), band_hz=None)
     z = start.copy()
