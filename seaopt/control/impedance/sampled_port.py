@@ -134,7 +134,8 @@ class SampledPort:
         locked = self.link.held()
         closed = Loop(plant=locked, law=self.link.law).eigenvalues()
         closed = np.log(closed[np.abs(closed) > 1e-6]) / period
-        at, width = self.link.port.modes_hz()
+        poles = self.link.port.find_poles()
+        at, width = np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
         at = 2 * np.pi * np.concatenate([at, np.abs(closed.imag) / (2 * np.pi)])
         width = 2 * np.pi * np.concatenate([width, np.abs(closed.real) / (2 * np.pi)])
         around = at[:, None] + width[:, None] * np.concatenate([-NEAR_MODES, [0.0], NEAR_MODES])

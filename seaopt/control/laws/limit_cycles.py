@@ -16,15 +16,13 @@ through; cycles that stick for a while at each turn (hunting of an integral agai
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.optimize import brentq
 
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction_margin import take_friction_out
+from seaopt.control.loops.crossings import find_crossings
 from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -117,17 +115,8 @@ def _find_crossings(loop: FrictionLoop, port: int) -> list[float]:
     close = (modes[:, None] * np.linspace(0.8, 1.25, 91)).ravel()
     grid = np.concatenate([np.geomspace(LOWEST_HZ, 0.999 * nyquist, FREQUENCIES), close])
     grid = np.unique(grid[(grid > LOWEST_HZ) & (grid < nyquist)])
-    response = _respond(loop, port, grid)[0]
-    side, negative = np.sign(np.imag(response)), np.real(response) < 0.0
-
-    def off_axis(f: float) -> float:
-        return float(np.imag(_respond(loop, port, np.array([f]))[0][0]))
-
-    crossings: list[float] = []
-    for i in np.flatnonzero((side[:-1] * side[1:] < 0) & negative[:-1] & negative[1:]):
-        root: Any = brentq(off_axis, grid[i], grid[i + 1])
-        crossings.append(float(root))
-    return crossings
+    crossings = find_crossings(lambda f: np.imag(_respond(loop, port, f)[0]), grid)
+    return crossings[np.real(_respond(loop, port, crossings)[0]) < 0.0].tolist()
 
 
 def _find_amplitudes(gains: Float[np.ndarray, " m"], wanted: float) -> list[float]:

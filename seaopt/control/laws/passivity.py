@@ -186,12 +186,17 @@ def passivity(
     port = port_of(
         take_sliding(plant, params), controller.delay(params), controller.signals, controller.command.per_effort
     )
-    law = controller.law
-    impedance, angle = _make_curves(port, law, ts, controller.compute_delay_samples)
-    f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, ts, low_hz, high)))
-    stable = is_held_stable(port, law, ts, controller.compute_delay_samples)
+    law, waits = controller.law, controller.compute_delay_samples
+    impedance, angle = _make_curves(port, law, waits)
+    f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, low_hz, high)))
+    stable = is_held_stable(port, law, waits)
     bands, violated = _find_bands(lambda x: angle(x) + COSINE_ROUNDING, f) if stable else ((), low_hz)
-    z = impedance(f)
+
+    def compare_directions(x: Frequencies) -> Frequencies:
+        response = port.response(x)
+        return np.real(response.motor_to_port * np.conj(response.motor_to_read[0]))
+
+    opposed, z = find_crossings(compare_directions, f), impedance(f)
     least = int(np.argmin(np.real(z)))
     return Passivity(
         low_hz=low_hz,
@@ -202,20 +207,17 @@ def passivity(
         least_damping_N_s_per_m=float(np.real(z[least])),
         least_hz=float(f[least]),
         least_cosine=float(np.real(z[least]) / max(abs(z[least]), TINY)),
-        limit_hz=_find_limit(port, f),
+        limit_hz=float(opposed[0]) if opposed.size else None,
         unit=mechanics_of(port.place_unit).damping,
     )
 
 
-def measure_port(
-    port: PortModel, law: Law, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
-) -> PortFigures:
+def measure_port(port: PortModel, law: Law, delay_samples: int, band_hz: tuple[float, float]) -> PortFigures:
     """Return the least Re Z/abs(Z) in a band, refined to rounding, where it is, and whether the held loop is stable."""
-    _, angle = _make_curves(port, law, sample_time_s, delay_samples)
-    f = add_minima(angle, _make_grid(port, law, sample_time_s, *band_hz))
+    _, angle = _make_curves(port, law, delay_samples)
+    f = add_minima(angle, _make_grid(port, law, *band_hz))
     cosine = angle(f)
-    least = int(np.argmin(cosine))
-    stable = is_held_stable(port, law, sample_time_s, delay_samples)
+    least, stable = int(np.argmin(cosine)), is_held_stable(port, law, delay_samples)
     return PortFigures(least_cosine=float(cosine[least]), at_hz=float(f[least]), held_stable=stable)
 
 
@@ -264,17 +266,18 @@ def passivity_rows(
     return np.real(condition.unit[:, None] * np.conj(condition.loops[0][:, None] * basis)), -np.real(condition.unit)
 
 
-def is_held_stable(port: PortModel, law: Law, sample_time_s: float, delay_samples: int) -> bool:
+def is_held_stable(port: PortModel, law: Law, delay_samples: int) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
-    poles = Loop(plant=port.hold_link(sample_time_s, delay_samples), law=law).eigenvalues()
+    poles = Loop(plant=port.hold_link(law.sample_time_s, delay_samples), law=law).eigenvalues()
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
 
 
-def _make_curves(port: PortModel, law: Law, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
+def _make_curves(port: PortModel, law: Law, delay_samples: int) -> tuple[Curve, Curve]:
     """Return Z and Re Z/abs(Z) as functions of frequency."""
 
     def impedance(f: Frequencies) -> Response:
-        return port.response(f).impedance(law.feedback_responses(f) * hold_response(f, sample_time_s, delay_samples))
+        late = hold_response(f, law.sample_time_s, delay_samples)
+        return port.response(f).impedance(law.feedback_responses(f) * late)
 
     def angle(f: Frequencies) -> Frequencies:
         z = impedance(f)
@@ -283,14 +286,12 @@ def _make_curves(port: PortModel, law: Law, sample_time_s: float, delay_samples:
     return impedance, angle
 
 
-def _make_grid(port: PortModel, law: Law, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:
+def _make_grid(port: PortModel, law: Law, low_hz: float, high_hz: float) -> Frequencies:
     """Return frequencies that resolve the modes of plant and law."""
-    roots = law.poles
-    poles = np.log(roots[np.abs(roots) > TINY]) / sample_time_s
-    at, width = port.modes_hz()
-    at = np.concatenate([at, np.abs(poles.imag) / (2 * np.pi)])
-    width = np.concatenate([width, np.abs(poles.real) / (2 * np.pi)])
-    fan = np.concatenate([[0.0], *([[-x, x] for x in np.geomspace(0.03, 10.0, 20)])])
+    poles = law.poles[np.abs(law.poles) > TINY]
+    poles = np.concatenate([port.find_poles(), np.log(poles) / law.sample_time_s])
+    at, width = np.abs(poles.imag) / (2 * np.pi), np.abs(poles.real) / (2 * np.pi)
+    fan = np.concatenate([[0.0], *([-x, x] for x in np.geomspace(0.03, 10.0, 20))])
     near = (at[:, None] + np.maximum(width, 1e-6 * high_hz)[:, None] * fan).ravel()
     inside = near[(near > low_hz) & (near < high_hz)]
     return np.unique(np.concatenate([np.geomspace(low_hz, high_hz, POINTS), inside]))
@@ -302,20 +303,6 @@ def _find_bands(
     """Return where the curve is not negative, and where it first is."""
     edges = np.concatenate([f[:1], find_crossings(curve, f), f[-1:]])
     good = curve(np.sqrt(edges[:-1] * edges[1:])) >= 0.0
-    bands: list[tuple[float, float]] = []
-    for low, high, fine in zip(edges[:-1], edges[1:], good, strict=True):
-        if fine and bands and bands[-1][1] == low:
-            bands[-1] = (bands[-1][0], float(high))
-        elif fine:
-            bands.append((float(low), float(high)))
-    bad = np.flatnonzero(~good)
-    return tuple(bands), float(edges[bad[0]]) if bad.size else None
-
-
-def _find_limit(port: PortModel, f: Frequencies) -> float | None:
-    def compare_directions(x: Frequencies) -> Frequencies:
-        response = port.response(x)
-        return np.real(response.motor_to_port * np.conj(response.motor_to_read[0]))
-
-    crossings = find_crossings(compare_directions, f)
-    return float(crossings[0]) if crossings.size else None
+    ends = np.flatnonzero(np.diff(good, prepend=False, append=False)).reshape(-1, 2)
+    bands = tuple((float(edges[first]), float(edges[last])) for first, last in ends)
+    return bands, None if np.all(good) else float(edges[np.argmin(good)])

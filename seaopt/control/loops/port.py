@@ -87,11 +87,6 @@ class PortModel:
             motion_to_port=taken[:, 1] - s * self.mass,
         )
 
-    def modes_hz(self) -> tuple[Frequencies, Frequencies]:
-        """Return frequency and half width of the poles with link 2 at rest."""
-        poles = self._poles()
-        return np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
-
     def hold_link(self, sample_time_s: float, delay_samples: int) -> DigitalPlant:
         """Return the sampled plant from motor force to what is fed back with link 2 at rest."""
         n, at = self.motor.size, self.force[self.speed]
@@ -106,16 +101,16 @@ class PortModel:
         (plant,) = sample_linear(linear, np.array([self.delay_s]), sample_time_s, delay_samples)
         return plant
 
-    def _poles(self) -> Complex[np.ndarray, " n"]:
-        """Return the poles with link 2 at rest."""
+    def find_poles(self) -> Complex[np.ndarray, " n"]:
+        """Return the poles with link 2 at rest (rad/s)."""
         moved = self.a - np.outer(self.force, self.a[self.speed]) / self.force[self.speed]
         return np.linalg.eigvals(moved).astype(complex)
 
     def _beside(self, f: Frequencies) -> Frequencies:
         out = f.copy()
-        for pole in self._poles():
+        for pole in self.find_poles():
             near = np.abs(2j * np.pi * out - pole) < BESIDE * np.abs(pole)
-            out[near] = abs(complex(pole).imag) * (1.0 + BESIDE) / (2 * np.pi)
+            out[near] = abs(pole.imag) * (1.0 + BESIDE) / (2 * np.pi)
         return out
 
 
@@ -126,15 +121,11 @@ def probe_of(plant: Plant) -> Plant:
 
     Raises ControlError: the plant states no port, or its port states no probe.
     """
-    if plant.port is None:
+    if plant.port is None or plant.port.probe is None:
+        missing = "has no port at link 2" if plant.port is None else "has a port that states no probe"
         raise ControlError(
-            f"plant {plant.name} has no port at link 2; use high_impedance, moving_output, two_link or rotary, or give "
-            "ports = (Port(..., probe=...),)"
-        )
-    if plant.port.probe is None:
-        raise ControlError(
-            f"the port of plant {plant.name} states no probe, by which its impedance is known; give Port(probe=...), "
-            "or use high_impedance, moving_output, two_link or rotary"
+            f"plant {plant.name} {missing}; use high_impedance, moving_output, "
+            "two_link or rotary, or give ports = (Port(..., probe=...),)"
         )
     return share_drive(freeze_heat(plant.port.probe()), plant)
 

@@ -554,7 +554,7 @@ class Task:
         """Return the same of any law, whose filter and integral are known."""
         port, spec, band = None, self.spec, self.spec.passive_band_hz
         if self.port is not None and band is not None:
-            port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
+            port = measure_port(self.port, law, spec.loop_delay_samples, band)
         slopes: dict[int, float] = {}
         if self.asks_margin:
             margins = zip(self.frictions, self.find_margins(law), strict=True)

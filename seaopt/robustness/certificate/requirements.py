@@ -61,7 +61,7 @@ def design_requirements(
     band, port = controller.spec.passive_band_hz, None
     if band is not None and controller.design is not None:
         held = port_of(states[state], controller.delay(values), controller.signals, controller.command.per_effort)
-        port = measure_port(held, controller.law, controller.sample_time_s, controller.compute_delay_samples, band)
+        port = measure_port(held, controller.law, controller.compute_delay_samples, band)
     rows = _judge(controller, controller.measure("", achieved, port), "design plant", Spot(DESIGN_PLANT, state))
     for other, loop in stuck:
         measured = controller.measure("", loop)
