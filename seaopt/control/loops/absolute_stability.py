@@ -45,10 +45,10 @@ from jaxtyping import Bool, Complex, Float, Int
 from scipy.special import polygamma
 
 from seaopt.control.loops.friction_loop import FrictionLoop
-from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.records import record
 
 ALIASES = 30  # on either side; what is beyond is bounded
+ORDERS = np.arange(-ALIASES, ALIASES + 1)
 TAIL_GROWTH = 1.1  # of the terms beyond the last alias, times frequency squared, over those at it
 ANGLES = 160
 LOWEST_ANGLE = 1e-4  # rad; below, a loop with an integrator is nearly static
@@ -123,10 +123,7 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
     margin is then zero.
     """
     none = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
-    obstacle = loop.obstacle
-    if not obstacle and np.max(np.abs(Loop(plant=loop.plant, law=loop.law).eigenvalues())) >= STABLE:
-        obstacle = "unstable without friction"
-    if obstacle:
+    if obstacle := find_obstacle(loop):
         return replace(none, multiplier=f"none: {obstacle}")
     responses = find_responses(loop, choose_angles(loop))
     bar = 1.0 / least if least else np.inf
@@ -152,6 +149,11 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
         if name == first and best.shown:
             break
     return best
+
+
+def find_obstacle(loop: FrictionLoop) -> str:
+    """Return why no test of absolute stability is for this loop under its law; empty where one is."""
+    return loop.obstacle or ("" if loop.sampled.is_stable() else "unstable without friction")
 
 
 def _settle(
@@ -194,16 +196,15 @@ class LoopResponses:
 def find_responses(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> LoopResponses:
     """Return G_v, a (without M) and b at angles; b of each signal, per unit of its K, without the feedback."""
     period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
-    orders = np.arange(-ALIASES, ALIASES + 1)
     seen = np.vstack([root[:, None] * loop.velocity, loop.sensed])  # phi = slope v: the slope of phi / root is 1
-    response, ports = loop.respond(theta, orders, seen), len(root)
+    response, ports = loop.respond(theta, ORDERS, seen), len(root)
     by_friction = root * response.by_friction
     read = np.swapaxes(by_friction[..., ports:, :] + loop.through * root, -1, -2)
     if feedback:
         read = np.einsum("ym,mkpy->mkp", loop.feedback(theta), read)
     return LoopResponses(
         theta=theta,
-        s=1j * (theta[:, None] + 2 * np.pi * orders) / period,
+        s=1j * (theta[:, None] + 2 * np.pi * ORDERS) / period,
         mobility=by_friction[..., :ports, :],
         command=-response.by_motor[..., :ports],
         sensed=np.conj(read),
@@ -357,7 +358,7 @@ def list_multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
 
 @record(eq=False)
 class FeedbackLimit:
-    r"""What a multiplier asks of the feedback C, one row per signal, at m angles: |weights C| < |1 + plants C|.
+    r"""The condition of a multiplier on the feedback C, one row per signal, at m angles: |weights C| < |1 + plants C|.
 
     K, to which b is proportional, is :math:`C/(1 + P^T C)`. So :math:`\gamma = \gamma_1^T K`,
     :math:`\beta = K^* B K`, and :math:`|2 + \gamma|^2 > \alpha\beta` reads
@@ -379,7 +380,7 @@ def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: f
     at = find_responses(loop, theta, feedback=False)
     through = loop.plant.responses(theta / (2 * np.pi * loop.plant.sample_time_s))
     weight = dict(list_multipliers(loop))[multiplier](at.s)
-    possible, inverse = _invert_mobility(weight, at.mobility, 1.0 / factor)
+    possible, inverse = invert_mobility(weight, at.mobility, 1.0 / factor)
     right = np.concatenate([(weight[..., None] * at.command)[..., None], at.sensed], axis=-1)
     terms = np.conj(np.swapaxes(right, -1, -2)) @ (inverse @ right)
     reach = TAIL_GROWTH * at.order**2 * at.tail
@@ -397,7 +398,7 @@ def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: f
     return FeedbackLimit(plants=through + 0.5 * sums[:, 1:, 0].T, weights=np.moveaxis(root, 0, -1))
 
 
-def _invert_mobility(
+def invert_mobility(
     weight: Complex[np.ndarray, "m k"], mobility: Complex[np.ndarray, "m k p p"], inverse: float
 ) -> tuple[Bool[np.ndarray, " m"], Complex[np.ndarray, "m k p p"]]:
     """Return where all D_k are positive definite at a 1/kappa, and their inverses; the identity where not."""

@@ -14,6 +14,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control.loops.drift import leave_out_drift
 from seaopt.control.loops.law import Law
+from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import (
     DigitalPlant,
     Measured,
@@ -58,6 +59,11 @@ class FrictionLoop:
     remembers: bool = False  # some friction has bristles, and is no curve of its velocity
 
     @property
+    def sampled(self) -> Loop:
+        """The sampled loop without friction."""
+        return Loop(plant=self.plant, law=self.law)
+
+    @property
     def obstacle(self) -> str:
         """Why no test of absolute stability is for this loop, whatever its law; empty where one is."""
         if not self.linear:
@@ -94,8 +100,7 @@ class FrictionLoop:
     def feedback(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
         """Return K, the motor command per measured output that comes from elsewhere, with the loop closed."""
         f = theta / (2 * np.pi * self.plant.sample_time_s)
-        law = self.law.feedback_responses(f)
-        return law / (1.0 + np.sum(self.plant.responses(f) * law, axis=0))
+        return self.law.feedback_responses(f) * self.sampled.sensitivity(f)
 
 
 @record(eq=False)
@@ -184,7 +189,7 @@ def _differentiate(plant: Plant) -> tuple[ca.SX, tuple[int, ...]]:
     return ca.jacobian(ca.vertcat(plant.dynamics, plant.output), ca.vertcat(plant.x, plant.u)), turning
 
 
-def _check_linear(plant: Plant, rest: Float[np.ndarray, " n"], values: Float[np.ndarray, " p"]) -> tuple[bool, bool]:
+def _check_linear(plant: Plant, at_rest: Float[np.ndarray, " n"], values: Float[np.ndarray, " p"]) -> tuple[bool, bool]:
     """Tell whether a plant is linear once links that turn stay about their rest; and whether some link then does."""
     slopes, turning = _differentiate(plant)
     variables = ca.vertcat(plant.x, plant.u)
@@ -192,7 +197,7 @@ def _check_linear(plant: Plant, rest: Float[np.ndarray, " n"], values: Float[np.
         return True, False
     slopes = ca.substitute(slopes, plant.p, ca.DM(values))
     kept = [column for column in range(slopes.shape[1]) if column not in turning]
-    turned = ca.vertcat(*(float(rest[i]) if i in turning else plant.x[i] for i in range(len(plant.states))))
+    turned = ca.vertcat(*(float(at_rest[i]) if i in turning else plant.x[i] for i in range(len(plant.states))))
     remaining = ca.substitute(slopes[:, kept], plant.x, turned)
     linear = not ca.depends_on(ca.vec(remaining), variables)
     return linear, linear and bool(ca.depends_on(ca.vec(slopes), variables))

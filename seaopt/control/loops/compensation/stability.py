@@ -45,18 +45,20 @@ from jaxtyping import Complex, Float
 from scipy.optimize import minimize_scalar
 
 from seaopt.control.loops.absolute_stability import (
+    ORDERS,
     REFINEMENTS,
     Angles,
     LoopResponses,
     Multiplier,
     bound_rest,
     choose_angles,
+    find_obstacle,
     find_responses,
+    invert_mobility,
     list_multipliers,
     refine_angles,
 )
 from seaopt.control.loops.friction_loop import FrictionLoop
-from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.control.loops.sampled_plant import sample_linear
 from seaopt.records import record
 
@@ -134,10 +136,7 @@ def compensation_margin(
     compensation's own slope, N s/m (N m s/rad). `first`: the name of a multiplier that is tried first. `enough`: a
     multiplier that shows a slope of so many times the one asked ends the search.
     """
-    obstacle = loop.obstacle
-    if not obstacle and np.max(np.abs(Loop(plant=loop.plant, law=loop.law).eigenvalues())) >= STABLE:
-        obstacle = "unstable without friction"
-    if obstacle:
+    if obstacle := find_obstacle(loop):
         return CompensationMargin(slope=0.0, asked=asked, frequency_hz=0.0, multiplier=obstacle)
     search = _Search(loop=loop, reading=reading, asked=asked, base=_Readings.at(loop, reading, choose_angles(loop)))
     best = CompensationMargin(
@@ -169,21 +168,18 @@ class _Readings:
     def at(cls, loop: FrictionLoop, reading: SpeedReading, theta: Angles) -> _Readings:
         """Return the responses of a loop at angles."""
         friction, period = find_responses(loop, theta), loop.plant.sample_time_s
-        orders = np.rint((np.imag(friction.s[0]) * period - theta[0]) / (2 * np.pi)).astype(int)
-        rows = loop.respond(theta, orders, reading.velocity[None]).by_friction[..., 0, :] * np.sqrt(loop.slopes)
-        f = theta / (2 * np.pi * period)
-        around = np.sum(loop.plant.responses(f) * loop.law.feedback_responses(f), axis=0)
+        rows = loop.respond(theta, ORDERS, reading.velocity[None]).by_friction[..., 0, :] * np.sqrt(loop.slopes)
         return cls(
             friction=friction,
             speed=rows * reading.weigh(theta, friction.s, period)[..., None],
             through=reading.respond(loop, theta),
-            sensitivity=1.0 / (1.0 + around),
+            sensitivity=loop.sampled.sensitivity(theta / (2 * np.pi * period)),
         )
 
 
 @record(eq=False)
 class _Form:
-    """What is left of the test for one multiplier of the friction: factors of Gamma, and of what it is tested with."""
+    """The test for one multiplier of the friction: factors of Gamma, and of what it is tested with."""
 
     at: _Readings
     left: Complex[np.ndarray, "m 3 3"]
@@ -236,21 +232,21 @@ class _Search:
 
     def measure(self, form: _Form, multiplier: Multiplier, shift: str, least: float) -> CompensationMargin | None:
         """Return what a pair of multipliers shows, looked at between the angles too; None where it is below `least`."""
-        found, needed, count = form.find_least_inverse(shift), -np.inf, self.base.through.size
-        worst = found.worst_angle
+        result, needed, count = form.find_least_inverse(shift), -np.inf, self.base.through.size
+        worst = result.worst_angle
         for _ in range(REFINEMENTS):
-            if least and found.inverse >= 1.0 / least:
+            if least and result.inverse >= 1.0 / least:
                 return None
-            if found.inverse > needed:
-                needed, worst = found.inverse, found.worst_angle
-            theta = refine_angles(found.theta, -found.at_ratio(found.ratio))
+            if result.inverse > needed:
+                needed, worst = result.inverse, result.worst_angle
+            theta = refine_angles(result.theta, -result.at_ratio(result.ratio))
             finer = _Form.of(_Readings.at(self.loop, self.reading, theta), multiplier)
             if finer is None:
                 return None
-            found, count = finer.find_least_inverse(shift), count + theta.size
-            if found.inverse <= needed * MARGIN_KEPT:
+            result, count = finer.find_least_inverse(shift), count + theta.size
+            if result.inverse <= needed * MARGIN_KEPT:
                 break
-        needed = max(needed, found.inverse)
+        needed = max(needed, result.inverse)
         slope = np.inf if needed <= 0.0 else 1.0 / (MARGIN_KEPT * needed)
         return CompensationMargin(
             slope=float(slope),
@@ -285,13 +281,12 @@ def _shift(name: str, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]
 
 def _gather(at: _Readings, weight: Complex[np.ndarray, "m k"]) -> Complex[np.ndarray, "m 3 3"] | None:
     """Return a factor L of Gamma = L L*, what is beyond the aliases added; None where some D is not positive."""
-    friction, ports = at.friction, at.friction.mobility.shape[-1]
-    block = weight[..., None, None] * (friction.mobility + np.eye(ports))
-    block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
-    if not np.all(np.linalg.eigvalsh(block) > 0.0):
+    friction = at.friction
+    possible, inverse = invert_mobility(weight, friction.mobility, 1.0)
+    if not np.all(possible):
         return None
     x = np.stack([-weight[..., None] * friction.command, friction.sensed, np.conj(at.speed)], axis=-1)
-    terms = np.conj(np.swapaxes(x, -1, -2)) @ np.linalg.solve(block, x)
+    terms = np.conj(np.swapaxes(x, -1, -2)) @ (inverse @ x)
     gamma = np.sum(terms, axis=1)
     for i in range(3):  # a positive matrix is at most three times its diagonal
         gamma[:, i, i] += 3.0 * bound_rest(friction, np.real(terms[..., i, i]))
