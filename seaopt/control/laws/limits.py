@@ -43,96 +43,50 @@ Scope = Literal["every plant", "design plant"]
 
 @record
 class PortFigures:
-    """How passive the design plant's port is in the band asked.
+    """How passive the design plant's port is in the band asked."""
 
-    Parameters
-    ----------
-    least_cosine : float
-        Least Re Z/abs(Z).
-    at_hz : float
-        Where it is.
-    held_stable : bool
-        Nothing grows in the loop with its link held; where something does, it is passive nowhere.
-
-    """
-
-    least_cosine: float
-    at_hz: float
-    held_stable: bool
+    least_cosine: float  # least Re Z/abs(Z)
+    at_hz: float  # where it is
+    held_stable: bool  # nothing grows in the loop with its link held; where something does, it is passive nowhere
 
 
 @record
 class MeasuredLoop:
-    """One plant's loop as limits are judged on it.
+    """One plant's loop as limits are judged on it."""
 
-    Parameters
-    ----------
-    name, figures
-        Of the plant, and its loop's.
-    port : PortFigures, optional
-        The design plant's, where a passive band is asked for.
-    filter_samples : float
-        Time constant of the derivative's filter in samples; infinite where nothing is differentiated.
-    integral_rad_s : float
-        How fast the integral takes an error away, k_i/(1 + k_p); infinite without one.
-    friction_slope : float
-        The steepest friction for which stability is shown; infinite where there is none, or none is asked about.
-    slope_unit : str
-        Its unit; empty without friction.
-    gain_unit : str
-        Of what the law gives over what it measures: N/N, N m/(N m), N m/rad.
-    other_gain_unit : str
-        The same of what it reads besides, where that is known.
-
-    """
-
-    name: str
+    name: str  # of the plant
     figures: LoopFigures
-    port: PortFigures | None = None
-    filter_samples: float = math.inf
-    integral_rad_s: float = math.inf
+    port: PortFigures | None = None  # the design plant's, where a passive band is asked for
+    filter_samples: float = math.inf  # time constant of the derivative's filter; infinite where there is no derivative
+    integral_rad_s: float = math.inf  # how fast the integral takes an error away, k_i/(1 + k_p); infinite without one
+    # friction_slope, slope_unit: the steepest friction for which stability is shown, infinite where there is none, or
+    # none is asked about, and its unit, empty without friction
     friction_slope: float = math.inf
     slope_unit: str = ""
-    gain_unit: str = LINEAR.gain
-    other_gain_unit: str = ""
+    gain_unit: str = LINEAR.gain  # of what the law gives over what it measures: N/N, N m/(N m), N m/rad
+    other_gain_unit: str = ""  # the same of what it reads besides, where that is known
 
     def unit(self, limit: Limit) -> str:
         """Return the unit of a limit's figure: those of a friction's slope and of the noise gain are the plant's."""
-        if limit.name == "max_noise_gain":
-            return self.gain_unit
-        if limit.name == OTHER_NOISE:
-            return self.other_gain_unit or limit.unit
-        return self.slope_unit if self.slope_unit and limit.name == "min_friction_margin" else limit.unit
+        plants = {
+            "max_noise_gain": self.gain_unit, OTHER_NOISE: self.other_gain_unit, "min_friction_margin": self.slope_unit
+        }  # fmt: skip
+        return plants.get(limit.name) or limit.unit
 
 
 @record(eq=False)
 class LimitCurve:
-    """What the tuner keeps at every frequency: abs(X) below, or above, m abs(1 + L).
+    """The constraint that the tuner keeps at every frequency: abs(X) below, or above, m abs(1 + L)."""
 
-    Parameters
-    ----------
-    of : str
-        X.
-    level : callable
-        m, of what the specification allows; that itself if left out.
-    from_hz, until_hz : callable, optional
-        Where it begins and ends, of what is allowed and of the bandwidth asked; at every frequency if left out.
-    floor : bool
-        abs(X) is to be above, not below.
-    fall : float
-        The level falls with the frequency to this power, from the bandwidth asked.
-    symbol : str
-        Of abs(X)/abs(1 + L), where a message states this rather than the figure.
-
-    """
-
-    of: Literal["1", "L", "1 - L", "C_y", "C_v", "P C_r"]
-    level: Callable[[float], float] = float
+    of: Literal["1", "L", "1 - L", "C_y", "C_v", "P C_r"]  # X
+    level: Callable[[float], float] = float  # m, of what the specification allows
+    # from_hz, until_hz: where it begins and ends, of what is allowed and of the bandwidth asked; None: at every
+    # frequency
     from_hz: Callable[[float, float], float] | None = None
     until_hz: Callable[[float, float], float] | None = None
-    floor: bool = False
-    fall: float = 0.0
-    symbol: str = ""
+    floor: bool = False  # abs(X) is to be above, not below
+    fall: float = 0.0  # the level falls with the frequency to this power, from the bandwidth asked
+    symbol: str = ""  # of abs(X)/abs(1 + L), where a message states this rather than the figure
 
     def numerator(self, p: Any, c_y: Any, c_r: Any, open_loop: Any, c_v: Any = 0.0) -> Any:
         """Return X of responses, which may be arrays or a solver's expressions."""
@@ -157,71 +111,35 @@ class LimitCurve:
 
 @record(eq=False)
 class Limit:
-    """One limit.
+    """One limit."""
 
-    Parameters
-    ----------
-    name : str
-        Of the specification's field, of the problem file's key, and in messages.
-    label : str
-        Of the figure, in tables.
-    figure : callable
-        The figure of a measured loop.
-    sense : {"at most", "at least", "equal to"}
-        What the figure is to be to what is allowed.
-    scope : {"every plant", "design plant"}
-        Whose figure.
-    unit : str
-        Of the figure; empty for a ratio.
-    meaning, remedy : str
-        What it means, and what to do where it is broken.
-    default : float, optional
-        What is allowed where the specification leaves it out (None); without one it is then not imposed. False in the
-        specification lifts a limit.
-    bandwidth_divisor : float, optional
-        The default is bandwidth_hz over this instead.
-    stuck_too : bool
-        Of a limit of the design plant: where friction sticks it holds there too, not on the sliding plant alone.
-    allowed : float, optional
-        What is always allowed, of a limit whose field says where it holds, or that has none.
-    has_field : bool
-        Of the specification; without one the limit always holds.
-    above, below : float
-        Ends, exclusive, of what may be asked; `above` is None where the specification has a check of its own.
-    condition : callable, optional
-        What must be true of the loop besides.
-    tolerance : float
-        By which the figure may miss what is allowed: a share of it, or an amount where it is zero.
-    reserve : {"figure", "curve", "none"}
-        Where the tuner takes the specification's reserve off: the figure itself; only the curve's level, where the
-        figure is a frequency; nowhere.
-    curve : LimitCurve, optional
-        What the tuner looks at.
-    requirement : str
-        The name in a certificate, where it is another.
-
-    """
-
-    name: str
-    label: str
+    name: str  # of the specification's field, of the problem file's key, and in messages
+    label: str  # of the figure, in tables
     figure: Callable[[MeasuredLoop], float]
-    sense: Sense
-    scope: Scope
+    sense: Sense  # what the figure is to be to what is allowed
+    scope: Scope  # whose figure
+    # meaning, remedy: what it means, and what to do where it is broken
     meaning: str
     remedy: str
-    unit: str = ""
+    unit: str = ""  # of the figure; empty for a ratio
+    # default, bandwidth_divisor: what is allowed where the specification leaves it out (None), a number or bandwidth_hz
+    # over one; without either it is then not imposed. False in the specification lifts a limit
     default: float | None = None
     bandwidth_divisor: float | None = None
+    # of a limit of the design plant: where friction sticks it holds there too, not on the sliding plant alone
     stuck_too: bool = False
-    allowed: float | None = None
-    has_field: bool = True
-    condition: Callable[[MeasuredLoop], bool] | None = None
+    allowed: float | None = None  # what is always allowed, of a limit whose field says where it holds, or that has none
+    has_field: bool = True  # of the specification; without one the limit always holds
+    # above, below: ends, exclusive, of what may be asked; `above` is None where the specification has its own check
     above: float | None = 0.0
     below: float | None = None
-    tolerance: float = LIMIT_ROUNDING
+    condition: Callable[[MeasuredLoop], bool] | None = None  # what must be true of the loop besides
+    tolerance: float = LIMIT_ROUNDING  # by which the figure may miss what is allowed: a share, or of 0 an amount
+    # where the tuner takes the specification's reserve off: the figure itself; only the curve's level, where the figure
+    # is a frequency; nowhere
     reserve: Literal["figure", "curve", "none"] = "figure"
-    curve: LimitCurve | None = None
-    requirement: str = ""
+    curve: LimitCurve | None = None  # what the tuner looks at
+    requirement: str = ""  # the name in a certificate, where it is another
 
     @property
     def symbol(self) -> str:
@@ -239,17 +157,13 @@ class Limit:
 
     @property
     def description(self) -> str:
-        """What it means, whose figure it is, what is allowed where it is left out, and what to do where broken."""
+        """Its meaning, the plant it judges, its default, and what to do where it is broken."""
         return f"{self.meaning} ({self.scope}; left out: {self.default_text}). Where it is broken: {self.remedy}."
 
     @property
     def is_default(self) -> bool:
         """Whether it is imposed where the specification leaves it out."""
         return self.default is not None or self.bandwidth_divisor is not None
-
-    def in_range(self, asked: float) -> bool:
-        """Tell whether a loop could keep what is asked."""
-        return (self.above is None or asked > self.above) and (self.below is None or asked < self.below)
 
     def allow(self, level: Any, bandwidth_hz: float) -> float | None:
         """Return what a specification's level allows, None being its default; None where nothing is imposed.
@@ -265,21 +179,14 @@ class Limit:
         return self.default if self.bandwidth_divisor is None else bandwidth_hz / self.bandwidth_divisor
 
     def check(self, level: Any, bandwidth_hz: float) -> None:
-        """Refuse a level that is not a finite number, None or False, or that no loop can keep.
-
-        Raises
-        ------
-        ControlError
-            The level is refused.
-
-        """
+        """Refuse a level that is not a finite number, None or False, or that no loop can keep."""
         if level is None or level is False:
             return
         if isinstance(level, bool) or not isinstance(level, (int, float)) or not math.isfinite(level):
             raise ControlError(
                 f"{self.name} = {level!r} is not a finite number; give one, or lift the limit: {self.name} = false"
             )
-        if self.above is not None and not self.in_range(level):
+        if self.above is not None and not self.above < level < (self.below or math.inf):
             upper = "" if self.below is None else f" and less than {self.below:g}"
             raise ControlError(
                 f"{self.name} = {level:g} can be met by no loop; give more than {self.above:g}{upper}, "
