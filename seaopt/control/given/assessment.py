@@ -72,21 +72,21 @@ def assess(
         raise ControlError("law = a Plant; the law comes first, as in certify: assess(law, plant, params, spec)")
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     require_plant(plant, "plant", ControlError)
-    given = law if isinstance(law, Law) else Law.from_control(law)
+    law = law if isinstance(law, Law) else Law.from_control(law)
     names, signals = list_names(spec.measured), find_signals(plant, spec.measured)
-    if given.d.size != 1 + len(names):
+    if law.d.size != 1 + len(names):
         raise ControlError(
-            f"law reads {given.d.size - 1} signals, and measured = {list(names)} names {len(names)}; give one of the "
+            f"law reads {law.d.size - 1} signals, and measured = {list(names)} names {len(names)}; give one of the "
             "reference and of each signal, or name them all in measured"
         )
     for column, (name, signal) in enumerate(zip(names, signals, strict=True), start=1):
-        given = given if name == signal else given.differenced(column)
-    if abs(given.sample_time_s * spec.sample_rate_hz - 1.0) > SAME_RATE:
+        law = law if name == signal else law.differenced(column)
+    if abs(law.sample_time_s * spec.sample_rate_hz - 1.0) > SAME_RATE:
         raise ControlError(
-            f"law has a sample time of {given.sample_time_s:g} s, and the specification sample_rate_hz = "
-            f"{spec.sample_rate_hz:g}; give sample_rate_hz = {1.0 / given.sample_time_s:g}, or sample the law again"
+            f"law has a sample time of {law.sample_time_s:g} s, and the specification sample_rate_hz = "
+            f"{spec.sample_rate_hz:g}; give sample_rate_hz = {1.0 / law.sample_time_s:g}, or sample the law again"
         )
-    given = replace(given, sample_time_s=spec.sample_time_s)
+    law = replace(law, sample_time_s=spec.sample_time_s)
     robust_to = take_own_delays(spec, plant, robust_to or {}, params)
     spec, values = settle_delays(spec, plant, params)
     spec = replace(
@@ -98,7 +98,5 @@ def assess(
         reference_weights="tuned",
     )
     task = make_task(plant, plant.complete(values), spec, robust_to, draws)
-    loops = task.measure_law(
-        given, filter_samples=count_filter_samples(given), integral_rad_s=find_integral_rate(given)
-    )
-    return describe_law(task, given, loops, (plant, values), gains={})
+    loops = task.measure_law(law, filter_samples=count_filter_samples(law), integral_rad_s=find_integral_rate(law))
+    return describe_law(task, law, loops, (plant, values), gains={})

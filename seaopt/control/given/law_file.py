@@ -173,7 +173,7 @@ class LawFile(_Strict):
 
     @property
     def delays(self) -> dict[str, Any]:
-        """What is stated of time; of a controller.json what was asked, for its drive's delay may be that of a fit."""
+        """The delays that the file states; of a controller.json those requested: its drive's may come from a fit."""
         if self.compute_delay_samples is None:
             samples = float(self.delay_samples or 0.0)
             return {"delay_samples": int(samples) if samples.is_integer() else samples}
@@ -212,8 +212,8 @@ class LawFile(_Strict):
         if self.law is None:
             return Law.from_transfer_functions(fractions[0][1], [fraction for _, fraction in fractions[1:]], ts)
         remedy = "give the matrices from (reference, measured) to effort"
-        given = from_content(StoredLaw, self.law, f"{source}: law", remedy=remedy).build(ts)
-        law, f = Law.from_state_space(given.a, given.b, given.c, given.d, ts), COMPARED / ts
+        matrices = from_content(StoredLaw, self.law, f"{source}: law", remedy=remedy).build(ts)
+        law, f = Law.from_state_space(matrices.a, matrices.b, matrices.c, matrices.d, ts), COMPARED / ts
         if fractions and len(fractions) != law.d.size:
             raise FileError(
                 f"{source}: measurement has {len(fractions) - 1} entries, and law reads {law.d.size - 1} signals"

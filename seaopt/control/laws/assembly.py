@@ -20,9 +20,11 @@ last bit, and the rest has one integrator less.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.minimal import build_chain
@@ -50,63 +52,62 @@ class Assembly:
 
     @property
     def static(self) -> Columns:
-        """What does not integrate, at 0 Hz."""
+        """The part that does not integrate, at 0 Hz."""
         return self.d + self.c @ np.linalg.solve(np.eye(self.c.size) - self.a, self.b)
 
     def plus(self, other: Assembly) -> Assembly:
         """Return the sum, on the same inputs."""
-        m, n, more = max(len(self.chain), len(other.chain)), self.c.size, other.c.size
-        chain = np.zeros((m, self.d.size))
+        chain = np.zeros((max(len(self.chain), len(other.chain)), self.d.size))
         chain[: len(self.chain)] += self.chain
         chain[: len(other.chain)] += other.chain
-        a = np.zeros((n + more, n + more))
-        a[:n, :n], a[n:, n:] = self.a, other.a
         return Assembly(
-            chain=chain, a=a, b=np.vstack([self.b, other.b]), c=np.concatenate([self.c, other.c]), d=self.d + other.d
+            chain=chain,
+            a=np.asarray(block_diag(self.a, other.a)),
+            b=np.vstack([self.b, other.b]),
+            c=np.concatenate([self.c, other.c]),
+            d=self.d + other.d,
         )
 
     def scaled(self, factor: float) -> Assembly:
         """Return this times a factor."""
-        return Assembly(chain=self.chain * factor, a=self.a, b=self.b, c=self.c * factor, d=self.d * factor)
+        return replace(self, chain=self.chain * factor, c=self.c * factor, d=self.d * factor)
 
     def widened(self, count: int) -> Assembly:
         """Return this on so many inputs, of which it does not read the last."""
         more = ((0, 0), (0, count - self.d.size))
-        return Assembly(
-            chain=np.pad(self.chain, more), a=self.a, b=np.pad(self.b, more), c=self.c, d=np.pad(self.d, more[1])
-        )
+        return replace(self, chain=np.pad(self.chain, more), b=np.pad(self.b, more), d=np.pad(self.d, more[1]))
 
     def through(self, part: TransferFunction) -> Assembly:
         """Return this in series with a stable part."""
         a, b, c, d = part.state_space()
-        n, more = self.c.size, c.size
         into, through, chain = np.outer(b, self.d), d * self.d, np.zeros_like(self.chain)
         drive, direct = b, d  # of one term of the part's Taylor series after the other, first the part itself
         for order in range(len(chain)):
-            fixed = np.linalg.solve(np.eye(more) - a, drive)
+            fixed = np.linalg.solve(np.eye(c.size) - a, drive)
             chain[: len(chain) - order] += (direct + float(c @ fixed)) * self.chain[order:]
             drive, direct = -a @ fixed, -float(c @ fixed)
             into = into + np.outer(drive, self.chain[order])
             through = through + direct * self.chain[order]
-        whole = np.zeros((n + more, n + more))
-        whole[:n, :n], whole[n:, n:], whole[n:, :n] = self.a, a, np.outer(b, self.c)
+        whole = np.block([[self.a, np.zeros((self.c.size, c.size))], [np.outer(b, self.c), a]])
         return Assembly(chain=chain, a=whole, b=np.vstack([self.b, into]), c=np.concatenate([d * self.c, c]), d=through)
 
     def integrated(self, static: Columns) -> Assembly:
         """Return this over delta; `static` is its `static`, in which the caller may know a zero to be one."""
         inner = np.eye(self.c.size) - self.a
         row = np.linalg.solve(inner.T, self.c)
-        return Assembly(chain=np.vstack([static, self.chain]), a=self.a, b=self.b, c=-row @ self.a, d=-row @ self.b)
+        return replace(self, chain=np.vstack([static, self.chain]), c=-row @ self.a, d=-row @ self.b)
 
-    def with_reference_behind(self, part: TransferFunction, rest: TransferFunction) -> Assembly:
+    def with_reference_behind(self, part: TransferFunction, difference: TransferFunction) -> Assembly:
         """Return this, the inputs being error, reference and further signals, with the reference behind a filter.
 
-        `part`: the filter F, stable and of unit static gain. `rest`: (F - 1)/delta, over the same denominator.
+        `part`: the filter F, stable and of unit static gain. `difference`: (F - 1)/delta, over the same denominator.
         """
-        a, b, row, through = rest.state_space()
-        n, more, chain, whole = self.c.size, b.size, self.chain.copy(), np.sum(self.chain[:, :2], axis=1)
-        c, d, inner = np.zeros(more), 0.0, np.eye(more) - a
-        for power in range(len(chain)):  # rest/delta^power: what it leaves at 0 Hz goes to the chain, term by term
+        a, b, row, through = difference.state_space()
+        n, chain, whole = self.c.size, self.chain.copy(), np.sum(self.chain[:, :2], axis=1)
+        c, d, inner = np.zeros(b.size), 0.0, np.eye(b.size) - a
+        for power in range(
+            len(chain)
+        ):  # difference/delta^power: what it leaves at 0 Hz goes to the chain, term by term
             c, d = c + whole[power] * row, d + whole[power] * through
             for order in range(power + 1, len(chain)):
                 chain[order - power - 1, 1] += whole[order] * (through + float(row @ np.linalg.solve(inner, b)))
@@ -115,13 +116,11 @@ class Assembly:
         _, _, seen, direct = part.state_space()  # of F; F - 1 has the same states
         direct -= 1.0
         into, onto = np.sum(self.b[:, :2], axis=1), float(np.sum(self.d[:2]))
-        states = np.zeros((n + more, n + more))
-        states[:n, :n], states[n:, n:], states[:n, n:] = self.a, a, np.outer(into, seen)
-        entry, direct_from = np.zeros((n + more, self.d.size)), self.d.copy()
-        direct_from[1] += onto * direct + d
-        entry[:n], entry[n:, 1] = self.b, b
-        entry[:n, 1] += into * direct
-        return Assembly(chain=chain, a=states, b=entry, c=np.concatenate([self.c, onto * seen + c]), d=direct_from)
+        states = np.block([[self.a, np.outer(into, seen)], [np.zeros((b.size, n)), a]])
+        reference = np.eye(self.d.size)[1]
+        entry = np.vstack([self.b + np.outer(into * direct, reference), np.outer(b, reference)])
+        through = self.d + (onto * direct + d) * reference
+        return Assembly(chain=chain, a=states, b=entry, c=np.concatenate([self.c, onto * seen + c]), d=through)
 
     def law(self, sample_time_s: float) -> Law:
         """Return the law of reference and measured signals, the inputs being error, reference and further signals."""

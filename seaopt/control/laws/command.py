@@ -1,4 +1,4 @@
-"""What a controller sends to the motor for an effort: the plant's actuation, in numbers."""
+"""The command that a controller sends to the motor for an effort: the plant's actuation, in numbers."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import math
 import re
 from collections.abc import Mapping
 from typing import Annotated
-
-import numpy as np
 
 from seaopt.codec import Limits
 from seaopt.control.laws.structures import PREFILTER
@@ -50,7 +48,7 @@ class Command:
 
     @property
     def word(self) -> str:
-        """What is commanded: current, voltage, or the input's own name."""
+        """The commanded quantity: current, voltage, or the input's own name."""
         return name_command(self.input, self.unit)
 
     @property
@@ -74,14 +72,14 @@ class Command:
         """Return a command as text, with its unit; of a pure number with what it is."""
         return show_command(value, self.input, self.unit)
 
-    def limit(self, asked: float | None) -> float | None:
-        """Return the limit that holds: the one asked for, and no more than what acts; None without any."""
-        limits = [limit for limit in (asked, self.largest) if limit is not None]
+    def limit(self, requested: float | None) -> float | None:
+        """Return the limit that holds: the one requested, and no more than what acts; None without any."""
+        limits = [limit for limit in (requested, self.largest) if limit is not None]
         return min(limits, default=None)
 
     @property
     def reference_unit(self) -> str:
-        """Of the reference, and of what is measured."""
+        """The unit of the reference and of the measurement."""
         return self.measured_unit or self.effort_unit
 
     @property
@@ -129,24 +127,20 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     if plant.actuation is not None:
         effort, effort_unit = evaluate(plant.actuation.effort, values), plant.actuation.unit
         if not 0.0 < effort < math.inf:
-            known = describe_parameters(plant.actuation.effort, values)
+            described = describe_parameters(plant.actuation.effort, values)
             raise ControlError(
                 f"plant {plant.name}: one {unit} of {source} makes an effort of {effort:g} {effort_unit}, which must "
-                f"be positive; check {known or 'its actuation'}"
+                f"be positive; check {described or 'its actuation'}"
             )
     else:
-        known = plant.sensing.regulated if plant.sensing is not None else ()
-        output = measured if measured in known or not known else known[0]
+        regulated = plant.sensing.regulated if plant.sensing is not None else ()
+        output = measured if measured in regulated or not regulated else regulated[0]
         effort, effort_unit = static_gain(plant, values, output), plant.outputs[output]
-        if -math.inf < effort < -1e-12:
-            raise ControlError(
-                f"plant {plant.name} states no actuation, and its static gain from {source} to {output} is negative, "
-                f"{effort:g}; reverse the input or the output, or give it actuation = Actuation(input, effort)"
-            )
-        if not (np.isfinite(effort) and effort > 1e-12):
+        if not 1e-12 < effort < math.inf:
+            remedy = "reverse the input or the output, or give it" if -math.inf < effort < -1e-12 else "give it"
             raise ControlError(
                 f"plant {plant.name} states no actuation, and its static gain from {source} to {output} is "
-                f"{effort:g}; give it actuation = Actuation(input, effort)"
+                f"{effort:g}; {remedy} actuation = Actuation(input, effort)"
             )
     measured_unit = plant.outputs.get(measured, effort_unit)
     return Command(
@@ -159,19 +153,19 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     )
 
 
-def limit_notes(command: Command, asked: float | None, *, in_amperes: bool = True) -> tuple[str, ...]:
+def limit_notes(command: Command, requested: float | None, *, in_amperes: bool = True) -> tuple[str, ...]:
     """Say what a limit is of where no current is commanded, and where the command's own range is narrower."""
     notes: list[str] = []
     key = "current_limit_A" if in_amperes else "command_limit"
-    if asked is not None and in_amperes and command.unit != "A":
+    if requested is not None and in_amperes and command.unit != "A":
         notes.append(
-            f"current_limit_A = {asked:g} is of what is commanded, {asked:g}{unit_after(command.unit)} of "
+            f"current_limit_A = {requested:g} is of what is commanded, {requested:g}{unit_after(command.unit)} of "
             f"{command.input}: the current itself is not limited; command_limit is the same under its own name"
         )
-    if command.largest is not None and (asked is None or asked > command.largest):
-        given = "no limit is given" if asked is None else f"{key} = {asked:g} is more than acts"
+    if command.largest is not None and (requested is None or requested > command.largest):
+        reason = "no limit is given" if requested is None else f"{key} = {requested:g} is more than acts"
         reach = f"{command.largest:.4g}{unit_after(command.unit)}"
-        notes.append(f"{given}: the {command.word} is limited to its range, {reach}")
+        notes.append(f"{reason}: the {command.word} is limited to its range, {reach}")
     return tuple(notes)
 
 

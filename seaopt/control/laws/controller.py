@@ -143,7 +143,7 @@ class Controller(LoopDelays, Result, Worded):
 
     @property
     def speed_loop(self) -> SpeedLoop | None:
-        """What the speed loop of a cascade reads; None of another structure."""
+        """The signal of a cascade's speed loop; None for another structure."""
         return self.spec.find_speed_loop(self.signals)
 
     @property
@@ -207,7 +207,7 @@ class Controller(LoopDelays, Result, Worded):
 
     @property
     def judged_on(self) -> str:
-        """What `achieved` is of: the design plant, or the worst of a measured response's discs."""
+        """The plant of `achieved`: the design plant, or the worst in a measured response's discs."""
         return "worst measured" if self.design is None and self.measured else "design plant"
 
     @property
@@ -290,14 +290,14 @@ class Controller(LoopDelays, Result, Worded):
 
     @property
     def rating(self) -> MotorRating | None:
-        """What the motor of the design plant can do without overheating; None without the part "thermal"."""
+        """The thermal rating of the design plant's motor; None without the part "thermal"."""
         if self.design is None or self.design[0].winding is None:
             return None
         return rate_motor(*self.design, self.command_limit)
 
     @property
     def heat_guard(self) -> HeatGuard | None:
-        """What may lower the limit of the exported law as the winding warms up; None where no current is commanded."""
+        """The guard that lowers the exported law's limit as the winding warms up; None without a current."""
         rating = self.rating
         return None if rating is None or self.command.unit != "A" else HeatGuard.of_rating(rating, self.sample_time_s)
 
@@ -453,8 +453,8 @@ class Controller(LoopDelays, Result, Worded):
         """Return the design plant's figures by its state, " sliding" and " stuck" where it has friction, else ""."""
         assert self.design is not None
         plant, params = self.design
-        _, *others = split_friction({"": plant}, params).items()
-        stuck = {name: Loop(plant=self.plant(one, params), law=self.law).figures() for name, one in others}
+        _, *sticking = split_friction({"": plant}, params).items()
+        stuck = {name: Loop(plant=self.plant(model, params), law=self.law).figures() for name, model in sticking}
         return {" sliding" if stuck else "": self.achieved} | stuck
 
 

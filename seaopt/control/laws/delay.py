@@ -38,7 +38,7 @@ from seaopt.records import record
 
 @runtime_checkable
 class DelayedSpec(Protocol):
-    """What a specification says of time; see the options of these names."""
+    """The timing of a specification; see the options of these names."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -56,12 +56,12 @@ class DelayedSpec(Protocol):
 
     @property
     def sample_rate_hz(self) -> float:
-        """Of the controller."""
+        """The rate of the controller."""
         ...
 
     @property
     def measured(self) -> Measured:
-        """What it reads."""
+        """The outputs that the controller reads."""
         ...
 
 
@@ -139,8 +139,8 @@ def check_delays(spec: DelayedSpec, most: int) -> None:
 
 def count_loop_samples(spec: DelayedSpec) -> int:
     """Return the whole samples that a controller waits: as given, or 1."""
-    given = spec.compute_delay_samples if spec.delay_samples is None else spec.delay_samples
-    return 1 if given is None else given
+    samples = spec.compute_delay_samples if spec.delay_samples is None else spec.delay_samples
+    return 1 if samples is None else samples
 
 
 def count_response_samples(spec: DelayedSpec, measured: MeasuredResponse) -> float:
@@ -177,9 +177,9 @@ def find_drive_delay(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet
 
 def find_drive(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> Drive:
     """Return the drive's delay, and of a fit the experiment that tells it: the one with the longest."""
-    given = find_given_drive_delay(spec)
-    if given is not None:
-        return Drive(delay_s=float(given))
+    stated = find_given_drive_delay(spec)
+    if stated is not None:
+        return Drive(delay_s=float(stated))
     if not isinstance(source, Fit):
         return Drive(delay_s=read_conditions(plant, source).get(DRIVE_DELAY, 0.0))
     fitted = {name: experiment.delay_s for name, experiment in source.list_delayed(plant).items()}
@@ -243,8 +243,8 @@ def settle_delays(
         return spec, values
     outputs = list(plant.outputs)
     rows = [plant.output[outputs.index(name)] for name in list_names(spec.measured) if name in outputs]
-    held = isinstance(source, Fit) and source.shows_delay(plant) and not plans
-    at_once = held and not any(ca.depends_on(row, plant.u[0]) for row in rows)
+    shown = isinstance(source, Fit) and source.shows_delay(plant) and not plans
+    at_once = shown and not any(ca.depends_on(row, plant.u[0]) for row in rows)
     return replace(spec, compute_delay_samples=0 if at_once else 1), values
 
 

@@ -1,4 +1,4 @@
-"""Whether a controller is shown to be stable on a plant for every friction curve of its sector, for the certificate."""
+"""Show that a controller is stable on a plant for every friction curve of its sector, for the certificate."""
 
 from __future__ import annotations
 

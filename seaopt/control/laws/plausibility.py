@@ -60,7 +60,7 @@ class GateState:
 
 @record(keywords=True)
 class GateSpec:
-    """What is asked of a gate: which readings a running law is to believe, and what it does about the others.
+    """The options of a gate: which readings a running law is to believe, and what it does about the others.
 
     Raises
     ------

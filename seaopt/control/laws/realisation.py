@@ -148,11 +148,9 @@ class RunnableLaw:
 
     def __repr__(self) -> str:
         tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
-        limit = (
-            f"no limit of the {name_command(*self.command)}"
-            if math.isinf(self.current_limit_A)
-            else f"limited to {show_command(self.current_limit_A, *self.command)}"
-        )
+        limit = f"limited to {show_command(self.current_limit_A, *self.command)}"
+        if math.isinf(self.current_limit_A):
+            limit = f"no limit of the {name_command(*self.command)}"
         return (
             f"RunnableLaw of order {self.c.size} ({self.integrators} of it integrators{tracking}) at "
             f"{1 / self.sample_time_s:.6g} Hz, {limit}"
@@ -190,15 +188,12 @@ class RunnableLaw:
         """
         for name, value in (("reference", reference), ("current_A", current_A)):
             require_number(value, name, ControlError)
-        seen, known = GateState(), measurement is not None
-        measurement = self._check_measurement(measurement)
-        if self.gate is not None and known:
-            seen = self.gate.start(float(np.ravel(measurement)[0]))
+        is_stated, measurement = measurement is not None, self._check_measurement(measurement)
+        seen = self.gate.start(float(np.ravel(measurement)[0])) if self.gate is not None and is_stated else GateState()
         if not all(map(is_number, (reference, current_A, *np.ravel(measurement), *readings))):
-            given = measurement if isinstance(measurement, np.ndarray) else f"{measurement:g}"
             raise ControlError(
-                f"reference = {reference:g}, measurement = {given}, current_A = {current_A:g}"
-                f"{f', readings = {list(readings)}' if readings else ''}: give finite numbers, within +-{LARGEST:g}"
+                f"reference = {reference:g}, measurement = {measurement}, current_A = {current_A:g}, readings = "
+                f"{list(readings)}: give finite numbers, within +-{LARGEST:g}"
             )
         if not abs(current_A) <= self.current_limit_A:
             limit = show_command(self.current_limit_A, *self.command)
@@ -255,7 +250,7 @@ class RunnableLaw:
             measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
             if seen.fault:
                 current = self.gate.ramp(state.current_A, self.sample_time_s)
-                return current, LawState(x=state.x, current_A=current, held=state.held, gate=seen, memory=state.memory)
+                return current, replace(state, current_A=current, gate=seen)
         taken = all(map(is_number, (reference, *np.ravel(measurement), *readings)))
         added, memory = 0.0, state.memory
         with np.errstate(all="ignore"):
@@ -339,20 +334,20 @@ def runnable(
     )
 
 
-def choose_limit(command: Command, spec: ControllerSpec, asked: float | None) -> float | None:
+def choose_limit(command: Command, spec: ControllerSpec, requested: float | None) -> float | None:
     """Return the limit of a running law: the one asked for, infinite for none at all, else the controller's own."""
-    if asked is not None and not 0.0 < require_number(asked, "current_limit_A", ControlError) < math.inf:
-        return asked  # none at all, or for `realise` to refuse
-    return command.limit(spec.limit_asked if asked is None else asked)
+    if requested is not None and not 0.0 < require_number(requested, "current_limit_A", ControlError) < math.inf:
+        return requested  # none at all, or for `realise` to refuse
+    return command.limit(spec.limit_asked if requested is None else requested)
 
 
-def find_raised_limit(command: Command, spec: ControllerSpec, asked: float | None) -> str:
+def find_raised_limit(command: Command, spec: ControllerSpec, requested: float | None) -> str:
     """Return the limit that a controller was designed with, where the one asked for is higher; else "".
 
     Its figures and its certificate are of that one.
     """
-    own, running = (choose_limit(command, spec, limit) for limit in (None, asked))
-    return command.show(own) if own is not None and running is not None and running > own else ""
+    designed, running = (choose_limit(command, spec, limit) for limit in (None, requested))
+    return command.show(designed) if designed is not None and running is not None and running > designed else ""
 
 
 def realise(
@@ -417,13 +412,14 @@ def realise(
     m = law.integrators
     tracking = _compute_tracking_time(law) if tracking_time_s is None and m else tracking_time_s
     share = law.sample_time_s / (tracking + law.sample_time_s) if tracking is not None else 0.0
+    measured = 1 if law.d.size == 2 else slice(1, None)
     return RunnableLaw(
         a=law.a,
         b_reference=law.b[:, 0].copy(),
-        b_measurement=-law.b[:, 1] if law.d.size == 2 else -law.b[:, 1:],
+        b_measurement=-law.b[:, measured],
         c=law.c,
         d_reference=float(law.d[0]),
-        d_measurement=-float(law.d[1]) if law.d.size == 2 else -law.d[1:],
+        d_measurement=-law.d[measured],
         anti_windup=np.array([math.comb(m, j) * share**j for j in range(1, m + 1)] + [0.0] * (law.c.size - m)),
         integrators=m,
         tracking_time_s=tracking if m else None,

@@ -248,8 +248,8 @@ class ControllerSpec:
     @property
     def reference_filter(self) -> Prefilter | None:
         """The prefilter with its fields; None without one."""
-        given = self.prefilter
-        return Prefilter(order=given) if isinstance(given, str) else given
+        stated = self.prefilter
+        return Prefilter(order=stated) if isinstance(stated, str) else stated
 
     @property
     def regulated(self) -> str:
@@ -316,11 +316,12 @@ class ControllerSpec:
                 f"frf:{measured.name}: is of {measured.output} alone, and of a plant whose link moves, which "
                 "link_feedforward reads; give a model of that plant, and responses of one that holds its link"
             )
-        for what, own, other in (("output", measured.output, self.measured), ("input", measured.source, command.input)):
-            if own != other:
+        ends = (("output", measured.output, self.measured), ("input", measured.source, command.input))
+        for end, measured_at, used in ends:
+            if measured_at != used:
                 raise ControlError(
-                    f"frf:{measured.name}: is measured at the {what} {own}, and the controller's is {other}; measure "
-                    "that"
+                    f"frf:{measured.name}: is measured at the {end} {measured_at}, and the controller's is {used}; "
+                    "measure that"
                 )
         waits = count_response_samples(self, measured)
         return sample_measured(measured, command.per_effort, self.sample_time_s, waits)

@@ -1,4 +1,4 @@
-"""What a controller needs of its controller.json, and whether its fields agree with each other."""
+"""Read a controller.json, and check that its fields agree with each other."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class StoredPlants:
 
 @record
 class StoredGuards:
-    """What stands between the law and the world."""
+    """The guards between the law and the hardware."""
 
     gate: PlausibilityGate | None = None
 
@@ -241,8 +241,10 @@ def _check_gains(
         "prefilter": (spec.reference_filter, _take(gains, "prefilter_")),
         "link_feedforward": (spec.link_feedforward, to_content(link) or {}),
     }
-    for name, (asked, has) in parts.items():
-        numbers = {} if asked is None else {key: value for key, value in asdict(asked).items() if value is not None}
+    for name, (requested, has) in parts.items():
+        numbers = (
+            {} if requested is None else {key: value for key, value in asdict(requested).items() if value is not None}
+        )
         check_agrees(numbers, has, FILE, remedy=TUNE_AGAIN, place=f"spec.{name}", rtol=AGREES)
     if (observer is not None) != (spec.structure == "pid_dob") or (observer and gains["T_q"] != observer.T_q):
         raise _contradict("observer", "is not that of structure and gains")

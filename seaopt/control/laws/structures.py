@@ -77,6 +77,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.codec import to_content
 from seaopt.control.laws.assembly import Assembly
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
@@ -145,13 +146,13 @@ class Prefilter:
         assert self.corner_hz is not None
         w = math.tan(math.pi * self.corner_hz * sample_time_s)
         if not self.is_second_order:
-            num, den, rest = [w, w], np.array([1 + w, w - 1]), [-1.0, 0.0]
+            num, den, difference = [w, w], np.array([1 + w, w - 1]), [-1.0, 0.0]
         else:
             assert self.damping is not None
             damping = 2 * self.damping * w
-            num, rest = [w * w, 2 * w * w, w * w], [-1 - damping, 1 - damping, 0.0]
+            num, difference = [w * w, 2 * w * w, w * w], [-1 - damping, 1 - damping, 0.0]
             den = np.array([1 + damping + w * w, 2 * (w * w - 1), 1 - damping + w * w])
-        over, left = (TransferFunction(num=np.array(top) / den[0], den=den / den[0]) for top in (num, rest))
+        over, left = (TransferFunction(num=np.array(top) / den[0], den=den / den[0]) for top in (num, difference))
         return over, left
 
 
@@ -172,10 +173,9 @@ class Nominal:
         zeros = np.roots(b[lead:]).astype(complex)
         inverted = (np.abs(zeros) < LARGEST_INVERTED) & (np.real(zeros) > 0.0)
         left = np.atleast_1d(np.real(np.poly(zeros[~inverted])))
-        pairs = zip_longest(
-            *(_factors(roots) for roots in (np.linalg.eigvals(plant.a).astype(complex), zeros[inverted]))
-        )
-        inverse = [TransferFunction(num=_or_one(top), den=_or_one(below)) for top, below in pairs]
+        poles = np.linalg.eigvals(plant.a).astype(complex)
+        pairs = zip_longest(_factors(poles), _factors(zeros[inverted]), fillvalue=np.ones(1))
+        inverse = [TransferFunction(num=top, den=below) for top, below in pairs]
         gain = 1.0 / (b[lead] * np.sum(left))
         if np.isfinite(plant.static_gain) and plant.static_gain:  # which is known better than what b and left give
             gain = 1.0 / (plant.static_gain * cls(kept=left, inverse=tuple(inverse)).static_inverse)
@@ -228,14 +228,15 @@ class DisturbanceObserver:
     def to_dict(self, sample_time_s: float) -> dict[str, Any]:
         """Return the filters, and what it takes to build it again, as they stand in controller.json."""
         q, inverse = self.filters(sample_time_s)
-        return {
+        content = {
             "T_q": self.T_q,
             "bandwidth_hz": self.bandwidth_hz,
-            "Q": {"num": q.num, "den": q.den},
-            "Q_over_P_n": {"num": inverse.num, "den": inverse.den},
+            "Q": q,
+            "Q_over_P_n": inverse,
             "kept": self.nominal.kept,
-            "inverse": [{"num": part.num, "den": part.den} for part in self.nominal.inverse],
+            "inverse": self.nominal.inverse,
         }
+        return to_content(content)
 
     def correct(self, law: Assembly, surplus: float, sample_time_s: float) -> Assembly:
         """Return (law - Q/P_n measurement)/(1 - Q), of the inputs error and reference.
@@ -250,8 +251,8 @@ class DisturbanceObserver:
         e[: kept.size - 1] = short**2 * np.cumsum(kept[:0:-1])[::-1]
         at_one = float(np.sum(e)) + 2 * pole * short
         e[:2] += [2 * pole * short + pole**2, -(pole**2)]
-        rest = TransferFunction(num=short**2 / e[:1], den=e / e[0])
-        estimate = law.through(TransferFunction(num=kept, den=np.ones(1))).plus(seen).through(rest)
+        over_e = TransferFunction(num=short**2 / e[:1], den=e / e[0])
+        estimate = law.through(TransferFunction(num=kept, den=np.ones(1))).plus(seen).through(over_e)
         return law.plus(estimate.integrated(np.array([estimate.static[0], short**2 / at_one * surplus])))
 
     def _pole(self, sample_time_s: float) -> tuple[float, float]:
@@ -261,7 +262,7 @@ class DisturbanceObserver:
 
 @record
 class SpeedLoop:
-    """What the speed loop of a cascade reads: the motor's speed, or its encoder."""
+    """The signal of a cascade's speed loop: the motor's speed, or its encoder."""
 
     differenced: bool  # it is an encoder's position, and the law takes the difference over one sample
 
@@ -403,9 +404,8 @@ class Gains:
         alone = self.k_r - self.k_p  # the two inputs are the error and the reference, on which these act alone
         short = sample_time_s / (self.T_f + sample_time_s)
         lag = TransferFunction(num=np.array([1.0, -1.0]), den=np.array([1.0, -self.T_f / (self.T_f + sample_time_s)]))
-        law = Assembly.of_gains(np.array([self.k_p, alone])).plus(
-            Assembly.of_gains(self.k_d * short / sample_time_s * np.array([1.0, self.c - 1.0])).through(lag)
-        )
+        rate = Assembly.of_gains(self.k_d * short / sample_time_s * np.array([1.0, self.c - 1.0])).through(lag)
+        law = Assembly.of_gains(np.array([self.k_p, alone])).plus(rate)
         if structure != "pd" and self.k_i:  # (1 + q)/(1 - q) = 2/delta - 1
             half = self.k_i * sample_time_s / 2 * np.array([1.0, 0.0])
             law = law.plus(Assembly.of_gains(2 * half).integrated(2 * half)).plus(Assembly.of_gains(-half))
@@ -433,12 +433,8 @@ def _factors(roots: Complex[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:
     return sorted(factors, key=np.sum)
 
 
-def _or_one(polynomial: Float[np.ndarray, " n"] | None) -> Float[np.ndarray, " m"]:
-    return np.ones(1) if polynomial is None else polynomial
-
-
 class LawTerms(NamedTuple):
-    """What a law is made of at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer).
+    """The parts of a law at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer).
 
     `ahead` is in series with feedforward: `series` but for the integral of a speed loop. C_r is behind the `prefilter`
     besides.

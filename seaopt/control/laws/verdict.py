@@ -1,4 +1,4 @@
-"""Whether measured loops keep the limits of a specification, for the tuner and for the certificate alike."""
+"""Judge measured loops by the limits of a specification, for the tuner and for the certificate alike."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the
 
 @runtime_checkable
 class Limits(Protocol):
-    """What limits need of a specification."""
+    """The part of a specification that limits need."""
 
     @property
     def bandwidth_hz(self) -> float:
@@ -227,7 +227,7 @@ class DesignFigure:
 
     @property
     def allowed_text(self) -> str:
-        """What is allowed, with its sense and unit; empty where nothing is imposed."""
+        """The allowed value, with its sense and unit; empty where nothing is imposed."""
         if self.allowed is None:
             return ""
         sense = "" if self.limit.sense == "equal to" else f"{self.limit.sense} "
@@ -236,15 +236,15 @@ class DesignFigure:
 
 def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[DesignFigure]:
     """Return each limit of one loop's figures; of friction and of further signals only where there are, or one asks."""
-    known = {"min_friction_margin": design.slope_unit != "", OTHER_NOISE: design.figures.other_noise_gains != ()}
+    present = {"min_friction_margin": design.slope_unit != "", OTHER_NOISE: design.figures.other_noise_gains != ()}
     rows: list[DesignFigure] = []
     for limit in spec.limits:
         allowed = spec.allowed(limit)
         alone = limit.has_field and limit.condition is None  # a figure of the loop alone
-        if not alone or (allowed is None and not known.get(limit.name, True)):
+        if not alone or (allowed is None and not present.get(limit.name, True)):
             continue
         value = limit.figure(design)
-        reached = limit.sense == "at most" or np.isfinite(value) or (limit.name in known and known[limit.name])
+        reached = limit.sense == "at most" or np.isfinite(value) or (limit.name in present and present[limit.name])
         rows.append(
             DesignFigure(limit=limit, value=value if reached else None, allowed=allowed, unit=design.unit(limit))
         )

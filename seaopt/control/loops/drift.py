@@ -1,4 +1,4 @@
-r"""What drifts, left out: motion that a plant's equations and its fed-back output do not depend on.
+r"""Leave out drift: motion that a plant's equations and its fed-back output do not depend on.
 
 A link that nothing holds may be anywhere: with :math:`v` its shift and that of what it carries along (of a geared
 joint, the motor's N turns for one of the link),

@@ -102,7 +102,7 @@ class Law:
 
     @property
     def static_rest(self) -> Float[np.ndarray, " k"]:
-        """What does not integrate, at 0 Hz: effort per reference and per measured signal."""
+        """The part that does not integrate, at 0 Hz: effort per reference and per measured signal."""
         a, b, c = self.rest
         return self.d + c @ np.linalg.solve(np.eye(c.size) - a, b)
 
@@ -328,22 +328,22 @@ class Law:
 
         """
         measurements = [measurement] if isinstance(measurement, TransferFunction) else list(measurement)
-        given = {"reference": reference} | {
+        paths_by_name = {"reference": reference} | {
             f"measurement {number}" if len(measurements) > 1 else "measurement": path
             for number, path in enumerate(measurements, start=1)
         }
-        parts = [split(name, tf) for name, tf in given.items()]
+        parts = [split(name, tf) for name, tf in paths_by_name.items()]
         m = max(part.chain.size for part in parts)
         chain = np.zeros((m, len(parts)))
         for column, part in enumerate(parts):
             chain[: part.chain.size, column] = part.chain
         sign = np.array([1.0] + [-1.0] * len(measurements))
-        through = sign * np.array([tf.num[0] for tf in given.values()], dtype=float)
+        through = sign * np.array([tf.num[0] for tf in paths_by_name.values()], dtype=float)
         a, b, c = realise_rest(parts)
         made = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s)
 
         def find_wrong(law: Law) -> str | None:
-            for i, (name, tf) in enumerate(given.items()):
+            for i, (name, tf) in enumerate(paths_by_name.items()):
                 if not has_response(tf, lambda f, i=i: sign[i] * law.responses(f)[i], sample_time_s):
                     return name
             return None
@@ -357,16 +357,16 @@ class Law:
         return _set_apart(made) if near else made
 
 
-def _set_apart(given: Law) -> Law:
+def _set_apart(original: Law) -> Law:
     """Return a law balanced, with the poles next to 1 made integrators where its response stays the same."""
-    slowest = np.abs(given.responses(np.array([LOWEST / given.sample_time_s]))[:, 0])
-    for chain, a, b, c in split_integrators(given.a, given.b, given.c):
-        law = replace(given, **build_chain(_settle(chain, slowest), a, b, c))
+    slowest = np.abs(original.responses(np.array([LOWEST / original.sample_time_s]))[:, 0])
+    for chain, a, b, c in split_integrators(original.a, original.b, original.c):
+        law = replace(original, **build_chain(_settle(chain, slowest), a, b, c))
         for made in (law.balanced(), law):
-            if _is_same(made, given, SAME_RESPONSE):
+            if _is_same(made, original, SAME_RESPONSE):
                 return made
-    balanced = given.balanced()
-    return balanced if _is_same(balanced, given) else given
+    balanced = original.balanced()
+    return balanced if _is_same(balanced, original) else original
 
 
 def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -> Float[np.ndarray, "l k"]:
@@ -386,10 +386,10 @@ def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -
     return out
 
 
-def _is_same(law: Law, given: Law, share: float = RESPONSE_TOLERANCE) -> bool:
+def _is_same(law: Law, original: Law, share: float = RESPONSE_TOLERANCE) -> bool:
     """Tell whether two laws have the same responses from `LOWEST` on, but for a share of them."""
     per_sample = np.geomspace(LOWEST, 0.49, 25)
-    response, wanted = (side.responses(per_sample / law.sample_time_s) for side in (law, given))
+    response, wanted = (side.responses(per_sample / law.sample_time_s) for side in (law, original))
     size = np.abs(wanted)
     above = np.maximum.accumulate(size[:, ::-1], axis=1)[:, ::-1]
     return bool(np.all(np.abs(response - wanted) <= share * size + ROUNDED * above + TINY))

@@ -19,7 +19,7 @@ delay in it.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.control.loops.crossings import add_minima
 from seaopt.control.loops.loop import GRID_LOWEST_HZ, GROWING, STABLE, Loop
@@ -135,8 +135,8 @@ def margins(loop: Loop) -> Margins:
         phase_hz=None if least is None else float(extremes.crossovers[least]) * hz,
         delay_s=None if soonest is None else float(delays[soonest]),
         delay_hz=None if soonest is None else float(extremes.crossovers[soonest]) * hz,
-        gain_crossings=_pairs(extremes.gain_angles * hz, extremes.gain_factors),
-        phase_crossings=_pairs(extremes.crossovers * hz, lag),
+        gain_crossings=tuple(zip((extremes.gain_angles * hz).tolist(), extremes.gain_factors.tolist(), strict=True)),
+        phase_crossings=tuple(zip((extremes.crossovers * hz).tolist(), lag.tolist(), strict=True)),
         disks=disks,
     )
 
@@ -146,14 +146,14 @@ def disk(skew: float, angle: float, s: complex, hz: float) -> DiskMargin:
     delta = 1.0 / (complex(s) + (skew - 1.0) / 2.0)
     alpha = abs(delta)
     ends = [_factor(skew, -alpha), _factor(skew, alpha)]
-    low, high = max(0.0, ends[0].real), ends[1].real if ends[1].real > 1.0 else np.inf
+    low, high = (end.real for end in ends)
     return DiskMargin(
         skew=skew,
         alpha=alpha,
         frequency_hz=angle * hz,
         perturbation=_factor(skew, delta),
-        gain_range=(low, high),
-        phase_deg=_phase(ends[0].real, ends[1].real),
+        gain_range=(max(0.0, low), high if high > 1.0 else np.inf),
+        phase_deg=_phase(low, high),
     )
 
 
@@ -168,10 +168,6 @@ def _phase(low: float, high: float) -> float:
         return float(np.degrees(np.arccos(np.clip(low, -1.0, 1.0))))
     cosine = (1.0 + low * high) / (low + high) if low + high else -1.0
     return float(np.degrees(np.arccos(cosine))) if abs(cosine) <= 1.0 else 180.0
-
-
-def _pairs(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[tuple[float, float], ...]:
-    return tuple((float(a), float(b)) for a, b in zip(x, y, strict=True))
 
 
 def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
@@ -202,14 +198,15 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     loops = (first, second)
     laws = [loop.about(loop.law.poles) for loop in loops]
     f = np.unique(np.concatenate([_low_frequencies(loops), *(loop.grid() for loop in loops), *laws]))
+    turns = np.zeros(0)
     for _ in range(40):
-        turning = _turning(first, second, f)
-        wide = np.flatnonzero(np.abs(np.angle(turning[1:] / turning[:-1])) > np.pi / 2)
+        distance = 1.0 + np.conj(second.open_loop(f)) * first.open_loop(f)
+        turns = np.angle(distance[1:] / distance[:-1])
+        wide = np.flatnonzero(np.abs(turns) > np.pi / 2)
         if not wide.size or np.min(np.diff(f)[wide] / f[wide]) < 1e-12:
             break
         f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
-    turning = _turning(first, second, f)
-    half_turns = round(2.0 * float(np.sum(np.angle(turning[1:] / turning[:-1]))) / np.pi)
+    half_turns = round(2.0 * float(np.sum(turns)) / np.pi)
     outside = [int(np.sum(np.abs(np.linalg.eigvals(loop.plant.a)) > GROWING)) for loop in loops]
     integrators = [_count_integrators(loop) for loop in loops]
     if half_turns != 2 * (outside[0] - outside[1]) + integrators[0] - integrators[1]:
@@ -241,7 +238,3 @@ def _count_integrators(loop: Loop) -> int:
 def _chord(first: Loop, second: Loop, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
     l1, l2 = first.open_loop(f), second.open_loop(f)
     return np.abs(l1 - l2) / np.sqrt((1.0 + np.abs(l1) ** 2) * (1.0 + np.abs(l2) ** 2))
-
-
-def _turning(first: Loop, second: Loop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
-    return 1.0 + np.conj(second.open_loop(f)) * first.open_loop(f)

@@ -44,7 +44,7 @@ class SplitLaw:
     """A transfer function taken apart: g_1 ... g_m, Y and R."""
 
     chain: Float[np.ndarray, " m"]
-    rest: Float[np.ndarray, " _"]
+    remainder: Float[np.ndarray, " _"]
     den: Float[np.ndarray, " _"]
 
 
@@ -57,7 +57,7 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
         raise ControlError(f"{name}: num or den has a number that is not finite, or den[0] is not 1; tune again")
     if not np.any(num):
-        return SplitLaw(chain=np.zeros(0), rest=np.zeros(1), den=np.ones(1))
+        return SplitLaw(chain=np.zeros(0), remainder=np.zeros(1), den=np.ones(1))
     for _ in range(_count_roots_at_one(name, den)):
         den, m = np.cumsum(den)[:-1], m + 1
         if num.size > 1 and _has_root_at_one(num, ZERO_AT_ONE):
@@ -72,7 +72,7 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     numerator[: removed.size] -= removed
     for _ in range(m):
         numerator = np.cumsum(numerator)[:-1]
-    return SplitLaw(chain=chain[1:], rest=numerator, den=den)
+    return SplitLaw(chain=chain[1:], remainder=numerator, den=den)
 
 
 def refuse_slow_poles(name: str) -> ControlError:
@@ -114,12 +114,12 @@ def realise_rest(
     drives: list[Float[np.ndarray, "_ k"]] = []
     rows: list[Float[np.ndarray, " _"]] = []
     for den, numbers in groups.items():
-        n = max(len(den), *(parts[number].rest.size for number in numbers)) - 1
+        n = max(len(den), *(parts[number].remainder.size for number in numbers)) - 1
         whole = np.pad(den, (0, n + 1 - len(den)))
         a, b = np.eye(n, k=1), np.zeros((n, len(parts)))
         a[:, :1] -= _shift(whole)[1:, None]
         for number in numbers:
-            num = parts[number].rest
+            num = parts[number].remainder
             b[:, number] = _shift((np.pad(num, (0, n + 1 - num.size)) - num[0] * whole)[1:])
         a, scale = _scale(a)
         blocks.append(np.eye(n) + a)

@@ -95,7 +95,7 @@ class OuterLoop:
 
     @property
     def impedance(self) -> Impedance:
-        """What it renders."""
+        """The impedance that it renders."""
         return Impedance(stiffness=self.stiffness, damping=self.damping, velocity_filter_s=self.velocity_filter_s)
 
     def describe(self) -> str:
@@ -108,12 +108,12 @@ class OuterLoop:
 
     @property
     def pole(self) -> float:
-        """What the filtered speed keeps from one sample to the next."""
+        """The share of the filtered speed that stays from one sample to the next."""
         return self.velocity_filter_s / (self.velocity_filter_s + self.sample_time_s)
 
     @property
     def rate(self) -> float:
-        """What a step of the position adds to the filtered speed, 1/s."""
+        """The filtered speed that a step of the position adds, 1/s."""
         return 1.0 / (self.velocity_filter_s + self.sample_time_s)
 
     def reset(self, position: float) -> float:

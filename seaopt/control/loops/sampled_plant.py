@@ -224,10 +224,10 @@ def add_drive_delay(params: ParameterSet, drive_delay_s: float) -> ParameterSet:
 
 def drop_drive_delay(params: ParameterSet) -> ParameterSet:
     """Return parameters without a drive's delay, where samples count it already."""
-    given = _list_given(params)
-    if DRIVE_DELAY not in given:
+    stated = _list_given(params)
+    if DRIVE_DELAY not in stated:
         return params
-    return ParameterSet(parameter for name, parameter in given.items() if name != DRIVE_DELAY)
+    return ParameterSet(parameter for name, parameter in stated.items() if name != DRIVE_DELAY)
 
 
 def _list_given(params: ParameterSet) -> ParameterSet:

@@ -1,1 +1,1 @@
-"""What is added to a law because its plant is known, as it runs, and whether the loop stays stable with it."""
+"""Terms that a running law adds because its plant is known, and whether the loop stays stable with them."""

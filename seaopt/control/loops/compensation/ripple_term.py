@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.codec import Limits
 from seaopt.errors import ControlError, require_number
@@ -36,7 +37,7 @@ Cycles = Annotated[int, Limits(ge=1, le=MOST_CYCLES)]
 
 @record
 class CompensateRipple:
-    """What is asked of a compensation of torque ripple.
+    """The options of a compensation of torque ripple.
 
     Raises
     ------
@@ -129,16 +130,22 @@ class RippleTerm:
 
     def slope(self, position: float) -> float:
         """Return its slope there, effort per unit of the reading."""
-        rates = 2.0 * np.pi / self.period * np.array(self.cycles)
-        return float(rates @ (np.array(self.sin) * np.cos(rates * position) - self.cos * np.sin(rates * position)))
+        return float(self._slopes(np.array([position]))[0])
+
+    @property
+    def _rates(self) -> Float[np.ndarray, " h"]:
+        """Radians per unit of the reading, of each harmonic."""
+        return 2.0 * np.pi / self.period * np.array(self.cycles)
+
+    def _slopes(self, positions: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        rates, angles = self._rates, np.outer(positions, self._rates)
+        return np.cos(angles) @ (rates * self.sin) - np.sin(angles) @ (rates * self.cos)
 
     @property
     def steepest(self) -> tuple[float, float]:
         """Bounds of its slope over a revolution: below the least and above the largest, by 0.1 % or so."""
-        rates = 2.0 * np.pi / self.period * np.array(self.cycles)
-        count = POINTS_PER_CYCLE * max(self.cycles)
-        angles = np.outer(np.arange(count) * (self.period / count), rates)
-        slopes = np.cos(angles) @ (rates * self.sin) - np.sin(angles) @ (rates * self.cos)
+        rates, count = self._rates, POINTS_PER_CYCLE * max(self.cycles)
+        slopes = self._slopes(np.arange(count) * (self.period / count))
         # Between points an extreme is at most half a step away, where the slope is flat.
         between = 0.5 * (0.5 * self.period / count) ** 2 * float(rates**3 @ np.hypot(self.cos, self.sin))
         return float(np.min(slopes)) - between, float(np.max(slopes)) + between

@@ -1,4 +1,4 @@
-r"""What a law adds because the plant is known, as it runs: once a sample, in Python, in simulation and in C.
+r"""The terms that a law adds because the plant is known: once a sample, in Python, in simulation and in C.
 
 Friction is met with an effort of the size of a fraction of Coulomb friction and of the sign of a velocity,
 
@@ -44,7 +44,7 @@ FORGOTTEN: Memory = (0.0, 0.0)
 
 @record
 class CompensateFriction:
-    """What is asked of a compensation of friction.
+    """The options of a compensation of friction.
 
     Raises
     ------
@@ -82,7 +82,7 @@ class CompensateFriction:
 
 @record
 class CompensateGravity:
-    """What is asked of a compensation of gravity.
+    """The options of a compensation of gravity.
 
     Raises
     ------
@@ -189,7 +189,7 @@ class FrictionTerm:
 
 @record
 class Compensation:
-    """What a law adds to its effort and to its reference.
+    """The terms that a law adds to its effort and to its reference.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ class Compensation:
 
     @property
     def shape(self) -> CompensationShape:
-        """What of it is no number."""
+        """Its structure, without its numbers."""
         return CompensationShape(
             friction=None if self.friction is None else self.friction.source,
             reads=self.reads,

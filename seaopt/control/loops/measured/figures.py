@@ -1,4 +1,4 @@
-"""What a law does on measured frequency responses: figures of every response in their discs, and what is assumed."""
+"""Figures of a law on measured frequency responses: the worst in their discs, and the assumptions."""
 
 from __future__ import annotations
 

@@ -155,9 +155,10 @@ class DiscLoop:
         """Return the least and the largest bandwidth of the responses in the discs."""
         f = self.grid()
         reference, negative = self.law.responses(f)[:2]
-        low, high = bound_disc("P C_r", self.plant.response(f), self.plant.discs(f), -negative, reference)
-        static = 1.0 if self.law.integrators else float(low[0])
-        return _first(f, HALF_POWER * static - low), _first(f, HALF_POWER * static - high)
+        sizes = bound_disc("P C_r", self.plant.response(f), self.plant.discs(f), -negative, reference)
+        static = 1.0 if self.law.integrators else float(sizes[0][0])
+        least, most = (_first(f, HALF_POWER * static - size) for size in sizes)
+        return least, most
 
     def _find_return(
         self, f: Float[np.ndarray, " m"], most: Float[np.ndarray, " m"], down: float, static: float
