@@ -259,12 +259,13 @@ class Loop:
         (ms, mt, skew, noise, reference, *further), ms_at = extremes.peaks, extremes.at[0]
         crossovers, slow, below = extremes.crossovers, extremes.sensitivity_edges, extremes.bandwidth_edges
         least = find_least(system, TRACKING, DROOP_BAND * (float(below[0]) if below.size else np.pi))
+        band_hz = float(below[0]) / per_hz if below.size else None
         quiet = abs(extremes.ends[0, 0]) < HALF_POWER
         band = _tracking_band(system, extremes.band_edges)
         return LoopFigures(
             stable=True,
             spectral_radius=radius,
-            bandwidth_hz=float(below[0]) / per_hz if below.size else None,
+            bandwidth_hz=band_hz,
             tracking_band_hz=None if band is None else (band[0] / per_hz, band[1] / per_hz),
             crossover_hz=float(crossovers[-1]) / per_hz if crossovers.size else None,
             sensitivity_bandwidth_hz=float(slow[0] if slow.size else np.pi) / per_hz if quiet else 0.0,
@@ -273,7 +274,7 @@ class Loop:
             ms_hz=float(ms_at) / per_hz,
             reference_peak=float(reference) / extremes.static if extremes.static else np.inf,
             droop_db=_droop_db(least, extremes.static),
-            return_hz=self._find_return(system, float(below[0]) / per_hz, extremes.static) if below.size else None,
+            return_hz=None if band_hz is None else self._find_return(system, band_hz, extremes.static),
             gain_margin_db=_least(extremes.gains_db),
             phase_margin_deg=_least(extremes.lags_deg),
             delay_margin_s=_least(extremes.delays * self.plant.sample_time_s),

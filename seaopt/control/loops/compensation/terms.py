@@ -227,10 +227,12 @@ class Compensation:
     @property
     def numbers(self) -> list[float]:
         """Its numbers, in the order in which `compensate` takes them."""
-        friction = self.friction
-        rubs = [] if friction is None else [friction.effort, friction.share_per_step(self.sample_time_s)]
-        weighs = [] if self.gravity is None else self.gravity.numbers
-        return rubs + weighs + ([] if self.ripple is None else self.ripple.numbers)
+        numbers: list[float] = []
+        if self.friction is not None:
+            numbers += [self.friction.effort, self.friction.share_per_step(self.sample_time_s)]
+        for term in (self.gravity, self.ripple):
+            numbers += [] if term is None else term.numbers
+        return numbers
 
     @property
     def shape(self) -> CompensationShape:

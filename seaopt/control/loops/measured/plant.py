@@ -99,12 +99,14 @@ def sample_measured(
     end, folded = float(np.abs(centre[-1]) + radius[-1]), 0.0
     turned = centre * np.exp(-2j * np.pi * f * late)
     if not (same and abs(samples - round(samples)) < WHOLE):
-        old, new = _hold(f, clock), _hold(f, Clock(period=sample_time_s))
-        ratio = new / old
+        own_clock, old = Clock(period=sample_time_s), _hold(f, clock)
+        ratio = _hold(f, own_clock) / old
         plain = end / float(np.abs(old[-1]))
-        extra = _fold(f, Clock(period=sample_time_s), plain, f[-1])
+        extra = _fold(f, own_clock, plain, f[-1])
         radius = (radius + _fold(f, clock, plain, f[-1])) * np.abs(ratio) + extra
-        turned, end, folded = turned * ratio, plain, _fold_most(Clock(period=sample_time_s), plain, f[-1])
+        above = np.linspace(f[-1], nyquist, 50)
+        folded = float(np.max(_fold(above, own_clock, plain, f[-1])))
+        turned, end = turned * ratio, plain
     _check_rest(measured, f, turned, late + clock.delay_s + 0.5 * sample_time_s)
     return MeasuredPlant(
         name=f"frf:{measured.name}",
@@ -147,7 +149,3 @@ def _fold(f: Float[np.ndarray, " m"], clock: Clock, end: float, end_hz: float) -
         out += end * np.minimum(end_hz / image, 1.0) * np.abs(_hold(image, clock))
     # Beyond: end_hz T/k of the plant and 1/(pi k) of the hold, on both sides.
     return out + 2.0 * end * end_hz * clock.period / (np.pi * FOLDED)
-
-
-def _fold_most(clock: Clock, end: float, end_hz: float) -> float:
-    return float(np.max(_fold(np.linspace(end_hz, 0.5 / clock.period, 50), clock, end, end_hz)))
