@@ -11,22 +11,23 @@ Every bound is a theorem but for rounding, which is estimated at every step and 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from seaopt.codec import OrInfinite
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.errors import ControlError
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.impulse import ImpulseTransfer, enclose_plant
-from seaopt.robustness.bounds.region import Boxes, Region, build_region
-from seaopt.robustness.bounds.unit_circle import ArcBounds, Arcs, bound_arcs, concatenate_arcs
+from seaopt.robustness.bounds.region import Boxes, Region, Rows, build_region
+from seaopt.robustness.bounds.unit_circle import ArcBounds, Arcs, bound_arcs
 from seaopt.robustness.uncertainty.batch import batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.uncertainty.draws import Points, Uncertainty
+from seaopt.robustness.uncertainty.rows import join_rows, take_rows
 from seaopt.robustness.uncertainty.severity import severities
 from seaopt.robustness.uncertainty.worst import Worst
 
@@ -90,10 +91,12 @@ class Bracket:
 
     """
 
-    ms_lower: float
-    ms_upper: float
-    mt_lower: float
-    mt_upper: float
+    json_keys = ("ms_lower", "ms_upper", "mt_lower", "mt_upper", "bounded_stable", "boxes", "left_out")
+
+    ms_lower: OrInfinite
+    ms_upper: OrInfinite
+    mt_lower: OrInfinite
+    mt_upper: OrInfinite
     bounded_stable: bool
     boxes: int
     left_out: str = ""
@@ -110,10 +113,6 @@ class Bracket:
             return f"no bound in {self.boxes} boxes"
         ms, mt = _round_up(self.ms_upper), _round_up(self.mt_upper)
         return f"bounded, rounding estimated: all stable, Ms below {ms}, Mt below {mt}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what robustness.json keeps with the worst case."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "parameters"}
 
     def __repr__(self) -> str:
         return f"Bracket(Ms from {self.ms_lower:.5g}, Mt from {self.mt_lower:.5g}; {self.statement})"
@@ -300,20 +299,20 @@ def _step(search: _BranchAndBound) -> None:
     np.maximum.at(worst, search.arcs.box, np.maximum(search.arcs.s / scale[0], search.arcs.t / scale[1]))
     order = np.argsort(-worst, kind="stable")
     chosen, others = np.sort(order[:BOX_BLOCK]), np.sort(order[BOX_BLOCK:])
-    boxes, arcs = search.boxes.take(chosen), _take_arcs_of(search.arcs, chosen, worst.size)
+    boxes, arcs = take_rows(search.boxes, chosen), _take_arcs_of(search.arcs, chosen, worst.size)
     waiting = _take_arcs_of(search.arcs, others, worst.size)
     stable = _measure(search, boxes.centre)
     sampled = enclose_plant(search.controller, search.plant, search.within, boxes)
     left, blame = _bound_block(search, sampled, boxes, arcs, stable)
     search.count += chosen.size
-    search.boxes, search.arcs = search.boxes.take(others), waiting
+    search.boxes, search.arcs = take_rows(search.boxes, others), waiting
     if left.box.size:
         _halve(search, boxes, left, blame)
 
 
 def _bound_block(
     search: _BranchAndBound, sampled: ImpulseTransfer, boxes: Boxes, arcs: Arcs, stable: Bool[np.ndarray, " b"]
-) -> tuple[Arcs, Float[np.ndarray, "b k"]]:
+) -> tuple[Arcs, Rows]:
     """Return the arcs whose box has to be halved, and how much each coordinate of the box is to blame.
 
     A box with an unstable centre, which is then outside the set, is halved whatever its bounds.
@@ -323,7 +322,7 @@ def _bound_block(
     blame, left = np.zeros_like(hard), list[Arcs]()
     first = True
     while arcs.box.size:
-        block, arcs = arcs.take(slice(0, ARC_BLOCK)), arcs.take(slice(ARC_BLOCK, None))
+        block, arcs = take_rows(arcs, slice(0, ARC_BLOCK)), take_rows(arcs, slice(ARC_BLOCK, None))
         new = bound_arcs(search.controller, sampled, boxes, search.within.ball, block)
         block = block.tighten(new.s, new.t)
         if first:
@@ -337,19 +336,19 @@ def _bound_block(
         by_box = np.maximum(np.max(new.by_box, axis=1, initial=0.0), new.remainder)
         halved = ~done & stable[block.box] & (new.by_angle >= ARC_SHARE * by_box) & (new.by_angle > SHORTEST)
         stuck = ~done & ~halved
-        left.append(block.take(stuck))
+        left.append(take_rows(block, stuck))
         share = new.by_box / np.maximum(np.sum(new.by_box, axis=1, keepdims=True), 1e-300)
         # A remainder does not show which coordinate makes it; the hardness measured on a trial does.
         beyond = ~(new.remainder <= np.max(new.by_box, axis=1, initial=0.0))
         share = np.where(beyond[:, None], hard[block.box], share)
         np.add.at(blame, block.box[stuck], np.nan_to_num(share[stuck]))
-        arcs = concatenate_arcs([arcs, block.take(halved).halve()])
-    return concatenate_arcs(left), blame
+        arcs = join_rows([arcs, take_rows(block, halved).halve()])
+    return join_rows(left), blame
 
 
-def _worst_corners(search: _BranchAndBound, boxes: Boxes, arcs: Arcs, bounds: ArcBounds) -> Float[np.ndarray, "c k"]:
+def _worst_corners(search: _BranchAndBound, boxes: Boxes, arcs: Arcs, bounds: ArcBounds) -> Points:
     """Return points of the set where abs(S) and abs(T) of the worst arcs are largest to first order."""
-    points: list[Float[np.ndarray, "c k"]] = []
+    points: list[Points] = []
     for bound, slope in ((arcs.s, bounds.gradients[0]), (arcs.t, bounds.gradients[1])):
         largest = np.argsort(-np.where(np.isfinite(bound), bound, 0.0), kind="stable")[:CORNERS_MEASURED]
         box = arcs.box[largest]
@@ -357,22 +356,20 @@ def _worst_corners(search: _BranchAndBound, boxes: Boxes, arcs: Arcs, bounds: Ar
     return search.within.project(np.vstack(points))
 
 
-def _halve(search: _BranchAndBound, boxes: Boxes, left: Arcs, blame: Float[np.ndarray, "b k"]) -> None:
+def _halve(search: _BranchAndBound, boxes: Boxes, left: Arcs, blame: Rows) -> None:
     """Replace boxes by their halves, each with the arcs that are left."""
     parents = np.unique(left.box)
     if not search.within.size:
         search.boxes, search.arcs = boxes, left
         return
     wide = np.where(boxes.radius[parents] > 0.0, blame[parents], -1.0)
-    halves, kept = search.within.cut(boxes.take(parents).halve(np.argmax(wide, axis=1)))
+    halves, kept = search.within.cut(take_rows(boxes, parents).halve(np.argmax(wide, axis=1)))
     parent = np.searchsorted(parents, left.box)
     index = np.where(kept, np.cumsum(kept) - 1, -1) + search.boxes.centre.shape[0]
     children = [parent + side * parents.size for side in (0, 1)]
-    both = [left.renumber(index[child]).take(kept[child]) for child in children]
-    search.boxes = Boxes(
-        centre=np.vstack([search.boxes.centre, halves.centre]), radius=np.vstack([search.boxes.radius, halves.radius])
-    )
-    search.arcs = concatenate_arcs([search.arcs, *both])
+    both = [take_rows(left.renumber(index[child]), kept[child]) for child in children]
+    search.boxes = join_rows([search.boxes, halves])
+    search.arcs = join_rows([search.arcs, *both])
 
 
 def _take_arcs_of(arcs: Arcs, boxes: Int[np.ndarray, " b"], count: int) -> Arcs:
@@ -380,10 +377,10 @@ def _take_arcs_of(arcs: Arcs, boxes: Int[np.ndarray, " b"], count: int) -> Arcs:
     index = np.full(count, -1)
     index[boxes] = np.arange(boxes.size)
     renumbered = arcs.renumber(index[arcs.box])
-    return renumbered.take(renumbered.box >= 0)
+    return take_rows(renumbered, renumbered.box >= 0)
 
 
-def _measure(search: _BranchAndBound, points: Float[np.ndarray, "c k"]) -> Bool[np.ndarray, " c"]:
+def _measure(search: _BranchAndBound, points: Points) -> Bool[np.ndarray, " c"]:
     """Close the loop at points and return which are stable; points of the set raise the lower bounds."""
     within = search.within
     count = points.shape[0]

@@ -20,20 +20,8 @@ LARGEST_POWER = 64
 def enclose(function: Any, arguments: Sequence[Sequence[Entry]]) -> list[list[Entry]]:
     """Return enclosures of the entries of a function's outputs, column by column.
 
-    Entries that depend on nothing uncertain are numbers, computed as CasADi does, whatever the instruction.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Of SX, its outputs dense.
-    arguments : sequence of sequences
-        The entries of each argument.
-
-    Raises
-    ------
-    ControlError
-        An instruction on something uncertain has no enclosure.
-
+    Entries that depend on nothing uncertain are numbers, computed as CasADi does, whatever the instruction. The
+    function is of SX, its outputs dense; an instruction on something uncertain may have no enclosure.
     """
     if not function.is_a("SXFunction"):
         raise ControlError(f"{function.name()} is not of scalar instructions (SX); no bound can be computed")

@@ -35,32 +35,17 @@ DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 
 class ImpulseTransfer:
     """P_i(z) = (head_i + tail_i / z) / (z^whole denominator), coefficients in ascending powers of w = z - 1.
 
-    Parameters
-    ----------
-    heads, tails : tuple of Taylor
-        Of each measured output, shapes (b, n + 1).
-    denominator : Taylor
-        Shape (b, n + 1), monic.
-    whole : array
-        Whole samples of the plant's own delay, shape (b,).
-
+    Polynomials have the shape (b, n + 1).
     """
 
-    heads: tuple[Taylor, ...]
+    heads: tuple[Taylor, ...]  # of each measured output
     tails: tuple[Taylor, ...]
-    denominator: Taylor
-    whole: Int[np.ndarray, " b"]
+    denominator: Taylor  # monic
+    whole: Int[np.ndarray, " b"]  # samples of the plant's own delay
 
 
 def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> ImpulseTransfer:
-    """Return the sampled plant over boxes, from motor force to every measured output.
-
-    Raises
-    ------
-    ControlError
-        The plant's equations have an instruction without an enclosure, or cannot rest at a box's centre.
-
-    """
+    """Return the sampled plant over boxes, from motor force to every measured output."""
     plant = leave_out_drift(freeze_heat(plant), controller.signals)
     degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
     uncertain = within.enclose(boxes, degree)

@@ -16,21 +16,19 @@ from seaopt.control.loops.sampled_plant import DELAY, DELAYS, DRIVE_DELAY, condi
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_linear
-from seaopt.robustness.uncertainty.draws import Uncertainty, confidence_radius
+from seaopt.robustness.uncertainty.draws import Column, Uncertainty, confidence_radius
 
 SMALLEST_AXIS = 1e-12  # half axis, as a fraction of the largest relative one, below which nothing is uncertain
+Rows = Float[np.ndarray, "b k"]  # coordinates, a row per box or point
+Mask = Bool[np.ndarray, " b"]
 
 
 @record(eq=False)
 class Boxes:
     """Boxes in coordinates: centres and half widths, shapes (b, k)."""
 
-    centre: Float[np.ndarray, "b k"]
-    radius: Float[np.ndarray, "b k"]
-
-    def take(self, index: Int[np.ndarray, " r"] | Bool[np.ndarray, " b"] | slice) -> Boxes:
-        """Return the boxes at an index."""
-        return Boxes(centre=self.centre[index], radius=self.radius[index])
+    centre: Rows
+    radius: Rows
 
     def halve(self, axis: Int[np.ndarray, " b"]) -> Boxes:
         """Return the lower halves, each box cut along its own axis, then the upper halves."""
@@ -43,36 +41,17 @@ class Boxes:
 
 @record(eq=False)
 class Region:
-    """The set of plants that differ in what is uncertain.
+    """The set of plants that differ in what is uncertain."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        Parameters and conditions that are uncertain.
-    centre, slopes
-        Their values at the coordinates' origin, shape (n,), and per coordinate, (n, k).
-    low, high
-        Physical bounds of those of the Gaussian part, infinite for the others, shape (n,).
-    ball : int
-        This many coordinates, the first ones, lie in a unit ball, the others between -1 and 1.
-    fixed : mapping of name to value
-        Conditions that are not uncertain.
-    nominal : CompletedParameters
-        What the plant has where nothing is uncertain.
-    lead_s : float
-        The delay besides the one that is uncertain, s.
-
-    """
-
-    names: tuple[str, ...]
-    centre: Float[np.ndarray, " n"]
-    slopes: Float[np.ndarray, "n k"]
-    low: Float[np.ndarray, " n"]
-    high: Float[np.ndarray, " n"]
-    ball: int
-    fixed: dict[str, float]
-    nominal: CompletedParameters
-    lead_s: float = 0.0
+    names: tuple[str, ...]  # parameters and conditions that are uncertain
+    centre: Column  # their values at the coordinates' origin
+    slopes: Float[np.ndarray, "n k"]  # and per coordinate
+    low: Column  # physical bounds of those of the Gaussian part, infinite for the others
+    high: Column
+    ball: int  # this many coordinates, the first ones, lie in a unit ball, the others between -1 and 1
+    fixed: dict[str, float]  # conditions that are not uncertain
+    nominal: CompletedParameters  # what the plant has where nothing is uncertain
+    lead_s: float = 0.0  # the delay besides the one that is uncertain
 
     @property
     def size(self) -> int:
@@ -102,7 +81,7 @@ class Region:
         centre[:, axis], radius[:, axis] = (points - middle) / half, widths / half
         return self.cut(Boxes(centre=centre, radius=radius))[0]
 
-    def cut(self, boxes: Boxes) -> tuple[Boxes, Bool[np.ndarray, " b"]]:
+    def cut(self, boxes: Boxes) -> tuple[Boxes, Mask]:
         """Return the boxes cut at the physical bounds, without those outside the set, and which boxes these are."""
         low, high = boxes.centre - boxes.radius, boxes.centre + boxes.radius
         for sign, bound in ((1.0, self.low), (-1.0, -self.high)):
@@ -124,17 +103,17 @@ class Region:
         centre, slopes = self.evaluate(boxes.centre), self.slopes[:, None] * boxes.radius
         return {name: make_linear(centre[name], slopes[row].T, over) for row, name in enumerate(self.names)}
 
-    def evaluate(self, points: Float[np.ndarray, "b k"]) -> dict[str, Float[np.ndarray, " b"]]:
+    def evaluate(self, points: Rows) -> dict[str, Float[np.ndarray, " b"]]:
         """Return the uncertain parameters and conditions at points."""
         return dict(zip(self.names, (self.centre + points @ self.slopes.T).T, strict=True))
 
-    def project(self, points: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b k"]:
+    def project(self, points: Rows) -> Rows:
         """Return the points, with those outside the ball or the box moved onto its edge."""
         inner = points[:, : self.ball]
         size = np.linalg.norm(inner, axis=1, keepdims=True)
         return np.hstack([inner / np.maximum(size, 1.0), np.clip(points[:, self.ball :], -1.0, 1.0)])
 
-    def contains(self, points: Float[np.ndarray, "b k"]) -> Bool[np.ndarray, " b"]:
+    def contains(self, points: Rows) -> Mask:
         """Tell which points are in the set."""
         values = self.centre + points @ self.slopes.T
         edge = 1.0 + 1e-12

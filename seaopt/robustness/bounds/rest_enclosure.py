@@ -8,7 +8,8 @@ Neumaier, Interval Methods for Systems of Equations, 1990, chapter 5).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -60,27 +61,23 @@ class _RestEquations:
 
     def truncate(self, degree: int) -> _RestEquations:
         """Return the equations on models of a lower degree."""
-        p, x = ([_truncate(entry, degree) for entry in entries] for entries in (self.p, self.x))
-        over = build_basis(self.over.size, degree)
-        return _RestEquations(plant=self.plant, p=p, x=x, loose=self.loose, count=self.count, over=over)
+        return self._convert(lambda model: model.truncate(degree), build_basis(self.over.size, degree))
 
     def at_centre(self) -> _RestEquations:
         """Return the equations at the centres of the boxes."""
-        p, x = ([_take_centre(entry) for entry in entries] for entries in (self.p, self.x))
-        return _RestEquations(plant=self.plant, p=p, x=x, loose=self.loose, count=self.count, over=POINT_BASIS)
+        return self._convert(lambda model: make_constant(model.c, POINT_BASIS), POINT_BASIS)
+
+    def _convert(self, change: Callable[[Taylor], Taylor], over: Basis) -> _RestEquations:
+        p, x = (
+            [change(entry) if isinstance(entry, Taylor) else entry for entry in entries] for entries in (self.p, self.x)
+        )
+        return replace(self, p=p, x=x, over=over)
 
 
 def enclose_equilibrium(
     plant: Plant, p: Sequence[Entry], prescribed: Mapping[str, Entry], count: int, over: Basis
 ) -> tuple[list[Entry], list[Entry]]:
-    """Return enclosures of the states and inputs at rest; infinite where it is not proven that there is one.
-
-    Raises
-    ------
-    ControlError
-        Two states are prescribed, or the plant cannot rest at the centre of a box.
-
-    """
+    """Return enclosures of the states and inputs at rest; infinite where it is not proven that there is one."""
     names = list(plant.states)
     x: list[Entry] = [prescribed.get(name, 0.0) for name in names]
     fixed = [k for k, state in enumerate(x) if isinstance(state, Taylor) or state != 0.0]
@@ -129,11 +126,3 @@ def _prove(equations: _RestEquations, y: Taylor, inverse: Float[np.ndarray, "b n
             break
     proven = np.all(image <= wide, axis=1, keepdims=True)
     return y.with_remainder(np.where(proven, wide, np.inf))
-
-
-def _truncate(entry: Entry, degree: int) -> Entry:
-    return entry.truncate(degree) if isinstance(entry, Taylor) else entry
-
-
-def _take_centre(entry: Entry) -> Entry:
-    return make_constant(entry.c, POINT_BASIS) if isinstance(entry, Taylor) else entry

@@ -26,7 +26,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Budget, bracket
-from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
+from seaopt.robustness.uncertainty.draws import combine_uncertainty
 
 ANGLES = 4000
 LOWEST = 1e-9  # of the sample rate: from here
@@ -74,36 +74,18 @@ def bound_stretch(
     params: ParameterSet,
     low: float,
     high: float,
-    budget: Budget = BUDGET,
 ) -> StretchBound:
-    """Bound Ms of a scheduled law on a stretch between two neighbouring points.
+    """Bound Ms of a scheduled law on a stretch between two neighbouring points, on a plant without friction.
 
-    Parameters
-    ----------
-    name : str
-        The plant's, for the result.
-    middle : Controller
-        The schedule at the middle of the stretch.
-    table : GainTable
-        The gains.
-    plant, params
-        The plant, without friction, and its nominal parameters.
-    low, high : float
-        Ends of the stretch, without a point of the table between them.
-    budget : Budget
-        For the enclosure of the plant.
-
+    `middle` is the schedule at the middle of the stretch.
     """
     frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s
     change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
     moves = table.over in plant.parameters or table.over in plant.states
     ranges = {table.over: (low, high)} if moves else {}  # of a plant without the variable the law alone changes
-    values = ParameterSet(replace(one, std=None) for one in params.values())  # of a fit its values alone count here
-    nominal = combine_uncertainty(values, ParameterSet(), ranges, {name: plant})
-    alone = Uncertainty(
-        nominal=nominal.nominal, names=(), covariance=np.zeros((0, 0)), ranges=nominal.ranges, absent=nominal.absent
-    )
-    bounded = bracket(middle, plant, alone, budget=budget)
+    values = ParameterSet(replace(each, std=None) for each in params.values())  # of a fit its values alone count here
+    unknown = combine_uncertainty(values, ParameterSet(), ranges, {name: plant})
+    bounded = bracket(middle, plant, replace(unknown, names=(), covariance=np.zeros((0, 0))), budget=BUDGET)
     reason = ""
     if not bounded.bounded_stable:
         reason = bounded.left_out or f"no bound in {bounded.boxes} boxes"

@@ -32,31 +32,15 @@ SPARSE = 8  # monomials up to which a product goes through them one by one
 
 @record(eq=False)
 class Basis:
-    """The monomials of some coordinates up to a degree, by ascending degree.
+    """The monomials of some coordinates up to a degree, by ascending degree."""
 
-    Parameters
-    ----------
-    size, degree : int
-        Coordinates and highest degree.
-    powers : array, shape (m, size)
-        Exponents of every monomial.
-    target : array, shape (m, m)
-        Index of the monomial that a product of two is; -1 beyond the degree.
-    until : array, shape (degree + 1,)
-        How many monomials have at most that degree.
-    degrees : array, shape (m,)
-        Degree of every monomial.
-    pairs : three arrays
-        Monomials whose products are within the degree, by ascending product, and where each product starts.
-
-    """
-
-    size: int
+    size: int  # coordinates
     degree: int
-    powers: Int[np.ndarray, "m k"]
-    target: Int[np.ndarray, "m m"]
-    until: Int[np.ndarray, " d"]
-    degrees: Int[np.ndarray, " m"]
+    powers: Int[np.ndarray, "m k"]  # exponents of every monomial
+    target: Int[np.ndarray, "m m"]  # the monomial that a product of two is; -1 beyond the degree
+    until: Int[np.ndarray, " d"]  # how many monomials have at most that degree
+    degrees: Int[np.ndarray, " m"]  # of every monomial
+    # Monomials whose products are within the degree, by ascending product, and where each product starts.
     pairs: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " m"]]
 
     def index_of(self, *coordinates: int) -> int:
@@ -97,12 +81,7 @@ def build_basis(size: int, degree: int) -> Basis:
 class Taylor:
     """Taylor models of several quantities: of many boxes, or of the entries of matrices.
 
-    Parameters
-    ----------
-    basis : Basis
-    a, r : arrays
-        Coefficients, shape (m, *s), and the remainder, s. A remainder that is infinite encloses everything.
-
+    The coefficients a have the shape (m, *s), the remainder r has s; one that is infinite encloses everything.
     """
 
     basis: Basis
@@ -174,15 +153,9 @@ class Taylor:
         return Taylor(self.basis, self.a, remainder)
 
     def compose(self, series: list[Array], last: Array) -> Taylor:
-        """Return a smooth function of this model.
+        """Return a smooth function of this model, from its Taylor coefficients about the centre up to the degree.
 
-        Parameters
-        ----------
-        series : list of arrays
-            The function's Taylor coefficients about the centre, up to the degree.
-        last : array
-            Largest size of the next coefficient over all values; not finite where the function is not smooth.
-
+        `last` is the largest size of the next coefficient over all values; not finite where it is not smooth.
         """
         centred = Taylor(self.basis, np.concatenate([np.zeros_like(self.a[:1]), self.a[1:]]), self.r)
         out = make_constant(series[-1], self.basis)

@@ -13,7 +13,7 @@ be zero there, the loop has no pole on the arc for any parameters of the box.
 from __future__ import annotations
 
 import functools
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -22,41 +22,34 @@ from seaopt.control import Controller, Law
 from seaopt.records import record
 from seaopt.robustness.bounds.impulse import ImpulseTransfer
 from seaopt.robustness.bounds.region import Boxes
-from seaopt.robustness.bounds.taylor import PRODUCT_ROUNDING, Taylor
+from seaopt.robustness.bounds.taylor import PRODUCT_ROUNDING, Array, Taylor
 
 MULTIPLIERS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0])
+PerArc = Float[np.ndarray, " p"]
+Slopes = Float[np.ndarray, "p k"]
+BallCoordinates = Float[np.ndarray, "p b"]
+Powers = Complex[np.ndarray, "p j 5"]  # value, first and second order, bounds on the remainder and on all
+Coefficients = Float[np.ndarray, " m"]  # of a polynomial, ascending
 
 
 @record(eq=False)
 class Arcs:
-    """Pairs of a box and an arc.
+    """Pairs of a box, by its index, and an arc, by its middle and half its length in rad.
 
-    Parameters
-    ----------
-    box : array
-        Index of the box, shape (p,).
-    middle, half : array
-        Angles in rad: the middle of the arc and half its length, shape (p,).
-    s, t : array
-        Bounds on abs(S) and abs(T) so far.
-
+    `s` and `t` bound abs(S) and abs(T) so far.
     """
 
     box: Int[np.ndarray, " p"]
-    middle: Float[np.ndarray, " p"]
-    half: Float[np.ndarray, " p"]
-    s: Float[np.ndarray, " p"]
-    t: Float[np.ndarray, " p"]
-
-    def take(self, index: Int[np.ndarray, " r"] | Bool[np.ndarray, " p"] | slice) -> Arcs:
-        """Return the arcs at an index."""
-        return Arcs(**{field.name: getattr(self, field.name)[index] for field in fields(Arcs)})
+    middle: PerArc
+    half: PerArc
+    s: PerArc
+    t: PerArc
 
     def renumber(self, box: Int[np.ndarray, " p"]) -> Arcs:
         """Return the arcs with other indices of their boxes."""
         return replace(self, box=box)
 
-    def tighten(self, s: Float[np.ndarray, " p"], t: Float[np.ndarray, " p"]) -> Arcs:
+    def tighten(self, s: PerArc, t: PerArc) -> Arcs:
         """Return the arcs with new bounds where those are smaller."""
         return replace(self, s=np.fmin(self.s, s), t=np.fmin(self.t, t))
 
@@ -68,34 +61,16 @@ class Arcs:
         return Arcs(**twice, middle=middle, half=np.tile(half, 2))
 
 
-def concatenate_arcs(parts: list[Arcs]) -> Arcs:
-    """Return several sets of arcs as one."""
-    return Arcs(**{field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Arcs)})
-
-
 @record(eq=False)
 class ArcBounds:
-    """Bounds on arcs, and where their width comes from.
+    """Bounds on arcs, and where their width comes from."""
 
-    Parameters
-    ----------
-    s, t : array
-        Bounds on abs(S) and abs(T), infinite where D may be zero, shape (p,).
-    by_box, by_angle : array
-        Share of D that each coordinate changes, shape (p, k), and that the angle changes, shape (p,).
-    remainder : array
-        Share of D that the models of the box leave open, shape (p,).
-    gradients : array
-        Slopes of abs(S)^2 and abs(T)^2 along the coordinates, shape (2, p, k).
-
-    """
-
-    s: Float[np.ndarray, " p"]
-    t: Float[np.ndarray, " p"]
-    by_box: Float[np.ndarray, "p k"]
-    by_angle: Float[np.ndarray, " p"]
-    remainder: Float[np.ndarray, " p"]
-    gradients: Float[np.ndarray, "2 p k"]
+    s: PerArc  # bounds on abs(S) and abs(T), infinite where D may be zero
+    t: PerArc
+    by_box: Slopes  # share of D that each coordinate changes
+    by_angle: PerArc  # share of D that the angle changes
+    remainder: PerArc  # share of D that the models of the box leave open
+    gradients: Float[np.ndarray, "2 p k"]  # slopes of abs(S)^2 and abs(T)^2 along the coordinates
 
 
 Packed = tuple[Float[np.ndarray, "p m j"], Float[np.ndarray, "p j"]]
@@ -108,15 +83,15 @@ class ArcModel:
     c: Complex[np.ndarray, " p"]
     g: Complex[np.ndarray, "p k"]
     h: Complex[np.ndarray, "p k k"]
-    r: Float[np.ndarray, " p"]
+    r: PerArc
 
     @property
-    def slope(self) -> Float[np.ndarray, " p"]:
+    def slope(self) -> PerArc:
         """Largest size of the first-order part."""
         return np.sum(np.abs(self.g), axis=1)
 
     @property
-    def curve(self) -> Float[np.ndarray, " p"]:
+    def curve(self) -> PerArc:
         """Largest size of the second-order part."""
         return np.sum(np.abs(self.h), axis=(1, 2))
 
@@ -172,7 +147,7 @@ def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
     return np.moveaxis(np.concatenate([model.a[: 1 + k], h]), 0, 1)[box], remainder[box]
 
 
-def _expand_law(law: Law) -> tuple[list[Float[np.ndarray, " m"]], Float[np.ndarray, " m"]]:
+def _expand_law(law: Law) -> tuple[list[Coefficients], Coefficients]:
     """Return the numerator of every C_y, and their denominator, in ascending powers of 1 - 1/z.
 
     In these, as in w, nothing cancels near z = 1, where the law's slow poles and its integrators lie.
@@ -180,7 +155,7 @@ def _expand_law(law: Law) -> tuple[list[Float[np.ndarray, " m"]], Float[np.ndarr
     m, (a, b, c) = law.integrators, law.rest
     delta, q = np.array([0.0, 1.0]), np.array([1.0, -1.0])
 
-    def characteristic(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " m"]:
+    def characteristic(matrix: Float[np.ndarray, "n n"]) -> Coefficients:
         poles = np.linalg.eigvals(matrix)
         return np.real(multiply(*(np.array([1.0 - pole, pole]) for pole in poles)))
 
@@ -199,9 +174,7 @@ def _expand_law(law: Law) -> tuple[list[Float[np.ndarray, " m"]], Float[np.ndarr
     return nums, multiply(*[delta] * m, slow)
 
 
-def _expand_powers(
-    law: Float[np.ndarray, " m"], delay: Int[np.ndarray, " p"], arcs: Arcs, count: int
-) -> Complex[np.ndarray, "p j 5"]:
+def _expand_powers(law: Coefficients, delay: Int[np.ndarray, " p"], arcs: Arcs, count: int) -> Powers:
     r"""Return law(1 - 1/z) z^-delay w^j for every j: value, first and second order, bounds on the remainder and on all.
 
     Each is a product of functions of the angle, whose derivatives up to the third are bounded over the arc: of
@@ -245,9 +218,7 @@ def _expand_powers(
     return np.stack([value, slope, curve, remainder, size], axis=2)
 
 
-def _bound_derivatives(
-    derivatives: list[Complex[np.ndarray, "..."]], third: Float[np.ndarray, "..."], half: Float[np.ndarray, "..."]
-) -> tuple[Float[np.ndarray, "..."], ...]:
+def _bound_derivatives(derivatives: list[Complex[np.ndarray, "..."]], third: Array, half: Array) -> tuple[Array, ...]:
     """Return bounds of a function and its derivatives over the arc, from their values at its middle."""
     zeroth, first, second = (np.abs(derivative) for derivative in derivatives)
     top = second + half * third
@@ -255,7 +226,7 @@ def _bound_derivatives(
     return zeroth + half * first + 0.5 * half**2 * second + half**3 / 6.0 * third, slope, top, third
 
 
-def _sum_models(parts: list[tuple[Packed, Complex[np.ndarray, "p j 5"]]]) -> ArcModel:
+def _sum_models(parts: list[tuple[Packed, Powers]]) -> ArcModel:
     """Return the sum of polynomials whose coefficients are models, over the arcs."""
     sums = np.sum([packed @ powers[:, :, :3] for (packed, _), powers in parts], axis=0)
     count, width = sums.shape[:2]
@@ -273,9 +244,7 @@ def _sum_models(parts: list[tuple[Packed, Complex[np.ndarray, "p j 5"]]]) -> Arc
     return ArcModel(c=sums[:, 0, 0], g=g, h=h, r=remainder)
 
 
-def _weigh_remainders(
-    remainders: Float[np.ndarray, "p j"], powers: Complex[np.ndarray, "p j 5"]
-) -> Float[np.ndarray, " p"]:
+def _weigh_remainders(remainders: Float[np.ndarray, "p j"], powers: Powers) -> PerArc:
     """Return what the remainders of a polynomial's coefficients add to its own."""
     return np.sum(np.real(powers[:, :, 4]) * remainders, axis=1)
 
@@ -299,9 +268,7 @@ def _divide(n: ArcModel, d: ArcModel) -> ArcModel:
     )
 
 
-def _bound_magnitude(
-    model: ArcModel, at: Float[np.ndarray, "p b"], width: Float[np.ndarray, "p b"]
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p k"]]:
+def _bound_magnitude(model: ArcModel, at: BallCoordinates, width: BallCoordinates) -> tuple[PerArc, Slopes]:
     """Return a bound on abs(model) and the slopes of its square."""
     centre, g = model.c[:, None], model.g
     top = np.abs(model.c) ** 2
@@ -313,12 +280,12 @@ def _bound_magnitude(
 
 
 def _bound_quadratic(
-    top: Float[np.ndarray, " p"],
-    a: Float[np.ndarray, "p k"],
+    top: PerArc,
+    a: Slopes,
     b: Float[np.ndarray, "p k k"],
-    at: Float[np.ndarray, "p b"],
-    width: Float[np.ndarray, "p b"],
-) -> Float[np.ndarray, " p"]:
+    at: BallCoordinates,
+    width: BallCoordinates,
+) -> PerArc:
     """Return a bound on top + a e + e b e over the cube, where at + width e is in the unit ball.
 
     A coordinate outside the ball along which it cannot but rise or fall is put at its end. What is left is split into
@@ -350,7 +317,7 @@ def _bound_quadratic(
     return top + cross + best
 
 
-def _maximise_parabola(bend: Float[np.ndarray, "p k"], slope: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
+def _maximise_parabola(bend: Slopes, slope: Slopes) -> Slopes:
     """Return the largest bend e^2 + slope e for e from -1 to 1."""
     inner = (bend < 0.0) & (np.abs(slope) <= -2.0 * bend)
     return np.where(inner, -(slope**2) / np.where(inner, 4.0 * bend, 1.0), bend + np.abs(slope))

@@ -11,7 +11,7 @@ parabola in the angle: Newton's method on its derivative, kept between the neigh
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -32,6 +32,8 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
+from seaopt.robustness.uncertainty.draws import Column
+from seaopt.robustness.uncertainty.rows import join_rows, take_rows
 
 DRAW_BLOCK = 8192  # draws linearised at once: bounds the memory
 CURVE_BLOCK = 512  # draws whose curves are evaluated at once: bounds the cache
@@ -41,8 +43,9 @@ MAXIMA = 3  # local maxima refined
 SPEED_NEWTON_STEPS = 40
 
 NO_PEAKS = ((np.nan, np.nan), (np.nan, np.nan))
+Curves = Complex[np.ndarray, "n m"]  # a row per draw
 
-Peaks = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+Peaks = tuple[Column, Column]
 
 
 @record(eq=False)
@@ -52,25 +55,16 @@ class BatchFigures:
     A draw so far off that the sampled plant is not finite is unstable, with an infinite spectral radius.
     """
 
-    spectral_radius: Float[np.ndarray, " n"]
-    ms: Float[np.ndarray, " n"]
-    mt: Float[np.ndarray, " n"]
-
-
-def join_figures(parts: Sequence[BatchFigures]) -> BatchFigures:
-    """Return the figures of draws that were measured in parts."""
-    return BatchFigures(
-        spectral_radius=np.concatenate([part.spectral_radius for part in parts]),
-        ms=np.concatenate([part.ms for part in parts]),
-        mt=np.concatenate([part.mt for part in parts]),
-    )
+    spectral_radius: Column
+    ms: Column
+    mt: Column
 
 
 def batch_figures(
     controller: Controller,
     plant: Plant,
     nominal: ParameterSet,
-    draws: Mapping[str, Float[np.ndarray, " n"]],
+    draws: Mapping[str, Column],
     progress: Progress = ignore,
     threads: int = 2,
     peaks: bool = True,
@@ -101,12 +95,8 @@ def batch_figures(
         one = {name: column[:1] for name, column in draws.items()}
         single = batch_figures(controller, plant, nominal, one, ignore, threads, peaks)
         progress(f"{count} of {count} draws", 1.0)
-        return BatchFigures(
-            spectral_radius=np.repeat(single.spectral_radius, count),
-            ms=np.repeat(single.ms, count),
-            mt=np.repeat(single.mt, count),
-        )
-    parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
+        return take_rows(single, np.zeros(count, dtype=int))
+    parts: list[BatchFigures] = []
     with ThreadPoolExecutor(threads) as pool:
         for start in range(0, count, DRAW_BLOCK):
             block = slice(start, min(start + DRAW_BLOCK, count))
@@ -121,13 +111,12 @@ def batch_figures(
                 pieces,
             )
             progress(f"{block.stop} of {count} draws", block.stop / count)
-    radius, ms, mt = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
+    return join_rows(parts)
 
 
 def expand_draws(
-    plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]]
-) -> tuple[Float[np.ndarray, "np n"], dict[str, Float[np.ndarray, " n"]]]:
+    plant: Plant, nominal: ParameterSet, draws: Mapping[str, Column]
+) -> tuple[Float[np.ndarray, "np n"], dict[str, Column]]:
     """Return a plant's parameters, one column per draw, and its conditions."""
     count = len(next(iter(draws.values()))) if draws else 1
     values = np.repeat(plant.complete(nominal).vector[:, None], count, axis=1)
@@ -149,9 +138,9 @@ class Products:
 
     opened: Complex[np.ndarray, "n k"]
     closed: Complex[np.ndarray, "n k"]
-    scale: Float[np.ndarray, " n"]
+    scale: Column
 
-    def sensitivity(self, z: Complex[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
+    def sensitivity(self, z: Curves) -> Curves:
         """Return S of each row at that row's points."""
         above, below = np.ones_like(z), np.ones_like(z)
         for k in range(self.opened.shape[1]):
@@ -159,9 +148,7 @@ class Products:
             below *= z - self.closed[:, k, None]
         return above / below * self.scale[:, None]
 
-    def logarithmic(
-        self, z: Complex[np.ndarray, "n m"]
-    ) -> tuple[Complex[np.ndarray, "n m"], Complex[np.ndarray, "n m"]]:
+    def logarithmic(self, z: Curves) -> tuple[Curves, Curves]:
         """Return S'/S and its derivative."""
         first, second = np.zeros_like(z), np.zeros_like(z)
         for k in range(self.opened.shape[1]):
@@ -170,15 +157,11 @@ class Products:
             second += below**2 - above**2
         return first, second
 
-    def take(self, index: Int[np.ndarray, " r"]) -> Products:
-        """Return the loops at an index."""
-        return Products(opened=self.opened[index], closed=self.closed[index], scale=self.scale[index])
-
 
 def _close_piece(
     controller: Controller, continuous: LinearPlants, delay: Float[np.ndarray, " k"], peaks: bool
-) -> tuple[Float[np.ndarray, " k"], ...]:
-    """Return spectral radius, Ms and Mt of some draws."""
+) -> BatchFigures:
+    """Return the figures of some draws."""
     a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
     count = len(d)
     whole = np.concatenate([matrix.reshape(count, -1) for matrix in (a, b, c, d)], axis=1)
@@ -189,8 +172,8 @@ def _close_piece(
     ms, mt = np.full(radius.size, np.inf), np.full(radius.size, np.inf)
     stable = np.flatnonzero(radius < STABLE)
     if stable.size:
-        (ms[stable], _), (mt[stable], _) = find_peaks(loops.take(stable)) if peaks else NO_PEAKS
-    return radius, ms, mt
+        (ms[stable], _), (mt[stable], _) = find_peaks(take_rows(loops, stable)) if peaks else NO_PEAKS
+    return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
 
 
 def compute_products(
@@ -256,15 +239,13 @@ def _find_highest(
             local[rows, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
         point = at[worth] + 1
         low, high = _find_neighbours(theta[worth], point)
-        peak, angle = _refine_peaks(loop.take(worth), low, theta[worth, point], high, complement)
+        peak, angle = _refine_peaks(take_rows(loop, worth), low, theta[worth, point], high, complement)
         higher = peak > top[worth]
         top[worth[higher]], where[worth[higher]] = peak[higher], angle[higher]
     return top, where
 
 
-def _find_neighbours(
-    theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _find_neighbours(theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n"]) -> tuple[Column, Column]:
     """Return the neighbours of a grid point that do not coincide with it."""
     rows, last = np.arange(point.size), theta.shape[1] - 1
     centre = theta[rows, point]
@@ -275,9 +256,9 @@ def _find_neighbours(
 
 def _refine_peaks(
     loop: Products,
-    low: Float[np.ndarray, " n"],
-    x: Float[np.ndarray, " n"],
-    high: Float[np.ndarray, " n"],
+    low: Column,
+    x: Column,
+    high: Column,
     complement: bool,
 ) -> Peaks:
     """Return the curve's value at its maximum between `low` and `high`, and the angle."""
@@ -286,7 +267,7 @@ def _refine_peaks(
     low, x, high = low.copy(), x.copy(), high.copy()
     small = 1e-6 * (high - low)
     for _ in range(SPEED_NEWTON_STEPS):
-        value, g, slope = _differentiate(loop.take(live), x[live], complement)
+        value, g, slope = _differentiate(take_rows(loop, live), x[live], complement)
         higher = value > best[live]
         best[live[higher]], where[live[higher]] = value[higher], x[live[higher]]
         low[live] = np.where(g > 0.0, x[live], low[live])
@@ -305,9 +286,7 @@ def _refine_peaks(
 
 
 @np.errstate(divide="ignore", invalid="ignore")  # on a pole of the open loop, an integrator at angle 0
-def _differentiate(
-    loop: Products, x: Float[np.ndarray, " n"], complement: bool
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _differentiate(loop: Products, x: Column, complement: bool) -> tuple[Column, Column, Column]:
     """Return abs(curve) and the first two derivatives of log abs(curve)^2 along the angle."""
     z = np.exp(1j * x)[:, None]
     s, (first, second) = loop.sensitivity(z), loop.logarithmic(z)

@@ -43,82 +43,48 @@ DELAY_BISECTIONS = 40
 PART_TOLERANCE = 1e-13  # of a sample
 LONGEST_DELAY = 20_000  # samples: beyond, a delay is no longer one of the loop that was modelled
 FULL_TURN = 2.0 * np.pi
+Crossovers = Float[np.ndarray, " k"]
+Whole = Int[np.ndarray, " w"]  # samples
 
 
 @record(eq=False)
 class _DelayedLoop:
-    """A loop whose plant is delayed by a part r of a sample, and what decides on every further whole sample.
+    """A loop whose plant is delayed by a part r of a sample, and what decides on every further whole sample."""
 
-    Parameters
-    ----------
-    part : float
-        r.
-    angles, phases
-        Crossovers, ascending, and the phase that is left to -1 at each.
-    outside : int
-        Closed-loop poles not inside the circle.
-    loud : bool
-        abs(L) > 1 at the Nyquist frequency.
-
-    """
-
-    part: float
-    angles: Float[np.ndarray, " k"]
-    phases: Float[np.ndarray, " k"]
-    outside: int
-    loud: bool
-
-    @property
-    def falling(self) -> Int[np.ndarray, " k"]:
-        """1 where abs(L) falls through 1, -1 where it rises."""
-        last = self.angles.size - 1 + int(self.loud)
-        return 1 - 2 * ((last - np.arange(self.angles.size)) % 2)
+    part: float  # r
+    angles: Crossovers  # ascending
+    phases: Crossovers  # what is left to -1 at each
+    outside: int  # closed-loop poles not inside the circle
+    loud: bool  # abs(L) > 1 at the Nyquist frequency
 
     def matches(self, other: _DelayedLoop) -> bool:
         """Return whether the crossovers are those of the other, moved."""
         return self.angles.size == other.angles.size and self.loud == other.loud
 
-    def count_unstable(self, samples: Int[np.ndarray, " w"]) -> Int[np.ndarray, " w"]:
+    def count_unstable(self, samples: Whole) -> Whole:
         """Return the number of closed-loop poles outside the circle with so many further samples."""
-        return self.outside + 2 * (self.count_passes(samples, self.phases) + 1) @ self.falling + samples * self.loud
+        last = self.angles.size - 1 + int(self.loud)
+        falling = 1 - 2 * ((last - np.arange(self.angles.size)) % 2)  # abs(L) through 1; -1 where it rises
+        return self.outside + 2 * (self.count_passes(samples, self.phases) + 1) @ falling + samples * self.loud
 
-    def turn(self, samples: Int[np.ndarray, " w"], phases: Float[np.ndarray, " k"]) -> Float[np.ndarray, "w k"]:
+    def turn(self, samples: Whole, phases: Crossovers) -> Float[np.ndarray, "w k"]:
         """Return by how many turns each crossover is beyond -1."""
         return (samples[:, None] * self.angles - phases) / FULL_TURN
 
-    def count_passes(self, samples: Int[np.ndarray, " w"], phases: Float[np.ndarray, " k"]) -> Int[np.ndarray, "w k"]:
+    def count_passes(self, samples: Whole, phases: Crossovers) -> Int[np.ndarray, "w k"]:
         """Return how often each crossover has passed -1."""
         return np.floor(self.turn(samples, phases)).astype(int)
 
-    def follow_phases(self, start: _DelayedLoop) -> Float[np.ndarray, " k"]:
+    def follow_phases(self, start: _DelayedLoop) -> Crossovers:
         """Return the phases continued from those of another loop, by less than half a turn."""
         step = self.phases - start.phases
         return start.phases + step - FULL_TURN * np.round(step / FULL_TURN)
 
 
 def sampled_delay_margin(controller: Controller, plant: Plant, params: ParameterSet, reach_s: float) -> float | None:
-    """Return the smallest extra delay that makes the sampled loop unstable.
+    """Return the smallest extra delay, s, that makes the sampled loop unstable; zero where it is without one.
 
-    Parameters
-    ----------
-    controller, plant, params
-        A loop that is stable; a delay among `params` stays in it.
-    reach_s : float
-        The largest delay to try, seconds.
-
-    Returns
-    -------
-    float or None
-        Seconds, zero for an unstable loop; None if no delay up to `reach_s` makes it unstable.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
-    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6))
-    >>> 1e-3 < sampled_delay_margin(controller, stand, thor, 0.02) < 0.02
-    True
-
+    None if no delay up to `reach_s` does. A delay among the parameters stays in the loop.
     """
     period = controller.sample_time_s
     sliding, effort = take_sliding(plant, params), controller.command.per_effort
@@ -171,7 +137,7 @@ def _build_grid(delay_loop: Callable[[float], _DelayedLoop]) -> list[_DelayedLoo
     return grid
 
 
-def _find_steps(first: _DelayedLoop, second: _DelayedLoop, samples: Int[np.ndarray, " w"]) -> Bool[np.ndarray, " w"]:
+def _find_steps(first: _DelayedLoop, second: _DelayedLoop, samples: Whole) -> Bool[np.ndarray, " w"]:
     """Return with which numbers of whole samples a crossover passes -1 between two neighbours."""
     if not first.matches(second):
         return np.zeros(samples.size, dtype=bool)

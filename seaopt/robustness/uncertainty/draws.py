@@ -28,27 +28,21 @@ from seaopt.units import factor
 
 MAX_REJECTION = 200
 LEVEL = 0.999  # probability of the part of the fit's distribution in which the worst case is searched
+Points = Float[np.ndarray, "n k"]  # draws as coordinates, a row each
+Column = Float[np.ndarray, " n"]  # a quantity, an entry per draw
+Plants = Mapping[str, Plant]
+Ranges = Mapping[str, tuple[float, float]]
+Source = Fit | ParameterSet  # of the parameters
 
 
 @record
 class Varied:
-    """One quantity that is drawn, in SI units.
-
-    Parameters
-    ----------
-    name, unit : str
-    value : float or None
-        Nominal; None where there is none (a mode's frequency).
-    std : float or None
-        Of a Gaussian, correlated as in the fit and cut at `low` and `high`; None for a uniform range.
-    low, high : float
-
-    """
+    """One quantity that is drawn, in SI units."""
 
     name: str
     unit: str
-    value: float | None
-    std: float | None
+    value: float | None  # nominal; None where there is none (a mode's frequency)
+    std: float | None  # of a Gaussian, correlated as in the fit and cut at `low` and `high`; None for a uniform range
     low: OrMinusInfinite
     high: OrInfinite
 
@@ -66,24 +60,17 @@ class Varied:
 
 @record(eq=False)
 class ModeTable:
-    """Which values of a parameter put a mode where, ascending in frequency.
-
-    Parameters
-    ----------
-    parameter : str
-    frequency_hz, value : arrays, shape (m,)
-
-    """
+    """Which values of a parameter put a mode where, ascending in frequency."""
 
     parameter: str
-    frequency_hz: Float[np.ndarray, " m"]
-    value: Float[np.ndarray, " m"]
+    frequency_hz: Column
+    value: Column
 
-    def values_at(self, frequency_hz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def values_at(self, frequency_hz: Column) -> Column:
         """Return the parameter's values that put the mode at frequencies."""
         return np.interp(frequency_hz, self.frequency_hz, self.value)
 
-    def slopes_at(self, frequency_hz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def slopes_at(self, frequency_hz: Column) -> Column:
         """Return the derivatives of `values_at`."""
         steps = np.diff(self.value) / np.diff(self.frequency_hz)
         return steps[np.clip(np.searchsorted(self.frequency_hz, frequency_hz) - 1, 0, steps.size - 1)]
@@ -111,7 +98,7 @@ class Uncertainty:
     nominal: ParameterSet
     names: tuple[str, ...]
     covariance: Float[np.ndarray, "n n"]
-    ranges: Mapping[str, tuple[float, float]]
+    ranges: Ranges
     modes: Mapping[str, ModeTable] = field(default_factory=dict[str, ModeTable])
     absent: Mapping[str, Parameter] = field(default_factory=dict[str, Parameter])
 
@@ -122,17 +109,16 @@ class Uncertainty:
 
     def varied(self) -> tuple[Varied, ...]:
         """Return what is drawn and how, the Gaussian part first."""
-        stds, known = np.sqrt(np.diag(self.covariance)), {**self.absent, **self.nominal}
+        stds, known = np.sqrt(np.diag(self.covariance)).tolist(), {**self.absent, **self.nominal}
+        quantities = [(name, std, known[name].min, known[name].max) for name, std in zip(self.names, stds, strict=True)]
+        quantities += [(name, None, low, high) for name, (low, high) in self.ranges.items()]
         varied: list[Varied] = []
-        for name, std in zip(self.names, stds, strict=True):
-            p = self.nominal[name]
-            varied.append(Varied(name=name, unit=p.unit, value=p.value, std=float(std), low=p.min, high=p.max))
-        for name, (low, high) in self.ranges.items():
+        for name, std, low, high in quantities:
             unit, value = (known[name].unit, known[name].value) if name in known else ("Hz", None)
-            varied.append(Varied(name=name, unit=unit, value=value, std=None, low=low, high=high))
+            varied.append(Varied(name=name, unit=unit, value=value, std=std, low=low, high=high))
         return tuple(varied)
 
-    def draw(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n k"]:
+    def draw(self, count: int, rng: np.random.Generator) -> Points:
         """Return `count` draws as coordinates; Gaussian draws outside a bound are drawn again.
 
         Coordinates of the Gaussian part are standard deviations along the principal axes of the correlation; those of
@@ -145,11 +131,9 @@ class Uncertainty:
 
         """
         width = len(self.names)
-        kept = np.empty((0 if width else count, width))
-        for _ in range(MAX_REJECTION):
-            if len(kept) >= count:
-                break
-            fresh = rng.normal(size=(count, width))
+        kept, tries = np.empty((0 if width else count, width)), 0
+        while len(kept) < count and tries < MAX_REJECTION:
+            fresh, tries = rng.normal(size=(count, width)), tries + 1
             kept = np.vstack([kept, fresh[self.inside(fresh)]])
         if len(kept) < count:
             raise ControlError(
@@ -158,14 +142,14 @@ class Uncertainty:
             )
         return np.hstack([kept[:count], rng.uniform(-1.0, 1.0, (count, len(self.ranges)))])
 
-    def inside(self, coordinates: Float[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
+    def inside(self, coordinates: Points) -> Bool[np.ndarray, " n"]:
         """Return which points of the Gaussian part lie inside the parameters' bounds."""
-        low = np.array([self.nominal[name].min for name in self.names])
-        high = np.array([self.nominal[name].max for name in self.names])
+        bounds = [self.nominal[name] for name in self.names]
+        low, high = np.array([each.min for each in bounds]), np.array([each.max for each in bounds])
         values = self._gaussian_values(coordinates)
         return np.all((values >= low) & (values <= high), axis=1)
 
-    def values(self, coordinates: Float[np.ndarray, "n k"]) -> dict[str, Float[np.ndarray, " n"]]:
+    def values(self, coordinates: Points) -> dict[str, Column]:
         """Return the parameters and conditions at the coordinates, by name."""
         out = dict(zip(self.names, self._gaussian_values(coordinates).T, strict=True))
         for (name, (low, high)), t in zip(self.ranges.items(), coordinates[:, len(self.names) :].T, strict=True):
@@ -179,10 +163,10 @@ class Uncertainty:
         values = self.values(self.draw(count, rng))
         return [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
 
-    def slopes(self, coordinates: Float[np.ndarray, "n k"]) -> dict[str, Float[np.ndarray, "n k"]]:
+    def slopes(self, coordinates: Points) -> dict[str, Points]:
         """Return the derivatives of `values` with respect to the coordinates, by name."""
         count, width = coordinates.shape
-        out: dict[str, Float[np.ndarray, "n k"]] = {}
+        out: dict[str, Points] = {}
         for name, row in zip(self.names, self.factor(), strict=True):
             out[name] = np.zeros((count, width))
             out[name][:, : row.size] = row
@@ -196,9 +180,7 @@ class Uncertainty:
             out[varied][:, i] = slope
         return out
 
-    def bounds(
-        self, coordinates: Float[np.ndarray, "n k"]
-    ) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, " n"]]]:
+    def bounds(self, coordinates: Points) -> Iterator[tuple[Float[np.ndarray, " k"], Column]]:
         """Yield each finite bound of the Gaussian part: its outward normal, and each point's distance from it."""
         values = self._gaussian_values(coordinates)
         for j, (name, row) in enumerate(zip(self.names, self.factor(), strict=True)):
@@ -215,16 +197,16 @@ class Uncertainty:
         """Return the covariance's factor, coordinates to parameters."""
         return take_root(self.covariance)
 
-    def _gaussian_values(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
+    def _gaussian_values(self, coordinates: Points) -> Float[np.ndarray, "n g"]:
         mean = np.array(self.nominal.values_of(self.names))
         return mean + coordinates[:, : mean.size] @ self.factor().T
 
 
 def combine_uncertainty(
-    source: Fit | ParameterSet,
+    source: Source,
     others: ParameterSet,
-    ranges: Mapping[str, tuple[float, float]],
-    plants: Mapping[str, Plant],
+    ranges: Ranges,
+    plants: Plants,
     drive: Drive | None = None,
 ) -> Uncertainty:
     """Combine a fit's covariance (or a ParameterSet's prior_stds) and the declared ranges into one description.
@@ -287,7 +269,7 @@ def combine_uncertainty(
     )
 
 
-def _in_plant_units(nominal: ParameterSet, plants: Mapping[str, Plant]) -> tuple[ParameterSet, dict[str, float]]:
+def _in_plant_units(nominal: ParameterSet, plants: Plants) -> tuple[ParameterSet, dict[str, float]]:
     """Return the values in the plants' units, and what each was multiplied by."""
     scale: dict[str, float] = {}
     for plant in plants.values():
@@ -298,20 +280,17 @@ def _in_plant_units(nominal: ParameterSet, plants: Mapping[str, Plant]) -> tuple
     return nominal, scale
 
 
-def _check_inside(ranges: Mapping[str, tuple[float, float]], nominal: ParameterSet) -> None:
+def _check_inside(ranges: Ranges, nominal: ParameterSet) -> None:
     """Refuse ranges beyond the given parameters' own bounds, which may be narrower than the plant's."""
-    known = dict(nominal)
     for name, (low, high) in ranges.items():
-        parameter = known.get(name)
-        if parameter is not None and (low < parameter.min or high > parameter.max):
-            bounds = f"[{parameter.min:g}, {parameter.max:g}]"
+        if name in nominal and (low < nominal[name].min or high > nominal[name].max):
             raise ControlError(
-                f"range of {name} = [{low:g}, {high:g}] leaves the bounds {bounds} of the given "
-                "parameters; keep inside them, or widen them"
+                f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{nominal[name].min:g}, "
+                f"{nominal[name].max:g}] of the given parameters; keep inside them, or widen them"
             )
 
 
-def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant]) -> None:
+def check_ranges(ranges: Ranges, plants: Plants) -> None:
     """Check the ranges against the plants.
 
     Raises
@@ -332,10 +311,9 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
             remedy = f'add parts = ["{part}"] to one' if part in PARTS else suggestion(str(name), known)
             raise ControlError(f'range of "{name}": no plant has it; {remedy}')
         low, high = _read_ends(name, ends)
-        if not (np.isfinite(low) and np.isfinite(high)):
-            raise ControlError(f"range of {name} = [{low:g}, {high:g}] is not finite; give [low, high]")
-        if not low <= high:
-            raise ControlError(f"range of {name} = [{low:g}, {high:g}] is empty; give [low, high]")
+        for wrong, what in ((not np.isfinite(high - low), "not finite"), (low > high, "empty")):
+            if wrong:
+                raise ControlError(f"range of {name} = [{low:g}, {high:g}] is {what}; give [low, high]")
         parameter = extra.get(name) or parameters.get(name)
         if parameter is not None and parameter.unit == "rad" and name in extra and max(-low, high) > np.pi:
             raise ControlError(
@@ -360,9 +338,7 @@ def _read_ends(name: str, value: Any) -> tuple[float, float]:
     return float(pair[0]), float(pair[1])
 
 
-def place_value(
-    plant: Plant, params: ParameterSet, name: str, value: float, plants: Mapping[str, Plant]
-) -> ParameterSet | None:
+def place_value(plant: Plant, params: ParameterSet, name: str, value: float, plants: Plants) -> ParameterSet | None:
     """Return a plant's parameters with what a range may name set to a value; None where the plant does not have it.
 
     Raises
@@ -381,7 +357,7 @@ def place_value(
     return values.with_parameters(replace(extra[name], value=value)) if name in extra else None
 
 
-def find_modes(plants: Mapping[str, Plant]) -> dict[str, Plant]:
+def find_modes(plants: Plants) -> dict[str, Plant]:
     """Return the modes that a range may name, each with the first plant that has it."""
     modes: dict[str, Plant] = {}
     for plant in plants.values():

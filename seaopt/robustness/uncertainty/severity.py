@@ -14,10 +14,8 @@ A peak's angle is stationary, so that it may stay fixed: :math:`d|S| = -|S|\, \m
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 
 from seaopt.control import Controller
 from seaopt.control.laws.limits import LIMIT_ROUNDING
@@ -26,7 +24,8 @@ from seaopt.control.loops.sampled_plant import DELAYS, differentiate_linearisati
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import BatchFigures, Products, compute_products, expand_draws, find_peaks
-from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.uncertainty.draws import Column, Points, Uncertainty
+from seaopt.robustness.uncertainty.rows import take_rows
 
 UNSTABLE = 1e6
 COMPLEX_STEP = 1e-20  # its square vanishes beside 1
@@ -34,7 +33,7 @@ LARGEST_MS, LARGEST_MT = np.array([1.0, np.inf]), np.array([np.inf, 1.0])  # lev
 
 Levels = Float[np.ndarray, "*n 2"]
 
-SeveritySlopes = Float[np.ndarray, "n k"]
+SeveritySlopes = Points
 
 
 @record(eq=False)
@@ -50,11 +49,8 @@ class _SampledPlants:
     dc: Float[np.ndarray, "n k y m"]
     dd: Float[np.ndarray, "n k y"]
 
-    def take(self, index: Int[np.ndarray, " r"]) -> _SampledPlants:
-        return _SampledPlants(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
-
-def severities(controller: Controller, figures: BatchFigures, by: Levels | None = None) -> Float[np.ndarray, " n"]:
+def severities(controller: Controller, figures: BatchFigures, by: Levels | None = None) -> Column:
     """Return the severity of every draw: instability first, then the fraction of the limits that it uses.
 
     With `by`, levels of Ms and Mt for all draws or for each, that is the fraction of these.
@@ -87,7 +83,7 @@ def severity_slopes(
     controller: Controller,
     plant: Plant,
     unknown: Uncertainty,
-    points: Float[np.ndarray, "n k"],
+    points: Points,
     by: Levels | None = None,
 ) -> SeveritySlopes:
     """Return the derivatives of each point's severity with respect to its coordinates.
@@ -110,22 +106,20 @@ def severity_slopes(
     finite = np.flatnonzero(np.all(np.isfinite(sampled.a), axis=(1, 2)) & np.all(np.isfinite(sampled.b), axis=1))
     if not finite.size:
         return out
-    sampled = sampled.take(finite)
+    sampled = take_rows(sampled, finite)
     with np.errstate(all="ignore"):  # where there is no derivative it is not finite
         loop = compute_products(controller, sampled.a, sampled.b, sampled.c, sampled.d)
         stable = np.max(np.abs(loop.closed), axis=1) < STABLE
         ranked = np.broadcast_to(levels(controller) if by is None else by, (points.shape[0], 2))[finite]
         rows, growing = np.flatnonzero(stable), np.flatnonzero(~stable)
         if rows.size:
-            out[finite[rows]] = _peak_slopes(controller, loop.take(rows), sampled.take(rows), ranked[rows])
+            out[finite[rows]] = _peak_slopes(controller, take_rows(loop, rows), take_rows(sampled, rows), ranked[rows])
         if growing.size:
-            out[finite[growing]] = _radius_slopes(controller, loop.take(growing), sampled.take(growing))
+            out[finite[growing]] = _radius_slopes(controller, take_rows(loop, growing), take_rows(sampled, growing))
     return np.where(np.isfinite(out), out, 0.0)
 
 
-def _sample_plants(
-    controller: Controller, plant: Plant, unknown: Uncertainty, points: Float[np.ndarray, "n k"]
-) -> _SampledPlants:
+def _sample_plants(controller: Controller, plant: Plant, unknown: Uncertainty, points: Points) -> _SampledPlants:
     """Return the plants behind hold and delay, and their derivatives along each coordinate."""
     count, width = points.shape
     repeated = np.repeat(points, width, axis=0)  # once per coordinate: each carries one complex step

@@ -26,7 +26,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, confidence_radius
+from seaopt.robustness.uncertainty.draws import Column, Points, Uncertainty, confidence_radius
 from seaopt.robustness.uncertainty.severity import (
     LARGEST_MS,
     LARGEST_MT,
@@ -47,10 +47,11 @@ PROBE_STEPS = np.repeat(np.array([0.3, 0.1, 0.03, 0.01]), 3)
 ON_BOUND = 1e-8  # of a physical bound, in standard deviations
 WITNESS_TOLERANCE = 1e-6
 SAME_TEXT = 1.001  # figures within this factor are printed alike
+Starts = Float[np.ndarray, "s k"]
 
 Trials = Float[np.ndarray, "s t k"]
-Score = Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]]
-Slopes = Callable[[Float[np.ndarray, "m k"]], SeveritySlopes]
+Score = Callable[[Points], Column]
+Slopes = Callable[[Points], SeveritySlopes]
 
 
 @record
@@ -126,11 +127,8 @@ class Worst(tuple[Plant, ParameterSet]):
     def elsewhere(self) -> dict[str, Witness]:
         """The witnesses of the largest Ms and Mt, by name, that are larger than at the worst case's own parameters."""
         ms, mt = self.largest
-        larger = {
-            "Ms": (ms, ms.ms > SAME_TEXT * self.witness.ms),
-            "Mt": (mt, mt.mt > SAME_TEXT * self.witness.mt),
-        }
-        return {name: witness for name, (witness, is_larger) in larger.items() if is_larger}
+        larger = {"Ms": ms} if ms.ms > SAME_TEXT * self.witness.ms else {}
+        return larger | ({"Mt": mt} if mt.mt > SAME_TEXT * self.witness.mt else {})
 
     def figures(self, controller: Controller) -> LoopFigures:
         """Return every figure of the loop there, computed again."""
@@ -158,37 +156,30 @@ class Worst(tuple[Plant, ParameterSet]):
         return html_table(("worst case", ""), rows)
 
 
-def find_worst(controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"]) -> Worst:
+def find_worst(controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Points) -> Worst:
     """Return the worst of the draws and of the points that searches from the worst draws reach.
 
-    Parameters
-    ----------
-    controller, plant, unknown
-        The loop's controller and plant, and what is uncertain of the plant.
-    drawn
-        Draws as coordinates, those of the largest Ms and Mt among them; empty if nothing is uncertain.
-
+    The draws hold those of the largest Ms and Mt; there is none if nothing is uncertain.
     """
     if not unknown.size:
         return measure_worst(controller, plant, unknown.nominal, {})
     start, levels = _choose_all_starts(controller, plant, unknown, drawn)
 
-    def score(points: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " m"]:
+    def score(points: Points) -> Column:
         """Return severities, each by its start's level; points outside the bounds score minus infinity."""
         figures = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
         by = np.repeat(levels, len(points) // len(levels), axis=0)
         return np.where(unknown.inside(points), severities(controller, figures, by), -np.inf)
 
-    def slopes(points: Float[np.ndarray, "s k"]) -> SeveritySlopes:
+    def slopes(points: Starts) -> SeveritySlopes:
         return severity_slopes(controller, plant, unknown, points, levels)
 
-    reached, _ = _climb(unknown, start, score, slopes)
-    found = np.vstack([drawn, reached])
-    figures = batch_figures(controller, plant, unknown.nominal, unknown.values(found))
-    largest = [found[int(np.argmax(severities(controller, figures, by)))] for by in (LARGEST_MS, LARGEST_MT)]
-    values = [unknown.values(point[None]) for point in largest]
-    at = [{name: float(column[0]) for name, column in each.items()} for each in values]
-    return combine_worst([measure_worst(controller, plant, unknown.nominal, each) for each in at])
+    points = np.vstack([drawn, _climb(unknown, start, score, slopes)])
+    values = unknown.values(points)
+    figures = batch_figures(controller, plant, unknown.nominal, values)
+    rows = [int(np.argmax(severities(controller, figures, by))) for by in (LARGEST_MS, LARGEST_MT)]
+    largest = [{name: float(column[row]) for name, column in values.items()} for row in rows]
+    return combine_worst([measure_worst(controller, plant, unknown.nominal, at) for at in largest])
 
 
 def combine_worst(cases: Sequence[Worst]) -> Worst:
@@ -226,7 +217,7 @@ def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, a
     return Worst(plant, values, witness, limited=bool(np.isfinite(min(limits(controller)))))
 
 
-def _list_corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
+def _list_corners(unknown: Uncertainty) -> Points:
     """Return vertices of the ranges, the Gaussian part at its mean: all of them, or a fixed choice of many."""
     size, rng = len(unknown.ranges), np.random.default_rng(0)
     if 2**size <= CORNERS:
@@ -237,12 +228,12 @@ def _list_corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
 
 
 def _choose_all_starts(
-    controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"]
-) -> tuple[Float[np.ndarray, "s k"], Levels]:
+    controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Points
+) -> tuple[Starts, Levels]:
     """Return where to start from for a large Ms, then for a large Mt, and the levels by which each is ranked."""
     points = _project(unknown, np.vstack([drawn, _list_corners(unknown)]))
     figures, inside = batch_figures(controller, plant, unknown.nominal, unknown.values(points)), unknown.inside(points)
-    starts, levels = list[Float[np.ndarray, "s k"]](), list[Levels]()
+    starts, levels = list[Starts](), list[Levels]()
     for by in (LARGEST_MS, LARGEST_MT):
         severity = np.where(inside, severities(controller, figures, by), -np.inf)
         starts.append(_choose_starts(unknown, points, severity))
@@ -250,9 +241,7 @@ def _choose_all_starts(
     return np.vstack(starts), np.vstack(levels)
 
 
-def _choose_starts(
-    unknown: Uncertainty, points: Float[np.ndarray, "n k"], severity: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "s k"]:
+def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> Starts:
     """Return the worst points that are apart, then the worst others: not all starts may lie in one valley."""
     scaled = points.copy()
     scaled[:, : len(unknown.names)] /= max(confidence_radius(len(unknown.names)), 1.0)
@@ -266,10 +255,8 @@ def _choose_starts(
     return points[kept]
 
 
-def _climb(
-    unknown: Uncertainty, x: Float[np.ndarray, "s k"], score: Score, slopes: Slopes
-) -> tuple[Float[np.ndarray, "s k"], Float[np.ndarray, " s"]]:
-    """Climb from every start until none rises further."""
+def _climb(unknown: Uncertainty, x: Starts, score: Score, slopes: Slopes) -> Starts:
+    """Climb from every start until none rises further, and return the ends."""
     value, rng = score(x), np.random.default_rng(0)
     for _ in range(ROUNDS):
         slope = _project_slopes(unknown, x, slopes(x))
@@ -282,10 +269,10 @@ def _climb(
         value = np.where(better, scores[rows, best], value)
         if not np.any(better):
             break
-    return x, value
+    return x
 
 
-def _project_slopes(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: SeveritySlopes) -> SeveritySlopes:
+def _project_slopes(unknown: Uncertainty, x: Starts, slope: SeveritySlopes) -> SeveritySlopes:
     """Return the slopes without what leads out of a physical bound that a point lies on."""
     slope = slope.copy()
     for normal, room in unknown.bounds(x):
@@ -294,9 +281,7 @@ def _project_slopes(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Se
     return slope
 
 
-def _propose_trials(
-    unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: SeveritySlopes, rng: np.random.Generator
-) -> Trials:
+def _propose_trials(unknown: Uncertainty, x: Starts, slope: SeveritySlopes, rng: np.random.Generator) -> Trials:
     """Return points towards the set's vertex in the slope's direction, along the slope, and at random about x.
 
     Random points serve the ridge between two peaks of S, where neither peak's slope leads up.
@@ -313,7 +298,7 @@ def _propose_trials(
     return _shorten(unknown, x, _project(unknown, trials.reshape(-1, x.shape[1])).reshape(trials.shape))
 
 
-def _shorten(unknown: Uncertainty, x: Float[np.ndarray, "s k"], trials: Trials) -> Trials:
+def _shorten(unknown: Uncertainty, x: Starts, trials: Trials) -> Trials:
     """Return the trials, with those beyond a physical bound moved back towards x."""
     share = np.ones(trials.shape[:2])
     for normal, room in unknown.bounds(x):
@@ -323,7 +308,7 @@ def _shorten(unknown: Uncertainty, x: Float[np.ndarray, "s k"], trials: Trials) 
     return x[:, None] + share[:, :, None] * (trials - x[:, None])
 
 
-def _project(unknown: Uncertainty, x: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+def _project(unknown: Uncertainty, x: Points) -> Points:
     """Return the points, with those outside the ellipsoid or the box moved onto its edge."""
     g = len(unknown.names)
     size = np.linalg.norm(x[:, :g], axis=1, keepdims=True)
