@@ -25,8 +25,10 @@ from seaopt.control.loops.friction_loop import FUNDAMENTAL
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
+from seaopt.records import record
 
 SATURATION_GAINS = np.geomspace(1.0, 1e-2, 80)
+Response = Complex[np.ndarray, " f"]
 
 
 def predict_gain(
@@ -39,16 +41,6 @@ def predict_gain(
     """Return force over reference at amplitudes (N) and frequencies (Hz), the fundamental alone.
 
     Where several frictions change with the velocity, each is taken for sliding.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
-    >>> controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
-    >>> stuck, sliding = np.abs(predict_gain(controller, stand, rubbing, np.array([15.0]), np.array([0.1, 1e4])))[:, 0]
-    >>> bool(stuck < sliding)
-    True
-
     """
     values = plant.complete(params)
     loop = controller.close(take_sliding(plant, values), values)
@@ -71,24 +63,22 @@ def predict_gain(
     return np.take_along_axis(force, first[None], axis=0)[0] / amplitude[:, None]
 
 
+@record(eq=False)
 class _Friction:
     """The friction of a plant as a port of its loop, at frequencies; none where nothing changes with the velocity."""
 
-    def __init__(
-        self,
-        on_outputs: Complex[np.ndarray, "y f"],
-        mobility: Complex[np.ndarray, " f"],
-        by_motor: Complex[np.ndarray, " f"],
-        gains: Float[np.ndarray, " v"],
-    ) -> None:
-        self.on_outputs, self.mobility, self.by_motor, self.gains = on_outputs, mobility, by_motor, gains
+    on_outputs: Complex[np.ndarray, "y f"]
+    mobility: Response
+    by_motor: Response
+    gains: Float[np.ndarray, " v"]
 
     @classmethod
     def of(cls, controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"]) -> _Friction:
         (loop,) = take_friction_out(controller, plant, [params])
         nothing = np.zeros(f.size, dtype=complex)
         if loop is None or loop.only_port is None:
-            return cls(nothing[None], nothing, nothing, np.zeros(AMPLITUDES.size))
+            still = np.zeros(AMPLITUDES.size)
+            return cls(on_outputs=nothing[None], mobility=nothing, by_motor=nothing, gains=still)
         port = loop.only_port
         seen = np.vstack([loop.velocity[port], loop.sensed])
         opened = loop.respond(2 * np.pi * f * loop.plant.sample_time_s, FUNDAMENTAL, seen)
@@ -104,8 +94,8 @@ class _Friction:
         self,
         sigma: Float[np.ndarray, "s 1 1"],
         closed: Complex[np.ndarray, "s 1 f"],
-        c_r: Complex[np.ndarray, " f"],
-        fed_back: Complex[np.ndarray, " f"],
+        c_r: Response,
+        fed_back: Response,
         amplitude: Float[np.ndarray, "1 a 1"],
     ) -> Complex[np.ndarray, "s a f"]:
         """Return the fundamental of the friction's effort on the plant; `fed_back` is the law's of a unit of it."""

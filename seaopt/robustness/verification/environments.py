@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.codec import to_content
 from seaopt.control import Controller
 from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.port import bare_port, probe_of
@@ -32,9 +33,10 @@ from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.uncertainty.draws import Column
 from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
-Value = TypeVar("Value", float, Float[np.ndarray, " n"])
+Value = TypeVar("Value", float, Column)
 
 MASSES = {LINEAR: (0.1, 1000.0), ROTARY: (1e-4, 10.0)}
 STIFFNESSES = {LINEAR: (1e1, 1e8), ROTARY: (1e-2, 1e6)}
@@ -47,26 +49,14 @@ DAMPER = Parameter(name="environment_damping", value=0.0, unit=LINEAR.damping, m
 
 @record
 class Environment:
-    """A mass m_2 on link 2, tied to the ground by k_e and d_e, and the loop against it, in the map's units.
-
-    Parameters
-    ----------
-    m_2, k_e, d_e : float
-    spectral_radius : float
-        Largest magnitude of the closed loop's eigenvalues.
-    frequency_hz : float
-        Frequency of that eigenvalue.
-    doubling_s : float or None
-        Time in which the oscillation doubles; None if it does not grow.
-
-    """
+    """A mass m_2 on link 2, tied to the ground by k_e and d_e, and the loop against it, in the map's units."""
 
     m_2: float
     k_e: float
     d_e: float
-    spectral_radius: float
-    frequency_hz: float
-    doubling_s: float | None
+    spectral_radius: float  # the largest of the closed loop's eigenvalues
+    frequency_hz: float  # of that eigenvalue
+    doubling_s: float | None  # time in which the oscillation doubles; None if it does not grow
 
 
 @record(eq=False)
@@ -123,7 +113,7 @@ class StabilityMap:
                 "d_e": self.damping.tolist(),
             },
             "stable_share": [float(np.mean(stable)) for stable in self.stable],
-            "worst": {name: getattr(self.worst, name) for name in Environment.__dataclass_fields__},
+            "worst": to_content(self.worst),
         }
 
     def __repr__(self) -> str:
@@ -152,12 +142,6 @@ def attach_environment(plant: Plant) -> Plant:
     """Return a plant's probe with an environment on its inertia; its last two parameters are k_e and d_e.
 
     Their names are `SPRING`'s and `DAMPER`'s, with underscores as long as the probe has the same name.
-
-    Raises
-    ------
-    ControlError
-        The plant declares no port.
-
     """
     probe = probe_of(plant)
     port = bare_port(probe)
@@ -248,9 +232,9 @@ def coupled_stability(
     _check_grid(masses, stiffnesses, dampings, points)
     mass, stiffness = (np.geomspace(*ends, points) for ends in (masses, stiffnesses))
     damping = np.array(dampings, dtype=float)
-    d, m, k = np.meshgrid(damping, mass, stiffness, indexing="ij")
-    radius = _compute_radii(controller, coupled, values, m.ravel(), k.ravel(), d.ravel()).reshape(d.shape)
-    at = np.unravel_index(int(np.argmax(radius)), radius.shape)
+    d, m, k = (axis.ravel() for axis in np.meshgrid(damping, mass, stiffness, indexing="ij"))
+    flat = _compute_radii(controller, coupled, values, m, k, d)
+    worst, radius = int(np.argmax(flat)), flat.reshape(damping.size, points, points)
     return StabilityMap(
         mass=mass,
         stiffness=stiffness,
@@ -260,8 +244,9 @@ def coupled_stability(
             _find_boundary(controller, coupled, values, mass, stiffness, float(value), stable)
             for value, stable in zip(damping, radius <= GROWING, strict=True)
         ),
-        worst=close_on_environment(controller, coupled, values, float(m[at]), float(k[at]), float(d[at])),
-        fixed_stable=_is_stable_fixed(controller, coupled, values),
+        worst=close_on_environment(controller, coupled, values, float(m[worst]), float(k[worst]), float(d[worst])),
+        # A mass of 1e9 kg on the ground stands for a link that is fixed.
+        fixed_stable=close_on_environment(controller, coupled, values, 1e9, 1e12, 1e9).spectral_radius <= GROWING,
         called=called,
     )
 
@@ -314,19 +299,13 @@ def _compute_radii(
     controller: Controller,
     coupled: Plant,
     parameters: CompletedParameters,
-    m: Float[np.ndarray, " n"],
-    k: Float[np.ndarray, " n"],
-    d: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
+    m: Column,
+    k: Column,
+    d: Column,
+) -> Column:
     """Return the spectral radii against n environments."""
     draws = _name_values(coupled, m, k, d)
     return batch_figures(controller, coupled, parameters, draws, peaks=False).spectral_radius
-
-
-def _is_stable_fixed(controller: Controller, coupled: Plant, parameters: CompletedParameters) -> bool:
-    """Return whether the loop is stable with the link fixed, for which a mass of 1e9 kg on the ground stands."""
-    values = parameters.update(**_name_values(coupled, 1e9, 1e12, 1e9))
-    return bool(np.max(np.abs(controller.close(coupled, values).eigenvalues())) <= GROWING)
 
 
 def _find_boundary(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import OrInfinite, OrNaN
 from seaopt.control import Controller
@@ -24,6 +23,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_dry_friction
 from seaopt.plants.plant import output_function
 from seaopt.records import record
+from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import NOMINAL_EFFORT
 
 SHARES = (0.05, 0.5)  # of the effort that the current limit holds at rest
@@ -36,26 +36,13 @@ AT_REST = 0.02  # of the step: peak to peak of a link at rest
 
 @record
 class ImpedanceStep:
-    """A step of x_0 as it was simulated.
+    """A step of x_0 as it was simulated; what is not its size is a share of the step."""
 
-    Parameters
-    ----------
-    size : float
-        Of x_0, m or rad.
-    moving : float
-        Peak to peak of the link over the last fifth of the run, as a share of the step; infinite where it runs away.
-    end, overshoot : float
-        Where the link ends, and how far it goes beyond that, as shares of the step.
-    saturated : bool
-        The command reached its limit.
-
-    """
-
-    size: float
-    moving: OrInfinite
-    end: OrNaN
-    overshoot: OrNaN
-    saturated: bool
+    size: float  # of x_0, m or rad
+    moving: OrInfinite  # peak to peak of the link over the last fifth of the run; infinite where it runs away
+    end: OrNaN  # where the link ends
+    overshoot: OrNaN  # how far it goes beyond that
+    saturated: bool  # the command reached its limit
 
     @property
     def rests(self) -> bool:
@@ -76,16 +63,7 @@ class ImpedanceStep:
 
 
 def play_impedance_steps(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[ImpedanceStep, ...]:
-    """Simulate steps of x_0 with a controller's outer loop; none where it renders no stiffness.
-
-    Parameters
-    ----------
-    controller : Controller
-        With its outer loop.
-    plant, params
-        The plant whose link moves.
-
-    """
+    """Simulate steps of x_0 with a controller's outer loop; none where it renders no stiffness."""
     outer = controller.outer
     assert outer is not None and plant.port is not None and plant.port.motion is not None
     if not outer.stiffness > 0.0:
@@ -101,17 +79,23 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
         longest_delay_s=find_longest_delay(plant, [params]),
         sticks=can_stick(plant),
     )
-    samples = _count_samples(controller, plant, completed)
+    samples, farthest = _count_samples(controller, plant, completed), _find_farthest(plant, completed)
+    rest, dry = controller.force_limit(0.0), sum(find_dry_friction(plant, completed).values())
+    efforts = [NOMINAL_EFFORT[controller.command.mechanics]]  # N or N m, that a step asks for at once
+    if rest is not None:
+        efforts = [share * rest for share in SHARES]
+    elif dry:
+        efforts = [share * dry for share in FRICTION_SHARES]
     steps: list[ImpedanceStep] = []
-    for effort in _size_efforts(controller, find_dry_friction(plant, completed)):
-        size = min(effort / outer.stiffness, _find_farthest(plant, completed))
+    for effort in efforts:
+        size = min(effort / outer.stiffness, farthest)
         run = run_loop(loop, [params], np.full(samples, size))
         limit = law.current_limit_A * (1.0 - 1e-9)
         steps.append(_judge(run.outputs[motion][0], size, bool(np.max(np.abs(run.current)) >= limit)))
     return tuple(steps)
 
 
-def _judge(path: Float[np.ndarray, " n"], size: float, saturated: bool) -> ImpedanceStep:
+def _judge(path: Signal, size: float, saturated: bool) -> ImpedanceStep:
     if not np.all(np.isfinite(path)):
         return ImpedanceStep(size=size, moving=np.inf, end=np.nan, overshoot=np.nan, saturated=saturated)
     last = path[int((1.0 - LAST_SHARE) * path.size) :]
@@ -123,14 +107,6 @@ def _judge(path: Float[np.ndarray, " n"], size: float, saturated: bool) -> Imped
         overshoot=max(float(np.max(path)) - end, 0.0) / size,
         saturated=saturated,
     )
-
-
-def _size_efforts(controller: Controller, friction: dict[str, float]) -> list[float]:
-    """Return the efforts, N or N m, that the steps ask for at once."""
-    rest, dry = controller.force_limit(0.0), sum(friction.values())
-    if rest is not None:
-        return [share * rest for share in SHARES]
-    return [share * dry for share in FRICTION_SHARES] if dry else [NOMINAL_EFFORT[controller.command.mechanics]]
 
 
 def _find_farthest(plant: Plant, params: ParameterSet) -> float:

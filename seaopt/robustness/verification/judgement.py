@@ -30,11 +30,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import Key, OrInfinite, OrNaN
 from seaopt.control.running.closed_loop import ENERGY
@@ -44,7 +43,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import find_locked_modes
 from seaopt.records import Result, record
 from seaopt.robustness.verification.linear import LinearView, linearise_last_phase
-from seaopt.robustness.verification.oscillation import find_oscillation
+from seaopt.robustness.verification.oscillation import Signal, find_oscillation
 from seaopt.robustness.verification.playback import Playback, Stage
 from seaopt.robustness.verification.scenarios import SETTLED, Scenario
 
@@ -68,26 +67,14 @@ LOST = ("overflow", "unstable")  # kinds of fault that explain every other of th
 
 @record
 class Fault:
-    """Something that a run is not allowed to do.
+    """Something that a run is not allowed to do."""
 
-    Parameters
-    ----------
-    kind : str
-        "overshoot", "settling", "steady error", "oscillation", "growth", ...: faults of one kind are one failure.
-    text, remedy : str
-        What happened, with figures, and what to do about it where that is particular.
-    value, limit : float
-        The figure and what is allowed, in `unit`.
-    unit : str
-
-    """
-
-    kind: str
-    text: str
+    kind: str  # "overshoot", "settling", "oscillation", "growth", ...: faults of one kind are one failure
+    text: str  # what happened, with figures
     value: OrInfinite = 1.0
     limit: OrInfinite = 0.0
-    unit: str = ""
-    remedy: str = ""
+    unit: str = ""  # of value and limit
+    remedy: str = ""  # where something particular can be done
 
     def __str__(self) -> str:
         return f"{self.text}; {self.remedy}" if self.remedy else self.text
@@ -181,170 +168,207 @@ class _Findings:
         self.faults.append(Fault(kind=kind, text=text, **figure))
 
 
+@record(eq=False)
+class _Run:
+    """One run of a trace."""
+
+    stage: Stage
+    scenario: Scenario
+    trace: Playback
+    index: int
+
+    @property
+    def regulated(self) -> str:
+        """The output that the law regulates."""
+        return self.stage.controller.spec.regulated
+
+    @property
+    def unit(self) -> str:
+        """Of that output."""
+        return self.stage.controller.command.reference_unit
+
+    @property
+    def force(self) -> Signal:
+        """That output."""
+        return self.trace.outputs[self.regulated][self.index]
+
+    @property
+    def step(self) -> float:
+        """The last phase's reference."""
+        return self.scenario.phases[-1].force_N
+
+    @property
+    def rest_force(self) -> float:
+        """The force of the rest where the run started."""
+        return 0.0 if self.trace.rest is None else float(self.trace.rest.force[self.index])
+
+    @property
+    def error(self) -> Signal:
+        """Reference minus force, each relative to rest: a law without integrator rests at another reference."""
+        rest = self.trace.rest
+        offset = 0.0 if rest is None or not self.scenario.about_rest else rest.reference[self.index] - self.rest_force
+        return self.trace.reference[self.index] - self.force - offset
+
+    @property
+    def response(self) -> Signal:
+        """The force from rest over the last phase's reference."""
+        return (self.force - self.rest_force) / self.step
+
+    @property
+    def largest(self) -> float:
+        """The largest force over the last phase's reference, between samples too where the run rests at zero."""
+        if self.rest_force:
+            return float(np.max(np.abs(self.response)))
+        return float(self.trace.peaks[self.regulated][self.index]) / abs(self.step)
+
+
 def judge_run(
     stage: Stage,
     name: str,
     scenario: Scenario,
     trace: Playback,
-    run: int,
+    index: int,
     sets: Sequence[ParameterSet],
-    ideal: Playback | None = None,
+    twin: Playback,
     unlimited: Playback | None = None,
 ) -> Outcome:
     """Return the outcome of one run of a trace, played on the plant `name` with `sets`, nominal first.
 
-    `ideal` is the same scenario on `stage.ideal`; the trace itself where the stage is ideal. `unlimited` is that one
+    `twin` is the same scenario on `stage.ideal`; the trace itself where the stage is ideal. `unlimited` is that one
     without a current limit, where it `overshoots_at_limit`.
     """
-    findings, twin = _Findings(), trace if ideal is None else ideal
-    view = linearise_last_phase(stage, scenario, sets[run])
+    findings, drawn, nominal = _Findings(), sets[index], sets[0]
+    view = linearise_last_phase(stage, scenario, drawn)
     if view.instability:
         findings.add("unstable", view.instability)
-    measured = stage.controller.spec.regulated
-    force, current = trace.outputs[measured][run], trace.current[run]
-    _judge_extremes(stage, scenario, trace, run, findings)
-    _judge_rest(stage, trace, run, sets[run], findings)
-    if all(np.all(np.isfinite(signal)) for signal in (force, current, twin.outputs[measured][run])):
+    run = _Run(stage=stage, scenario=scenario, trace=trace, index=index)
+    ideal = replace(run, trace=twin)
+    _judge_extremes(run, findings)
+    _judge_rest(run, drawn, findings)
+    if all(np.all(np.isfinite(signal)) for signal in (run.force, trace.current[index], ideal.force)):
         if scenario.friction == "smooth" or scenario.settling_s is None:
-            _judge_growth(stage, scenario, twin, run, findings)
-        if not view.instability:
-            _judge_outbreak(stage, scenario, trace, twin, run, view, findings)
-        _judge_oscillation(stage, scenario, trace, run, sets[run], view, findings)
-        _judge_step(stage, scenario, twin, run, findings, unlimited)
-        _judge_final_error(stage, scenario, trace, twin, run, findings)
+            _judge_growth(ideal, findings)
+        if not view.instability and twin is not trace:
+            _judge_outbreak(run, ideal, view, findings)
+        if scenario.quiet:
+            _judge_oscillation(run, drawn, view, findings)
+        if scenario.settling_s is not None:
+            _judge_step(ideal, scenario.settling_s, findings, unlimited)
+        _judge_final_error(run, ideal, findings)
     else:
         findings.faults.insert(0, Fault(kind="overflow", text="its numbers overflow"))
     return Outcome(
         scenario=scenario.name,
         plant=name,
-        draw=NOMINAL if run == 0 else str(run),
+        draw=NOMINAL if index == 0 else str(index),
         faults=tuple(findings.faults),
-        parameters=_find_differences(sets[0], sets[run]),
+        parameters={n: p.value for n, p in drawn.items() if n not in nominal or p.value != nominal[n].value},
         **findings.figures,
     )
 
 
-def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings) -> None:
-    controller, plant = stage.controller, stage.plant
-    force = float(trace.peaks[controller.spec.regulated][run])
-    angles = [float(trace.peaks[name][run]) for name, unit in plant.outputs.items() if unit == "rad"]
-    current, limit = np.abs(trace.current[run]), controller.command_limit
-    most = largest_current(math.inf if limit is None else limit, stage.current_step_A)
-    hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[run]), default=None)
+def _judge_extremes(run: _Run, findings: _Findings) -> None:
+    scenario, trace, index, command = run.scenario, run.trace, run.index, run.stage.controller.command
+    force = float(trace.peaks[run.regulated][index])
+    angles = [float(trace.peaks[name][index]) for name, unit in run.stage.plant.outputs.items() if unit == "rad"]
+    current, limit = np.abs(trace.current[index]), run.stage.controller.command_limit
+    most = largest_current(math.inf if limit is None else limit, run.stage.current_step_A)
+    hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[index]), default=None)
     findings.figures.update(
         peak_force_N=force,
         peak_current_A=float(np.max(current)),
         peak_angle_rad=max(angles) if angles else None,
         saturated=float(np.mean(current >= most * (1 - 1e-9))),
-        peak_energy_J=float(trace.peaks[ENERGY][run]) if ENERGY in trace.peaks else None,
-        contact_impulse=None if hardest is None else float(hardest.impulse[run]),
-        contact_loss_J=None if hardest is None else float(hardest.loss_J[run]),
+        peak_energy_J=float(trace.peaks[ENERGY][index]) if ENERGY in trace.peaks else None,
+        contact_impulse=None if hardest is None else float(hardest.impulse[index]),
+        contact_loss_J=None if hardest is None else float(hardest.loss_J[index]),
     )
     if np.max(current) > most * (1 + 1e-9):
-        findings.add(
-            "current",
-            f"the {controller.command.word} reaches {controller.command.show(np.max(current))}, above its limit of "
-            f"{controller.command.show(most)}",
-        )
+        reached = f"the {command.word} reaches {command.show(np.max(current))}"
+        findings.add("current", f"{reached}, above its limit of {command.show(most)}")
     for what, value, allowed, unit in (
-        (controller.spec.regulated, force, scenario.max_force_N, controller.command.reference_unit),
+        (run.regulated, force, scenario.max_force_N, run.unit),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
     ):
         if allowed is not None and not value <= allowed:
             findings.add(f"peak of {what}", f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed")
     for name, value in scenario.passes.items():
-        reached = trace.outputs[name][run]
-        if not np.nanmin(reached) <= value <= np.nanmax(reached):
+        output = trace.outputs[name][index]
+        if not np.nanmin(output) <= value <= np.nanmax(output):
             findings.add("no event", f"{name} never passes {value:g}, so that the scenario does not happen")
 
 
-def _judge_rest(stage: Stage, trace: Playback, run: int, drawn: ParameterSet, findings: _Findings) -> None:
+def _judge_rest(run: _Run, drawn: ParameterSet, findings: _Findings) -> None:
     """Check that the motor can hold the plant where the draw puts it at rest."""
-    limit, show = stage.controller.command_limit, stage.controller.command.show
-    if trace.rest is None or limit is None or abs(trace.rest.current_A[run]) <= limit * (1 + 1e-9):
+    controller, rest = run.stage.controller, run.trace.rest
+    limit, show = controller.command_limit, controller.command.show
+    if rest is None or limit is None or abs(rest.current_A[run.index]) <= limit * (1 + 1e-9):
         return
-    where = format_values({name: drawn[name].value for name in stage.plant.states if name in drawn}, missing="")
-    findings.add(
-        "rest",
-        f"to rest at {where} takes {show(trace.rest.current_A[run])}, above the limit of {show(limit)}",
-        remedy="narrow its range",
-    )
+    where = format_values({name: drawn[name].value for name in run.stage.plant.states if name in drawn}, missing="")
+    text = f"to rest at {where} takes {show(rest.current_A[run.index])}, above the limit of {show(limit)}"
+    findings.add("rest", text, remedy="narrow its range")
 
 
-def _judge_growth(stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings) -> None:
+def _judge_growth(run: _Run, findings: _Findings) -> None:
+    trace = run.trace
     if ENERGY in trace.outputs:
-        base = 0.0 if trace.rest is None or not scenario.about_rest else trace.rest.energy_J[run]
-        level, what = trace.outputs[ENERGY][run] - base, "the energy"
+        base = 0.0 if trace.rest is None or not run.scenario.about_rest else trace.rest.energy_J[run.index]
+        level, what = trace.outputs[ENERGY][run.index] - base, "the energy"
     else:
-        name = stage.controller.spec.regulated
         with np.errstate(over="ignore"):
-            level = _error(scenario, trace, run, trace.outputs[name][run]) ** 2
-        what = f"the square of the error of {name}"
+            level = run.error**2
+        what = f"the square of the error of {run.regulated}"
     level = np.abs(level[np.isfinite(level)])
     last = level[-(trace.edges[-1] - trace.edges[-2]) :]
     last = last[int(SETTLE * last.size) :]
     first, second = (float(np.max(half)) for half in np.array_split(last, 2))
-    findings.figures["energy_growth"] = second / max(first, 1e-300)
+    growth = findings.figures["energy_growth"] = second / max(first, 1e-300)
     if second > GROWTH * first + GROWTH_FLOOR * float(np.max(level)):
-        findings.add("growth", f"{what} grows {second / max(first, 1e-300):.3g} times while the reference is constant")
+        findings.add("growth", f"{what} grows {growth:.3g} times while the reference is constant")
 
 
-def _judge_outbreak(
-    stage: Stage, scenario: Scenario, trace: Playback, twin: Playback, run: int, view: LinearView, findings: _Findings
-) -> None:
+def _judge_outbreak(run: _Run, ideal: _Run, view: LinearView, findings: _Findings) -> None:
     """Check that noise does not set off a growing force error."""
-    if twin is trace:
-        return
-    name = stage.controller.spec.regulated
-    off, alone = (np.abs(_error(scenario, one, run, one.outputs[name][run])) for one in (trace, twin))
-    half = trace.last.stop - (trace.last.stop - trace.last.start) // 2
-    before, after = max(float(np.max(off[:half])), float(np.max(alone))), float(np.max(off[half:]))
-    allowed = OUTBREAK * before + OUTLIER * view.force_std()
-    if not after <= allowed:
-        unit = stage.controller.command.reference_unit
-        end = f"{after:.4g} {unit} in the end, without noise by {np.max(alone):.4g} {unit}"
-        findings.add("outbreak", f"{name} is off by up to {end}")
+    off, alone, last = np.abs(run.error), float(np.max(np.abs(ideal.error))), run.trace.last
+    half = last.stop - (last.stop - last.start) // 2
+    before, after = max(float(np.max(off[:half])), alone), float(np.max(off[half:]))
+    if not after <= OUTBREAK * before + OUTLIER * view.force_std():
+        end = f"{after:.4g} {run.unit} in the end, without noise by {alone:.4g} {run.unit}"
+        findings.add("outbreak", f"{run.regulated} is off by up to {end}")
 
 
-def _judge_oscillation(
-    stage: Stage,
-    scenario: Scenario,
-    trace: Playback,
-    run: int,
-    drawn: ParameterSet,
-    view: LinearView,
-    findings: _Findings,
-) -> None:
+def _judge_oscillation(run: _Run, drawn: ParameterSet, view: LinearView, findings: _Findings) -> None:
     """Check that no oscillation lasts: a slow one in a long window, one whose phase noise moves in a short one."""
-    spec, period = stage.controller.spec, stage.controller.sample_time_s
-    if not scenario.quiet:
-        return
+    stage, scenario = run.stage, run.scenario
+    band, period = stage.controller.spec.bandwidth_hz, stage.controller.sample_time_s
     free = stage.plant.moves and not scenario.phases[-1].held
-    for window in _find_windows(stage, trace):
+    # A window long enough for the slowest oscillation, and a short one, where noise moves fast phases less.
+    last, slow = find_judged_window(run.trace), max(LEAST_WINDOW_S, LINE_PERIODS * SLOWEST / band)
+    for length in (math.ceil(duration / period) for duration in (slow, slow / SHORTER)):
+        window = slice(max(last.start, last.stop - length), last.stop)
         lasting = period * (window.stop - window.start)
-        lowest = max(spec.bandwidth_hz / SLOWEST, LINE_PERIODS / lasting) if free else STILL_PERIODS / lasting
-        floor = find_noise_floor(stage, float(trace.peaks[spec.regulated][run]))
+        lowest = max(band / SLOWEST, LINE_PERIODS / lasting) if free else STILL_PERIODS / lasting
+        floor = find_noise_floor(stage, float(run.trace.peaks[run.regulated][run.index]))
         if scenario.settling_s is not None:  # what creeps against friction is no pure exponential
-            floor = max(floor, VISIBLE * abs(scenario.phases[-1].force_N))
+            floor = max(floor, VISIBLE * abs(run.step))
         if not view.instability:
             floor = max(floor, LINE_SIGMAS * view.force_std(lowest))
-        line = find_oscillation(trace.outputs[spec.regulated][run][window], period, floor=floor, lowest_hz=lowest)
-        if line is not None and not line.growing and _swings_alone(stage, scenario, drawn, line.frequency_hz):
+        line = find_oscillation(run.force[window], period, floor=floor, lowest_hz=lowest)
+        if line is None or (not line.growing and _swings_alone(run, drawn, line.frequency_hz)):
             continue
-        if line is not None and (line.sustained or line.growing):
+        if line.sustained or line.growing:
             findings.figures.update(limit_cycle_N=line.amplitude, limit_cycle_hz=line.frequency_hz)
             what = "sustains itself" if line.sustained else f"grows {line.growth:.3g} times"
-            unit = stage.controller.command.reference_unit
-            text = f"an oscillation of {line.amplitude:.3g} {unit} at {line.frequency_hz:.4g} Hz {what}"
-            findings.add("oscillation", text, value=line.amplitude, unit=unit)
+            text = f"an oscillation of {line.amplitude:.3g} {run.unit} at {line.frequency_hz:.4g} Hz {what}"
+            findings.add("oscillation", text, value=line.amplitude, unit=run.unit)
             return
 
 
-def _swings_alone(stage: Stage, scenario: Scenario, drawn: ParameterSet, frequency_hz: float) -> bool:
+def _swings_alone(run: _Run, drawn: ParameterSet, frequency_hz: float) -> bool:
     """Tell whether a moving plant has a mode at a frequency while its joints stick, which no law can then damp."""
-    if scenario.friction == "smooth" or not stage.plant.moves:
+    if run.scenario.friction == "smooth" or not run.stage.plant.moves:
         return False
-    modes = find_locked_modes(stage.plant, drawn)
+    modes = find_locked_modes(run.stage.plant, drawn)
     return bool(np.any(np.abs(modes / frequency_hz - 1.0) < SAME_FREQUENCY))
 
 
@@ -354,21 +378,11 @@ def find_judged_window(trace: Playback) -> slice:
     return slice(last.start + int(SETTLE * (last.stop - last.start)), last.stop)
 
 
-def _find_windows(stage: Stage, trace: Playback) -> tuple[slice, slice]:
-    """Return a window long enough for the slowest oscillation, and a short one, where noise moves fast phases less."""
-    last, controller = find_judged_window(trace), stage.controller
-    slow = max(LEAST_WINDOW_S, LINE_PERIODS * SLOWEST / controller.spec.bandwidth_hz)
-    lengths = (math.ceil(duration / controller.sample_time_s) for duration in (slow, slow / SHORTER))
-    long, short = (slice(max(last.start, last.stop - length), last.stop) for length in lengths)
-    return long, short
-
-
 def find_noise_floor(stage: Stage, peak: float) -> float:
     """Return the amplitude (N) that noise, quantisation and rounding make without an oscillation in a run's peak."""
     rounding = 0.5 * stage.current_step_A / stage.controller.command.per_effort
     std, step = stage.reading_errors
-    noise = 2.0 * std + 1.5 * step
-    return max(noise + rounding, 1e-3 * peak)
+    return max(2.0 * std + 1.5 * step + rounding, 1e-3 * peak)
 
 
 def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bool:
@@ -376,78 +390,47 @@ def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bo
     limit, allowed = stage.controller.command_limit, scenario.max_overshoot
     if limit is None or allowed is None:
         return False
-    at_limit = np.max(np.abs(trace.current), axis=1) >= limit * (1 - 1e-9)
-    return any(_find_peak(stage, scenario, trace, int(run)) > allowed for run in np.flatnonzero(at_limit))
+    at_limit = np.flatnonzero(np.max(np.abs(trace.current), axis=1) >= limit * (1 - 1e-9))
+    runs = (_Run(stage=stage, scenario=scenario, trace=trace, index=int(index)) for index in at_limit)
+    return any(run.largest > allowed for run in runs)
 
 
-def _respond(stage: Stage, scenario: Scenario, trace: Playback, run: int) -> Float[np.ndarray, " n"]:
-    """Return the force from rest over the last phase's reference."""
-    rest = 0.0 if trace.rest is None else float(trace.rest.force[run])
-    return (trace.outputs[stage.controller.spec.regulated][run] - rest) / scenario.phases[-1].force_N
-
-
-def _find_peak(stage: Stage, scenario: Scenario, trace: Playback, run: int) -> float:
-    """Return the largest force over the last phase's reference, between samples too where the run rests at zero."""
-    if trace.rest is not None and trace.rest.force[run]:
-        return float(np.max(np.abs(_respond(stage, scenario, trace, run))))
-    return float(trace.peaks[stage.controller.spec.regulated][run]) / abs(scenario.phases[-1].force_N)
-
-
-def _judge_step(
-    stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings, unlimited: Playback | None
-) -> None:
+def _judge_step(run: _Run, most_s: float, findings: _Findings, unlimited: Playback | None) -> None:
     """Judge a step from rest by its largest force, between samples too, and by when it has settled."""
-    if scenario.settling_s is None:
-        return
-    step, last, unit = scenario.phases[-1].force_N, trace.last, stage.controller.command.reference_unit
-    response, largest = _respond(stage, scenario, trace, run), _find_peak(stage, scenario, trace, run)
-    outside = np.flatnonzero(np.abs(response[last] - 1.0) > SETTLED)
+    last, largest, allowed = run.trace.last, run.largest, run.scenario.max_overshoot
+    outside = np.flatnonzero(np.abs(run.response[last] - 1.0) > SETTLED)
     settled = outside.size == 0 or outside[-1] + 1 < last.stop - last.start
-    settling_s = float(outside[-1] + 1 if outside.size else 0) * stage.controller.sample_time_s if settled else math.inf
+    samples = float(outside[-1] + 1 if outside.size else 0) if settled else math.inf
+    settling_s = samples * run.stage.controller.sample_time_s
     findings.figures.update(overshoot=max(largest - 1.0, 0.0), settling_s=settling_s)
-    allowed = scenario.max_overshoot
+    step = f"a step of {run.step:.3g} {run.unit}"
     if allowed is not None and largest > allowed:
-        by_limit = unlimited is not None and _find_peak(stage, scenario, unlimited, run) <= allowed
+        by_limit = unlimited is not None and replace(run, trace=unlimited).largest <= allowed
         findings.figures.update(overshoot_by_limit=by_limit)
         if not by_limit:
             over, most = (f"{100.0 * (share - 1.0):.3g} %" for share in (largest, allowed))
-            text = f"a step of {step:.3g} {unit} overshoots by {over}, {most} are allowed"
-            remedy = SLOWER_INTEGRAL if scenario.friction == "sticking" else ""
+            remedy = SLOWER_INTEGRAL if run.scenario.friction == "sticking" else ""
+            text = f"{step} overshoots by {over}, {most} are allowed"
             findings.add("overshoot", text, value=largest, limit=allowed, remedy=remedy)
-    if settling_s > scenario.settling_s:
+    if settling_s > most_s:
         when = f"after {settling_s:.4g} s" if settled else "not at all"
-        text = f"a step of {step:.3g} {unit} settles {when}, {scenario.settling_s:.4g} s are allowed"
-        findings.add("settling", text, value=settling_s, limit=scenario.settling_s, unit="s")
+        text = f"{step} settles {when}, {most_s:.4g} s are allowed"
+        findings.add("settling", text, value=settling_s, limit=most_s, unit="s")
 
 
-def _judge_final_error(
-    stage: Stage, scenario: Scenario, trace: Playback, twin: Playback, run: int, findings: _Findings
-) -> None:
-    last, name, called = trace.last, stage.controller.spec.regulated, stage.controller.command.mechanics
+def _judge_final_error(run: _Run, ideal: _Run, findings: _Findings) -> None:
+    last, stage, most = run.trace.last, run.stage, run.scenario.final_error
     end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
-    error, alone = (float(np.mean(_error(scenario, one, run, one.outputs[name][run])[end])) for one in (trace, twin))
+    error, alone = (float(np.mean(each.error[end])) for each in (run, ideal))
     findings.figures["final_error_N"] = error
+    if most is None:
+        return
     (noise, count), rounding = stage.reading_errors, stage.current_step_A / stage.controller.command.per_effort
     spare = MEAN_SIGMAS * noise / math.sqrt(end.stop - end.start) + 0.5 * (count + rounding)
-    for value, more, what in ((error, spare, ""), (alone, 0.0, " without noise")):
-        if scenario.final_error is not None and not abs(value) <= scenario.final_error + more:
-            allowed = scenario.final_error + more
-            side = "below" if value > 0.0 else "above"
-            word, unit = called.word, called.unit
-            text = (
-                f"the {word} ends {abs(value):.4g} {unit} {side} its reference{what}, {allowed:.4g} {unit} are allowed"
-            )
-            findings.add("steady error", text, value=abs(value), limit=allowed, unit=unit)
+    for value, allowed, what in ((error, most + spare, ""), (alone, most, " without noise")):
+        if not abs(value) <= allowed:
+            called, side = stage.controller.command.mechanics, "below" if value > 0.0 else "above"
+            ends = f"the {called.word} ends {abs(value):.4g} {called.unit} {side} its reference{what}"
+            text = f"{ends}, {allowed:.4g} {called.unit} are allowed"
+            findings.add("steady error", text, value=abs(value), limit=allowed, unit=called.unit)
             return
-
-
-def _error(scenario: Scenario, trace: Playback, run: int, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return reference minus force, each relative to rest: a law without integrator rests at another reference."""
-    at_rest = (
-        0.0 if trace.rest is None or not scenario.about_rest else trace.rest.reference[run] - trace.rest.force[run]
-    )
-    return trace.reference[run] - force - at_rest
-
-
-def _find_differences(nominal: ParameterSet, drawn: ParameterSet) -> dict[str, float]:
-    return {name: p.value for name, p in drawn.items() if name not in nominal or p.value != nominal[name].value}

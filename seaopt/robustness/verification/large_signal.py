@@ -15,18 +15,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from seaopt.codec import OrInfinite, OrNaN, from_content
+from seaopt.codec import Fields, Key, OrInfinite, OrNaN
 from seaopt.control import Controller
-from seaopt.control.laws.realisation import runnable
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.peaks import HALF_POWER
-from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.sampled_loop import find_longest_delay
+from seaopt.control.running.closed_loop import run_loop
 from seaopt.errors import ControlError
 from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
@@ -34,6 +32,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import find_dry_friction, take_sliding
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
+from seaopt.robustness.verification.scenarios import build_loop
 from seaopt.units import LINEAR
 
 MEASURED_PERIODS, SETTLING_PERIODS = 6, 12
@@ -91,6 +90,10 @@ class LargeSignal:
     """
 
     plot = PlotAccessor()
+    json_keys = (
+        "plant", "unit", "amplitude_N", "bandwidth_hz", "predicted_hz", "friction_N", "saturation_map",
+        Key(field="gain_parts", name="gain"), "saturated",
+    )  # fmt: skip
 
     plant: str
     frequency_hz: Float[np.ndarray, " f"]
@@ -103,35 +106,26 @@ class LargeSignal:
     friction_N: float
     unit: str = LINEAR.unit
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return amplitudes, bandwidths and the saturation map, for robustness.json."""
-        return {
-            "plant": self.plant,
-            "unit": self.unit,
-            "amplitude_N": self.amplitude_N.tolist(),
-            "bandwidth_hz": list(self.bandwidth_hz),
-            "predicted_hz": list(self.predicted_hz),
-            "friction_N": self.friction_N,
-            "saturation_map": {"frequency_hz": self.frequency_hz.tolist(), "amplitude_N": self.onset_N.tolist()},
-            "gain": {"re": np.real(self.gain).tolist(), "im": np.imag(self.gain).tolist()},
-            "saturated": self.saturated.tolist(),
-        }
+    @property
+    def saturation_map(self) -> dict[str, Float[np.ndarray, " f"]]:
+        """The amplitudes from which the command saturates, by frequency, as a file has them."""
+        return {"frequency_hz": self.frequency_hz, "amplitude_N": self.onset_N}
+
+    @property
+    def gain_parts(self) -> dict[str, Float[np.ndarray, "a f"]]:
+        """The gain's real and imaginary parts, as a file has them."""
+        return {"re": np.real(self.gain), "im": np.imag(self.gain)}
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any], source: str, remedy: str) -> LargeSignal:
-        """Return what `to_dict` gave; nothing is simulated."""
-        stored = from_content(_StoredSweep, content, source, remedy=remedy)
+    def _from_json(cls, content: Annotated[Mapping[str, Any], Fields(of=_StoredSweep)]) -> LargeSignal:
+        saturation_map, gain = content["saturation_map"], content["gain"]
         return cls(
-            plant=stored.plant,
-            unit=stored.unit,
-            frequency_hz=np.array(stored.saturation_map["frequency_hz"]),
-            amplitude_N=np.array(stored.amplitude_N),
-            gain=np.array(stored.gain["re"]) + 1j * np.array(stored.gain["im"]),
-            saturated=np.array(stored.saturated, dtype=bool),
-            onset_N=np.array(stored.saturation_map["amplitude_N"]),
-            bandwidth_hz=stored.bandwidth_hz,
-            predicted_hz=stored.predicted_hz,
-            friction_N=stored.friction_N,
+            **{name: content[name] for name in ("plant", "unit", "bandwidth_hz", "predicted_hz", "friction_N")},
+            frequency_hz=np.array(saturation_map["frequency_hz"]),
+            amplitude_N=np.array(content["amplitude_N"]),
+            gain=np.array(gain["re"]) + 1j * np.array(gain["im"]),
+            saturated=np.array(content["saturated"], dtype=bool),
+            onset_N=np.array(saturation_map["amplitude_N"]),
         )
 
     def __repr__(self) -> str:
@@ -203,13 +197,7 @@ def large_signal(
     linear = controller.close(take_sliding(plant, values), values)
     if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
-    loop = SampledLoop(
-        plant=plant,
-        law=runnable(controller),
-        measured=controller.signals,
-        delay_samples=controller.compute_delay_samples,
-        longest_delay_s=find_longest_delay(plant, [parameters]),
-    )
+    loop = build_loop(controller, plant, parameters)
     if frequencies_hz is None:
         wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)
     else:
@@ -254,18 +242,7 @@ def large_signal(
 def predict_bandwidths(
     controller: Controller, plant: Plant, parameters: ParameterSet, amplitude: Float[np.ndarray, " a"]
 ) -> tuple[float | None, ...]:
-    """Return the bandwidth (Hz) at amplitudes of the reference (N), by describing functions, as in a `LargeSignal`.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
-    >>> controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
-    >>> small, large = predict_bandwidths(controller, stand, rubbing, np.array([30.0, 1e5]))
-    >>> small < large, round(large)
-    (True, 20)
-
-    """
+    """Return the bandwidth (Hz) at amplitudes of the reference (N), by describing functions, as in a `LargeSignal`."""
     band, values = controller.spec.bandwidth_hz, plant.complete(parameters)
     f = np.geomspace(band / SLOWEST_STUCK, min(2.0 * band, 0.24 / controller.sample_time_s), PREDICTED_POINTS)
     linear = controller.close(take_sliding(plant, values), values)

@@ -26,21 +26,11 @@ REAL = 1e-12  # rad a sample: an eigenvalue of a smaller angle is real but for r
 
 @record(eq=False)
 class LinearView:
-    """The linear loop of a scenario's last phase, at rest.
-
-    Parameters
-    ----------
-    loop : Loop
-    noise : tuple of float
-        Standard deviation of the white noise that represents each sensor, in its unit, the regulated one's first.
-    step_N : float
-        The same of the rounded current.
-
-    """
+    """The linear loop of a scenario's last phase, at rest."""
 
     loop: Loop
-    noise: tuple[float, ...]
-    step_N: float
+    noise: tuple[float, ...]  # std of the white noise that represents each sensor, the regulated one's first
+    step_N: float  # the same of the rounded current
 
     @property
     def instability(self) -> str:
@@ -73,28 +63,7 @@ def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) 
     """Return the linear loop of a scenario's last phase, with the load and the link as they are then.
 
     It is that of the plant at rest, where the phase ends, with friction as steep as it is there; what the loop does in
-    motion the simulation shows.
-
-    Parameters
-    ----------
-    stage : Stage
-        Controller, plants and devices.
-    scenario : Scenario
-        The scenario that is simulated.
-    drawn : ParameterSet
-        Parameters and conditions of the run.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> from seaopt.robustness.verification.scenarios import default_scenarios
-    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
-    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    >>> stage = Stage(controller=controller, plant=stand, sensors=so.Sensors(noise_std={"F1": 2.0}))
-    >>> view = linearise_last_phase(stage, default_scenarios(controller, stand)[0], thor)
-    >>> view.instability, view.force_std() < 2.0
-    ('', True)
-
+    motion the simulation shows. `drawn` has the parameters and conditions of the run.
     """
     last = scenario.phases[-1]
     plant = stage.partner if last.held and stage.partner is not None else stage.plant

@@ -12,28 +12,17 @@ from seaopt.records import record
 
 LINE_SHARE = 0.5  # of the power above lowest_hz: the least that one spectral line must explain
 STEADY = 1.3  # largest ratio of the amplitudes of the two halves
+Signal = Float[np.ndarray, " n"]  # samples
 
 
 @record
 class Oscillation:
-    """A line in the spectrum of a window.
-
-    Parameters
-    ----------
-    frequency_hz : float
-    amplitude : float
-        In the window's second half, in the signal's unit.
-    growth : float
-        Ratio of that to the amplitude in the first half.
-    peak : float
-        The largest deviation in the second half, that of bursts included.
-
-    """
+    """A line in the spectrum of a window."""
 
     frequency_hz: float
-    amplitude: float
-    growth: float
-    peak: float
+    amplitude: float  # in the window's second half, in the signal's unit
+    growth: float  # ratio of that to the amplitude in the first half
+    peak: float  # the largest deviation in the second half, that of bursts included
 
     @property
     def sustained(self) -> bool:
@@ -46,36 +35,13 @@ class Oscillation:
         return self.growth > STEADY
 
 
-def find_oscillation(
-    signal: Float[np.ndarray, " n"], sample_time_s: float, *, floor: float, lowest_hz: float
-) -> Oscillation | None:
+def find_oscillation(signal: Signal, sample_time_s: float, *, floor: float, lowest_hz: float) -> Oscillation | None:
     """Return the oscillation that stands out in a window, or None.
 
     It stands out if its amplitude is above `floor`, in both halves or only in the second, and if it explains at least
-    half of the power above `lowest_hz`; noise filtered by a loop does not.
-
-    Parameters
-    ----------
-    signal : array, shape (n,)
-        A window under constant conditions.
-    sample_time_s : float
-        Seconds.
-    floor : float
-        The amplitude that noise and quantisation alone make, in the signal's unit.
-    lowest_hz : float
-        Slower movement is removed; at least two periods of this frequency should fit into half of the window.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> t = np.arange(2000) * 1e-3
-    >>> line = find_oscillation(3.0 * np.sin(2 * np.pi * 41.7 * t), 1e-3, floor=0.1, lowest_hz=5.0)
-    >>> round(line.frequency_hz, 1), round(line.amplitude, 2), line.sustained
-    (41.7, 3.0, True)
-    >>> fading = 3.0 * np.sin(2 * np.pi * 41.7 * t) * np.exp(-2 * t)
-    >>> find_oscillation(fading, 1e-3, floor=0.1, lowest_hz=5.0).sustained
-    False
-
+    half of the power above `lowest_hz`; noise filtered by a loop does not. `floor` is the amplitude that noise and
+    quantisation alone make. Movement slower than `lowest_hz` is removed; at least two periods of it should fit into
+    half of the window.
     """
     size = float(np.max(np.abs(signal)))
     spread = float(np.std(signal / size)) if size else 0.0
@@ -98,25 +64,11 @@ def find_oscillation(
     )
 
 
-def measure_swing(signal: Float[np.ndarray, " n"], sample_time_s: float, *, lowest_hz: float) -> Oscillation:
+def measure_swing(signal: Signal, sample_time_s: float, *, lowest_hz: float) -> Oscillation:
     """Return what swings in a window, whether it is a line or wanders as rounding makes it.
 
     Its amplitude is that of a sine of the same power in the window's second half, its frequency that of the largest
     line.
-
-    Parameters
-    ----------
-    signal, sample_time_s, lowest_hz
-        As in `find_oscillation`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> t = np.arange(400) * 1e-3
-    >>> swing = measure_swing(100 * t + 3.0 * np.sin(2 * np.pi * 40 * t), 1e-3, lowest_hz=10.0)
-    >>> round(swing.frequency_hz), round(swing.amplitude, 1), round(swing.peak, 1), swing.sustained
-    (40, 3.0, 3.2, True)
-
     """
     fast = _remove_slow(signal, sample_time_s, lowest_hz)
     halves = np.array_split(fast, 2)
@@ -129,7 +81,7 @@ def measure_swing(signal: Float[np.ndarray, " n"], sample_time_s: float, *, lowe
     )
 
 
-def _remove_slow(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: float) -> Float[np.ndarray, " n"]:
+def _remove_slow(signal: Signal, sample_time_s: float, lowest_hz: float) -> Signal:
     """Return the signal less the least-squares fit of a line and of the window's slow cosines."""
     n = signal.size
     basis = _slow_basis(n, max(int(2 * n * sample_time_s * lowest_hz), 0))
@@ -144,7 +96,7 @@ def _slow_basis(n: int, harmonics: int) -> Float[np.ndarray, "n k"]:
     return np.linalg.qr(np.column_stack([np.ones(n), time, slow]))[0]
 
 
-def _find_frequency(signal: Float[np.ndarray, " n"], sample_time_s: float) -> float:
+def _find_frequency(signal: Signal, sample_time_s: float) -> float:
     """Return the frequency of the largest line, refined between the bins by a parabola through their logarithms."""
     n = signal.size
     spectrum = np.abs(np.fft.rfft(signal * np.hanning(n)))
@@ -155,6 +107,6 @@ def _find_frequency(signal: Float[np.ndarray, " n"], sample_time_s: float) -> fl
     return float((k + np.clip(shift, -0.5, 0.5)) / (n * sample_time_s))
 
 
-def _fit_amplitude(signal: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], f: float) -> float:
+def _fit_amplitude(signal: Signal, time: Signal, f: float) -> float:
     basis = np.column_stack([np.cos(2 * np.pi * f * time), np.sin(2 * np.pi * f * time)])
     return float(np.hypot(*np.linalg.lstsq(basis, signal, rcond=None)[0]))

@@ -52,16 +52,7 @@ class _Play:
 
 
 def predict_play_cycles(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[LimitCycle, ...]:
-    """Return the limit cycles that the describing function of a plant's play predicts; none without play.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
-    >>> predict_play_cycles(so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)), stand, thor)
-    ()
-
-    """
+    """Return the limit cycles that the describing function of a plant's play predicts; none without play."""
     if plant.moves:
         return ()
     values = plant.complete(controller.delay(params)).drop_conditions()
@@ -133,17 +124,7 @@ def _predict(controller: Controller, loop: Loop, play: _Play) -> list[LimitCycle
 
 
 def describe_play(share: Float[np.ndarray, " d"], amplitude: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return N at amplitudes, of a share s that is known at `DEFLECTIONS`.
-
-    Examples
-    --------
-    >>> dead = (DEFLECTIONS > 1e-3).astype(float)  # a dead zone of 1 mm
-    >>> x = 1e-3 / 4e-3
-    >>> expected = 1 - 2 / np.pi * (np.arcsin(x) + x * np.sqrt(1 - x**2))
-    >>> bool(abs(describe_play(dead, np.array([4e-3]))[0] - expected) < 0.05)
-    True
-
-    """
+    """Return N at amplitudes, of a share s that is known at `DEFLECTIONS`."""
     theta = (np.arange(ANGLES) + 0.5) * np.pi / ANGLES
     met = np.interp(np.abs(amplitude[:, None] * np.cos(theta)), DEFLECTIONS, share)
     return 2.0 * np.mean(met * np.sin(theta) ** 2, axis=1)

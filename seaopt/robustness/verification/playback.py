@@ -23,6 +23,7 @@ from seaopt.plants.impacts import catch, offset, release, strike
 from seaopt.plants.plant import fill_vector, output_function
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
+from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 
 RunSamples = Float[np.ndarray, "runs n"]
@@ -30,24 +31,11 @@ RunSamples = Float[np.ndarray, "runs n"]
 
 @record(eq=False)
 class Stage:
-    """Controller, plant and devices that scenarios are simulated on.
-
-    Parameters
-    ----------
-    controller : Controller
-        Its law runs as exported.
-    plant : Plant
-        With the link at its port as it is.
-    partner : Plant or None
-        The same actuator with that link fixed, for phases in which it is held.
-    sensors, current_step_A
-        As in `SampledLoop`.
-
-    """
+    """Controller, plant and devices that scenarios are simulated on."""
 
     controller: Controller
-    plant: Plant
-    partner: Plant | None = None
+    plant: Plant  # with the link at its port as it is
+    partner: Plant | None = None  # the same actuator with that link fixed, for phases in which it is held
     sensors: Sensors = field(default_factory=Sensors)
     current_step_A: float = 0.0
 
@@ -105,52 +93,27 @@ class Stage:
 
 @record(eq=False)
 class Contact:
-    """A link that is caught: when (s), the impulse that stops it and the energy (J) it loses, one per run."""
+    """A link that is caught: the impulse that stops it and the energy (J) it loses, one per run."""
 
-    time_s: float
     impulse: Float[np.ndarray, " runs"]
     loss_J: Float[np.ndarray, " runs"]
 
 
 @record(eq=False)
 class Playback:
-    """The samples of a simulated scenario.
+    """The samples of a simulated scenario."""
 
-    Parameters
-    ----------
-    time : array, shape (n,)
-        Seconds from the start.
-    reference, current : array, shape (runs, n)
-        N and A.
-    outputs : mapping of name to array, shape (runs, n)
-        Outputs of `plant`, and "energy" where it declares that; NaN while the link is held and there is no such output.
-    peaks : mapping of name to array, shape (runs,)
-        Largest magnitudes, between samples too.
-    rest : Equilibrium or None
-        The rest where runs started; None where the scenario has an initial state.
-    edges : tuple of int
-        First samples of the phases, and one past the last.
-    contacts : tuple of Contact
-    error : float
-        Estimated integration error of the worst sample, relative.
-    substeps : int
-        Integration steps per sample, the largest number of all phases.
-    wall_s : float
-        Time of computing.
-
-    """
-
-    time: Float[np.ndarray, " n"]
-    reference: RunSamples
-    current: RunSamples
-    outputs: Mapping[str, RunSamples]
-    peaks: Mapping[str, Float[np.ndarray, " runs"]]
-    rest: Equilibrium | None
-    edges: tuple[int, ...]
+    time: Signal
+    reference: RunSamples  # N
+    current: RunSamples  # A
+    outputs: Mapping[str, RunSamples]  # and "energy" where declared; NaN while a held link has no such output
+    peaks: Mapping[str, Float[np.ndarray, " runs"]]  # largest magnitudes, between samples too
+    rest: Equilibrium | None  # where runs started; None where the scenario has an initial state
+    edges: tuple[int, ...]  # first samples of the phases, and one past the last
     contacts: tuple[Contact, ...]
-    error: float
-    substeps: int
-    wall_s: float
+    error: float  # estimated integration error of the worst sample, relative
+    substeps: int  # integration steps per sample, the largest number of all phases
+    wall_s: float  # time of computing
     command: tuple[str, str] = ("I", "A")
 
     def __repr__(self) -> str:
@@ -170,26 +133,8 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
 
     A run starts at rest: at zero, or where a condition among its parameters (an angle such as phi) puts the plant, with
     the law and the commands that wait at rest too, and the scenario's forces counted from the one that keeps it there.
-    A scenario with an `initial_state` starts in that, whatever the conditions.
-
-    Parameters
-    ----------
-    stage : Stage
-        Controller, plant and devices.
-    scenario : Scenario
-        What is simulated.
-    params : sequence of ParameterSet
-        One per run; they may contain conditions: where the run rests, and `delay_s`, a delay besides the controller's.
-    seed : int
-        Of the sensor noise and of random excitations.
-
-    Raises
-    ------
-    ControlError
-        The scenario cannot be played on this plant, or the plant cannot rest where it is to start.
-    SimulationError
-        The plant cannot be simulated well enough.
-
+    A scenario with an `initial_state` starts in that, whatever the conditions. `delay_s` among the parameters is a
+    delay besides the controller's. `seed` is of the sensor noise and of random excitations.
     """
     obstacle = scenario.obstacle(stage.plant, stage.partner)
     if obstacle is not None:
@@ -210,10 +155,12 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         carried = [apply_load(unloaded, phase.scale) for unloaded in carried]
         values = [stage.plant.complete(loaded) for loaded in carried]
         if phase.held and grip is None:
-            now, grip, contact = _catch(stage, values, now, begin_s)
+            now, grip, contact = _catch(stage, values, now)
             contacts.append(contact)
         elif grip is not None and not phase.held:
-            now, grip = _let_go(stage, values, grip, now), None
+            port, rows = _port(stage.plant), zip(now.x, values, grip, strict=True)
+            freed = [release(stage.plant, p, port, row, link) for row, p, link in rows]
+            now, grip = LoopState(x=np.stack(freed), z=now.z), None
         if phase.impulse_Ns:
             link = _port(stage.plant).motion or ""
             blows = [strike(stage.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
@@ -255,13 +202,13 @@ def apply_load(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet
     """Return the scaled parameters; their bounds, which limit what is known and not what is carried, are widened."""
     changed: list[Parameter] = []
     for name, factor in scale.items():
-        value = factor * params[name].value
-        low, high = min(params[name].min, value), max(params[name].max, value)
-        changed.append(replace(params[name], value=value, min=low, max=high))
+        loaded = params[name]
+        value = factor * loaded.value
+        changed.append(replace(loaded, value=value, min=min(loaded.min, value), max=max(loaded.max, value)))
     return params.with_parameters(*changed)
 
 
-def _build_reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+def _build_reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Signal:
     samples = phase.duration_s / sample_time_s
     require_memory(20.0 * samples, f"phase: duration_s = {phase.duration_s:g}", ControlError)
     n = max(1, round(samples))
@@ -271,17 +218,17 @@ def _build_reference(phase: Phase, sample_time_s: float, rng: np.random.Generato
 
 
 def _catch(
-    stage: Stage, values: Sequence[CompletedParameters], now: LoopState, time_s: float
+    stage: Stage, values: Sequence[CompletedParameters], now: LoopState
 ) -> tuple[LoopState, list[dict[str, float]], Contact]:
     """Return the states after the link is caught, where its coordinate stands in each run, and the contact."""
     plant, port = stage.plant, _port(stage.plant)
-    catches = [catch(plant, p, row, port) for p, row in zip(values, now.x, strict=True)]
     name = port.coordinate or ""
-    place = list(plant.states).index(name)
-    after = LoopState(x=np.stack([state for state, _, _ in catches]), z=now.z)
-    impulse, loss = (np.array([figures[k] for figures in catches]) for k in (1, 2))
-    contact = Contact(time_s=time_s, impulse=impulse, loss_J=loss)
-    return after, [{name: float(row[place])} for row in now.x], contact
+    column = list(plant.states).index(name)
+    states, impulses, losses = zip(
+        *(catch(plant, p, row, port) for p, row in zip(values, now.x, strict=True)), strict=True
+    )
+    contact = Contact(impulse=np.array(impulses), loss_J=np.array(losses))
+    return LoopState(x=np.stack(states), z=now.z), [{name: float(row[column])} for row in now.x], contact
 
 
 def _read_standing(
@@ -294,14 +241,6 @@ def _read_standing(
     return np.array(
         [np.array(observe(0.0, x, still, each.vector)).ravel()[rows] for x, each in zip(places, values, strict=True)]
     )
-
-
-def _let_go(
-    stage: Stage, values: Sequence[CompletedParameters], grip: Sequence[Mapping[str, float]], now: LoopState
-) -> LoopState:
-    plant, port = stage.plant, _port(stage.plant)
-    rows = [release(plant, p, port, row, link) for row, p, link in zip(now.x, values, grip, strict=True)]
-    return LoopState(x=np.stack(rows), z=now.z)
 
 
 def _join_phases(

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
+from typing import Any
 
 import numpy as np
 
 from seaopt.bench import Chirp, Excitation
 from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_NAME, STEADY, STEADY_PERIODS
-from seaopt.control.laws.realisation import runnable
+from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.control.running.sampled_loop import find_longest_delay
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_hold, can_stick, find_breakaway, find_dry_friction, take_sliding
@@ -22,6 +23,7 @@ from seaopt.plants.impacts import strike
 from seaopt.records import record
 from seaopt.units import LINEAR, ROTARY, Mechanics
 
+DOUBLET, HOLD = "saturating doublet", "saturating hold"
 FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
 NOMINAL_EFFORT = {LINEAR: 100.0, ROTARY: 1.0}  # where no limit and no friction sizes the steps
@@ -131,12 +133,10 @@ class Scenario:
     def __post_init__(self) -> None:
         if not self.phases:
             raise ControlError(f'scenario "{self.name}" has no phases; give at least one')
-        if self.on not in ("any", "held", "free"):
-            raise ControlError(f'scenario "{self.name}": on = "{self.on}" is not known; use "any", "held" or "free"')
-        if self.friction not in ("smooth", "sticking"):
-            raise ControlError(
-                f'scenario "{self.name}": friction = "{self.friction}" is not known; use "smooth" or "sticking"'
-            )
+        for name, words in (("on", ("any", "held", "free")), ("friction", ("smooth", "sticking"))):
+            word = getattr(self, name)
+            if word not in words:
+                raise ControlError(f'scenario "{self.name}": {name} = "{word}" is not known; {suggestion(word, words)}')
 
     def describe_size(self, called: Mechanics = LINEAR) -> str:
         """Return its magnitudes as text: forces (or torques), blows, loads and initial state.
@@ -218,17 +218,36 @@ def default_scenarios(controller: Controller, plant: Plant, sets: Sequence[Param
     small = 0.5 * step if step is not None else NOMINAL_EFFORT[controller.command.mechanics]
     tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / band)
     scenarios = list(step_scenarios(controller, plant, sets))
+
+    def add(name: str, *phases: Phase, **limits: Any) -> None:
+        scenarios.append(Scenario(name=name, phases=phases, **limits))
+
+    end = Phase(duration_s=tail)
     if step is not None and rest is not None:
-        scenarios += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
-    scenarios.append(_chirp(controller, small, tail))
+        half = 1.5 / band
+        there, back = (Phase(duration_s=half, force_N=force) for force in (4.0 * step, -4.0 * step))
+        add(DOUBLET, there, back, end)
+        # More than the limit holds, then a quarter: an integrator that has wound up overshoots. The force that the
+        # limit can hold does not depend on where the plant rests.
+        more, quarter = Phase(duration_s=2 * lasting, force_N=1.2 * rest), Phase(duration_s=tail, force_N=0.25 * rest)
+        add(HOLD, more, quarter, about_rest=False, final_error=0.005 * rest, on="held")
+    limit = controller.force_limit(float(band))
+    sweep = Chirp(amplitude=0.5 * limit if limit is not None else small, f0_hz=band / 5, f1_hz=1.5 * band)
+    add("chirp", Phase(duration_s=2.0, excitation=(sweep,)), end)
     if _struck(plant) is not None and plant.energy is not None:
-        scenarios.append(_impact(_size_blow(controller, plant, 2.0 * small), tail))
+        blow = _size_blow(controller, plant, 2.0 * small)
+        add("impact", Phase(duration_s=0.1), Phase(duration_s=tail, impulse_Ns=blow), on="free")
+    push = Phase(duration_s=lasting, force_N=small)
     if plant.port is not None and plant.port.payload:
-        scenarios.append(_payload(plant.port.payload, small, lasting, tail))
+        heavy, light = (dict.fromkeys(plant.port.payload, factor) for factor in (1.5, 1 / 1.5))
+        add("payload", push, Phase(duration_s=lasting, scale=heavy), Phase(duration_s=tail, scale=light), on="free")
     angle = _lever(plant)
-    if angle is not None:
-        scenarios.append(_fall(angle, 2.0 * tail))
-    scenarios.append(_contact(small, lasting, tail))
+    if angle is not None:  # let go above the horizontal: the arm L_a cos(phi) vanishes at 90 degrees and changes sign
+        start, horizontal = {angle: math.radians(FALL_DEG)}, {angle: math.pi / 2}
+        fall = Phase(duration_s=2.0 * tail)
+        add("fall through 90 deg", fall, initial_state=start, passes=horizontal, quiet=False, on="free")
+    caught = replace(push, held=True)
+    add("contact", caught, push, caught, end, on="free")
     return tuple(scenario for scenario in scenarios if scenario.obstacle(plant, plant) is None)
 
 
@@ -247,22 +266,10 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
     longer, by `WAITING_PERIODS` for each time that the friction is the step, and the force may end further off, by 2 %
     of the friction, but by no more than a tenth of the step.
 
-    Parameters
-    ----------
-    controller : Controller
-        A controller that knows its design plant.
-    plant : Plant
-        The plant to verify it on.
-    sets : sequence of ParameterSet
-        The parameters that are played, nominal first; the design's if left out.
-
-    Raises
-    ------
-    ControlError
-        The controller does not know its design plant.
-
+    `sets` are the parameters that are played, nominal first; the design's if left out.
     """
-    sizes, stuck = _size_steps(controller), _find_sticking_friction(plant, sets or (_require_design(controller)[1],))
+    sizes, played = _size_steps(controller), sets or (_require_design(controller)[1],)
+    stuck = max(find_breakaway(plant, plant.complete(each)) for each in played) if can_hold(plant) else 0.0
     tail = _size_last_phase(controller, plant)
     steps = [_step(controller, plant, name, force, tail) for name, force in sizes.items()]
     if stuck:
@@ -278,11 +285,6 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
 def make_sticking(scenario: Scenario) -> Scenario:
     """Return a scenario with friction that sticks, under a name that says so; its limits are the same."""
     return replace(scenario, name=f"{scenario.name}, sticking", friction="sticking")
-
-
-def _find_sticking_friction(plant: Plant, sets: Sequence[ParameterSet]) -> float:
-    """Return the largest friction (N) of the sets that holds joints at rest; 0 for none."""
-    return max(find_breakaway(plant, plant.complete(each)) for each in sets) if can_hold(plant) else 0.0
 
 
 def _step(controller: Controller, plant: Plant, name: str, force: float, tail: float) -> Scenario:
@@ -333,8 +335,7 @@ def list_left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
     """Return the names of the default scenarios that are left out because the controller has no current limit."""
     if controller.command_limit is not None:
         return ()
-    saturating = _doublet(1.0, 1.0, 1.0), _hold(1.0, 1.0, 1.0)
-    return tuple(scenario.name for scenario in saturating if scenario.obstacle(plant, plant) is None)
+    return (DOUBLET,) if plant.moves else (DOUBLET, HOLD)
 
 
 def find_step_limit(controller: Controller) -> float | None:
@@ -342,12 +343,6 @@ def find_step_limit(controller: Controller) -> float | None:
 
     It is that of the loop in which friction slides; one that is unstable, or runs away, reaches the limit with every
     step, and what the limit holds at rest stands for it.
-
-    Raises
-    ------
-    ControlError
-        The controller does not know its design plant.
-
     """
     limit = controller.command_limit
     plant, params = _require_design(controller)
@@ -356,18 +351,25 @@ def find_step_limit(controller: Controller) -> float | None:
     sliding = take_sliding(plant, params)
     if not controller.close(sliding, params).figures().stable:
         return controller.force_limit(0.0)
-    loop = SampledLoop(
-        plant=sliding,
-        law=runnable(controller, current_limit_A=math.inf),
-        measured=controller.signals,
-        delay_samples=controller.compute_delay_samples,
-        longest_delay_s=find_longest_delay(sliding, [params]),
-    )
+    loop = build_loop(controller, sliding, params, runnable(controller, current_limit_A=math.inf))
     tried = NOMINAL_EFFORT[controller.command.mechanics]
     run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), tried))
     step, held = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.0)
     assert held is not None
     return step if step > LEAST_STEP * held else held  # with play it may run away where the loop at rest is stable
+
+
+def build_loop(
+    controller: Controller, plant: Plant, params: ParameterSet, law: RunnableLaw | None = None
+) -> SampledLoop:
+    """Return a controller's loop on a nonlinear plant, with ideal devices; `law` runs in place of its own."""
+    return SampledLoop(
+        plant=plant,
+        law=law or runnable(controller),
+        measured=controller.signals,
+        delay_samples=controller.compute_delay_samples,
+        longest_delay_s=find_longest_delay(plant, [params]),
+    )
 
 
 def _require_design(controller: Controller) -> tuple[Plant, ParameterSet]:
@@ -387,13 +389,7 @@ def _size_blow(controller: Controller, plant: Plant, force: float) -> float:
     link = _struck(plant)
     assert link is not None
     params = plant.complete(_require_design(controller)[1]).drop_conditions()
-    loop = SampledLoop(
-        plant=plant,
-        law=runnable(controller),
-        measured=controller.signals,
-        delay_samples=controller.compute_delay_samples,
-        longest_delay_s=find_longest_delay(plant, [params]),
-    )
+    loop = build_loop(controller, plant, params)
 
     def measure_peak(blow: float) -> float:
         state = strike(plant, params, np.zeros(len(plant.states)), link, blow)
@@ -426,64 +422,3 @@ def _size_last_phase(controller: Controller, plant: Plant) -> float:
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0
     judged = max(np.clip(SWINGS * slowest, 1.0, LONGEST_S), JUDGED_PERIODS / controller.spec.bandwidth_hz)
     return float(min(judged, LONGEST_SLOW_S))
-
-
-def _doublet(force: float, half: float, tail: float) -> Scenario:
-    phases = (
-        Phase(duration_s=half, force_N=force),
-        Phase(duration_s=half, force_N=-force),
-        Phase(duration_s=tail),
-    )
-    return Scenario(name="saturating doublet", phases=phases)
-
-
-def _hold(rest: float, lasting: float, tail: float) -> Scenario:
-    """Ask for more than the limit holds, then for a quarter: an integrator that has wound up overshoots.
-
-    The force that the limit can hold does not depend on where the plant rests.
-    """
-    phases = (Phase(duration_s=2 * lasting, force_N=1.2 * rest), Phase(duration_s=tail, force_N=0.25 * rest))
-    return Scenario(name="saturating hold", phases=phases, about_rest=False, final_error=0.005 * rest, on="held")
-
-
-def _chirp(controller: Controller, small: float, tail: float) -> Scenario:
-    band = controller.spec.bandwidth_hz
-    limit = controller.force_limit(float(band))
-    sweep = Chirp(amplitude=0.5 * limit if limit is not None else small, f0_hz=band / 5, f1_hz=1.5 * band)
-    return Scenario(name="chirp", phases=(Phase(duration_s=2.0, excitation=(sweep,)), Phase(duration_s=tail)))
-
-
-def _impact(impulse: float, tail: float) -> Scenario:
-    phases = (Phase(duration_s=0.1), Phase(duration_s=tail, impulse_Ns=impulse))
-    return Scenario(name="impact", phases=phases, on="free")
-
-
-def _payload(names: tuple[str, ...], force: float, lasting: float, tail: float) -> Scenario:
-    phases = (
-        Phase(duration_s=lasting, force_N=force),
-        Phase(duration_s=lasting, scale=dict.fromkeys(names, 1.5)),
-        Phase(duration_s=tail, scale=dict.fromkeys(names, 1 / 1.5)),
-    )
-    return Scenario(name="payload", phases=phases, on="free")
-
-
-def _fall(angle: str, lasting: float) -> Scenario:
-    """Let go above the horizontal: the lever arm L_a cos(phi) vanishes at 90 degrees and changes sign."""
-    return Scenario(
-        name="fall through 90 deg",
-        phases=(Phase(duration_s=lasting),),
-        initial_state={angle: math.radians(FALL_DEG)},
-        passes={angle: math.pi / 2},
-        quiet=False,
-        on="free",
-    )
-
-
-def _contact(force: float, lasting: float, tail: float) -> Scenario:
-    phases = (
-        Phase(duration_s=lasting, force_N=force, held=True),
-        Phase(duration_s=lasting, force_N=force),
-        Phase(duration_s=lasting, force_N=force, held=True),
-        Phase(duration_s=tail),
-    )
-    return Scenario(name="contact", phases=phases, on="free")

@@ -22,19 +22,18 @@ points leave under the same reference while the variable stands still.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import OrInfinite
-from seaopt.control.running.force_run import ForceRun, close_loop
+from seaopt.control.running.force_run import ForceRun
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, SimulationError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
+from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import SETTLED
 from seaopt.robustness.verification.schedule_sweep import RestStart, find_least_effort
 
@@ -48,33 +47,17 @@ LOST_SHARE = 4.0  # of what is allowed, that a push is taken to take which is lo
 
 @record
 class Motion:
-    """What the simulation of a plant that moves the variable found.
-
-    Parameters
-    ----------
-    plant : str
-        Its name.
-    asked, rate, low, high : float
-        The rate of the variable that was to be reached, in its unit per second, the largest that was, and the ends of
-        its motion.
-    size : float
-        A, in the output's unit.
-    left, ringing : float
-        At the end of a push, over 2 A: how far the output is off, and what of that is fast.
-    fault : str
-        Why it does not keep the judgement; empty where it does.
-
-    """
+    """What the simulation of a plant that moves the variable found."""
 
     plant: str
-    asked: float
-    rate: float
-    low: float
+    asked: float  # the rate of the variable that was to be reached, in its unit per second
+    rate: float  # the largest that was
+    low: float  # ends of its motion
     high: float
-    size: float
-    left: OrInfinite
-    ringing: OrInfinite
-    fault: str
+    size: float  # A, in the output's unit
+    left: OrInfinite  # at the end of a push, over 2 A: how far the output is off
+    ringing: OrInfinite  # what of that is fast
+    fault: str  # why it does not keep the judgement; empty where it does
 
 
 @record(eq=False)
@@ -97,28 +80,17 @@ class _Pushing:
     start: RestStart
     middle: float
     room: float
-    pushes: Float[np.ndarray, " n"]
+    pushes: Signal
     lasting: int
     period: int
 
     def run(self, size: float) -> ForceRun:
         """Return the loop under pushes of a size."""
-        law, start, spec = self.schedule.runnable(), self.start, self.schedule.spec
-        return close_loop(
-            law.step,
-            law.reset(start.output, start.output, self.middle, start.command),
-            self.plant,
-            start.params,
-            start.output + size * self.pushes,
-            measured=spec.regulated,
-            sample_time_s=spec.sample_time_s,
-            delay_samples=spec.loop_delay_samples,
-            start_state=start.take(self.plant),
-            start_command=start.command,
-            place=self.schedule.over,
-        )
+        law, start = self.schedule.runnable(), self.start
+        state, reference = law.reset(start.output, start.output, self.middle, start.command), size * self.pushes
+        return start.run(law.step, state, self.plant, start.params, reference, place=self.schedule.over)
 
-    def follow(self, run: ForceRun) -> Float[np.ndarray, " n"]:
+    def follow(self, run: ForceRun) -> Signal:
         """Return the variable at each sample."""
         return run.state[:, list(self.plant.states).index(self.schedule.over)]
 
@@ -145,7 +117,7 @@ class _Pushing:
             size *= AIM / max(share, AIM / LOST_SHARE)
         return kept
 
-    def measure(self, error: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    def measure(self, error: Signal) -> tuple[float, float]:
         """Return how large an error is at the ends of pushes, over their step, and its fast part."""
         ends, judged = np.arange(self.lasting, self.pushes.size + 1, self.lasting), JUDGED_PERIODS * self.period
         windows = np.array([error[end - judged : end] for end in ends])
@@ -157,50 +129,30 @@ class _Pushing:
 def move_schedule(
     schedule: ScheduledController, name: str, plant: Plant, params: ParameterSet, rate: float
 ) -> Motion | None:
-    """Push a plant so that it moves its scheduling variable, under the schedule; None of one that holds it.
+    """Push a plant so that it moves its scheduling variable at a rate; None of one that holds it.
 
-    Parameters
-    ----------
-    schedule : ScheduledController
-        The law.
-    name : str
-        The plant's, for the result.
-    plant, params
-        Of which the variable is a state.
-    rate : float
-        Of the variable, in its unit per second, that the pushes are to reach.
-
-    Raises
-    ------
-    ControlError
-        The plant cannot rest in the middle of the table.
-
+    The rate is in the variable's unit per second.
     """
     if schedule.over not in plant.states:
         return None
     pushing = _make_pushing(schedule, plant, params, rate)
     push = pushing.find_push(rate, FIRST_SHARE * find_least_effort(schedule))
     if push is None:
-        return Motion(
-            plant=name,
-            asked=rate,
-            rate=0.0,
-            low=pushing.middle,
-            high=pushing.middle,
-            size=0.0,
-            left=math.inf,
-            ringing=math.inf,
-            fault="is lost under any push, small ones too",
-        )
+        still, lost = dict.fromkeys(("low", "high"), pushing.middle), dict.fromkeys(("left", "ringing"), math.inf)
+        fault = "is lost under any push, small ones too"
+        return Motion(plant=name, asked=rate, rate=0.0, size=0.0, fault=fault, **still, **lost)
     if push.rate < rate:
         pushing, push = _change_length(pushing, push, rate)
     place, size = pushing.follow(push.run), push.size
     left, ringing = pushing.measure((push.run.force - push.run.reference) / size)
-    still = [(0.0, 0.0)]
-    for loop in schedule.close_points(plant, params):
-        if loop.is_stable():
-            still.append(pushing.measure(loop.simulate(pushing.pushes)[0] - pushing.pushes))
-    most, most_ringing = (max(SETTLED, 2.0 * max(values)) for values in zip(*still, strict=True))
+    standing = [
+        pushing.measure(loop.simulate(pushing.pushes)[0] - pushing.pushes)
+        for loop in schedule.close_points(plant, params)
+        if loop.is_stable()
+    ]
+    most, most_ringing = (
+        max(SETTLED, *(2.0 * each for each in values)) for values in zip((0.0, 0.0), *standing, strict=True)
+    )
     fault = ""
     if not ringing <= most_ringing:
         fault = f"rings: {100 * ringing:.3g} % of a push at its end, {100 * most_ringing:.3g} % allowed"
@@ -251,19 +203,11 @@ def _limit_length(samples: float, period: int) -> int:
     return int(np.clip(round(samples), LEAST_PERIODS * period, MOST_PERIODS * period))
 
 
-def _make_pushes(lasting: int, period: int) -> Float[np.ndarray, " n"]:
+def _make_pushes(lasting: int, period: int) -> Signal:
     """Return pushes of one that last so many samples."""
     edge = np.hanning(period + 2)
     steps = np.repeat([*(PUSHES * ROUNDS), 0.0, 0.0], lasting)
     return np.convolve(steps, edge / np.sum(edge))[: steps.size]
-
-
-def move_plants(
-    schedule: ScheduledController, plants: Mapping[str, Plant], params: ParameterSet, rate: float
-) -> dict[str, Motion]:
-    """Return what is found of each plant that moves the variable."""
-    found = {name: move_schedule(schedule, name, plant, params, rate) for name, plant in plants.items()}
-    return {name: motion for name, motion in found.items() if motion is not None}
 
 
 def describe_motion(motion: Motion, over: str, unit: str) -> str:

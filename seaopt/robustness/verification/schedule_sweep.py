@@ -20,7 +20,7 @@ This finds where a sweep of this shape goes wrong. It proves nothing of other mo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from types import SimpleNamespace
@@ -28,12 +28,11 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import OrInfinite
 from seaopt.control.loops.sampled_plant import find_rest
-from seaopt.control.running.force_run import close_loop
-from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
+from seaopt.control.running.force_run import ForceRun, close_loop
+from seaopt.control.scheduling.runnable_schedule import ScheduleState
 from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
 from seaopt.errors import ControlError, SimulationError
 from seaopt.executors import Shared, map_ordered
@@ -43,9 +42,10 @@ from seaopt.plants.memo import memo
 from seaopt.plants.plant import output_function
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
+from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import PEAK_GRACE, SETTLED
 
-SLOWEST, FASTEST = 1.0 / 128.0, 0.5  # of the least bandwidth: frequencies of the sweeps
+SHARES = tuple(2.0**power for power in range(-7, 0))  # of the least bandwidth: frequencies of the sweeps
 PULSE_PERIODS = 10.0  # of the least bandwidth, that a pulse lasts, and a pause
 LEAST_PULSES = 4
 STEP_SHARE = 0.1  # of the effort that the command's limit leaves
@@ -131,7 +131,7 @@ def sweep_schedule(
         return ()
     least, pulses = min(schedule.bandwidths_hz), _choose_pulses(schedule, plant, params)
     sweeps: list[Sweep] = []
-    frequencies = [least * share for share in _list_shares()]
+    frequencies = [least * share for share in SHARES]
     runs = map_ordered(partial(_run_sweep, Shared((schedule, name, plant, params, pulses))), frequencies, executor)
     for number, frequency in enumerate(frequencies):
         progress(f"sweep at {frequency:.3g} Hz", number / len(frequencies))
@@ -139,13 +139,6 @@ def sweep_schedule(
         if sweeps[-1].fault:
             break
     return tuple(sweeps)
-
-
-def _list_shares() -> Iterator[float]:
-    share = SLOWEST
-    while share <= FASTEST:
-        yield share
-        share *= 2.0
 
 
 def find_fastest(sweeps: Sequence[Sweep]) -> float:
@@ -203,64 +196,38 @@ def _run_sweep(
         )
     )
 
-    def run(size: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        out = close_loop(
-            _follow(law, place),
-            (0, law.reset(start.output, start.output, low, start.command)),
-            swept,
-            values,
-            start.output + size * pulse,
-            measured=schedule.spec.regulated,
-            sample_time_s=ts,
-            delay_samples=schedule.spec.loop_delay_samples,
-            start_state=start.take(swept),
-            start_command=start.command,
-        )
-        return out.force, out.current
-
-    rate = 0.5 * (high - low) * omega
-    try:
-        (calm, first), (moved, second) = run(0.0), run(pulses.size)
-    except (ControlError, SimulationError) as error:
-        return Sweep(
-            plant=name, rate=rate, frequency_hz=frequency_hz, peak=math.inf, left=math.inf, fault=f"is lost: {error}"
-        )
-    response = (moved - calm) / pulses.size
-    peak = float(max(np.max(response), 1.0 - np.min(response)))
-    ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
-    left = float(np.max(np.abs(response - pulse)[ends]))
-    largest = max(float(np.max(np.abs(first))), float(np.max(np.abs(second))))
-    fault = _find_fault(pulses, peak, left, saturated=largest >= law.limit)
-    return Sweep(plant=name, rate=rate, frequency_hz=frequency_hz, peak=peak, left=left, fault=fault)
-
-
-def _find_fault(pulses: _Pulses, peak: float, left: float, *, saturated: bool) -> str:
-    if saturated:
-        return "the motion takes the command to its limit"
-    if not peak <= pulses.allowed_peak:
-        return f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
-    if not left <= pulses.allowed_left:
-        return f"a step is still {100 * left:.3g} % off at its end, {100 * pulses.allowed_left:.3g} % allowed"
-    return ""
-
-
-def _follow(law: RunnableSchedule, place: Float[np.ndarray, " n"]) -> Callable[..., Any]:
-    """Return the law as a function of reference and measurement, whose state counts the samples of a sweep."""
-
     def step(
         state: tuple[int, ScheduleState], reference: float, measurement: float
     ) -> tuple[float, tuple[int, ScheduleState]]:
-        number, before = state
+        number, before = state  # of the sample
         command, after = law.step(before, reference, measurement, float(place[number]))
         return command, (number + 1, after)
 
-    return step
+    reset = 0, law.reset(start.output, start.output, low, start.command)
+    found = partial(Sweep, plant=name, rate=0.5 * (high - low) * omega, frequency_hz=frequency_hz)
+    try:
+        calm, moved = (start.run(step, reset, swept, values, size * pulse) for size in (0.0, pulses.size))
+    except (ControlError, SimulationError) as error:
+        return found(peak=math.inf, left=math.inf, fault=f"is lost: {error}")
+    response = (moved.force - calm.force) / pulses.size
+    peak = float(max(np.max(response), 1.0 - np.min(response)))
+    ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
+    left = float(np.max(np.abs(response - pulse)[ends]))
+    fault = ""
+    if max(np.max(np.abs(calm.current)), np.max(np.abs(moved.current))) >= law.limit:
+        fault = "the motion takes the command to its limit"
+    elif not peak <= pulses.allowed_peak:
+        fault = f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
+    elif not left <= pulses.allowed_left:
+        fault = f"a step is still {100 * left:.3g} % off at its end, {100 * pulses.allowed_left:.3g} % allowed"
+    return found(peak=peak, left=left, fault=fault)
 
 
 @record(eq=False)
 class RestStart:
     """Where a run starts: the plant at rest at a value of the variable, what it measures there, and what holds it."""
 
+    schedule: ScheduledController
     params: ParameterSet
     states: dict[str, float]
     output: float
@@ -274,15 +241,31 @@ class RestStart:
         row = list(plant.outputs).index(schedule.spec.regulated)
         output = float(output_function(plant)(0.0, x, u, placed.vector)[row])
         return cls(
+            schedule=schedule,
             params=placed.drop_conditions(),
             states=dict(zip(plant.states, x.tolist(), strict=True)),
             output=output,
             command=float(u[0]),
         )
 
-    def take(self, plant: Plant) -> Float[np.ndarray, " nx"]:
-        """Return the states that a plant still has."""
-        return np.array([self.states[name] for name in plant.states])
+    def run(
+        self, step: Callable[..., Any], reset: Any, plant: Plant, values: ParameterSet, reference: Signal, **more: Any
+    ) -> ForceRun:
+        """Return the loop of a law from there, of a plant that has these states; the reference counts from there."""
+        spec = self.schedule.spec
+        return close_loop(
+            step,
+            reset,
+            plant,
+            values,
+            self.output + reference,
+            measured=spec.regulated,
+            sample_time_s=spec.sample_time_s,
+            delay_samples=spec.loop_delay_samples,
+            start_state=np.array([self.states[name] for name in plant.states]),
+            start_command=self.command,
+            **more,
+        )
 
 
 @memo
@@ -290,13 +273,6 @@ def make_swept_plant(plant: Plant, over: str) -> Plant:
     """Return a plant in which a parameter, or a state with its rate, follows a sweep of time.
 
     Its parameters are those of the plant, and sweep_from, sweep_to and sweep_rad_s.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> make_swept_plant(so.plants.moving_output(), "phi").states.keys()
-    dict_keys(['q', 'qd'])
-
     """
     unit = plant.parameter_unit(over) if over in plant.parameters else plant.states[over]
     rate = _find_rate(plant, over)

@@ -10,12 +10,12 @@ from functools import partial
 from typing import Any
 
 from seaopt.bench import Sensors
-from seaopt.codec import OrInfinite, from_content, to_content
+from seaopt.codec import Key, OrInfinite, read_fields, to_content
 from seaopt.control import Controller
 from seaopt.control.laws.command import Command
 from seaopt.errors import ControlError, StepSizeError, suggestion
 from seaopt.executors import Shared, map_ordered
-from seaopt.formatting import format_number, format_table, html_text
+from seaopt.formatting import format_number, format_table, format_values, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
@@ -24,13 +24,13 @@ from seaopt.plants.plant import share_drive
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, record
+from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
 from seaopt.units import LINEAR, Mechanics, unit_after
 
 ChooseScenarios = Callable[[Controller, Plant, Sequence[ParameterSet]], Sequence[Scenario]]
-SKIPPED_KEYS = ("scenario", "plant", "reason")
 TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it is played as friction that sticks"
 
 
@@ -60,11 +60,15 @@ class Verification(Result):
     """
 
     plot = PlotAccessor()
+    json_keys = (
+        "met", "passed", "seed", Key(field="error", name="integration_error"), "follows_hz", "rows",
+        Key(field="skipped_rows", name="skipped"), "scenarios",
+    )  # fmt: skip
 
     rows: tuple[Outcome, ...]
     skipped: tuple[tuple[str, str, str], ...]
     real_time_factor: Mapping[str, float]
-    error: float
+    error: OrInfinite
     seed: int
     stages: Mapping[str, Stage]
     scenarios: Mapping[str, tuple[Scenario, ...]]
@@ -103,13 +107,13 @@ class Verification(Result):
         self, stage: Stage, name: str, scenario: Scenario, draws: Sequence[ParameterSet], seed: int
     ) -> list[Outcome]:
         """Return the rows of a scenario that was played on this stage, at these draws; none if it was not."""
-        mine = self.stages.get(name)
-        if mine is None or mine.controller is not stage.controller or mine.plant is not stage.plant:
+        before = self.stages.get(name)
+        if before is None or before.controller is not stage.controller or before.plant is not stage.plant:
             return []
-        same_devices = (mine.sensors, mine.current_step_A, self.seed) == (stage.sensors, stage.current_step_A, seed)
-        same_draws = [id(drawn) for drawn in self.draws[name]] == [id(drawn) for drawn in draws]
+        devices, same = ((each.sensors, each.current_step_A) for each in (before, stage))
+        same_draws = list(map(id, self.draws[name])) == list(map(id, draws))
         held = any(phase.held for phase in scenario.phases)  # by a partner, which may be another one
-        if held or not (same_devices and same_draws and scenario in self.scenarios[name]):
+        if held or devices != same or self.seed != seed or not same_draws or scenario not in self.scenarios[name]:
             return []
         return [row for row in self.rows if (row.plant, row.scenario) == (name, scenario.name)]
 
@@ -122,19 +126,15 @@ class Verification(Result):
         """Return one row per scenario and plant: one that failed, else the one with the largest force."""
         best: dict[tuple[str, str], Outcome] = {}
         for row in self.rows:
-            key = (row.plant, row.scenario)
-            if key not in best or (not row.met, row.peak_force_N) > (not best[key].met, best[key].peak_force_N):
-                best[key] = row
+            before = best.setdefault((row.plant, row.scenario), row)
+            if (not row.met, row.peak_force_N) > (not before.met, before.peak_force_N):
+                best[row.plant, row.scenario] = row
         return tuple(best.values())
 
     def describe_draws(self) -> list[str]:
         """Return a line per draw: where it differs from nominal."""
         rows = {(row.plant, row.draw): row for row in self.rows if row.draw != NOMINAL}
-        return [
-            f"draw {row.draw} on {row.plant}: "
-            + (", ".join(f"{name} = {value:.6g}" for name, value in row.parameters.items()) or "nominal")
-            for row in rows.values()
-        ]
+        return [f"draw {row.draw} on {row.plant}: {format_values(row.parameters, 6, NOMINAL)}" for row in rows.values()]
 
     def describe_tracking(self) -> list[str]:
         """Return a line per plant whose moving output keeps the force from following slow references."""
@@ -158,8 +158,10 @@ class Verification(Result):
             rows = [row for row in self.rows if row.plant == plant and row.settling_s is not None]
             if not rows:
                 continue
-            over = max((row.overshoot or 0.0 for row in rows if not row.overshoot_by_limit), default=0.0)
-            more = max((row.overshoot or 0.0 for row in rows if row.overshoot_by_limit), default=0.0)
+            over, more = (
+                max((row.overshoot or 0.0 for row in rows if row.overshoot_by_limit is by_limit), default=0.0)
+                for by_limit in (False, True)
+            )
             limited = f" ({100 * more:.3g} % where the current limit makes it)" if more else ""
             slowest = max(row.settling_s or 0.0 for row in rows)
             sizes = [self.scenario(row).phases[-1].force_N for row in rows]
@@ -169,18 +171,15 @@ class Verification(Result):
             lines.append(f"steps on {plant}, {ends} {unit}: overshoot up to {100 * over:.3g} %{limited}, {settled}")
         return lines
 
+    @property
+    def skipped_rows(self) -> tuple[Mapping[str, str], ...]:
+        """What is skipped, as a file has it."""
+        keys = ("scenario", "plant", "reason")
+        return tuple(dict(zip(keys, row, strict=True)) for row in self.skipped)
+
     def to_dict(self) -> dict[str, Any]:
         """Return what goes into robustness.json under "simulation"."""
-        return {
-            "met": self.met,
-            "passed": self.met,
-            "seed": self.seed,
-            "integration_error": self.error,
-            "follows_hz": {name: None if band is None else list(band) for name, band in self.follows_hz.items()},
-            "rows": to_content(self.rows),
-            "skipped": [dict(zip(SKIPPED_KEYS, row, strict=True)) for row in self.skipped],
-            "scenarios": to_content(self.scenarios),
-        }
+        return to_content(self)
 
     @classmethod
     def from_dict(
@@ -199,18 +198,10 @@ class Verification(Result):
             A key is missing or a value of the wrong kind.
 
         """
-        stored = from_content(_StoredRuns, content, source, remedy=remedy)
-        return cls(
-            rows=tuple(map(_restore_settling, stored.rows)),
-            skipped=tuple((row["scenario"], row["plant"], row["reason"]) for row in stored.skipped),
-            real_time_factor={},
-            error=stored.integration_error,
-            seed=stored.seed,
-            stages=stages,
-            scenarios=stored.scenarios,
-            draws=draws,
-            follows_hz=stored.follows_hz,
-        )
+        stored = read_fields(cls, content, source, remedy=remedy)
+        stored["rows"] = tuple(map(_restore_settling, stored["rows"]))
+        skipped = tuple((row["scenario"], row["plant"], row["reason"]) for row in content["skipped"])
+        return cls(skipped=skipped, real_time_factor={}, stages=stages, draws=draws, **stored)
 
     def __repr__(self) -> str:
         failed = len(self.failures)
@@ -230,18 +221,6 @@ class Verification(Result):
         return html_text(self) + self.plot.to_html()
 
 
-@record(eq=False)
-class _StoredRuns:
-    """What a file has of a verification."""
-
-    rows: tuple[Outcome, ...]
-    seed: int
-    integration_error: OrInfinite
-    follows_hz: Mapping[str, tuple[float, float] | None]
-    skipped: tuple[Mapping[str, str], ...]
-    scenarios: Mapping[str, tuple[Scenario, ...]]
-
-
 def _restore_settling(row: Outcome) -> Outcome:
     """Return a step that never settles with the infinite time that JSON cannot hold."""
     never = row.settling_s is None and row.overshoot is not None
@@ -250,10 +229,10 @@ def _restore_settling(row: Outcome) -> Outcome:
 
 def make_stages(
     controller: Controller,
-    plants: Mapping[str, Plant],
+    plants: Plants,
     sensors: Sensors | None,
     current_step_A: float,
-    partners: Mapping[str, Plant] | None = None,
+    partners: Plants | None = None,
 ) -> dict[str, Stage]:
     """Return where a controller is played: on plants as it sees them, with what holds their links."""
     seen = {name: controller.see(plant) for name, plant in plants.items()}
@@ -271,14 +250,14 @@ def make_stages(
 
 def verify(
     controller: Controller,
-    plants: Mapping[str, Plant],
+    plants: Plants,
     parameters: ParameterSet,
     *,
     scenarios: Sequence[Scenario] | ChooseScenarios | None = None,
     draws: Mapping[str, Sequence[ParameterSet]] | None = None,
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
-    partners: Mapping[str, Plant] | None = None,
+    partners: Plants | None = None,
     seed: int = 1,
     known: Verification | None = None,
     executor: Executor | None = None,
@@ -341,61 +320,50 @@ def verify(
     check_plants(plants, draws or {}, partners or {})
     check_sensors(sensors, controller, plants)
     stages = make_stages(controller, plants, sensors, current_step_A, partners)
-    played: dict[str, tuple[Scenario, ...]] = {}
-    skipped: list[tuple[str, str, str]] = []
     sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
-    choose = default_scenarios if scenarios is None or isinstance(scenarios, Sequence) else scenarios
-    parts: dict[str, list[tuple[Scenario, list[Outcome]]]] = {}  # with what is known of each
+    skipped: list[tuple[str, str, str]] = []
+    parts: list[tuple[str, Scenario, list[Outcome]]] = []  # with the rows that are known
     for name, stage in stages.items():
-        chosen = tuple(scenarios if isinstance(scenarios, Sequence) else choose(controller, stage.plant, sets[name]))
-        obstacles = [(scenario, scenario.obstacle(stage.plant, stage.partner)) for scenario in chosen]
         if scenarios is None:
             reason = "nothing saturates without a limit of the command"
             skipped += [(scenario, name, reason) for scenario in list_left_out(controller, stage.plant)]
-        skipped += [(scenario.name, name, obstacle) for scenario, obstacle in obstacles if obstacle is not None]
-        parts[name] = [
-            (scenario, [] if known is None else known.recall(stage, name, scenario, sets[name], seed))
-            for scenario, obstacle in obstacles
-            if obstacle is None
-        ]
-    unknown = [(name, scenario) for name, part in parts.items() for scenario, before in part if not before]
-    names = {name: {scenario.name for scenario, _ in part} for name, part in parts.items()}
+        choose = scenarios or default_scenarios
+        for scenario in choose if isinstance(choose, Sequence) else choose(controller, stage.plant, sets[name]):
+            obstacle = scenario.obstacle(stage.plant, stage.partner)
+            if obstacle is None:
+                rows = [] if known is None else known.recall(stage, name, scenario, sets[name], seed)
+                parts.append((name, scenario, rows))
+            else:
+                skipped.append((scenario.name, name, obstacle))
+    names = {name: {scenario.name for plant, scenario, _ in parts if plant == name} for name in stages}
     play_part = partial(_play_part, Shared((stages, sets, names, seed)))
-    results, total = map_ordered(play_part, unknown, executor), sum(map(len, parts.values()))
-    rows: list[Outcome] = []
-    speeds: dict[str, float] = {}
-    error, number = 0.0, 0
-    for name, part in parts.items():
-        done: list[Scenario] = []
-        simulated = wall = 0.0
-        for k, (scenario, before) in enumerate(part):
-            progress(f"{name}, scenario {k + 1} of {len(part)}", number / total)
-            number += 1
-            if before:
-                rows, error = rows + before, max(error, known.error if known is not None else 0.0)
-                done.append(scenario)
-                continue
-            runs = next(results)
-            if runs.actual != scenario:
-                skipped.append((scenario.name, name, TOO_STEEP))
-            if runs.outcomes:
-                rows += runs.outcomes
-                done.append(runs.actual)
-            simulated, wall, error = simulated + runs.simulated_s, wall + runs.wall_s, max(error, runs.error)
-        played[name] = tuple(done)
-        speeds[name] = simulated / wall if wall else math.nan
+    results = map_ordered(play_part, [(name, scenario) for name, scenario, rows in parts if not rows], executor)
+    played: dict[str, list[_Runs]] = {name: [] for name in stages}
+    for number, (name, scenario, rows) in enumerate(parts):
+        progress(f"{name}, scenario {number + 1} of {len(parts)}", number / len(parts))
+        if rows and known is not None:
+            played[name].append(_Runs(actual=scenario, outcomes=rows, error=known.error))
+            continue
+        runs = next(results)
+        if runs.actual != scenario:
+            skipped.append((scenario.name, name, TOO_STEEP))
+        played[name].append(runs)
+    walls = {name: sum(runs.wall_s for runs in of_plant) for name, of_plant in played.items()}
     return Verification(
-        rows=tuple(rows),
+        rows=tuple(row for of_plant in played.values() for runs in of_plant for row in runs.outcomes),
         skipped=tuple(skipped),
-        real_time_factor=speeds,
-        error=error,
+        real_time_factor={
+            name: sum(runs.simulated_s for runs in of_plant) / walls[name] if walls[name] else math.nan
+            for name, of_plant in played.items()
+        },
+        error=max((runs.error for of_plant in played.values() for runs in of_plant), default=0.0),
         seed=seed,
         stages=stages,
-        scenarios=played,
+        scenarios={name: tuple(runs.actual for runs in of_plant if runs.outcomes) for name, of_plant in played.items()},
         draws=sets,
         follows_hz={
-            name: controller.close(take_sliding(plant, parameters), parameters).figures().tracking_band_hz
-            for name, plant in ((name, stage.plant) for name, stage in stages.items())
+            name: controller.close(take_sliding(stage.plant, parameters), parameters).figures().tracking_band_hz
+            for name, stage in stages.items()
         },
     )
 
@@ -437,7 +405,7 @@ def _run_scenario(stage: Stage, name: str, scenario: Scenario, sets: Sequence[Pa
     unlimited = None
     if overshoots_at_limit(stage, scenario, ideal):
         unlimited = play(stage.ideal.unlimited, scenario, sets, seed=seed)
-    traces = [trace] if ideal is trace else [trace, ideal]
+    traces = {id(trace): trace, id(ideal): ideal}.values()
     return _Runs(
         actual=scenario,
         outcomes=[judge_run(stage, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))],
@@ -447,7 +415,7 @@ def _run_scenario(stage: Stage, name: str, scenario: Scenario, sets: Sequence[Pa
     )
 
 
-def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:
+def check_plants(plants: Plants, draws: Mapping[str, Any], partners: Plants) -> None:
     """Check that there is a plant, and that draws and partners are of known plants."""
     if not isinstance(plants, Mapping) or not plants:
         raise ControlError("verify needs a mapping of name to plant with at least one; give {name: plant}")
@@ -457,7 +425,7 @@ def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners
                 raise ControlError(f'{argument} = {{"{name}": ...}} is none of the plants; {suggestion(name, plants)}')
 
 
-def list_readings(controller: Controller, plants: Mapping[str, Plant]) -> list[str]:
+def list_readings(controller: Controller, plants: Plants) -> list[str]:
     """Return the signals whose sensors' errors are in the runs: what the law reads, and encoders that make it."""
     compensation = controller.compensation
     named = [*controller.signals, *(() if compensation is None else compensation.reads)]
@@ -468,24 +436,17 @@ def list_readings(controller: Controller, plants: Mapping[str, Plant]) -> list[s
     return list(dict.fromkeys([*named, *encoders]))
 
 
-def check_sensors(sensors: Sensors | None, controller: Controller, plants: Mapping[str, Plant]) -> None:
-    """Refuse errors of a sensor that the law does not read: they would be in no run.
-
-    Raises
-    ------
-    ControlError
-        A name is nothing that the law reads, and no encoder that it is computed from.
-
-    """
+def check_sensors(sensors: Sensors | None, controller: Controller, plants: Plants) -> None:
+    """Refuse errors of a sensor that the law does not read, and no encoder that it is computed from."""
     if sensors is None:
         return
-    known = list_readings(controller, plants)
+    read = list_readings(controller, plants)
     for kind in ("noise_std", "offset", "quantisation", "saturation"):
         for name in getattr(sensors, kind):
-            if name not in known:
+            if name not in read:
                 raise ControlError(
-                    f'sensors: {kind} of "{name}" would be in no run, for the law reads {", ".join(known)}; '
-                    + suggestion(name, known)
+                    f'sensors: {kind} of "{name}" would be in no run, for the law reads {", ".join(read)}; '
+                    + suggestion(name, read)
                 )
 
 
@@ -505,24 +466,13 @@ def describe_witness(row: Outcome) -> str:
 
 
 def _format_worst(verification: Verification) -> list[str]:
-    called = verification.mechanics
+    called, command = verification.mechanics, verification.command
     unit = called.unit
     head = (
-        "plant",
-        "scenario",
-        "size",
-        "",
-        f"{called.word} {unit}",
-        "overshoot",
-        "settles s",
-        f"{verification.command.word}{unit_after(verification.command.unit)}",
-        "angle deg",
-        "energy J",
-        "at limit",
-        f"ends off {unit}",
-        f"allowed {unit}",
-        "draw",
-    )
+        "plant", "scenario", "size", "", f"{called.word} {unit}", "overshoot", "settles s",
+        f"{command.word}{unit_after(command.unit)}", "angle deg", "energy J", "at limit", f"ends off {unit}",
+        f"allowed {unit}", "draw",
+    )  # fmt: skip
     cells: list[tuple[str, ...]] = []
     for row in verification.worst():
         angle = None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad)

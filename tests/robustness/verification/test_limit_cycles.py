@@ -69,8 +69,8 @@ def test_a_relay_with_a_third_order_lag_oscillates_at_the_square_root_of_three(b
     f = np.linspace(0.2, 0.35, 15001)  # Tsypkin's condition, with every harmonic: sum of Im G(jnw)/n over odd n
     lag = [(1.0 / (1.0 + 2j * np.pi * n * f) ** 3) for n in range(1, 40, 2)]
     exact = int(np.argmin(np.abs(sum(np.imag(g) / n for n, g in zip(range(1, 40, 2), lag, strict=True)))))
-    assert found.simulated_hz == pytest.approx(f[exact], rel=0.005)
-    assert found.simulated_N == pytest.approx(4 * RELAY / np.pi * np.abs(lag[0][exact]), rel=0.02)
+    assert found.simulated.frequency_hz == pytest.approx(f[exact], rel=0.005)
+    assert found.simulated.force_N == pytest.approx(4 * RELAY / np.pi * np.abs(lag[0][exact]), rel=0.02)
 
 
 def test_a_cycle_whose_simulation_fails_is_still_predicted(blind, monkeypatch):
@@ -86,7 +86,7 @@ def test_a_cycle_whose_simulation_fails_is_still_predicted(blind, monkeypatch):
     (found,) = seek_limit_cycles(open_loop, plant, so.ParameterSet())
     assert found.predicted.frequency_hz == pytest.approx(np.sqrt(3.0) / (2 * np.pi), rel=1e-2)
     assert found.lasts and found.force_N == found.predicted.force_N
-    assert found.to_dict()["not_simulated"] == "the integration does not end"
+    assert found.not_simulated == "the integration does not end"
     assert "the integration does not end" in str(found)
     assert not replace(found, predicted=replace(found.predicted, stable=False)).lasts
 
@@ -188,7 +188,7 @@ def test_play_makes_the_cycle_of_an_independent_simulator(stand, thor):
     end = runs.force[0, -2048:]
     spectrum = np.abs(np.fft.rfft(end * np.hanning(2048), 16384)) / 512.0
     top = int(np.argmax(spectrum))
-    assert found.simulated_hz == pytest.approx(top / 16.384, rel=0.01)
-    assert found.simulated_N == pytest.approx(spectrum[top], rel=0.03)
+    assert found.simulated.frequency_hz == pytest.approx(top / 16.384, rel=0.01)
+    assert found.simulated.force_N == pytest.approx(spectrum[top], rel=0.03)
     assert found.predicted.frequency_hz == pytest.approx(top / 16.384, rel=0.03)
     assert found.predicted.force_N == pytest.approx(spectrum[top], rel=0.1)
