@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import field, replace
 from functools import partial
@@ -19,7 +19,7 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.law import describe_integrators
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, SeaoptError
 from seaopt.estimation import warn_unidentified
 from seaopt.executors import Shared, map_ordered
 from seaopt.files import seal
@@ -37,24 +37,28 @@ from seaopt.robustness.certificate.compensation import (
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
-from seaopt.robustness.certificate.requirement import DESIGN_PLANT, LIMIT_CYCLE, Requirement
+from seaopt.robustness.certificate.requirement import DESIGN_PLANT, LIMIT_CYCLE, Requirement, require_at_most
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
     Simulated,
     require_runs,
     run_simulations,
-    simulate_steps,
 )
-from seaopt.robustness.uncertainty.draws import Varied
+from seaopt.robustness.uncertainty.draws import Plants, Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.plant_margins import PlantMargins
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cycles, seek_limit_cycles
-from seaopt.robustness.verification.verification import Verification
+from seaopt.robustness.verification.scenarios import step_scenarios
+from seaopt.robustness.verification.verification import Verification, verify
 
 ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
+NO_NOISE = (
+    "the simulations' sensor has no noise, which can free a joint that sticks, so that what is regulated wanders; give "
+    "certify(sensors=...), or sensors = { noise_std = ... } in [robustness]"
+)
 NO_MODEL = "nothing drawn or simulated: measured points alone, without a model"
 DESIGN_NAMES = ("design", DESIGN_PLANT)  # of the design plant where the caller does not list it
 _REPORTED = (
@@ -124,7 +128,7 @@ class Certificate(Result, Worded):
     worst: Mapping[str, Worst]
     monte_carlo: MonteCarlo
     controller: Controller
-    models: Mapping[str, Plant]
+    models: Plants
     parameters: ParameterSet
     varied: tuple[Varied, ...] = ()
     simulated: Simulated | None = None
@@ -193,7 +197,18 @@ class Certificate(Result, Worded):
         """
         if not self.models:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
-        simulations = self._simulate(sensors, current_step_A, seed, executor, progress)
+        simulations = run_simulations(
+            self.controller,
+            self.models,
+            self.parameters,
+            draws=self.list_draws(),
+            sensors=sensors,
+            current_step_A=current_step_A,
+            seed=seed,
+            steps=self.steps if isinstance(self.steps, Verification) else None,
+            executor=executor,
+            progress=progress,
+        )
         runs = simulations.verification
         rows = require_runs(simulations.left_out["simulation"] if runs is None else runs)
         requirements = (*self._drop_runs(), *rows)
@@ -214,10 +229,36 @@ class Certificate(Result, Worded):
         reference; nothing may oscillate. `certify` always does this, on ideal sensors; `with_simulation` plays all
         other scenarios too.
         """
-        played = self.play_steps(progress, executor, sensors=sensors, current_step_A=current_step_A, seed=seed)
+        try:
+            steps: Verification | str = verify(
+                self.controller,
+                self.models,
+                self.parameters,
+                scenarios=step_scenarios,
+                draws=self.list_draws(),
+                executor=executor,
+                progress=progress,
+                sensors=sensors,
+                current_step_A=current_step_A,
+                seed=seed,
+            )
+        except SeaoptError as error:
+            steps = str(error)
+        shown_of = {name: self.shows_friction_harmless(name) for name in self.models}
+        seek = partial(_seek_cycles, Shared((self.controller, self.models, self.parameters)))
+        cycles: dict[str, tuple[FoundCycle, ...]] = {}
+        for name, found in zip(shown_of, map_ordered(seek, shown_of.items(), executor), strict=True):
+            if found or not shown_of[name]:
+                ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
+                cycles[name] = (*found, *ends)
+        lasting = (  # those that steps end in are required of the steps
+            require_at_most(LIMIT_CYCLE, cycle.force_N, 0.0, plant=name, text=str(cycle))
+            for name, found in cycles.items()
+            for cycle in found
+            if cycle.predicted is not None and cycle.lasts
+        )
         others = (row for row in self._drop_runs() if row.name != LIMIT_CYCLE)
-        requirements = (*others, *played._require_cycles(), *require_runs("" if played.steps is None else played.steps))
-        return replace(played, requirements=requirements)
+        return replace(self, steps=steps, cycles=cycles, requirements=(*others, *lasting, *require_runs(steps)))
 
     def _drop_runs(self) -> tuple[Requirement, ...]:
         """Return what is required besides simulated runs, which are played again."""
@@ -236,87 +277,28 @@ class Certificate(Result, Worded):
             return self.simulated.verification
         return self.steps if isinstance(self.steps, Verification) else None
 
-    def play_steps(
-        self,
-        progress: Progress = ignore,
-        executor: Executor | None = None,
-        *,
-        sensors: Sensors | None = None,
-        current_step_A: float = 0.0,
-        seed: int = 1,
-    ) -> Certificate:
-        """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
-        if not self.models:
-            return replace(self, steps=NO_MODEL)
-        steps = simulate_steps(
-            self.controller,
-            self.models,
-            self.parameters,
-            self.list_draws(),
-            executor,
-            progress,
-            sensors=sensors,
-            current_step_A=current_step_A,
-            seed=seed,
-        )
-        shown_of = {name: self.shows_friction_harmless(name) for name in self.models}
-        seek = partial(_seek_cycles, Shared((self.controller, self.models, self.parameters)))
-        cycles: dict[str, tuple[FoundCycle, ...]] = {}
-        for name, found in zip(shown_of, map_ordered(seek, shown_of.items(), executor), strict=True):
-            if found or not shown_of[name]:
-                ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
-                cycles[name] = (*found, *ends)
-        return replace(self, steps=steps, cycles=cycles)
-
     def shows_friction_harmless(self, name: str) -> bool:
         """Tell whether a model has no friction at the nominal parameters, or one that is shown to leave it stable."""
         return name not in self.friction or self.friction[name].shown
 
-    def _require_cycles(self) -> list[Requirement]:
-        """Return the limit cycles that last; those that steps end in are required of the steps."""
-        return [
-            Requirement(name=LIMIT_CYCLE, limit=0.0, value=cycle.force_N, met=False, plant=name, text=str(cycle))
-            for name, cycles in self.cycles.items()
-            for cycle in cycles
-            if cycle.predicted is not None and cycle.lasts
-        ]
-
     def list_draws(self) -> dict[str, list[ParameterSet]]:
         """Return the worst draws of each plant, of those with friction sliding and stuck, without what is nominal."""
-        draws: dict[str, list[ParameterSet]] = {name: [] for name in self.models}
-        for name, model in self.models.items():
-            states = split_friction({name: model}, self.parameters, [varied.name for varied in self.varied])
-            worst = [self.worst[state] for state in states if state in self.worst]
-            draws[name] += [case[1] for case in worst if case.parameters]
-        return draws
-
-    def _simulate(
-        self,
-        sensors: Sensors | None,
-        current_step_A: float,
-        seed: int,
-        executor: Executor | None = None,
-        progress: Progress = ignore,
-    ) -> Simulated:
-        return run_simulations(
-            self.controller,
-            self.models,
-            self.parameters,
-            draws=self.list_draws(),
-            sensors=sensors,
-            current_step_A=current_step_A,
-            seed=seed,
-            steps=self.steps if isinstance(self.steps, Verification) else None,
-            executor=executor,
-            progress=progress,
-        )
+        varied = [each.name for each in self.varied]
+        return {
+            name: [
+                self.worst[state][1]
+                for state in split_friction({name: model}, self.parameters, varied)
+                if state in self.worst and self.worst[state].parameters
+            ]
+            for name, model in self.models.items()
+        }
 
     @classmethod
     def from_dict(
         cls,
         content: Mapping[str, Any],
         controller: Controller,
-        models: Mapping[str, Plant],
+        models: Plants,
         parameters: ParameterSet,
     ) -> Certificate:
         """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated.
@@ -362,68 +344,48 @@ class Certificate(Result, Worded):
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the requirements, one sentence each."""
-        used = {name for plant in self.models.values() for name in plant.parameters}
-        outside = (
-            f"the nominal {varied.name} = {varied.value:.4g} lies outside its range of {varied.low:.4g} to "
-            f"{varied.high:.4g}, so that no draw is like the nominal plant"
-            for varied in self.varied
-            if varied.outside
-        )
-        few = self.monte_carlo.samples and not self.monte_carlo.failures
-        bound = self.monte_carlo.failure_probability_bound
-        little = (
-            (f"so few draws say little: a failure probability below {bound:.2g}",)
-            if few and bound > UNINFORMATIVE_BOUND
-            else ()
-        )
-        friction = [f"{name}: {self._describe_margin(name)}{self._describe_draws(name)}" for name in self._frictions]
-        peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
-        lifted = self.controller.lifted_notes
-        lifted += (
-            ()
-            if peak or not self.models
-            else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
-        )
-        constrained = () if self.constrained is None else self.constrained.notes
-        return (
-            *constrained,
-            *self._law_notes(),
-            *self.remarks,
-            *warn_unidentified(self.parameters, used),
-            *friction,
-            *describe_compensation(self.controller, self.compensation, self.compensation_draws),
-            *self._ideal_notes(),
-            *outside,
-            *little,
-            *lifted,
-        )
+        return (*(() if self.constrained is None else self.constrained.notes), *self._list_notes())
 
-    def _law_notes(self) -> tuple[str, ...]:
-        """Say how many integrators a law of one's own has, which nothing else of it tells."""
-        if self.controller.structure != CUSTOM or self.constrained is not None:
-            return ()
-        return (f"a law of one's own with {describe_integrators(self.controller.law)}",)
-
-    def _ideal_notes(self) -> tuple[str, ...]:
-        """Say that friction that sticks was simulated with a sensor without noise, where nothing else was."""
-        if self.runs is None or any(any(stage.sensors.noise_std.values()) for stage in self.runs.stages.values()):
-            return ()
-        if not any(each.friction == "sticking" for chosen in self.runs.scenarios.values() for each in chosen):
-            return ()
-        return (
-            "the simulations' sensor has no noise, which can free a joint that sticks, so that what is regulated "
-            "wanders; give certify(sensors=...), or sensors = { noise_std = ... } in [robustness]",
+    def _list_notes(self) -> Iterator[str]:
+        if self.controller.structure == CUSTOM and self.constrained is None:
+            yield f"a law of one's own with {describe_integrators(self.controller.law)}"
+        yield from self.remarks
+        yield from warn_unidentified(
+            self.parameters, {name for plant in self.models.values() for name in plant.parameters}
         )
+        yield from (f"{name}: {self._describe_friction(name)}" for name in self._frictions)
+        yield from describe_compensation(self.controller, self.compensation, self.compensation_draws)
+        if self._sticks_without_noise:
+            yield NO_NOISE
+        for varied in self.varied:
+            if varied.outside:
+                yield (
+                    f"the nominal {varied.name} = {varied.value:.4g} lies outside its range of {varied.low:.4g} to "
+                    f"{varied.high:.4g}, so that no draw is like the nominal plant"
+                )
+        draws = self.monte_carlo
+        if draws.samples and not draws.failures and draws.failure_probability_bound > UNINFORMATIVE_BOUND:
+            yield f"so few draws say little: a failure probability below {draws.failure_probability_bound:.2g}"
+        yield from self.controller.lifted_notes
+        if self.models and not self.controller.spec.allowed(BY_NAME["max_reference_peak"]):
+            yield "the overshoot of steps is not judged: no max_reference_peak is asked for"
+
+    @property
+    def _sticks_without_noise(self) -> bool:
+        """Whether friction that sticks was simulated with a sensor without noise."""
+        runs = self.runs
+        if runs is None or any(any(stage.sensors.noise_std.values()) for stage in runs.stages.values()):
+            return False
+        return any(each.friction == "sticking" for chosen in runs.scenarios.values() for each in chosen)
 
     def _worst_dict(self, name: str) -> dict[str, Any]:
         """Return the worst case, the largest Ms and Mt with their parameters, and bounds where there are any."""
         worst = self.worst[name]
-        ms, mt = worst.largest
         largest = {
-            "ms": {"value": ms.ms, "parameters": ms.parameters},
-            "mt": {"value": mt.mt, "parameters": mt.parameters},
+            figure: {"value": getattr(at, figure), "parameters": at.parameters}
+            for figure, at in zip(("ms", "mt"), worst.largest, strict=True)
         }
-        bounds = self.brackets[name].to_dict() if name in self.brackets else {}
+        bounds = to_content(self.brackets[name]) if name in self.brackets else {}
         return to_content(worst.witness) | {"largest": largest} | bounds
 
     @property
@@ -431,46 +393,43 @@ class Certificate(Result, Worded):
         """The plants with friction, at the nominal parameters or at draws, and those with limit cycles."""
         return tuple(dict.fromkeys((*self.friction, *self.friction_draws, *self.cycles)))
 
-    def _describe_margin(self, name: str) -> str:
-        if name in self.friction:
-            return str(self.friction[name])
-        return "friction: none at the nominal parameters" if name in self.friction_draws else "play"
-
-    def _describe_draws(self, name: str) -> str:
-        """Return what draws and predicted limit cycles add to what is said of a plant's friction."""
-        drawn = f"; {self.friction_draws[name]}" if name in self.friction_draws else ""
-        return drawn + self._describe_cycles(name)
+    def _describe_friction(self, name: str) -> str:
+        """Return what is said of a plant's friction: its margin, draws and limit cycles."""
+        drawn = self.friction_draws.get(name)
+        margin = "play" if drawn is None else "friction: none at the nominal parameters"
+        parts = (self.friction.get(name, margin), drawn, *self._describe_cycles(name))
+        return "; ".join(str(part) for part in parts if part is not None)
 
     def _friction_dict(self, name: str) -> dict[str, Any]:
         """Return what friction and play do to a plant; a plant with play alone has no sector."""
         margin, cycles = self.friction.get(name), self.cycles.get(name, ())
         stable = True if margin is not None and margin.shown and not cycles else None
-        entry: dict[str, Any] = {"sector_stable": stable, "limit_cycles": [cycle.to_dict() for cycle in cycles]}
+        entry: dict[str, Any] = {"sector_stable": stable, "limit_cycles": to_content(cycles)}
         if margin is not None:
             entry |= to_content(margin) | {"draws": None}
         if name in self.friction_draws:
             entry["draws"] = to_content(self.friction_draws[name])
         return entry
 
-    def _describe_cycles(self, name: str) -> str:
+    def _describe_cycles(self, name: str) -> tuple[FoundCycle | str, ...]:
         if name not in self.cycles:
-            return ""
+            return ()
         if any(cycle.lasts for cycle in self.cycles[name]):
-            return "; it oscillates"  # a requirement that is not met says how
+            return ("it oscillates",)  # a requirement that is not met says how
         if self.cycles[name]:
-            return "; " + "; ".join(map(str, self.cycles[name]))
+            return self.cycles[name]
         if not isinstance(self.steps, Verification):
-            return "; limit cycles are not looked for, as nothing can be simulated"
+            return ("limit cycles are not looked for, as nothing can be simulated",)
         if remembers(self.models[name]):
-            return "; no simulated step ends in a limit cycle, and those of bristles are not predicted"
+            return ("no simulated step ends in a limit cycle, and those of bristles are not predicted",)
         flattest, steepest = friction_slopes(self.models[name], self.parameters)
         if np.count_nonzero(steepest - flattest) > 1:
-            return "; no simulated step ends in a limit cycle, and with several frictions none can be predicted"
-        return "; no limit cycle is predicted, and no simulated step ends in one"
+            return ("no simulated step ends in a limit cycle, and with several frictions none can be predicted",)
+        return ("no limit cycle is predicted, and no simulated step ends in one",)
 
 
 def _seek_cycles(
-    loops: Shared[tuple[Controller, Mapping[str, Plant], ParameterSet]], model: tuple[str, bool]
+    loops: Shared[tuple[Controller, Plants, ParameterSet]], model: tuple[str, bool]
 ) -> tuple[FoundCycle, ...]:
     """Return the limit cycles of one model, whose friction is shown to be harmless or is not."""
     controller, models, parameters = loops.value

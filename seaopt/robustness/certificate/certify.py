@@ -7,7 +7,7 @@ and with failures the bound is Clopper's and Pearson's. Draws are made and measu
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from hashlib import sha256
@@ -20,7 +20,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.delay import Drive, find_drive, find_given_drive_delay, split_delayed, warn_delays
 from seaopt.control.loops.measured.figures import measure_discs
 from seaopt.control.loops.sampled_plant import DELAYS, DRIVE_DELAY
-from seaopt.errors import ControlError, require_number, require_type
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor
 from seaopt.formatting import format_count
@@ -45,8 +45,9 @@ from seaopt.robustness.certificate.compensation import (
 )
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
-from seaopt.robustness.certificate.measured_draws import Loops, measure_draws, search_worst
-from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, Requirement, Spot
+from seaopt.robustness.certificate.measured_draws import Failures, Loops, measure_draws, search_worst
+from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
+from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, Spot
 from seaopt.robustness.certificate.requirements import (
     compensation_requirements,
     design_requirements,
@@ -57,14 +58,12 @@ from seaopt.robustness.certificate.requirements import (
     measured_requirements,
     plant_requirements,
 )
-from seaopt.robustness.uncertainty.draws import check_ranges, combine_uncertainty
-from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, failure_bound
+from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source, Uncertainty, check_ranges, combine_uncertainty
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
 from seaopt.robustness.verification.verification import check_sensors
 
-CONFIDENCE = 1.0 - 1e-6
 AMPLITUDES = 9  # looked at for the remark on bandwidth
 MOST_DELAY_SAMPLES = 20  # samples
 # Seconds that a part takes as a rule: of each draw and plant, or of each plant.
@@ -74,10 +73,10 @@ CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, wh
 
 def certify(
     controller: Controller,
-    plants: Mapping[str, Plant],
-    parameters: Fit | ParameterSet,
+    plants: Plants,
+    parameters: Source,
     *,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
+    ranges: Ranges | None = None,
     others: ParameterSet | None = None,
     samples: int = 1375,
     seed: int = 1,
@@ -167,7 +166,19 @@ def certify(
     True
 
     """
-    _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability, min_friction_margin)
+    require_type(controller, Controller, "controller", "give a Controller; a ForceMPC to certify_mpc", ControlError)
+    require_type(plants, Mapping, "plants", "give a mapping of name to plant", ControlError)
+    if not plants and controller.design is not None:
+        raise ControlError("certify needs at least one plant; give {name: plant}")
+    for name, plant in plants.items():
+        require_plant(plant, f"plants: {name}", ControlError)
+    check_numbers(
+        samples=samples,
+        seed=seed,
+        confidence=confidence,
+        max_failure_probability=max_failure_probability,
+        min_friction_margin=min_friction_margin,
+    )
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     if controller.design is None:
         return _certify_points(controller, plants, parameters, measured or {}, seed=seed, confidence=confidence)
@@ -179,11 +190,15 @@ def certify(
         raise ControlError(
             "sensors and current_step_A are of the simulations, which are left out; give simulations=True"
         )
-    asked = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
-    min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
+    slopes = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
+    min_friction_margin = max((slope for slope in slopes if slope is not None), default=None)
+    design, values = controller.design
     seen = {name: controller.see(plant) for name, plant in plants.items()}
-    models, others = _with_design(controller, seen, others or ParameterSet())
-    models = split_delayed(controller.spec, controller.design[0], models, parameters)
+    models, others = add_design(design, seen), others or ParameterSet()
+    if len(models) > len(seen):  # the design plant has its own values of what nobody else gives
+        missing = (values[name] for name in values if name in design.parameters and name not in others)
+        others = others.with_parameters(*missing)
+    models = split_delayed(controller.spec, design, models, parameters)
     check_sensors(sensors, controller, models)
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
     ranges = _add_warm_winding(ranges or {}, models, parameters, others)
@@ -191,8 +206,7 @@ def certify(
     _check_delay(controller, unknown.ranges)
     nominal, varied = unknown.nominal, unknown.varied()
     names = [row.name for row in varied]
-    plants = split_friction(models, nominal, names)
-    spots = {label: Spot(*state) for label, state in name_states(models, nominal, names).items()}
+    plants, spots = split_states(models, unknown), name_spots(models, unknown)
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
@@ -208,16 +222,7 @@ def certify(
     loops = Shared(Loops(controller=controller, models=models, plants=plants, unknown=unknown, bounds=bounds))
     failures, drawn, drawn_ms = measure_draws(loops, samples, rng, executor, drawing)
     worst, brackets = search_worst(loops, drawn, executor, searching)
-    monte_carlo = MonteCarlo(
-        samples=samples,
-        failures=failures.count,
-        seed=seed,
-        confidence=confidence,
-        failure_probability_bound=failure_bound(samples, failures.count, confidence),
-        unstable=failures.unstable,
-        over_ms=failures.over_ms,
-        over_mt=failures.over_mt,
-    )
+    monte_carlo = failures.bound(samples, seed, confidence)
     rubbing("friction at the draws", 0.0)
     friction = find_nominal_margins(controller, models, nominal)
     friction_draws = find_margins_at_draws(loops, friction, samples, rng, min_friction_margin, executor)
@@ -228,8 +233,11 @@ def certify(
     compensation_draws = find_compensation_at_draws(loops, compensation, samples, rng, executor)
     gravity = find_gravity_cases(loops, samples, rng, executor)
     ripple = find_ripple_cases(loops, samples, rng, executor)
+    of_design = values.with_parameters(
+        *(nominal[name] for name in nominal if name in {*design.parameters, DRIVE_DELAY})
+    )
     requirements = (
-        *_design_requirements(controller, nominal, names),
+        *design_requirements(controller, design, of_design, names),
         *(row for name, spot in spots.items() for row in plant_requirements(controller, spot, figures[name])),
         *draw_requirements(monte_carlo, {spots[name]: one for name, one in worst.items()}, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin, controller.command.mechanics.damping),
@@ -257,8 +265,8 @@ def certify(
         drawn_ms=drawn_ms,
         remarks=(
             *_remark_measured(controller, measured or {}),
-            *_remark_delay(controller, parameters),
-            *_remark_amplitude(controller, models, nominal),
+            *warn_delays(controller.spec, design, parameters),
+            *_remark_amplitude(controller, design, models, nominal),
         ),
     )
     certificate = certificate.with_steps(stepping, executor)
@@ -271,20 +279,20 @@ def certify(
 
 
 def _add_warm_winding(
-    ranges: Mapping[str, tuple[float, float]],
-    models: Mapping[str, Plant],
-    parameters: Fit | ParameterSet,
+    ranges: Ranges,
+    models: Plants,
+    parameters: Source,
     others: ParameterSet,
 ) -> dict[str, tuple[float, float]]:
     """Return the ranges with the temperatures of every winding that changes its loop, and those given for the air."""
     known = parameters.parameters if isinstance(parameters, Fit) else parameters
     values = others.with_parameters(*known.values())
-    warm = [found for plant in models.values() if (found := find_warm_range(plant, values)) is not None]
+    warm = [ends for plant in models.values() if (ends := find_warm_range(plant, values)) is not None]
     if not warm:
         return dict(ranges)
     check_ranges(ranges, models)
-    ends = [*warm, *([ranges[AMBIENT]] if AMBIENT in ranges else [])]
-    return {**ranges, AMBIENT: (min(low for low, _ in ends), max(high for _, high in ends))}
+    lows, highs = zip(*warm, *([ranges[AMBIENT]] if AMBIENT in ranges else []), strict=True)
+    return {**ranges, AMBIENT: (min(lows), max(highs))}
 
 
 def _remark_measured(controller: Controller, measured: Mapping[str, MeasuredResponse]) -> tuple[str, ...]:
@@ -294,30 +302,22 @@ def _remark_measured(controller: Controller, measured: Mapping[str, MeasuredResp
     return tuple(str(measure_discs(plant, controller.law, spec.bandwidth_hz)) for plant in plants.values())
 
 
-def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tuple[str, ...]:
-    """Return a warning where the controller counts on less delay than the fit's experiments have."""
-    assert controller.design is not None
-    plant, _ = controller.design
-    return warn_delays(controller.spec, plant, parameters)
-
-
-def find_own_drive(controller: Controller, source: Fit | ParameterSet) -> Drive | None:
+def find_own_drive(controller: Controller, source: Source) -> Drive | None:
     """Return a certificate's delay of the drive: the fit's or the parameters', or else what the law counts on."""
     assert controller.design is not None
     counted = Drive(delay_s=controller.drive_delay_s)
-    stated = isinstance(source, Fit) or DRIVE_DELAY in source or find_given_drive_delay(controller.spec) is not None
-    found = find_drive(controller.spec, controller.design[0], source) if stated else counted
     has_own = DRIVE_DELAY in (source.parameters if isinstance(source, Fit) else source)
-    return found if found.delay_s or counted.delay_s or has_own else None
+    stated = isinstance(source, Fit) or has_own or find_given_drive_delay(controller.spec) is not None
+    drive = find_drive(controller.spec, controller.design[0], source) if stated else counted
+    return drive if drive.delay_s or counted.delay_s or has_own else None
 
 
-def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nominal: ParameterSet) -> tuple[str, ...]:
+def _remark_amplitude(controller: Controller, plant: Plant, models: Plants, nominal: ParameterSet) -> tuple[str, ...]:
     """Say which bandwidth the design plant has at amplitudes of use, where friction makes it depend on them.
 
     They are shares of the force that the current limit holds at rest, those of the simulated steps.
     """
-    assert controller.design is not None
-    name, plant = next((name, plant) for name, plant in models.items() if plant is controller.design[0])
+    name = next(name for name, model in models.items() if model is plant)
     rest, sliding = controller.force_limit(0.0), controller.achieved.bandwidth_hz
     if rest is None or sliding is None or not has_friction(plant, nominal):
         return ()
@@ -331,46 +331,10 @@ def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nomin
     return (f"{name}: bandwidth {sliding:.3g} Hz sliding; between {least} and {max(reached):.3g} Hz {at}, predicted",)
 
 
-def _check_arguments(
-    controller: Controller,
-    plants: Mapping[str, Plant],
-    samples: int,
-    seed: int,
-    confidence: float,
-    max_failure_probability: float | None,
-    min_friction_margin: float | None,
-) -> None:
-    require_type(controller, Controller, "controller", "give a Controller; a ForceMPC to certify_mpc", ControlError)
-    if not isinstance(plants, Mapping):
-        raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
-    if not plants and controller.design is not None:
-        raise ControlError("certify needs at least one plant; give {name: plant}")
-    for name, plant in plants.items():
-        require_plant(plant, f"plants: {name}", ControlError)
-    for name, value, least, what in (("samples", samples, 1, "number of draws"), ("seed", seed, 0, "seed")):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            raise ControlError(f"{name} = {value!r} is not a {what}; give a whole number, {least} or more")
-    for name, value in (
-        ("min_friction_margin", min_friction_margin),
-        ("confidence", confidence),
-        ("max_failure_probability", max_failure_probability),
-    ):
-        if value is not None:
-            require_number(value, name, ControlError)
-    if min_friction_margin is not None and not 0.0 < min_friction_margin < np.inf:
-        raise ControlError(f"min_friction_margin = {min_friction_margin:g} is not a slope; give one above zero")
-    if not 0.0 < confidence < 1.0:
-        raise ControlError(f"confidence = {confidence:g} is not between 0 and 1")
-    if max_failure_probability is not None and not 0.0 < max_failure_probability <= 1.0:
-        raise ControlError(
-            f"max_failure_probability = {max_failure_probability:g} is not a probability; give 0.01, say"
-        )
-
-
 def _certify_points(
     controller: Controller,
-    plants: Mapping[str, Plant],
-    parameters: Fit | ParameterSet,
+    plants: Plants,
+    parameters: Source,
     measured: Mapping[str, MeasuredResponse],
     *,
     seed: int,
@@ -391,13 +355,12 @@ def _certify_points(
         *measured_requirements(controller, *next(iter(measured.items())), "design plant"),
         *(row for name, one in measured.items() for row in measured_requirements(controller, name, one)),
     )
-    nothing_drawn = MonteCarlo(samples=0, failures=0, seed=seed, confidence=confidence, failure_probability_bound=1.0)
     return Certificate(
         requirements=requirements,
         plants={},
         margins={},
         worst={},
-        monte_carlo=nothing_drawn,
+        monte_carlo=Failures().bound(0, seed, confidence),
         controller=controller,
         models={},
         parameters=parameters.parameters if isinstance(parameters, Fit) else parameters,
@@ -406,20 +369,18 @@ def _certify_points(
     )
 
 
-def _with_design(
-    controller: Controller, plants: Mapping[str, Plant], others: ParameterSet
-) -> tuple[dict[str, Plant], ParameterSet]:
-    """Return the plants with the design plant among them, and its own values of what nobody else gives."""
-    assert controller.design is not None
-    design, values = controller.design
-    models = add_design(design, plants)
-    if len(models) > len(plants):
-        missing = (values[name] for name in values if name in design.parameters and name not in others)
-        others = others.with_parameters(*missing)
-    return models, others
+def split_states(models: Plants, unknown: Uncertainty) -> dict[str, Plant]:
+    """Return the plants whose loops are measured: one with friction is there sliding and stuck."""
+    return split_friction(models, unknown.nominal, [row.name for row in unknown.varied()])
 
 
-def add_design(design: Plant, plants: Mapping[str, Plant]) -> dict[str, Plant]:
+def name_spots(models: Plants, unknown: Uncertainty) -> dict[str, Spot]:
+    """Return plant and state behind each name of `split_states`."""
+    states = name_states(models, unknown.nominal, [row.name for row in unknown.varied()])
+    return {label: Spot(*state) for label, state in states.items()}
+
+
+def add_design(design: Plant, plants: Plants) -> dict[str, Plant]:
     """Return the plants with the design plant first, by a name that is free, where it is not among them."""
     if any(plant is design for plant in plants.values()):
         return dict(plants)
@@ -430,7 +391,7 @@ def add_design(design: Plant, plants: Mapping[str, Plant]) -> dict[str, Plant]:
     return {name: design, **plants}
 
 
-def _check_delay(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> None:
+def _check_delay(controller: Controller, ranges: Ranges) -> None:
     """Refuse delays of so many samples that a plant with them is no plant to control."""
     period = controller.sample_time_s
     for name in DELAYS:
@@ -451,11 +412,3 @@ def _digest(controller: Controller) -> int:
         f"{value:.6g}" for part in (controller.reference, controller.measurement) for value in (*part.num, *part.den)
     )
     return int.from_bytes(sha256(" ".join(coefficients).encode()).digest()[:8], "big")
-
-
-def _design_requirements(controller: Controller, nominal: ParameterSet, varied: Collection[str]) -> list[Requirement]:
-    """Return what is required of the design plant at the nominal parameters, computed from the law again."""
-    assert controller.design is not None
-    plant, values = controller.design
-    named = values.with_parameters(*(nominal[name] for name in nominal if name in {*plant.parameters, DRIVE_DELAY}))
-    return design_requirements(controller, plant, named, varied)

@@ -19,7 +19,7 @@ elsewhere than compensated may double the slope.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from functools import partial
@@ -31,7 +31,6 @@ from seaopt.codec import OrInfinite
 from seaopt.control import Controller, Law, Loop, runnable
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
 from seaopt.control.loops.compensation.stability import CompensationMargin
-from seaopt.control.loops.compensation.terms import GravityTerm
 from seaopt.control.loops.sampled_plant import find_rest, sample
 from seaopt.control.running.outer_run import enclose_controller
 from seaopt.errors import ControlError
@@ -42,15 +41,15 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import output_function
 from seaopt.records import record
-from seaopt.robustness.certificate.friction import MARGIN_DRAWS
-from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws, select_own
+from seaopt.robustness.certificate.friction import MARGIN_DRAWS, find_least_margin
+from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws
 from seaopt.robustness.uncertainty.worst import place_values
 
 FRICTION_COMPENSATION = "friction_compensation"
 GRAVITY_COMPENSATION = "gravity_compensation"
 RIPPLE_COMPENSATION = "ripple_compensation"
-GRAVITY_DRAWS = 20
-RIPPLE_DRAWS, SLOPES = 20, 9  # draws, and slopes from the steepest negative to the steepest positive
+EIGENVALUE_DRAWS = 20  # at most so many are looked at, of gravity and of ripple
+SLOPES = 9  # from the steepest negative to the steepest positive
 PLACES, INSIDE = 9, 0.95  # over so much of the range
 NEUTRAL = 1e-6  # beyond 1, of an eigenvalue that neither grows nor decays, by rounding and the series' last digits
 FROM_REFERENCE = "friction is compensated from the reference, outside the loop: its stability is the law's without it"
@@ -58,23 +57,12 @@ FROM_REFERENCE = "friction is compensated from the reference, outside the loop: 
 
 @record
 class CompensationDraws:
-    """For how many draws stability is shown with friction compensated, and the least slope for which it is.
-
-    Parameters
-    ----------
-    samples, shown : int
-        Draws looked at, and those for which it is.
-    least_slope : float
-        The steepest compensation for which it is shown, of the draw with the least; zero where it is not for one.
-    parameters : mapping
-        That draw.
-
-    """
+    """For how many draws stability is shown with friction compensated, and the least slope for which it is."""
 
     samples: int
     shown: int
-    least_slope: OrInfinite
-    parameters: dict[str, float]
+    least_slope: OrInfinite  # of the draw with the least; zero where stability is not shown for one
+    parameters: dict[str, float]  # of that draw
 
     def __str__(self) -> str:
         where = f", the least at {format_values(self.parameters)}" if self.parameters else ""
@@ -111,24 +99,24 @@ def find_compensation_at_draws(
         return {}
     draws = loops.value.unknown.list_draws(count, rng)
     found: dict[str, CompensationDraws] = {}
-    for name, margin in enough.items():
-        own = select_own(loops, name, draws)
-        margins = list(judge_draws(partial(_find_margins, margin.multiplier), loops, name, own, executor))
-        least = int(np.argmin([one.slope for one in margins]))
+    for name, nominal_margin in enough.items():
+        judge = partial(_find_margins, nominal_margin.multiplier)
+        shown, margin, parameters = find_least_margin(judge, _take_slope, loops, name, draws, executor)
         found[name] = CompensationDraws(
-            samples=count,
-            shown=sum(one.shown for one in margins),
-            least_slope=margins[least].slope,
-            parameters=own[least],
+            samples=count, shown=shown, least_slope=_take_slope(margin), parameters=parameters
         )
     return found
 
 
+def _take_slope(margin: CompensationMargin) -> float:
+    return margin.slope
+
+
 def _find_margins(first: str, loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[CompensationMargin]:
     """Return the margins of one plant at draws, a multiplier tried first."""
-    plant, nominal = loops.value.models[name], loops.value.unknown.nominal
-    placed = [place_values(plant, nominal, draw) for draw in draws]
-    return find_compensation_margins(loops.value.controller, plant, placed, first=first)
+    return find_compensation_margins(
+        loops.value.controller, loops.value.models[name], loops.value.place(name, draws), first=first
+    )
 
 
 def describe_compensation(
@@ -155,214 +143,89 @@ def list_compensation(
 
 
 @record
-class GravityCase:
-    """The largest eigenvalue of a loop with gravity compensated, and where."""
+class EigenvalueCase:
+    """The largest eigenvalue of a loop with a term compensated, and at which draw.
+
+    `at` is the angle of the link where gravity is compensated, the slope over the motor's position where ripple is.
+    """
 
     radius: float
-    angle: float
+    at: float = 0.0
     parameters: dict[str, float]
+
+
+Measure = Callable[[Controller, Plant, ParameterSet, Draw], EigenvalueCase]
 
 
 def find_gravity_cases(
     loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
-) -> dict[str, GravityCase]:
+) -> dict[str, EigenvalueCase]:
     """Return how fast the link of every plant runs away at most with its weight compensated; empty where none is.
 
-    Parameters
-    ----------
-    loops : Shared of Loops
-        Models whose link is held are left out.
-    samples : int
-        Draws; at most `GRAVITY_DRAWS` are looked at.
-    rng : numpy.random.Generator
-        Of the draws.
-    executor : Executor, optional
-        Where draws are looked at.
-
+    Models whose link is held are left out.
     """
     compensation = loops.value.controller.compensation
     term = None if compensation is None else compensation.gravity
     if term is None:
         return {}
-    draws = [{}, *loops.value.unknown.list_draws(min(samples, GRAVITY_DRAWS), rng)]
-    return {
-        name: _choose_worst_gravity(judge_draws(_find_gravity, loops, name, draws, executor))
-        for name, model in loops.value.models.items()
-        if model.port is not None and term.reads in model.outputs
-    }
+    models = loops.value.models
+    moving = [name for name, model in models.items() if model.port is not None and term.reads in model.outputs]
+    return _find_worst(measure_gravity, loops, moving, samples, rng, executor)
 
 
-def _find_gravity(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[GravityCase]:
+def find_ripple_cases(
+    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
+) -> dict[str, EigenvalueCase]:
+    """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without."""
+    compensation = loops.value.controller.compensation
+    if compensation is None or compensation.ripple is None:
+        return {}
+    return _find_worst(measure_ripple, loops, loops.value.models, samples, rng, executor)
+
+
+def _find_worst(
+    measure: Measure,
+    loops: Shared[Loops],
+    names: Collection[str],
+    samples: int,
+    rng: np.random.Generator,
+    executor: Executor | None,
+) -> dict[str, EigenvalueCase]:
+    """Return the worst case of some plants, among the nominal parameters and draws."""
+    draws = [{}, *loops.value.unknown.list_draws(min(samples, EIGENVALUE_DRAWS), rng)]
+    judge = partial(_measure_draws, measure)
+    return {name: choose_worst(judge_draws(judge, loops, name, draws, executor)) for name in names}
+
+
+def _measure_draws(measure: Measure, loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[EigenvalueCase]:
     known = loops.value
-    return [_measure_gravity(known.controller, known.models[name], known.unknown.nominal, draw) for draw in draws]
+    return [measure(known.controller, known.models[name], known.unknown.nominal, draw) for draw in draws]
 
 
-def find_worst_gravity(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draws: Sequence[Mapping[str, float]]
-) -> GravityCase:
-    """Return the largest eigenvalue over angles and draws.
-
-    Parameters
-    ----------
-    controller : Controller
-        With a compensation of gravity.
-    plant : Plant
-        Whose link moves.
-    nominal : ParameterSet
-        What is not drawn.
-    draws : sequence of mapping
-        Values by name.
-
-    """
-    return _choose_worst_gravity(_measure_gravity(controller, plant, nominal, draw) for draw in draws)
-
-
-def _choose_worst_gravity(cases: Iterable[GravityCase]) -> GravityCase:
+def choose_worst(cases: Iterable[EigenvalueCase]) -> EigenvalueCase:
+    """Return the case with the largest eigenvalue; infinite where the link falls by itself in all of them."""
     worst = max(cases, key=lambda case: case.radius)
-    return worst if worst.radius else replace(worst, radius=np.inf)  # the link falls wherever it is: nothing is shown
+    return worst if worst.radius else replace(worst, radius=np.inf)
 
 
-def _measure_gravity(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draw: Mapping[str, float]
-) -> GravityCase:
+def measure_gravity(controller: Controller, plant: Plant, nominal: ParameterSet, draw: Draw) -> EigenvalueCase:
     """Return the largest eigenvalue over angles at one draw; zero where the link falls at all of them."""
     assert controller.compensation is not None and controller.compensation.gravity is not None
     assert plant.port is not None and plant.port.coordinate is not None
     term, coordinate, unit = controller.compensation.gravity, plant.port.coordinate, plant.states[plant.port.coordinate]
     reach = INSIDE * (min(abs(term.low), abs(term.high)) if term.unit == unit else np.pi / 3)
-    worst, placed = GravityCase(radius=0.0, angle=0.0, parameters={}), place_values(plant, nominal, draw)
-    for angle in np.linspace(-reach, reach, PLACES):
-        at = placed.with_parameters(Parameter(name=coordinate, value=float(angle), unit=unit))
-        if _find_radius(controller, term, plant, at, share=0.0) > 1.0 + NEUTRAL:
+    placed, cases = place_values(plant, nominal, draw), list[tuple[float, float]]()
+    for angle in map(float, np.linspace(-reach, reach, PLACES)):
+        at = placed.with_parameters(Parameter(name=coordinate, value=angle, unit=unit))
+        if find_radius(controller, plant, at) > 1.0 + NEUTRAL:
             continue  # a link that stands on its head falls by itself
-        radius = _find_radius(controller, term, plant, at)
-        if radius > worst.radius:
-            used = {name: value for name, value in draw.items() if name in placed}
-            worst = GravityCase(radius=radius, angle=float(angle), parameters=used)
-    return worst
+        weight = term.reads, term.slope(_read_position(plant, at, term.reads))
+        cases.append((find_radius(controller, plant, at, weight=weight), angle))
+    return _make_case(cases, placed, draw)
 
 
-def _find_radius(
-    controller: Controller, term: GravityTerm, plant: Plant, params: ParameterSet, share: float = 1.0
-) -> float:
-    """Return the largest eigenvalue of the loop at one angle, with a share of the compensation."""
-    slope = share * term.slope(_read_position(plant, params, term.reads))
-    return _find_largest_eigenvalue(controller, plant, params, _Slopes(weight=(term.reads, slope)))
-
-
-@record
-class _Slopes:
-    """What is fed back besides the law: the reference by the link's position, the effort by the motor's."""
-
-    weight: tuple[str, float] | None = None
-    ripple: tuple[str, float] | None = None
-
-
-def _find_largest_eigenvalue(controller: Controller, plant: Plant, params: ParameterSet, slopes: _Slopes) -> float:
-    """Return the largest eigenvalue of the sampled loop, sliding, with further feedback."""
-    law, signals, per_reference = runnable(controller), list(controller.signals), 1.0
-    if controller.outer is not None and plant.port is not None and plant.port.motion in plant.outputs:
-        law, read = enclose_controller(controller, str(plant.port.motion))
-        signals = list(read)
-        per_reference = controller.outer.direction * controller.outer.stiffness
-    n = law.c.size
-    b, d = np.reshape(law.b_measurement, (n, -1)).copy(), np.ravel(law.d_measurement).copy()
-    for reads in (one[0] for one in (slopes.weight, slopes.ripple) if one is not None):
-        if reads not in signals:
-            signals.append(reads)
-            b, d = np.hstack([b, np.zeros((n, 1))]), np.append(d, 0.0)
-    if slopes.weight is not None:
-        column, slope = signals.index(slopes.weight[0]), slopes.weight[1] / per_reference
-        b[:, column] -= law.b_reference * slope
-        d[column] -= law.d_reference * slope
-    if slopes.ripple is not None:
-        d[signals.index(slopes.ripple[0])] -= slopes.ripple[1]
-    whole = Law(
-        a=law.a,
-        b=np.column_stack([law.b_reference, -b]),
-        c=law.c,
-        d=np.append(law.d_reference, -d),
-        sample_time_s=law.sample_time_s,
-    )
-    sliding = take_sliding(plant, params)
-    sampled = sample(
-        sliding,
-        controller.delay(params),
-        tuple(signals),
-        controller.command.per_effort,
-        law.sample_time_s,
-        controller.compute_delay_samples,
-    )
-    return float(np.max(np.abs(Loop(plant=sampled, law=whole).eigenvalues())))
-
-
-def _read_position(plant: Plant, params: ParameterSet, output: str) -> float:
-    values = plant.complete(params)
-    x, u = find_rest(plant, values)
-    return float(output_function(plant)(0.0, x, u, values.vector)[list(plant.outputs).index(output)])
-
-
-@record
-class RippleCase:
-    """The largest eigenvalue of a loop with ripple compensated, and at which slope over the motor's position."""
-
-    radius: float
-    slope: float
-    parameters: dict[str, float]
-
-
-def find_ripple_cases(
-    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
-) -> dict[str, RippleCase]:
-    """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without.
-
-    Parameters
-    ----------
-    loops : Shared of Loops
-        With the controller, the plants, and what is uncertain of them.
-    samples : int
-        Draws; at most `RIPPLE_DRAWS` are looked at.
-    rng : numpy.random.Generator
-        Of the draws.
-    executor : Executor, optional
-        Where draws are looked at.
-
-    Raises
-    ------
-    ControlError
-        A plant has no output that is read.
-
-    """
-    compensation = loops.value.controller.compensation
-    if compensation is None or compensation.ripple is None:
-        return {}
-    draws = [{}, *loops.value.unknown.list_draws(min(samples, RIPPLE_DRAWS), rng)]
-    return {
-        name: max(judge_draws(_find_ripple, loops, name, draws, executor), key=lambda case: case.radius)
-        for name in loops.value.models
-    }
-
-
-def _find_ripple(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[RippleCase]:
-    known = loops.value
-    return [find_worst_ripple(known.controller, known.models[name], known.unknown.nominal, [draw]) for draw in draws]
-
-
-def find_worst_ripple(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draws: Sequence[Mapping[str, float]]
-) -> RippleCase:
-    """Return the largest eigenvalue over slopes and draws.
-
-    Parameters
-    ----------
-    controller : Controller
-        With a compensation of ripple.
-    plant : Plant
-        With its output.
-    nominal : ParameterSet
-        What is not drawn.
-    draws : sequence of mapping
-        Values by name.
+def measure_ripple(controller: Controller, plant: Plant, nominal: ParameterSet, draw: Draw) -> EigenvalueCase:
+    """Return the largest eigenvalue over the slopes at one draw.
 
     Raises
     ------
@@ -378,16 +241,70 @@ def find_worst_ripple(
             f"compensate.ripple: {plant.name} has no output {ripple.reads}, by which ripple is compensated; give it "
             "one, or leave the plant out of [robustness]"
         )
-    worst = RippleCase(radius=0.0, slope=0.0, parameters={})
-    for draw in draws:
-        placed = place_values(plant, nominal, draw)
-        weight = None
-        if gravity is not None and gravity.reads in plant.outputs:
-            weight = gravity.reads, gravity.slope(_read_position(plant, placed, gravity.reads))
-        for slope in map(float, np.linspace(*ripple.steepest, SLOPES)):
-            slopes = _Slopes(weight=weight, ripple=(ripple.reads, slope))
-            radius = _find_largest_eigenvalue(controller, plant, placed, slopes)
-            if radius > worst.radius:
-                used = {name: value for name, value in draw.items() if name in placed}
-                worst = RippleCase(radius=radius, slope=slope, parameters=used)
-    return worst
+    placed, weight = place_values(plant, nominal, draw), None
+    if gravity is not None and gravity.reads in plant.outputs:
+        weight = gravity.reads, gravity.slope(_read_position(plant, placed, gravity.reads))
+    slopes = map(float, np.linspace(*ripple.steepest, SLOPES))
+    cases = [(find_radius(controller, plant, placed, weight, (ripple.reads, slope)), slope) for slope in slopes]
+    return _make_case(cases, placed, draw)
+
+
+def _make_case(cases: Sequence[tuple[float, float]], placed: ParameterSet, draw: Draw) -> EigenvalueCase:
+    """Return the first of the largest of some eigenvalues, each with where it is."""
+    if not cases:
+        return EigenvalueCase(radius=0.0, parameters={})
+    radius, at = max(cases, key=lambda case: case[0])
+    used = {name: value for name, value in draw.items() if name in placed}
+    return EigenvalueCase(radius=radius, at=at, parameters=used)
+
+
+def find_radius(
+    controller: Controller,
+    plant: Plant,
+    params: ParameterSet,
+    weight: tuple[str, float] | None = None,
+    ripple: tuple[str, float] | None = None,
+) -> float:
+    """Return the largest eigenvalue of the sampled loop, sliding, with further feedback.
+
+    `weight` feeds the reference by the link's position, `ripple` the effort by the motor's: each an output and a slope.
+    """
+    law, signals, per_reference = runnable(controller), list(controller.signals), 1.0
+    if controller.outer is not None and plant.port is not None and plant.port.motion in plant.outputs:
+        law, read = enclose_controller(controller, str(plant.port.motion))
+        signals = list(read)
+        per_reference = controller.outer.direction * controller.outer.stiffness
+    n = law.c.size
+    b, d = np.reshape(law.b_measurement, (n, -1)).copy(), np.ravel(law.d_measurement).copy()
+    for reads, _ in filter(None, (weight, ripple)):
+        if reads not in signals:
+            signals.append(reads)
+            b, d = np.hstack([b, np.zeros((n, 1))]), np.append(d, 0.0)
+    if weight is not None:
+        column, slope = signals.index(weight[0]), weight[1] / per_reference
+        b[:, column] -= law.b_reference * slope
+        d[column] -= law.d_reference * slope
+    if ripple is not None:
+        d[signals.index(ripple[0])] -= ripple[1]
+    whole = Law(
+        a=law.a,
+        b=np.column_stack([law.b_reference, -b]),
+        c=law.c,
+        d=np.append(law.d_reference, -d),
+        sample_time_s=law.sample_time_s,
+    )
+    sampled = sample(
+        take_sliding(plant, params),
+        controller.delay(params),
+        tuple(signals),
+        controller.command.per_effort,
+        law.sample_time_s,
+        controller.compute_delay_samples,
+    )
+    return float(np.max(np.abs(Loop(plant=sampled, law=whole).eigenvalues())))
+
+
+def _read_position(plant: Plant, params: ParameterSet, output: str) -> float:
+    values = plant.complete(params)
+    x, u = find_rest(plant, values)
+    return float(output_function(plant)(0.0, x, u, values.vector)[list(plant.outputs).index(output)])

@@ -22,7 +22,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
@@ -42,7 +41,7 @@ from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_floor
 from seaopt.robustness.verification.linear import view_loop
-from seaopt.robustness.verification.oscillation import Oscillation, measure_swing
+from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
 from seaopt.robustness.verification.playback import Stage
 from seaopt.units import LINEAR
 
@@ -154,18 +153,18 @@ class ConstrainedRuns(Result):
 
 @record(eq=False)
 class _Outcome:
-    """One run on one plant: its first fault ("" if none), its ring's peak, and what it did in so many steps."""
+    """One run on one plant: its first fault ("" if none), its ring's peak, and what the law did in so many steps."""
 
-    kind: str
-    text: str
-    violation: float
-    signal: str
-    ring: float
-    steps: int
-    unsolved: int
-    late: int
-    iterations: int
-    at_limit: int
+    kind: str = ""
+    text: str = ""
+    violation: float = 0.0
+    signal: str = ""
+    ring: float = 0.0
+    steps: int = 0
+    unsolved: int = 0
+    late: int = 0
+    iterations: int = 0
+    at_limit: int = 0
 
 
 @record(eq=False)
@@ -174,7 +173,8 @@ class _Run:
 
     draw: dict[str, float]
     seed: int
-    references: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+    reference: Signal
+    disturbance: Signal
 
 
 @record(eq=False)
@@ -198,6 +198,151 @@ class _Bench:
         return self.sensors == Sensors() and not self.current_step_A
 
 
+@record(eq=False)
+class _Case:
+    """A run on one plant."""
+
+    bench: _Bench
+    plant: Plant
+    values: ParameterSet
+    drawn: _Run
+
+    def play(self) -> _Outcome:
+        """Simulate the run, and judge it."""
+        steps: list[MPCStep] = []
+        return replace(
+            self._judge(steps),
+            steps=len(steps),
+            unsolved=sum(not step.solved for step in steps),
+            late=sum(step.status.startswith(UNFINISHED) and not step.solved for step in steps),
+            iterations=max((step.iterations for step in steps), default=0),
+        )
+
+    def _judge(self, steps: list[MPCStep]) -> _Outcome:
+        mpc = self.bench.mpc
+        try:
+            run = self._simulate(steps)
+        except SeaoptError as error:
+            return _Outcome(kind=DIVERGED, text=str(error))
+        violation, signal = self._find_violation(run)
+        kind, text = self._judge_force(run, np.array([step.target_N for step in steps]))
+        if not kind and violation > self.bench.tolerance:
+            kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
+        ring, lasting = self._find_ring(run)
+        if not kind and lasting:
+            kind, text = RINGS, lasting
+        current = np.array([step.current_A for step in steps])  # before the amplifier rounds it
+        slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
+        at_limit = int(np.count_nonzero(slews | (np.abs(current) > mpc.command_limit * (1.0 - 1e-6))))
+        return _Outcome(kind=kind, text=text, violation=violation, signal=signal, ring=ring, at_limit=at_limit)
+
+    def _simulate(self, steps: list[MPCStep]) -> ForceRun:
+        """Return the samples of the run, and add each step of the law to `steps`."""
+        mpc = self.bench.mpc
+
+        def law(state: Any, r: Any, y: float) -> tuple[float, Any]:
+            steps.append(mpc.step(state, r, y))
+            return steps[-1].current_A, steps[-1].state
+
+        return close_loop(
+            law,
+            mpc.start,
+            self.plant,
+            self.values,
+            self.drawn.reference,
+            measured=mpc.measured,
+            sample_time_s=mpc.sample_time_s,
+            delay_samples=mpc.compute_delay_samples,
+            preview_samples=mpc.spec.preview_samples,
+            sensors=self.bench.sensors,
+            current_step_A=self.bench.current_step_A,
+            current_limit_A=mpc.command_limit,
+            disturbance_A=self.drawn.disturbance,
+            seed=self.drawn.seed,
+        )
+
+    def _judge_force(self, run: ForceRun, target: Signal) -> tuple[str, str]:
+        """Return what is wrong with the force of a run, a kind and a sentence; "" twice where nothing is."""
+        mpc = self.bench.mpc
+        limit = abs(mpc.static_gain) * mpc.command_limit
+        _, phase, lasting = _count_samples(mpc)
+        peak = float(np.max(np.abs(run.force)))
+        if not peak < RUNAWAY * limit:
+            return DIVERGED, f"{peak:.4g} {run.unit}, and the limits hold {limit:.4g} {run.unit}"
+        off = np.abs(run.force - target)
+        first, second = np.max(off[-lasting : -lasting // 2]), np.max(off[-lasting // 2 :])
+        if second > GROWTH * first + SETTLED * limit:
+            return DIVERGED, f"the error grows to {second:.4g} {run.unit} over the last phase"
+        if self.plant.moves:
+            return "", ""
+        last = max(round(LAST_SHARE * phase), 1)
+        end_of_step = run.time.size - lasting - mpc.spec.preview_samples  # before its end the next phase is known
+        for end in (run.time.size, end_of_step, end_of_step - phase):
+            error = float(np.mean(off[end - last : end]))
+            if error > SETTLED * abs(run.reference[-1]):
+                return UNSETTLED, f"{error:.4g} {run.unit} off {end / run.time.size:.0%} into the run"
+        return "", ""
+
+    def _find_ring(self, run: ForceRun) -> tuple[float, str]:
+        """Return the peak of what swings at the end of a run, 0 for nothing, and a sentence where it is a fault.
+
+        What rounding makes comes and goes, so that half of the runs that ring look as if they died out. What dies out
+        is therefore no fault only where the same run on ideal devices has as much of it.
+        """
+        bench = self.bench
+        swing = _measure_ring(bench.mpc, run)
+        fading = not (swing.sustained or swing.growing)
+        if fading and bench.is_ideal:
+            return 0.0, ""
+        stage = Stage(
+            controller=bench.law, plant=self.plant, sensors=bench.sensors, current_step_A=bench.current_step_A
+        )
+        view = view_loop(stage, self.plant, self.values)
+        floor = find_noise_floor(stage, float(np.max(np.abs(run.force))))
+        if not view.instability:
+            floor = max(floor, LINE_SIGMAS * view.force_std(SLOWEST * bench.mpc.spec.bandwidth_hz))
+        if swing.amplitude <= floor:
+            return swing.peak, ""
+        if fading and not self._rings_by_devices(swing.amplitude):
+            return 0.0, ""
+        what = f"an oscillation of {swing.amplitude:.3g} {run.unit}, at {swing.frequency_hz:.3g} Hz most, "
+        return swing.peak, f"{what}does not die out; noise and rounding explain {floor:.3g} {run.unit}"
+
+    def _rings_by_devices(self, amplitude: float) -> bool:
+        """Tell whether most of what swings is gone with ideal devices, so that it is no transient of the loop."""
+        try:
+            ideal = replace(self, bench=self.bench.ideal)._simulate([])
+        except SeaoptError:
+            return False
+        return _measure_ring(self.bench.mpc, ideal).amplitude < 0.5 * amplitude
+
+    def _find_violation(self, run: ForceRun) -> tuple[float, str]:
+        """Return by how much a bounded signal leaves its bounds at most, over half their width, and which it is."""
+        mpc, plant = self.bench.mpc, self.plant
+        worst, signal = 0.0, ""
+        completed = plant.complete(self.values)
+        delay_s = float(find_delay(plant, read_conditions(plant, self.values)))
+        whole, rest_s = whole_samples(delay_s, mpc.sample_time_s)
+        late = mpc.compute_delay_samples + whole + (rest_s > 0.0)  # of what acts as a sample is read
+        inputs = np.zeros((run.time.size, len(plant.inputs)))
+        inputs[:, 0] = np.append(np.zeros(late), run.current)[: run.time.size] + self.drawn.disturbance
+        outputs_of = output_function(plant).map(run.time.size)
+        outputs = np.array(outputs_of(run.time[None], run.state.T, inputs.T, ca.DM(completed.vector)))
+        traces = dict(zip(plant.states, run.state.T, strict=True)) | dict(zip(plant.outputs, outputs, strict=True))
+        for name, (low, high) in mpc.spec.bounds.items():
+            if not _has(plant, name):
+                continue
+            if name in traces:
+                trace = traces[name]
+            else:
+                trace = run.state @ deflection_row(plant, completed)
+                trace = np.gradient(trace, mpc.sample_time_s) if name == "spring_rate" else trace
+            beyond = float(np.max(np.maximum(low - trace, trace - high))) / (0.5 * (high - low))
+            if beyond > worst:
+                worst, signal = beyond, name
+        return worst, signal
+
+
 def run_constrained(
     mpc: ForceMPC,
     law: Controller,
@@ -213,33 +358,15 @@ def run_constrained(
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> ConstrainedRuns:
-    """Draw and simulate runs with limits active.
-
-    Parameters
-    ----------
-    mpc : ForceMPC
-        The law.
-    law : Controller
-        The same in its linear region.
-    plants : mapping of name to Plant
-        Each is played at every draw.
-    unknown : Uncertainty
-        What is drawn of the parameters.
-    runs, seed, confidence, tolerance, sensors, current_step_A, executor, progress
-        As in `certify_mpc`.
-
-    """
+    """Draw and simulate runs with limits active, each on every plant; `law` is the same in its linear region."""
     rng = np.random.default_rng([require_seed(seed, ControlError), CONSTRAINED_STREAM])
     drawn = unknown.values(unknown.draw(runs, rng))
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name not in DELAYS}
-    parts = [
-        _Run(
-            draw={name: float(column[k]) for name, column in drawn.items() if name not in placed},
-            seed=seed + k,
-            references=_draw_references(mpc, rng),
-        )
-        for k in range(runs)
-    ]
+    parts: list[_Run] = []
+    for k in range(runs):
+        draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
+        reference, disturbance = _draw_references(mpc, rng)
+        parts.append(_Run(draw=draw, seed=seed + k, reference=reference, disturbance=disturbance))
     bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, current_step_A=current_step_A)
     played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, executor)
     kinds: list[str] = []
@@ -247,14 +374,15 @@ def run_constrained(
     for k in count_off(range(runs), "limits active, run", progress):
         of_plants = dict(zip(plants, next(played), strict=True))
         outcomes += of_plants.values()
-        failed = [name for name, one in of_plants.items() if one.kind]
-        kinds.append(of_plants[failed[0]].kind if failed else "")
-        if failed and not failed_run:
-            name, plant, draw = failed[0], plants[failed[0]], parts[k].draw
+        failed = next((name for name, outcome in of_plants.items() if outcome.kind), None)
+        kinds.append("" if failed is None else of_plants[failed].kind)
+        if failed is not None and not failed_run:
+            plant, draw, outcome = plants[failed], parts[k].draw, of_plants[failed]
             used = {key: draw[key] for key in draw if key in place_values(plant, unknown.nominal, draw)}
-            remedy = _find_remedy(bench, name, plant, unknown.nominal, used, of_plants[name], parts[k])
-            failed_run.update(plant=name, run=str(k + 1), text=of_plants[name].text, parameters=used, remedy=remedy)
-    failures, steps = sum(map(bool, kinds)), sum(one.steps for one in outcomes)
+            case = _Case(bench=bench, plant=plant, values=place_values(plant, unknown.nominal, used), drawn=parts[k])
+            remedy = _find_remedy(case, failed, unknown.nominal, used, outcome)
+            failed_run.update(plant=failed, run=str(k + 1), text=outcome.text, parameters=used, remedy=remedy)
+    failures, steps = sum(map(bool, kinds)), max(sum(outcome.steps for outcome in outcomes), 1)
     missing = (
         f"{name} has no {signal}: its bounds are not checked there"
         for name, plant in plants.items()
@@ -273,11 +401,11 @@ def run_constrained(
         confidence=confidence,
         failure_probability_bound=failure_bound(runs, failures, confidence),
         bound_tolerance=tolerance,
-        largest_violation=max(one.violation for one in outcomes),
-        largest_ring=max(one.ring for one in outcomes),
-        at_limit=sum(one.at_limit for one in outcomes) / max(steps, 1),
-        fallback=sum(one.unsolved for one in outcomes) / max(steps, 1),
-        iterations=max(one.iterations for one in outcomes),
+        largest_violation=max(outcome.violation for outcome in outcomes),
+        largest_ring=max(outcome.ring for outcome in outcomes),
+        at_limit=sum(outcome.at_limit for outcome in outcomes) / steps,
+        fallback=sum(outcome.unsolved for outcome in outcomes) / steps,
+        iterations=max(outcome.iterations for outcome in outcomes),
         sensors=sensors,
         current_step_A=current_step_A,
         unit=law.command.reference_unit,
@@ -286,9 +414,7 @@ def run_constrained(
     )
 
 
-def _draw_references(
-    mpc: ForceMPC, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _draw_references(mpc: ForceMPC, rng: np.random.Generator) -> tuple[Signal, Signal]:
     """Return the reference of a run, and the disturbance of its command, which lasts a phase and what is judged."""
     rest, phase, last = _count_samples(mpc)
     force = rng.choice([-1.0, 1.0]) * rng.uniform(*STEP_SHARES) * abs(mpc.static_gain) * mpc.command_limit
@@ -307,102 +433,39 @@ def _count_samples(mpc: ForceMPC) -> tuple[int, int, int]:
 def _play_run(shared: Shared[tuple[_Bench, dict[str, Plant], ParameterSet]], run: _Run) -> list[_Outcome]:
     """Simulate one run on every plant, and judge it."""
     bench, plants, nominal = shared.value
-    return [_play(bench, plant, place_values(plant, nominal, run.draw), run) for plant in plants.values()]
+    return [
+        _Case(bench=bench, plant=plant, values=place_values(plant, nominal, run.draw), drawn=run).play()
+        for plant in plants.values()
+    ]
 
 
-def _play(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run) -> _Outcome:
-    """Simulate one run on one plant, and judge it."""
-    mpc = bench.mpc
-    steps: list[MPCStep] = []
-
-    def report(
-        kind: str, text: str, violation: float = 0.0, signal: str = "", at_limit: int = 0, ring: float = 0.0
-    ) -> _Outcome:
-        return _Outcome(
-            kind=kind,
-            text=text,
-            violation=violation,
-            signal=signal,
-            at_limit=at_limit,
-            ring=ring,
-            steps=len(steps),
-            unsolved=sum(not step.solved for step in steps),
-            late=sum(step.status.startswith(UNFINISHED) and not step.solved for step in steps),
-            iterations=max((step.iterations for step in steps), default=0),
-        )
-
-    try:
-        run = _simulate(bench, plant, values, drawn, steps)
-    except SeaoptError as error:
-        return report(DIVERGED, str(error))
-    violation, signal = _find_violation(mpc, plant, values, run, drawn.references[1])
-    kind, text = _judge(mpc, plant, run, np.array([step.target_N for step in steps]))
-    if not kind and violation > bench.tolerance:
-        kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
-    ring, lasting = _find_ring(bench, plant, values, drawn, run)
-    if not kind and lasting:
-        kind, text = RINGS, lasting
-    current = np.array([step.current_A for step in steps])  # before the amplifier rounds it
-    slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
-    at_limit = int(np.count_nonzero(slews | (np.abs(current) > mpc.command_limit * (1.0 - 1e-6))))
-    return report(kind, text, violation, signal, at_limit, ring)
-
-
-def _simulate(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run, steps: list[MPCStep]) -> ForceRun:
-    """Return one run on one plant, and add each step of the law to `steps`."""
-    mpc, (reference, disturbance) = bench.mpc, drawn.references
-
-    def law(state: Any, r: Any, y: float) -> tuple[float, Any]:
-        steps.append(mpc.step(state, r, y))
-        return steps[-1].current_A, steps[-1].state
-
-    return close_loop(
-        law,
-        mpc.start,
-        plant,
-        values,
-        reference,
-        measured=mpc.measured,
-        sample_time_s=mpc.sample_time_s,
-        delay_samples=mpc.compute_delay_samples,
-        preview_samples=mpc.spec.preview_samples,
-        sensors=bench.sensors,
-        current_step_A=bench.current_step_A,
-        current_limit_A=mpc.command_limit,
-        disturbance_A=disturbance,
-        seed=drawn.seed,
-    )
-
-
-def _find_remedy(
-    bench: _Bench,
-    name: str,
-    plant: Plant,
-    nominal: ParameterSet,
-    draw: Mapping[str, float],
-    failed: _Outcome,
-    drawn: _Run,
-) -> str:
+def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome) -> str:
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
-    mpc, play = bench.mpc, partial(_play, bench, drawn=drawn)
+    bench, plant, mpc = case.bench, case.plant, case.bench.mpc
+    over_bound = failed.kind == OVER_BOUND
+
+    def fails(values: ParameterSet) -> bool:
+        return bool(replace(case, values=values).play().kind)
+
     if failed.late:
         return f"a larger max_iterations in [mpc]: {format_count(failed.late, 'sample')} of that run had no plan"
-    real = failed.kind != OVER_BOUND and not bench.is_ideal  # of a bound the room that it needs is named
-    if real and not _play(bench.ideal, plant, place_values(plant, nominal, draw), drawn).kind:
+    # Of a bound the room that it needs is named.
+    if not over_bound and not bench.is_ideal and not replace(case, bench=bench.ideal).play().kind:
         return (
             "finer sensors of less offset and more range, a finer current_step_A, or a lower bandwidth_hz: with ideal "
             "ones that run passes"
         )
-    if (own := play(*mpc.design)).kind:
-        return f"{_name_obstacle(mpc, own)}: the run fails on the design plant with its own parameters too"
-    room = f", or leave {failed.signal} more room by bound_tolerance" if failed.kind == OVER_BOUND else ""
-    values = place_values(plant, nominal, {})
-    known = plant is mpc.design[0] and values == place_values(*mpc.design, {})  # that run has just passed
-    if not known and play(plant, values).kind:
+    design, values = mpc.design
+    if (of_design := replace(case, plant=design, values=values).play()).kind:
+        return f"{_name_obstacle(mpc, of_design)}: the run fails on the design plant with its own parameters too"
+    room = f", or leave {failed.signal} more room by bound_tolerance" if over_bound else ""
+    at_nominal = place_values(plant, nominal, {})
+    passes = plant is design and at_nominal == place_values(design, values, {})  # that run has just passed
+    if not passes and fails(at_nominal):
         return f"design on {name}, which is not what the model says at its nominal parameters either{room}"
     alone = list(draw)  # of a single one it is the run that failed
     if len(draw) > 1:
-        alone = [key for key in draw if play(plant, place_values(plant, nominal, {key: draw[key]})).kind]
+        alone = [key for key in draw if fails(place_values(plant, nominal, {key: draw[key]}))]
     wrong = ", ".join(alone or draw)
     together = "" if alone else " together"
     return f"fit {wrong} or narrow their ranges in [robustness]: the model is too wrong in them{together}{room}"
@@ -417,95 +480,11 @@ def _name_obstacle(mpc: ForceMPC, failed: _Outcome) -> str:
     return f"bounds of {failed.signal} wider than [{low - more:.3g}, {high + more:.3g}] in [mpc], or bound_tolerance"
 
 
-def _judge(mpc: ForceMPC, plant: Plant, run: ForceRun, target: Float[np.ndarray, " n"]) -> tuple[str, str]:
-    """Return what is wrong with the force of a run, a kind and a sentence; "" twice where nothing is."""
-    held = abs(mpc.static_gain) * mpc.command_limit
-    _, phase, lasting = _count_samples(mpc)
-    peak = float(np.max(np.abs(run.force)))
-    if not peak < RUNAWAY * held:
-        return DIVERGED, f"{peak:.4g} {run.unit}, and the limits hold {held:.4g} {run.unit}"
-    off = np.abs(run.force - target)
-    first, second = np.max(off[-lasting : -lasting // 2]), np.max(off[-lasting // 2 :])
-    if second > GROWTH * first + SETTLED * held:
-        return DIVERGED, f"the error grows to {second:.4g} {run.unit} over the last phase"
-    if plant.moves:
-        return "", ""
-    last = max(round(LAST_SHARE * phase), 1)
-    known = mpc.spec.preview_samples  # before the end of a phase the next one is known
-    for end in (run.time.size, run.time.size - lasting - known, run.time.size - lasting - phase - known):
-        error = float(np.mean(off[end - last : end]))
-        if error > SETTLED * abs(run.reference[-1]):
-            return UNSETTLED, f"{error:.4g} {run.unit} off {end / run.time.size:.0%} into the run"
-    return "", ""
-
-
-def _find_ring(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run, run: ForceRun) -> tuple[float, str]:
-    """Return the peak of what swings at the end of a run, 0 for nothing, and a sentence where it is a fault.
-
-    What rounding makes comes and goes, so that half of the runs that ring look as if they died out. What dies out is
-    therefore no fault only where the same run on ideal devices has as much of it.
-    """
-    mpc = bench.mpc
-    swing = _measure_ring(mpc, run)
-    fading = not (swing.sustained or swing.growing)
-    if fading and bench.is_ideal:
-        return 0.0, ""
-    stage = Stage(controller=bench.law, plant=plant, sensors=bench.sensors, current_step_A=bench.current_step_A)
-    view = view_loop(stage, plant, values)
-    floor = find_noise_floor(stage, float(np.max(np.abs(run.force))))
-    if not view.instability:
-        floor = max(floor, LINE_SIGMAS * view.force_std(SLOWEST * mpc.spec.bandwidth_hz))
-    if swing.amplitude <= floor:
-        return swing.peak, ""
-    if fading and not _rings_by_devices(bench, plant, values, drawn, swing.amplitude):
-        return 0.0, ""
-    what = f"an oscillation of {swing.amplitude:.3g} {run.unit}, at {swing.frequency_hz:.3g} Hz most, does not die out"
-    return swing.peak, f"{what}; noise and rounding explain {floor:.3g} {run.unit}"
-
-
 def _measure_ring(mpc: ForceMPC, run: ForceRun) -> Oscillation:
     """Return what swings at the end of a run."""
     judged = round(JUDGED_PERIODS / mpc.spec.bandwidth_hz * mpc.spec.sample_rate_hz)
     return measure_swing(run.force[-judged:], mpc.sample_time_s, lowest_hz=SLOWEST * mpc.spec.bandwidth_hz)
 
 
-def _rings_by_devices(bench: _Bench, plant: Plant, values: ParameterSet, drawn: _Run, amplitude: float) -> bool:
-    """Tell whether most of what swings is gone with ideal devices, so that it is no transient of the loop."""
-    try:
-        ideal = _simulate(bench.ideal, plant, values, drawn, [])
-    except SeaoptError:
-        return False
-    return _measure_ring(bench.mpc, ideal).amplitude < 0.5 * amplitude
-
-
 def _has(plant: Plant, name: str) -> bool:
     return name in plant.outputs or name in plant.states or (name.startswith("spring_") and plant.spring is not None)
-
-
-def _find_violation(
-    mpc: ForceMPC, plant: Plant, values: ParameterSet, run: ForceRun, disturbance: Float[np.ndarray, " n"]
-) -> tuple[float, str]:
-    """Return by how much a bounded signal of a run leaves its bounds at most, over half their width, and which."""
-    worst, signal = 0.0, ""
-    completed = plant.complete(values)
-    whole, rest_s = whole_samples(float(find_delay(plant, read_conditions(plant, values))), mpc.sample_time_s)
-    late = mpc.compute_delay_samples + whole + (rest_s > 0.0)  # of what acts as a sample is read
-    applied = np.append(np.zeros(late), run.current)[: run.time.size] + disturbance
-    inputs = np.zeros((run.time.size, len(plant.inputs)))
-    inputs[:, 0] = applied
-    outputs_of = output_function(plant).map(run.time.size)
-    outputs = np.array(outputs_of(run.time[None], run.state.T, inputs.T, ca.DM(completed.vector)))
-    for name, (low, high) in mpc.spec.bounds.items():
-        if not _has(plant, name):
-            continue
-        if name in plant.outputs:
-            trace = outputs[list(plant.outputs).index(name)]
-        elif name in plant.states:
-            trace = run.state[:, list(plant.states).index(name)]
-        else:
-            trace = run.state @ deflection_row(plant, completed)
-            trace = np.gradient(trace, mpc.sample_time_s) if name == "spring_rate" else trace
-        beyond = float(np.max(np.maximum(low - trace, trace - high))) / (0.5 * (high - low))
-        if beyond > worst:
-            worst, signal = beyond, name
-    return worst, signal

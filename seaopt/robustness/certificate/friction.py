@@ -6,9 +6,10 @@ only where it shows too little: a margin of a draw is then a lower bound of what
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from seaopt.codec import OrInfinite
 from seaopt.control import Controller
 from seaopt.control.laws.friction_margin import find_friction_margin, find_friction_margins
 from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.executors import Shared
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
@@ -23,9 +25,9 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
 from seaopt.records import record
 from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws, select_own
-from seaopt.robustness.uncertainty.worst import place_values
 
 MARGIN_DRAWS = 100  # at most so many are looked at
+Margin = TypeVar("Margin", FrictionMargin | None, CompensationMargin)
 
 
 @record
@@ -33,26 +35,13 @@ class FrictionDraws:
     """For how many draws stability is shown for every friction curve of their sector, and the least margin.
 
     A draw without friction counts.
-
-    Parameters
-    ----------
-    samples, shown : int
-        Draws looked at, and those for which it is.
-    least_slope : float
-        The steepest friction for which it is, N s/m (N m s/rad), of the draw with the least; zero where it is not for
-        one, infinite where none is bounded.
-    factor : float
-        That slope over the draw's own; zero where nothing is shown.
-    parameters : mapping
-        That draw: the first for which nothing is shown, if there is one.
-
     """
 
     samples: int
     shown: int
-    least_slope: OrInfinite
-    factor: OrInfinite
-    parameters: dict[str, float]
+    least_slope: OrInfinite  # the steepest friction for which it is, N s/m; zero where it is not for one draw
+    factor: OrInfinite  # that slope over the draw's own; zero where nothing is shown
+    parameters: dict[str, float]  # of the draw with the least: the first for which nothing is shown, if there is one
 
     def __str__(self) -> str:
         head = f"over draws, it is shown for {self.shown} of {self.samples}"
@@ -94,7 +83,22 @@ def find_margins_at_draws(
     if not count or not enough:
         return {}
     draws = unknown.list_draws(count, rng)
-    return {name: _count_shown(loops, name, draws, margin, executor) for name, margin in enough.items()}
+    found: dict[str, FrictionDraws] = {}
+    for name, nominal_margin in enough.items():
+        judge = partial(_find_margins, nominal_margin)
+        shown, margin, parameters = find_least_margin(judge, _take_slope, loops, name, draws, executor)
+        found[name] = FrictionDraws(
+            samples=count,
+            shown=shown,
+            least_slope=_take_slope(margin),
+            factor=np.inf if margin is None else margin.factor,
+            parameters=parameters,
+        )
+    return found
+
+
+def _take_slope(margin: FrictionMargin | None) -> float:
+    return np.inf if margin is None else margin.least_slope  # without friction there is nothing to show
 
 
 def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool:
@@ -102,28 +106,28 @@ def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool
     return margin is None or margin.shown or (required is not None and margin.least_slope >= required)
 
 
-def _count_shown(
-    loops: Shared[Loops], name: str, draws: Sequence[Draw], known: FrictionMargin | None, executor: Executor | None
-) -> FrictionDraws:
-    """Return for how many draws of one plant stability is shown, and the least margin."""
+def find_least_margin(
+    judge: Callable[[Shared[Loops], str, Sequence[Draw]], Sequence[Margin]],
+    slope: Callable[[Margin], float],
+    loops: Shared[Loops],
+    name: str,
+    draws: Sequence[Draw],
+    executor: Executor | None,
+) -> tuple[int, Margin, dict[str, float]]:
+    """Return for how many draws of one plant stability is shown, the margin of the least slope, and its draw."""
     own = select_own(loops, name, draws)
     distinct = {tuple(draw.items()): draw for draw in own}  # draws that vary what this plant does not have are one loop
-    found = judge_draws(partial(_find_margins, known), loops, name, list(distinct.values()), executor)
-    margins = dict(zip(distinct, found, strict=True))
-    shown, slope, factor, place = 0, np.inf, np.inf, 0
-    for k, draw in enumerate(own):
-        margin = margins[tuple(draw.items())]
-        shown += margin is None or margin.shown  # without friction there is nothing to show
-        if margin is not None and margin.least_slope < slope:
-            slope, factor, place = margin.least_slope, margin.factor, k
-    return FrictionDraws(samples=len(draws), shown=shown, least_slope=slope, factor=factor, parameters=own[place])
+    judged = judge_draws(judge, loops, name, list(distinct.values()), executor)
+    of_draw = dict(zip(distinct, judged, strict=True))
+    margins = [of_draw[tuple(draw.items())] for draw in own]
+    least = int(np.argmin([slope(margin) for margin in margins]))
+    return sum(margin is None or margin.shown for margin in margins), margins[least], own[least]
 
 
 def _find_margins(
-    known: FrictionMargin | None, loops: Shared[Loops], name: str, draws: Sequence[Draw]
+    nominal: FrictionMargin | None, loops: Shared[Loops], name: str, draws: Sequence[Draw]
 ) -> list[FrictionMargin | None]:
     """Return the margins of one plant at draws, the multiplier that served at the nominal parameters tried first."""
-    first, least = ("", 0.0) if known is None else (known.multiplier, 1.0 if known.shown else 0.0)
-    plant, nominal = loops.value.models[name], loops.value.unknown.nominal
-    placed = [place_values(plant, nominal, draw) for draw in draws]
-    return find_friction_margins(loops.value.controller, plant, placed, first, least)
+    first, least = ("", 0.0) if nominal is None else (nominal.multiplier, 1.0 if nominal.shown else 0.0)
+    known = loops.value
+    return find_friction_margins(known.controller, known.models[name], known.place(name, draws), first, least)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from seaopt.codec import OrMinusInfinite
+from seaopt.codec import OrMinusInfinite, to_content
 from seaopt.control import Controller, Impedance, ImpedanceRegion, Rendering, passive_region, render
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
@@ -35,23 +34,13 @@ class ImpedanceDraws:
     """For how many draws the link is stable by itself, and passive with its own damper.
 
     A draw of a plant with friction counts where it is so sliding and stuck.
-
-    Parameters
-    ----------
-    samples, stable, passive : int
-        Draws looked at, and those for which it is.
-    margin : float
-        The least of the passivity condition over the draws, as a share: above zero it is kept.
-    parameters : mapping
-        That draw.
-
     """
 
     samples: int
     stable: int
     passive: int
-    margin: OrMinusInfinite
-    parameters: dict[str, float]
+    margin: OrMinusInfinite  # the least of the passivity condition, as a share: above zero it is kept
+    parameters: dict[str, float]  # of the draw with the least margin
 
     def __str__(self) -> str:
         at = f", least so at {format_values(self.parameters)}" if self.parameters else ""
@@ -60,36 +49,19 @@ class ImpedanceDraws:
 
 @record(eq=False)
 class CertifiedImpedance:
-    """An impedance at a link, as it is rendered, and what could be.
+    """An impedance at a link, as it is rendered, and what could be."""
 
-    Parameters
-    ----------
-    plant : str
-        Whose link it is.
-    rendering : Rendering
-        The pair that is asked for, with friction sliding.
-    region : ImpedanceRegion
-        Every pair with the same filter.
-    stuck : Rendering or None
-        The same pair with friction stuck, of a plant that has some.
-    draws : ImpedanceDraws or None
-        The pair over draws of the parameters; None where nothing is uncertain, or it fails without draws.
-    steps : tuple of ImpedanceStep
-        Steps of x_0 simulated on the nonlinear plant.
-
-    """
-
-    plant: str
-    rendering: Rendering
-    region: ImpedanceRegion
-    stuck: Rendering | None = None
-    draws: ImpedanceDraws | None = None
-    steps: tuple[ImpedanceStep, ...] = ()
+    plant: str  # whose link it is
+    rendering: Rendering  # the pair that is asked for, with friction sliding
+    region: ImpedanceRegion  # every pair with the same filter
+    stuck: Rendering | None = None  # the same pair with friction stuck, of a plant that has some
+    draws: ImpedanceDraws | None = None  # None where nothing is uncertain, or it fails without draws
+    steps: tuple[ImpedanceStep, ...] = ()  # of x_0, simulated on the nonlinear plant
 
     @property
     def safe(self) -> bool:
         """The link rests by itself and is passive, with friction sliding and stuck, at the nominal parameters."""
-        return all(one.stable and one.passive for one in (self.rendering, self.stuck) if one is not None)
+        return all(pair.stable and pair.passive for pair in (self.rendering, self.stuck) if pair is not None)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all of it, for robustness.json."""
@@ -99,15 +71,15 @@ class CertifiedImpedance:
             | {
                 "region": self.region.to_dict(),
                 "stuck": None if self.stuck is None else self.stuck.to_dict(),
-                "draws": None if self.draws is None else asdict(self.draws),
-                "steps": [asdict(step) for step in self.steps],
+                "draws": to_content(self.draws),
+                "steps": to_content(self.steps),
             }
         )
 
     def lines(self) -> list[str]:
         """Return the findings, one line each."""
-        asked, called = self.rendering.impedance, self.rendering.called
-        head = f"{asked.stiffness:.4g} {called.stiffness} and {asked.damping:.4g} {called.damping} at the link of "
+        pair, called = self.rendering.impedance, self.rendering.called
+        head = f"{pair.stiffness:.4g} {called.stiffness} and {pair.damping:.4g} {called.damping} at the link of "
         stuck = [] if self.stuck is None else [f"with its friction stuck: {self.stuck.describe()[0]}"]
         drawn = [] if self.draws is None else [str(self.draws)]
         return [
@@ -129,24 +101,18 @@ def certify_impedance(
     """Measure the impedance of a controller's outer loop at the nominal parameters; None where it has none.
 
     `draws` is what `draw_impedance` found; `steps` what was simulated, which is simulated if left out.
-
-    Raises
-    ------
-    ControlError
-        The plant that the outer loop names is not among the models, or no model has a link that moves.
-
     """
     outer = controller.outer
     if outer is None:
         return None
     name = _find_plant(controller, models)
     impedance, model = outer.impedance, models[name]
-    sliding, *others = split_friction({name: model}, parameters).values()
+    sliding, *stuck = split_friction({name: model}, parameters).values()
     return CertifiedImpedance(
         plant=name,
         rendering=render(controller, sliding, parameters, impedance),
         region=passive_region(controller, sliding, parameters, velocity_filter_s=impedance.velocity_filter_s),
-        stuck=render(controller, others[0], parameters, impedance) if others else None,
+        stuck=render(controller, stuck[0], parameters, impedance) if stuck else None,
         draws=draws,
         steps=play_impedance_steps(controller, model, parameters) if steps is None else steps,
     )
@@ -197,11 +163,9 @@ def _judge_states(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> lis
     states = split_friction({name: loops.value.models[name]}, unknown.nominal, varied).values()
     found: list[tuple[bool, float]] = []
     for draw in draws:
-        judged = [
-            _judge(controller, state, place_values(state, unknown.nominal, draw), controller.outer.impedance)
-            for state in states
-        ]
-        found.append((all(rests for rests, _ in judged), min(margin for _, margin in judged)))
+        placed = ((state, place_values(state, unknown.nominal, draw)) for state in states)
+        rests, margins = zip(*(_judge(controller, *pair, controller.outer.impedance) for pair in placed), strict=True)
+        found.append((all(rests), min(margins)))
     return found
 
 

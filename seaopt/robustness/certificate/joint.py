@@ -15,13 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from types import NoneType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, tune
 from seaopt.control.laws.delay import settle_delays
-from seaopt.errors import ControlError, require_number, require_type
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_table, format_values, html_text
 from seaopt.parameters import ParameterSet
@@ -29,10 +29,12 @@ from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import Result, record
 from seaopt.robustness.certificate.certificate import Certificate
-from seaopt.robustness.certificate.certify import CONFIDENCE, certify
+from seaopt.robustness.certificate.certify import certify
+from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
+from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
-from seaopt.robustness.uncertainty.worst import Worst, place_values
+from seaopt.robustness.uncertainty.worst import place_values
 
 MOST_ROUNDS = 6
 TUNING, CERTIFYING = 1.0, 2.0  # of the time of a round
@@ -124,11 +126,11 @@ class JointTuning(Result):
 
 def tune_certified(
     plant: Plant,
-    parameters: Fit | ParameterSet,
+    parameters: Source,
     spec: ControllerSpec,
-    plants: Mapping[str, Plant],
+    plants: Plants,
     *,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
+    ranges: Ranges | None = None,
     robust_to: Pairs | None = None,
     draws: Sequence[Mapping[str, float]] = (),
     others: ParameterSet | None = None,
@@ -192,12 +194,10 @@ def tune_certified(
     """
     require_type(plants, Mapping, "plants", "give a mapping of name to plant", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
-    require_type(rounds, int, "rounds", "give a whole number, 1 or more", ControlError)
-    require_number(confidence, "confidence", ControlError)
-    if rounds < 1:
-        raise ControlError(f"rounds = {rounds} is not a number of rounds; give 1 or more")
+    check_numbers(rounds=rounds, confidence=confidence)
     spec, settled = settle_delays(spec, plant, parameters)
-    values = _merge_values(settled, others or ParameterSet())
+    fitted = settled.parameters if isinstance(settled, Fit) else settled
+    values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share = 1.0 - (1.0 - confidence) / rounds
     done: list[Round] = []
@@ -221,41 +221,23 @@ def tune_certified(
                 progress=certifying,
             )
         added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
-        done.append(
-            Round(
-                number=number,
-                plants=1 + len(witnesses),
-                controller=controller,
-                certificate=certificate,
-                added=(*added,),
-            )
-        )
-        status = _end_of_round(certificate, added, last=number == rounds)
-        if status is not None:
-            progress(f"{status} after {format_count(number, 'round')}", 1.0)
-            return JointTuning(
-                status=status, controller=controller, certificate=certificate, rounds=tuple(done), robust_to=witnesses
-            )
-        witnesses |= added
+        plants_met = 1 + len(witnesses)
+        made: dict[str, Any] = {"controller": controller, "certificate": certificate}
+        done.append(Round(number=number, plants=plants_met, added=(*added,), **made))
+        if certificate is None:
+            status = "infeasible"
+        elif certificate.passed:
+            status = "certified"
+        elif not added:
+            status = "stuck"
+        elif number == rounds:
+            status = "rounds"
+        else:
+            witnesses |= added
+            continue
+        progress(f"{status} after {format_count(number, 'round')}", 1.0)
+        return JointTuning(status=status, rounds=tuple(done), robust_to=witnesses, **made)
     raise AssertionError("the last round has a status")
-
-
-def _end_of_round(
-    certificate: Certificate | None, added: Pairs, *, last: bool
-) -> Literal["certified", "infeasible", "stuck", "rounds"] | None:
-    """Return what a round ends with; None if another follows."""
-    if certificate is None:
-        return "infeasible"
-    if certificate.passed:
-        return "certified"
-    if not added:
-        return "stuck"
-    return "rounds" if last else None
-
-
-def _merge_values(parameters: Fit | ParameterSet, others: ParameterSet) -> ParameterSet:
-    known = parameters.parameters if isinstance(parameters, Fit) else parameters
-    return others.with_parameters(*known.values())
 
 
 def _list_new_witnesses(
@@ -279,7 +261,7 @@ def _list_new_witnesses(
     return {
         f"{name}, round {number}: {format_values(place, missing='nominal')}": (plant, values)
         for name, (plant, values, place) in cases.items()
-        if not any(plant is pair[0] and _agree(values, pair[1], place) for pair in known)
+        if not any(plant is other and _agree(values, at, place) for other, at in known)
     }
 
 
@@ -291,15 +273,11 @@ def _agree(values: ParameterSet, others: ParameterSet, names: Iterable[str]) -> 
     )
 
 
-def _describe_place(worst: Worst) -> str:
-    return format_values(worst.parameters, missing="nominal")
-
-
 def _list_cells(entry: Round) -> tuple[str, str, str, str]:
     """Return a row of the table of rounds."""
     if entry.certificate is None:
         return str(entry.number), str(entry.plants), "–", "limits not met on these plants"
     name, worst = max(entry.certificate.worst.items(), key=lambda pair: pair[1].severity)
     size = "unstable" if worst.severity >= UNSTABLE else f"{worst.severity:.4f}"
-    failures = str(entry.certificate.monte_carlo.failures)
-    return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {_describe_place(worst)}"
+    failures, place = str(entry.certificate.monte_carlo.failures), format_values(worst.parameters, missing="nominal")
+    return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {place}"

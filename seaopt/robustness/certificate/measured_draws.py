@@ -18,12 +18,15 @@ from jaxtyping import Bool, Float
 
 from seaopt.control import Controller
 from seaopt.executors import Shared, map_ordered
+from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
-from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures, join_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures
+from seaopt.robustness.uncertainty.draws import Column, Points, Uncertainty
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, failure_bound
+from seaopt.robustness.uncertainty.rows import join_rows, take_rows
 from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, find_failures, severities
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, find_worst, measure_worst, place_values
 
@@ -38,40 +41,30 @@ Case = TypeVar("Case")
 
 @record(eq=False)
 class Loops:
-    """What is measured at draws: a controller on its plants, what is uncertain of them, and how much work to bound it.
-
-    Parameters
-    ----------
-    controller : Controller
-    models : mapping of name to Plant
-        As they are, with their friction.
-    plants : mapping of name to Plant
-        Without friction that sticks: sliding or stuck.
-    unknown : Uncertainty
-    bounds : Budget or None
-        None for no bounds.
-
-    """
+    """What is measured at draws: a controller on its plants, what is uncertain, and how much work to bound it."""
 
     controller: Controller
-    models: Mapping[str, Plant]
-    plants: Mapping[str, Plant]
+    models: Mapping[str, Plant]  # as they are, with their friction
+    plants: Mapping[str, Plant]  # without friction that sticks: sliding or stuck
     unknown: Uncertainty
-    bounds: Budget | None
+    bounds: Budget | None = None
+
+    def place(self, name: str, draws: Sequence[Draw]) -> list[ParameterSet]:
+        """Return the parameters of the model of a name at draws."""
+        return [place_values(self.models[name], self.unknown.nominal, draw) for draw in draws]
 
 
 @record(eq=False)
 class _Tally:
     """The worst draws of a plant so far by one figure, as coordinates."""
 
-    points: Float[np.ndarray, "n k"]
-    severity: Float[np.ndarray, " n"]
+    points: Points
+    severity: Column
 
-    def add(self, points: Float[np.ndarray, "m k"], severity: Float[np.ndarray, " m"]) -> _Tally:
+    def add(self, points: Points, severity: Column) -> _Tally:
         """Return the worst of these and of new draws."""
-        points, severity = np.vstack([self.points, points]), np.concatenate([self.severity, severity])
-        worst = np.argsort(severity)[::-1][:WORST_KEPT]
-        return _Tally(points=points[worst], severity=severity[worst])
+        both = join_rows([self, _Tally(points=points, severity=severity)])
+        return take_rows(both, np.argsort(both.severity)[::-1][:WORST_KEPT])
 
 
 @dataclass(slots=True, kw_only=True)  # counts up, block by block
@@ -81,6 +74,19 @@ class Failures:
     unstable: int = 0
     over_ms: int = 0
     over_mt: int = 0
+
+    def bound(self, samples: int, seed: int, confidence: float) -> MonteCarlo:
+        """Return what these failures among so many draws say of the probability of failure."""
+        return MonteCarlo(
+            samples=samples,
+            failures=self.count,
+            seed=seed,
+            confidence=confidence,
+            failure_probability_bound=failure_bound(samples, self.count, confidence),
+            unstable=self.unstable,
+            over_ms=self.over_ms,
+            over_mt=self.over_mt,
+        )
 
     def add(self, failed: Bool[np.ndarray, "3 n"]) -> None:
         """Count draws of a block, each failed on some plant as `find_failures` tells."""
@@ -105,7 +111,7 @@ def measure_draws(
     failures = Failures()
     sizes = [min(DRAWS_PER_BLOCK, samples - start) for start in range(0, samples, DRAWS_PER_BLOCK)]
     hooks = iter(divide(progress, *(float(size) for size in sizes)))
-    first: dict[str, Float[np.ndarray, " m"]] = {}
+    first: dict[str, Column] = {}
     for size in sizes:
         points = unknown.draw(size, rng)
         failed = np.zeros((3, size), dtype=bool)
@@ -141,10 +147,10 @@ def _measure_block(
             pieces.append(next(measured))
             share = (number + (k + 1) / len(slices)) / len(names)
             progress(f"{name}, {min(piece.stop, size)} of {size} draws", share)
-        yield name, join_figures(pieces)
+        yield name, join_rows(pieces)
 
 
-def _measure_part(loops: Shared[Loops], part: tuple[str, Mapping[str, Float[np.ndarray, " n"]], int]) -> BatchFigures:
+def _measure_part(loops: Shared[Loops], part: tuple[str, Mapping[str, Column], int]) -> BatchFigures:
     """Return the figures of one plant at some draws."""
     name, values, threads = part
     known = loops.value
@@ -167,7 +173,7 @@ def search_worst(
     return worst, brackets
 
 
-def _search_plant(loops: Shared[Loops], part: tuple[str, Float[np.ndarray, "n k"]]) -> tuple[Worst, Bracket | None]:
+def _search_plant(loops: Shared[Loops], part: tuple[str, Points]) -> tuple[Worst, Bracket | None]:
     """Return the worst case found of one plant, from its worst draws, and the bounds where they are asked for."""
     name, drawn = part
     controller, plant, unknown = loops.value.controller, loops.value.plants[name], loops.value.unknown
@@ -194,22 +200,7 @@ def judge_draws(
     draws: Sequence[Draw],
     executor: Executor | None,
 ) -> Iterator[Case]:
-    """Yield what a judgement makes of every draw on the plant of a name, in order.
-
-    Parameters
-    ----------
-    judge : callable
-        Of these loops, the name and some draws; it returns a case for each.
-    loops : Shared of Loops
-        What the judgement takes.
-    name : str
-        Among the models.
-    draws : sequence of mapping
-        Values by name.
-    executor : Executor or None
-        Where it is made; here, if None.
-
-    """
+    """Yield what a judgement makes of every draw on the plant of a name, in order; it gets some draws at a time."""
     parts = (draws[k : k + DRAWS_PER_PART] for k in range(0, len(draws), DRAWS_PER_PART))
     for cases in map_ordered(partial(judge, loops, name), parts, executor):
         yield from cases

@@ -7,30 +7,26 @@ there is no such law: `constrained` simulates that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from types import NoneType
 from typing import Any
-
-import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, ControllerSpec, ForceMPC, Law, MPCSpec, assess
 from seaopt.control.laws.delay import DELAY_KEYS
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
-from seaopt.errors import ControlError, require_number, require_type
-from seaopt.estimation import Fit
+from seaopt.errors import ControlError, require_type
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
 from seaopt.robustness.certificate.certificate import Certificate
-from seaopt.robustness.certificate.certify import CONFIDENCE, STEPS, certify, find_own_drive
+from seaopt.robustness.certificate.certify import STEPS, certify, find_own_drive
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, run_constrained
-from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
-from seaopt.robustness.uncertainty.draws import combine_uncertainty
+from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
+from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source, combine_uncertainty
 from seaopt.robustness.verification.verification import check_sensors
 
 CONSTRAINED_FAILURES, CONSTRAINED_PROBABILITY = "constrained_failures", "constrained_failure_probability"
@@ -79,10 +75,10 @@ def linear_spec(spec: MPCSpec) -> ControllerSpec:
 
 def certify_mpc(
     mpc: ForceMPC,
-    plants: Mapping[str, Plant],
-    parameters: Fit | ParameterSet,
+    plants: Plants,
+    parameters: Source,
     *,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
+    ranges: Ranges | None = None,
     others: ParameterSet | None = None,
     runs: int = 100,
     seed: int = 1,
@@ -140,13 +136,8 @@ def certify_mpc(
 
     """
     require_type(mpc, ForceMPC, "mpc", "give a ForceMPC", ControlError)
-    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
-        raise ControlError(f"runs = {runs!r} is not a number of runs; give a whole number, 1 or more")
+    check_numbers(runs=runs, bound_tolerance=bound_tolerance, current_step_A=current_step_A)
     require_type(sensors, (Sensors, NoneType), "sensors", "give Sensors", ControlError)
-    for name, value in (("bound_tolerance", bound_tolerance), ("current_step_A", current_step_A)):
-        require_number(value, name, ControlError)
-        if not 0.0 <= value < np.inf:
-            raise ControlError(f"{name} = {value!r} is negative or not finite; give zero or more")
     real = sensors not in (None, Sensors()) or current_step_A > 0.0
     linearly, stepping, simulating = divide(
         progress, LINEAR_RUN, STEPS * real, CONSTRAINED_RUN * runs * max(len(plants), 1)
@@ -171,14 +162,14 @@ def certify_mpc(
         certificate = certificate.with_steps(
             sensors=sensors, current_step_A=current_step_A, seed=seed, executor=executor, progress=stepping
         )
-    models, (_, values), known = certificate.models, mpc.design, others or ParameterSet()
-    known = known.with_parameters(*(values[name] for name in values if name not in known))
+    models, (_, values), others = certificate.models, mpc.design, others or ParameterSet()
+    others = others.with_parameters(*(values[name] for name in values if name not in others))
     drive = find_own_drive(law, parameters)
     constrained = run_constrained(
         mpc,
         law,
         models,
-        combine_uncertainty(parameters, known, dict(ranges or {}), models, drive),
+        combine_uncertainty(parameters, others, dict(ranges or {}), models, drive),
         runs=runs,
         seed=seed,
         confidence=confidence,
@@ -194,11 +185,10 @@ def certify_mpc(
 
 def _require_runs(runs: ConstrainedRuns, max_failure_probability: float | None) -> tuple[Requirement, ...]:
     """Return what the runs with limits active require."""
-    failures = Requirement(
-        name=CONSTRAINED_FAILURES,
-        limit=0.0,
-        value=float(runs.failures),
-        met=runs.met,
+    failures = require_at_most(
+        CONSTRAINED_FAILURES,
+        float(runs.failures),
+        0.0,
         plant=runs.plant,
         scenario="limits active",
         draw=DrawnAt(parameters=runs.parameters, number=runs.run, seed=runs.seed),
@@ -207,12 +197,6 @@ def _require_runs(runs: ConstrainedRuns, max_failure_probability: float | None) 
     )
     if max_failure_probability is None:
         return (failures,)
+    text = f"{format_count(runs.failures, 'failure')} in {format_count(runs.runs, 'run')}"
     bound = runs.failure_probability_bound
-    probability = Requirement(
-        name=CONSTRAINED_PROBABILITY,
-        limit=max_failure_probability,
-        value=bound,
-        met=bound <= max_failure_probability,
-        text=f"{format_count(runs.failures, 'failure')} in {format_count(runs.runs, 'run')}",
-    )
-    return failures, probability
+    return failures, require_at_most(CONSTRAINED_PROBABILITY, bound, max_failure_probability, text=text)

@@ -6,11 +6,13 @@ What is not met is said once: each kind of requirement by its worst case, with a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, field
+from dataclasses import field
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from seaopt.codec import to_content
+from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.formatting import format_count, format_number, format_values
 from seaopt.records import Result, record
 
@@ -31,22 +33,11 @@ class Spot(NamedTuple):
 
 @record
 class DrawnAt:
-    """A set of parameters besides the nominal ones: where it differs, and what a run needs to be played again.
+    """A set of parameters besides the nominal ones: where it differs, and what a run needs to be played again."""
 
-    Parameters
-    ----------
-    parameters : mapping of name to float
-        Empty at the nominal parameters.
-    number : str
-        "nominal", or the number of a draw from 1; "" of what is no run.
-    seed : int or None
-        Of a run's noise and random excitations.
-
-    """
-
-    parameters: Mapping[str, float] = field(default_factory=dict[str, float])
-    number: str = ""
-    seed: int | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict[str, float])  # empty at the nominal ones
+    number: str = ""  # "nominal", or the number of a draw from 1; "" of what is no run
+    seed: int | None = None  # of a run's noise and random excitations
 
 
 @record
@@ -135,10 +126,20 @@ class Requirement(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row of robustness.json."""
-        fields = asdict(self) | {"place": None if self.place is None else dict([self.place])}
-        if self.draw is not None:
-            fields["draw"] = asdict(self.draw) | {"parameters": dict(self.draw.parameters)}
-        return fields | {"where": self.where}
+        place = None if self.place is None else dict([self.place])
+        return to_content(self) | {"place": place, "where": self.where}
+
+
+def require_at_most(name: str, value: float, limit: float, **fields: Any) -> Requirement:
+    """Return a requirement of a value that must not be above its limit; one that lies on it is met."""
+    met = bool(value <= limit + LIMIT_ROUNDING * abs(limit))
+    return Requirement(name=name, value=value, limit=limit, met=met, **fields)
+
+
+def require_at_least(name: str, value: float, limit: float, **fields: Any) -> Requirement:
+    """Return a requirement of a value that must not be below its limit; one that lies on it is met."""
+    met = bool(value >= limit - LIMIT_ROUNDING * abs(limit))
+    return Requirement(name=name, value=value, limit=limit, met=met, sense="≥", **fields)
 
 
 @record(eq=False)
@@ -186,9 +187,7 @@ def usage_of(row: Requirement) -> float | None:
 
     A stable loop's spectral radius is next to 1 however stable it is.
     """
-    if not np.isfinite(row.value):
-        return None if row.met else np.inf
-    if row.name == SPECTRAL_RADIUS or row.sense == "=":
+    if not np.isfinite(row.value) or row.name == SPECTRAL_RADIUS or row.sense == "=":
         return None if row.met else np.inf
     if row.limit == 0.0:
         return 0.0 if row.met else np.inf

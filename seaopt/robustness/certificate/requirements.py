@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.laws.limits import BY_NAME, LIMIT_ROUNDING, MeasuredLoop, PortFigures, Scope
+from seaopt.control.laws.limits import BY_NAME, MeasuredLoop, PortFigures, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import judge
 from seaopt.control.loops.absolute_stability import FrictionMargin
@@ -26,8 +26,7 @@ from seaopt.robustness.certificate.compensation import (
     NEUTRAL,
     RIPPLE_COMPENSATION,
     CompensationDraws,
-    GravityCase,
-    RippleCase,
+    EigenvalueCase,
 )
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
@@ -39,6 +38,8 @@ from seaopt.robustness.certificate.requirement import (
     DrawnAt,
     Requirement,
     Spot,
+    require_at_least,
+    require_at_most,
 )
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.severity import UNSTABLE
@@ -131,11 +132,10 @@ def draw_requirements(
     spot, case = max(worst.items(), key=lambda found: found[1].severity)
     size = f"has Ms {case.witness.ms:.4g}, Mt {case.witness.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
     rows = [
-        Requirement(
-            name="monte_carlo_failures",
-            limit=0.0,
-            value=float(result.failures),
-            met=result.failures == 0,
+        require_at_most(
+            "monte_carlo_failures",
+            float(result.failures),
+            0.0,
             draw=DrawnAt(parameters=case.parameters),
             text=f"the worst case {size}",
             remedy=WITNESS_REMEDY if result.failures else "",
@@ -143,7 +143,7 @@ def draw_requirements(
         )
     ]
     if not result.failures:
-        rows += [row for key, one in worst.items() for row in _require_worst(key, one)]
+        rows += [_require_worst(key, case) for key, case in worst.items() if case.limited or case.severity >= UNSTABLE]
     return rows + bound
 
 
@@ -157,20 +157,17 @@ def friction_requirements(
     if least is None:
         return []
 
-    def require(value: float, **found: Any) -> Requirement:
-        met = bool(value >= least * (1.0 - LIMIT_ROUNDING))
-        return Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=value, met=met, sense="≥", unit=unit, **found)
-
+    require = partial(require_at_least, MIN_FRICTION_MARGIN, limit=least, unit=unit)
     rows: list[Requirement] = []
     for name in dict.fromkeys((*margins, *draws)):
         margin, drawn = margins.get(name), draws.get(name)
         nominal = np.inf if margin is None else margin.least_slope
         if drawn is not None and drawn.least_slope < nominal:
-            rows.append(require(drawn.least_slope, plant=name, draw=DrawnAt(parameters=drawn.parameters)))
+            rows.append(require(value=drawn.least_slope, plant=name, draw=DrawnAt(parameters=drawn.parameters)))
         else:
             text = NO_FRICTION if margin is None else f"{margin.multiplier} at {margin.frequency_hz:.4g} Hz"
-            rows.append(require(nominal, plant=name, text=text))
-    return rows or [require(np.inf, text=NO_FRICTION)]
+            rows.append(require(value=nominal, plant=name, text=text))
+    return rows or [require(value=np.inf, text=NO_FRICTION)]
 
 
 def compensation_requirements(
@@ -190,12 +187,10 @@ def compensation_requirements(
         if friction is not None and value:
             said.append(f"shown up to {value / margin.asked * friction.fraction:.3g} of the friction")
         rows.append(
-            Requirement(
-                name=FRICTION_COMPENSATION,
-                limit=margin.asked,
-                value=value,
-                met=bool(value >= margin.asked * (1.0 - LIMIT_ROUNDING)),
-                sense="≥",
+            require_at_least(
+                FRICTION_COMPENSATION,
+                value,
+                margin.asked,
                 unit=controller.command.mechanics.damping,
                 plant=name,
                 draw=draw,
@@ -208,37 +203,34 @@ def compensation_requirements(
 def eigenvalue_requirements(
     controller: Controller,
     models: Mapping[str, Plant],
-    gravity: Mapping[str, GravityCase],
-    ripple: Mapping[str, RippleCase],
+    gravity: Mapping[str, EigenvalueCase],
+    ripple: Mapping[str, EigenvalueCase],
 ) -> list[Requirement]:
     """Return that neither a weight nor a ripple compensated makes a loop grow, at nominal values and over draws."""
-    limit = 1.0 + NEUTRAL
-
-    def require(name: str, plant: str, case: GravityCase | RippleCase, text: str) -> Requirement:
-        return Requirement(
-            name=name,
-            limit=limit,
-            value=case.radius,
-            met=case.radius <= limit,
+    terms, found = controller.compensation, list[tuple[str, str, EigenvalueCase, str]]()
+    if terms is not None and terms.gravity is not None:
+        compensated = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
+        for name, case in gravity.items():
+            port = models[name].port
+            unit = "" if port is None else models[name].states[str(port.coordinate)]
+            found.append((GRAVITY_COMPENSATION, name, case, f"{compensated}, at {case.at:.3g} {unit}".rstrip()))
+    if terms is not None and terms.ripple is not None:
+        unit = f"{controller.command.effort_unit}/{terms.ripple.unit}"
+        found += [
+            (RIPPLE_COMPENSATION, name, case, f"over the slopes, at {case.at:.3g} {unit}")
+            for name, case in ripple.items()
+        ]
+    return [
+        require_at_most(
+            requirement,
+            case.radius,
+            1.0 + NEUTRAL,
             plant=plant,
             draw=DrawnAt(parameters=case.parameters),
             text=f"the largest eigenvalue, {text}",
         )
-
-    def list_rows() -> Iterator[Requirement]:
-        terms = controller.compensation
-        if terms is not None and terms.gravity is not None:
-            looked = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
-            for name, case in gravity.items():
-                port = models[name].port
-                unit = "" if port is None else models[name].states[str(port.coordinate)]
-                yield require(GRAVITY_COMPENSATION, name, case, f"{looked}, at {case.angle:.3g} {unit}".rstrip())
-        if terms is not None and terms.ripple is not None:
-            unit = f"{controller.command.effort_unit}/{terms.ripple.unit}"
-            for name, case in ripple.items():
-                yield require(RIPPLE_COMPENSATION, name, case, f"over the slopes, at {case.slope:.3g} {unit}")
-
-    return list(list_rows())
+        for requirement, plant, case, text in found
+    ]
 
 
 def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
@@ -277,24 +269,21 @@ def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Require
         ]
     drawn = impedance.draws
     if drawn is not None:
-        failed = drawn.samples - min(drawn.stable, drawn.passive)
         rows.append(
-            Requirement(
-                name="impedance_draws",
-                limit=0.0,
-                value=float(failed),
-                met=not failed,
+            require_at_most(
+                "impedance_draws",
+                float(drawn.samples - min(drawn.stable, drawn.passive)),
+                0.0,
                 plant=plant,
                 draw=DrawnAt(parameters=drawn.parameters),
                 text=f"stable in {drawn.stable} of {drawn.samples} draws and passive in {drawn.passive}",
             )
         )
     return rows + [
-        Requirement(
-            name="impedance_rest",
-            limit=AT_REST,
-            value=step.moving,
-            met=step.rests,
+        require_at_most(
+            "impedance_rest",
+            step.moving,
+            AT_REST,
             plant=plant,
             scenario=f"step of x_0 by {step.size:.3g} {unit}",
             text=step.describe(unit),
@@ -314,24 +303,18 @@ def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]
         text, remedy = "nothing is uncertain, so that nothing was drawn", "give a fit, prior_std or ranges"
     elif value > limit:
         remedy = f"{fewest} draws without a failure would do"
-    met = bool(value <= limit)
-    return [Requirement(name="max_failure_probability", limit=limit, value=value, met=met, text=text, remedy=remedy)]
+    return [require_at_most("max_failure_probability", value, limit, text=text, remedy=remedy)]
 
 
-def _require_worst(spot: Spot, case: Worst) -> list[Requirement]:
+def _require_worst(spot: Spot, case: Worst) -> Requirement:
     """Return how much of the limits the worst case uses: 1 is all of it."""
-    if not case.limited and case.severity < UNSTABLE:
-        return []
-    met = case.severity <= 1.0 + LIMIT_ROUNDING
-    return [
-        Requirement(
-            name="worst_case",
-            limit=1.0,
-            value=case.severity if case.severity < UNSTABLE else np.inf,
-            met=met,
-            draw=DrawnAt(parameters=case.parameters),
-            text="" if case.severity < UNSTABLE else UNSTABLE_LOOP,
-            remedy="" if met else WITNESS_REMEDY,
-            **spot._asdict(),
-        )
-    ]
+    unstable = case.severity >= UNSTABLE
+    row = require_at_most(
+        "worst_case",
+        np.inf if unstable else case.severity,
+        1.0,
+        draw=DrawnAt(parameters=case.parameters),
+        text=UNSTABLE_LOOP if unstable else "",
+        **spot._asdict(),
+    )
+    return row if row.met else replace(row, remedy=WITNESS_REMEDY)

@@ -25,29 +25,35 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
-from seaopt.control import Controller, LoopFigures, ScheduledController
+from seaopt.control import LoopFigures, ScheduledController
 from seaopt.control.laws.delay import split_delayed
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
-from seaopt.errors import ControlError, require_number, require_seed, require_type
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor, map_ordered
 from seaopt.formatting import format_count, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import name_states, split_friction
+from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import Result, Worded, record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
 from seaopt.robustness.certificate.certificate import Certificate
-from seaopt.robustness.certificate.certify import CONFIDENCE, add_design, certify, failure_bound, find_own_drive
+from seaopt.robustness.certificate.certify import add_design, certify, find_own_drive, name_spots, split_states
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.measured_draws import Failures, Loops
-from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, Requirement, Spot
+from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
+from seaopt.robustness.certificate.requirement import (
+    MIN_FRICTION_MARGIN,
+    Requirement,
+    Spot,
+    require_at_least,
+    require_at_most,
+)
 from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
@@ -55,11 +61,19 @@ from seaopt.robustness.certificate.requirements import (
     plant_requirements,
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty, find_modes
+from seaopt.robustness.uncertainty.draws import (
+    Plants,
+    Points,
+    Ranges,
+    Source,
+    Uncertainty,
+    combine_uncertainty,
+    find_modes,
+)
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.severity import find_failures
 from seaopt.robustness.uncertainty.worst import Worst, find_worst
-from seaopt.robustness.verification.schedule_motion import Motion, describe_motion, move_plants
+from seaopt.robustness.verification.schedule_motion import Motion, describe_motion, move_schedule
 from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps, find_fastest, sweep_schedule
 from seaopt.units import unit_after
 
@@ -107,19 +121,42 @@ class PlaceCertificate(Result):
         """Whether every requirement there is met."""
         return all(row.met for row in self.requirements)
 
-    def on(self, plants: Mapping[str, Plant]) -> PlaceCertificate:
+    def on(self, plants: Plants) -> PlaceCertificate:
         """Return the same of plants that equal its own (`Worst.on`)."""
         return replace(self, worst={name: case.on(plants[name]) for name, case in self.worst.items()})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what schedule_robustness.json has of it."""
+        figures = ("stable", "bandwidth_hz", "ms", "mt", "disk_margin")
+        return {
+            "met": self.met,
+            "value": self.value,
+            "point": self.point,
+            "plants": {name: {key: getattr(loop, key) for key in figures} for name, loop in self.plants.items()},
+            "worst": {
+                name: {
+                    "parameters": case.parameters,
+                    "ms": case.ms,
+                    "mt": case.mt,
+                    "largest": dict(
+                        zip(("ms", "mt"), ({"parameters": at.parameters} for at in case.largest), strict=True)
+                    ),
+                }
+                for name, case in self.worst.items()
+            },
+            **{name: getattr(self, name) for name in ("draws", "unstable", "over_ms", "over_mt")},
+            "simulated": None if self.simulated is None else self.simulated.to_dict(),
+        }
 
     @property
     def ms(self) -> float:
         """The largest Ms of its plants at the nominal parameters."""
-        return max(one.ms for one in self.plants.values())
+        return max(loop.ms for loop in self.plants.values())
 
     @property
     def worst_ms(self) -> float | None:
         """The largest Ms of the worst cases that were searched for; None between the points."""
-        return max((one.ms for one in self.worst.values()), default=None)
+        return max((case.ms for case in self.worst.values()), default=None)
 
 
 @record(eq=False, repr=False)
@@ -166,35 +203,30 @@ class ScheduleCertificate(Result, Worded):
     @property
     def rate_unit(self) -> str:
         """Unit of `fastest`."""
-        return f"{unit_after(self.schedule.unit).strip()}/s"
+        return _rate_unit(self.schedule)
 
     @property
     def assumption(self) -> str:
         """What is assumed of the variable's motion, with the number that the simulations give it."""
-        over, rate = self.schedule.over, f"{self.fastest:.3g} {self.rate_unit}"
-        if not self.sweeps:
-            return (
-                f"{over} is assumed to move slowly: the limits hold with it standing still, and no sweep was simulated"
-            )
-        if not self.fastest:
+        over = self.schedule.over
+        if self.sweeps and not self.fastest:
             return f"{over} is assumed to stand still: the slowest sweep that was simulated does not keep its judgement"
-        return (
-            f"{over} is assumed to move slowly: the limits hold with it standing still, and sweeps of up to {rate} "
-            "keep the judgement of a step in simulation"
-        )
+        swept = f"sweeps of up to {self.fastest:.3g} {self.rate_unit} keep the judgement of a step in simulation"
+        found = swept if self.sweeps else "no sweep was simulated"
+        return f"{over} is assumed to move slowly: the limits hold with it standing still, and {found}"
 
     @property
     def proof(self) -> str:
         """What is proved between the points, and what is not."""
         over, first, last = self.schedule.over, self.schedule.points[0], self.schedule.points[-1]
-        missing = [one for one in self.stretches if not one.shown]
-        shown = [one.ms for one in self.stretches if one.shown]
+        missing = [stretch for stretch in self.stretches if not stretch.shown]
         if not missing:
+            largest = np.ceil(1e3 * max(stretch.ms for stretch in self.stretches)) / 1e3
             return (
                 f"for every {over} from {first:g} to {last:g}, standing still, at the nominal parameters: stable, Ms "
-                f"below {_round_up(max(shown))}, proved"
+                f"below {largest:.3f}, proved"
             )
-        spans = [f"{over} = {one.low:.4g} to {one.high:.4g} on {one.plant}" for one in missing[:3]]
+        spans = [f"{over} = {stretch.low:.4g} to {stretch.high:.4g} on {stretch.plant}" for stretch in missing[:3]]
         more = [f"{len(missing) - 3} more"] if len(missing) > 3 else []
         where = join_words([*spans, *more])
         return f"nothing is proved between the values that were looked at for {where}: {missing[0].reason}"
@@ -216,34 +248,7 @@ class ScheduleCertificate(Result, Worded):
             "over": self.schedule.over,
             "unit": self.schedule.unit,
             "requirements": [row.to_dict() for row in self.requirements],
-            "places": [
-                {
-                    "met": place.met,
-                    "value": place.value,
-                    "point": place.point,
-                    "plants": {
-                        name: {key: getattr(one, key) for key in ("stable", "bandwidth_hz", "ms", "mt", "disk_margin")}
-                        for name, one in place.plants.items()
-                    },
-                    "worst": {
-                        name: {
-                            "parameters": one.parameters,
-                            "ms": one.ms,
-                            "mt": one.mt,
-                            "largest": {
-                                figure: at.parameters for figure, at in zip(("ms", "mt"), one.largest, strict=True)
-                            },
-                        }
-                        for name, one in place.worst.items()
-                    },
-                    "draws": place.draws,
-                    "unstable": place.unstable,
-                    "over_ms": place.over_ms,
-                    "over_mt": place.over_mt,
-                    "simulated": None if place.simulated is None else place.simulated.to_dict(),
-                }
-                for place in self.places
-            ],
+            "places": [place.to_dict() for place in self.places],
             "monte_carlo": to_content(self.monte_carlo),
             "stretches": to_content(self.stretches),
             "sweeps": to_content(self.sweeps),
@@ -260,10 +265,10 @@ class ScheduleCertificate(Result, Worded):
         cls,
         content: Mapping[str, Any],
         schedule: ScheduledController,
-        plants: Mapping[str, Plant],
-        parameters: Fit | ParameterSet,
+        plants: Plants,
+        parameters: Source,
         *,
-        ranges: Mapping[str, tuple[float, float]] | None = None,
+        ranges: Ranges | None = None,
         others: ParameterSet | None = None,
     ) -> ScheduleCertificate:
         """Return the certificate of a schedule_robustness.json; nothing is simulated.
@@ -284,10 +289,10 @@ class ScheduleCertificate(Result, Worded):
 
 def certify_schedule(
     schedule: ScheduledController,
-    plants: Mapping[str, Plant],
-    parameters: Fit | ParameterSet,
+    plants: Plants,
+    parameters: Source,
     *,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
+    ranges: Ranges | None = None,
     others: ParameterSet | None = None,
     samples: int = 1375,
     seed: int = 1,
@@ -343,31 +348,44 @@ def certify_schedule(
     require_type(schedule, ScheduledController, "schedule", "give a ScheduledController", ControlError)
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     check_executor(executor, ControlError)
-    if min_rate is not None and not require_number(min_rate, "min_rate", ControlError) > 0.0:
-        raise ControlError(f"min_rate = {min_rate:g} is not positive; give a rate in {schedule.unit}/s")
-    ranges, others = dict(ranges or {}), others or ParameterSet()
-    _check_variable(schedule, parameters, ranges)
-    given = find_standing(schedule, plants, parameters, ranges, others)
-    models, values, unknowns, sources = given.models, given.values, given.unknowns, given.sources
-    standing, proving, sweeping = divide(
+    check_numbers(
+        samples=samples,
+        seed=seed,
+        confidence=confidence,
+        max_failure_probability=max_failure_probability,
+        min_rate=min_rate,
+    )
+    ranges, over = dict(ranges or {}), schedule.over
+    if over in ranges:
+        raise ControlError(f"range of {over}: the schedule is over it, and its points are its range; take it out")
+    if isinstance(parameters, Fit) and over in parameters.covariance.names:
+        raise ControlError(
+            f"{over} is estimated by the fit, and the schedule is over it; fix it in the experiments that are fitted"
+        )
+    standing = find_standing(schedule, plants, parameters, ranges, others or ParameterSet())
+    models, values, unknowns = standing.models, standing.values, standing.unknowns
+    holding, proving, sweeping = divide(
         progress, POINT * len(schedule.points), BOUND * len(values) * len(models), SWEEP * len(models) * simulations
     )
     count = -(-samples // len(values))
-    rng = np.random.default_rng([require_seed(seed, ControlError), *_digest(schedule)])
+    rng = np.random.default_rng([seed, *_digest(schedule)])
     drawn = [unknown.draw(count if unknown.size else 0, rng) for unknown in unknowns]
     shared, nominal = Shared((schedule, models)), unknowns[-1].nominal
     parts = zip(values, unknowns, drawn, rng.spawn(len(values)), strict=True)
-    standing_at = map_ordered(partial(_certify_place, shared), parts, executor)
+    certified = map_ordered(partial(_certify_place, shared), parts, executor)
     places: list[PlaceCertificate] = []
-    for number, value in enumerate(count_off(values, f"value of {schedule.over}", standing)):
-        place, (source, rest) = next(standing_at).on(split_states(models, unknowns[number])), sources[number]
+    worst: dict[Spot, Worst] = {}
+    for number, value in enumerate(count_off(values, f"value of {over}", holding)):
+        place, spots = next(certified).on(split_states(models, unknowns[number])), name_spots(models, unknowns[number])
+        worst |= {spots[name]._replace(place=(over, value)): case for name, case in place.worst.items()}
         if held := list_held(schedule, models, value):
+            source, other = standing.sources[number]
             simulated = certify(
                 schedule.at(value),
                 held,
                 source,
                 ranges=_choose_ranges(ranges, held),
-                others=rest,
+                others=other,
                 samples=count,
                 seed=seed,
                 simulations=simulations,
@@ -375,47 +393,45 @@ def certify_schedule(
                 current_step_A=current_step_A if simulations else 0.0,
                 executor=executor,
             )
-            place = _add_simulations(schedule, place, simulated)
+            known = {(row.name, row.plant, row.state) for row in place.requirements}
+            rows = _place(schedule, value, simulated.requirements)
+            new = (row for row in rows if (row.name, row.plant, row.state) not in known)
+            place = replace(place, simulated=simulated, requirements=(*place.requirements, *new))
         places.append(place)
     pairs = list(pairwise(values))
     bounds = map_ordered(partial(_bound_plants, shared, nominal), pairs, executor)
     stretches = [bound for _ in count_off(pairs, "stretch", proving) for bound in next(bounds)]
     sweeps: dict[str, tuple[Sweep, ...]] = {}
     for name in count_off(list(models), "sweeps, plant", sweeping) if simulations else ():
-        found = sweep_schedule(schedule, name, models[name], nominal, executor=executor)
-        sweeps |= {name: found} if found else {}
-    draws = _count_draws(places, seed, confidence)
-    spots = {
-        value: {
-            label: spot._replace(place=(schedule.over, value)) for label, spot in _name_spots(models, unknown).items()
-        }
-        for value, unknown in zip(values, unknowns, strict=True)
-    }
-    certificate = ScheduleCertificate(
+        of_plant = sweep_schedule(schedule, name, models[name], nominal, executor=executor)
+        sweeps |= {name: of_plant} if of_plant else {}
+    motions: dict[str, Motion] = {}
+    if sweeps:
+        fastest = min(find_fastest(of_plant) for of_plant in sweeps.values())
+        slowest = min(of_plant[0].rate for of_plant in sweeps.values())
+        rate = min_rate or fastest or slowest
+        moved = (move_schedule(schedule, name, plant, nominal, rate) for name, plant in models.items())
+        motions = {motion.plant: motion for motion in moved if motion is not None}
+    failures = Failures(
+        unstable=sum(place.unstable for place in places),
+        over_ms=sum(place.over_ms for place in places),
+        over_mt=sum(place.over_mt for place in places),
+    )
+    draws, unit = failures.bound(sum(place.draws for place in places), seed, confidence), _rate_unit(schedule)
+    progress(f"{format_count(len(places), 'value')} of {over}", 1.0)
+    return ScheduleCertificate(
         schedule=schedule,
         places=tuple(places),
         monte_carlo=draws,
         stretches=tuple(stretches),
         sweeps=sweeps,
-        motions={},
+        motions=motions,
         requirements=(
             *(row for place in places for row in place.requirements),
             *_require_limits_between(schedule),
-            *_require_draws(places, spots, draws, max_failure_probability),
-        ),
-    )
-    progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
-    if not sweeps:
-        return certificate
-    slowest = min(found[0].rate for found in sweeps.values())
-    motions = move_plants(schedule, models, nominal, min_rate or certificate.fastest or slowest)
-    return replace(
-        certificate,
-        motions=motions,
-        requirements=(
-            *certificate.requirements,
-            *_require_rate(certificate, min_rate),
-            *(_require_motion(motion, schedule.over, certificate.rate_unit, min_rate) for motion in motions.values()),
+            *draw_requirements(draws, worst, max_failure_probability),
+            *(_require_rate(of_plant, unit, min_rate) for of_plant in sweeps.values()),
+            *(_require_motion(motion, over, unit, min_rate) for motion in motions.values()),
         ),
     )
 
@@ -426,79 +442,56 @@ class Standing:
 
     models: dict[str, Plant]
     values: tuple[float, ...]
-    sources: tuple[tuple[Fit | ParameterSet, ParameterSet], ...]  # and others
+    sources: tuple[tuple[Source, ParameterSet], ...]  # and others
     unknowns: tuple[Uncertainty, ...]
 
 
 def find_standing(
     schedule: ScheduledController,
-    plants: Mapping[str, Plant],
-    parameters: Fit | ParameterSet,
-    ranges: Mapping[str, tuple[float, float]],
+    plants: Plants,
+    parameters: Source,
+    ranges: Ranges,
     others: ParameterSet,
 ) -> Standing:
     """Return what a schedule is certified at: its points and the values between them, with the design plant."""
-    models = add_design(schedule.design[0], plants)
-    models = split_delayed(schedule.spec, schedule.design[0], models, parameters)
+    design, _ = schedule.design
+    models = split_delayed(schedule.spec, design, add_design(design, plants), parameters)
     values = tuple(sorted({*schedule.points, *list_inner(schedule.points, PARTS)}))
     sources = tuple(_place_source(schedule, parameters, others, value) for value in values)
     drive = find_own_drive(schedule.controllers[0], parameters)
-    unknowns = tuple(combine_uncertainty(source, rest, ranges, models, drive) for source, rest in sources)
+    unknowns = tuple(combine_uncertainty(*source, ranges, models, drive) for source in sources)
     return Standing(models=models, values=values, sources=sources, unknowns=unknowns)
 
 
-def _check_variable(
-    schedule: ScheduledController, parameters: Fit | ParameterSet, ranges: Mapping[str, tuple[float, float]]
-) -> None:
-    over = schedule.over
-    if over in ranges:
-        raise ControlError(f"range of {over}: the schedule is over it, and its points are its range; take it out")
-    if isinstance(parameters, Fit) and over in parameters.covariance.names:
-        raise ControlError(
-            f"{over} is estimated by the fit, and the schedule is over it; fix it in the experiments that are fitted"
-        )
-
-
 def _place_source(
-    schedule: ScheduledController, parameters: Fit | ParameterSet, others: ParameterSet, value: float
-) -> tuple[Fit | ParameterSet, ParameterSet]:
+    schedule: ScheduledController, parameters: Source, others: ParameterSet, value: float
+) -> tuple[Source, ParameterSet]:
     """Return what is known of the parameters, and the others, with the variable at a value."""
-    here = Parameter(name=schedule.over, value=value, unit=schedule.unit)
+    variable = Parameter(name=schedule.over, value=value, unit=schedule.unit)
     if isinstance(parameters, ParameterSet):
-        return parameters.with_parameters(here), others
+        return parameters.with_parameters(variable), others
     if schedule.over in parameters.parameters:
-        return replace(parameters, parameters=parameters.parameters.with_parameters(here)), others
-    return parameters, others.with_parameters(here)
-
-
-_Scheduled = tuple[ScheduledController, dict[str, Plant]]
-
-
-def split_states(models: Mapping[str, Plant], unknown: Uncertainty) -> dict[str, Plant]:
-    """Return the plants whose loops are measured: one with friction is there sliding and stuck."""
-    return split_friction(models, unknown.nominal, [row.name for row in unknown.varied()])
-
-
-def _name_spots(models: Mapping[str, Plant], unknown: Uncertainty) -> dict[str, Spot]:
-    """Return plant and state behind each name of `split_states`."""
-    states = name_states(models, unknown.nominal, [row.name for row in unknown.varied()])
-    return {label: Spot(*state) for label, state in states.items()}
+        return replace(parameters, parameters=parameters.parameters.with_parameters(variable)), others
+    return parameters, others.with_parameters(variable)
 
 
 def _certify_place(
-    shared: Shared[_Scheduled], part: tuple[float, Uncertainty, Float[np.ndarray, "n k"], np.random.Generator]
+    shared: Shared[tuple[ScheduledController, dict[str, Plant]]],
+    part: tuple[float, Uncertainty, Points, np.random.Generator],
 ) -> PlaceCertificate:
     """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case."""
     (schedule, models), (value, unknown, points, rng) = shared.value, part
     controller, point, plants = schedule.at(value), value in schedule.points, split_states(models, unknown)
     figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
-    failures = _count_failures(controller, plants, unknown, points)
-    spots = _name_spots(models, unknown)
+    failed, drawn, failures = np.zeros((3, len(points)), dtype=bool), unknown.values(points), Failures()
+    for plant in plants.values() if len(points) else ():
+        failed |= find_failures(controller, batch_figures(controller, plant, unknown.nominal, drawn))
+    failures.add(failed)
+    spots = name_spots(models, unknown)
     rows = [row for name, spot in spots.items() for row in plant_requirements(controller, spot, figures[name])]
     rows += _require_friction(schedule, models, value, unknown, len(points), rng)
     if point:
-        design, _ = schedule.design
-        rows += design_requirements(controller, design, unknown.nominal)
+        rows += design_requirements(controller, schedule.design[0], unknown.nominal)
     return PlaceCertificate(
         value=value,
         point=point,
@@ -512,7 +505,7 @@ def _certify_place(
     )
 
 
-def list_held(schedule: ScheduledController, models: Mapping[str, Plant], value: float) -> dict[str, Plant]:
+def list_held(schedule: ScheduledController, models: Plants, value: float) -> dict[str, Plant]:
     """Return the plants that `certify` takes: at a point those that hold the variable, if the design plant does.
 
     Where a plant moves the variable, a law that is frozen there is not what runs.
@@ -524,7 +517,7 @@ def list_held(schedule: ScheduledController, models: Mapping[str, Plant], value:
 
 def _require_friction(
     schedule: ScheduledController,
-    models: Mapping[str, Plant],
+    models: Plants,
     value: float,
     unknown: Uncertainty,
     samples: int,
@@ -537,30 +530,20 @@ def _require_friction(
     if least is None or not apart:
         return []
     margins = find_nominal_margins(controller, apart, unknown.nominal)
-    loops = Loops(controller=controller, models=apart, plants=apart, unknown=unknown, bounds=None)
+    loops = Loops(controller=controller, models=apart, plants=apart, unknown=unknown)
     draws = find_margins_at_draws(Shared(loops), margins, samples, rng, least)
     return friction_requirements(margins, draws, least, controller.command.mechanics.damping)
 
 
-def _count_failures(
-    controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, points: Float[np.ndarray, "n k"]
-) -> Failures:
-    """Count the draws that fail on some plant, as `certify` does."""
-    failed, drawn = np.zeros((3, len(points)), dtype=bool), unknown.values(points)
-    for plant in plants.values() if len(points) else ():
-        failed |= find_failures(controller, batch_figures(controller, plant, unknown.nominal, drawn))
-    failures = Failures()
-    failures.add(failed)
-    return failures
+def _rate_unit(schedule: ScheduledController) -> str:
+    return f"{unit_after(schedule.unit).strip()}/s"
 
 
 def _place(schedule: ScheduledController, value: float, rows: Sequence[Requirement]) -> tuple[Requirement, ...]:
     return tuple(replace(row, place=(schedule.over, value)) for row in rows)
 
 
-def _choose_ranges(
-    ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant]
-) -> dict[str, tuple[float, float]]:
+def _choose_ranges(ranges: Ranges, plants: Plants) -> dict[str, tuple[float, float]]:
     """Return the ranges of what some of these plants have."""
     known = {*conditions(tuple(plants.values())), *find_modes(plants)}.union(
         *(one.parameters for one in plants.values())
@@ -568,18 +551,8 @@ def _choose_ranges(
     return {name: ends for name, ends in ranges.items() if name in known}
 
 
-def _add_simulations(
-    schedule: ScheduledController, place: PlaceCertificate, certificate: Certificate
-) -> PlaceCertificate:
-    """Return a point with the certificate of the plants that hold the variable there."""
-    known = {(row.name, row.plant, row.state) for row in place.requirements}
-    rows = _place(schedule, place.value, certificate.requirements)
-    new = tuple(row for row in rows if (row.name, row.plant, row.state) not in known)
-    return replace(place, simulated=certificate, requirements=(*place.requirements, *new))
-
-
 def _bound_plants(
-    shared: Shared[_Scheduled], nominal: ParameterSet, stretch: tuple[float, float]
+    shared: Shared[tuple[ScheduledController, dict[str, Plant]]], nominal: ParameterSet, stretch: tuple[float, float]
 ) -> list[StretchBound]:
     """Return what is proved of every plant on the stretch between two neighbouring values."""
     (schedule, models), (low, high) = shared.value, stretch
@@ -591,42 +564,13 @@ def _bound_plants(
     return out
 
 
-def _count_draws(places: Sequence[PlaceCertificate], seed: int, confidence: float) -> MonteCarlo:
-    unstable, over_ms, over_mt, samples = (
-        sum(getattr(place, name) for place in places) for name in ("unstable", "over_ms", "over_mt", "draws")
-    )
-    failures = unstable + over_ms + over_mt
-    return MonteCarlo(
-        samples=samples,
-        failures=failures,
-        seed=seed,
-        confidence=confidence,
-        unstable=unstable,
-        over_ms=over_ms,
-        over_mt=over_mt,
-        failure_probability_bound=failure_bound(samples, failures, confidence),
-    )
-
-
-def _require_draws(
-    places: Sequence[PlaceCertificate],
-    spots: Mapping[float, Mapping[str, Spot]],
-    draws: MonteCarlo,
-    max_failure_probability: float | None,
-) -> list[Requirement]:
-    """Return what the draws require, the worst case found at a point beside them."""
-    worst = {spots[place.value][name]: case for place in places for name, case in place.worst.items()}
-    return draw_requirements(draws, worst, max_failure_probability)
-
-
 def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
     """Return that the design plant's limits hold between the points, 0.9 of the bandwidth asked among them."""
     return [
-        Requirement(
-            name="limits_between_points",
-            limit=0.0,
-            value=float(len(place.broken)),
-            met=not place.broken,
+        require_at_most(
+            "limits_between_points",
+            float(len(place.broken)),
+            0.0,
             place=(schedule.over, place.value),
             text=", ".join(place.broken),
             remedy=schedule.remedy if place.broken else "",
@@ -635,27 +579,18 @@ def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
     ]
 
 
-def _require_rate(certificate: ScheduleCertificate, least: float | None) -> list[Requirement]:
-    """Return that sweeps keep their judgement: the slowest at all, and as fast as asked."""
-    rows: list[Requirement] = []
-    for sweeps in certificate.sweeps.values():
-        fastest, faults = find_fastest(sweeps), [sweep.fault for sweep in sweeps if sweep.fault]
-        asked = sweeps[0].rate if least is None else least
-        text = faults[0] if faults else f"the fastest tried is {sweeps[-1].rate:.3g} {certificate.rate_unit}"
-        rows.append(
-            Requirement(
-                name="min_schedule_rate",
-                limit=asked,
-                value=fastest,
-                met=fastest >= asked,
-                sense="≥",
-                unit=certificate.rate_unit,
-                plant=sweeps[0].plant,
-                scenario="sweep",
-                text=text,
-            )
-        )
-    return rows
+def _require_rate(sweeps: Sequence[Sweep], unit: str, least: float | None) -> Requirement:
+    """Return that a plant's sweeps keep their judgement: the slowest at all, and as fast as asked."""
+    faults = [sweep.fault for sweep in sweeps if sweep.fault]
+    return require_at_least(
+        "min_schedule_rate",
+        find_fastest(sweeps),
+        sweeps[0].rate if least is None else least,
+        unit=unit,
+        plant=sweeps[0].plant,
+        scenario="sweep",
+        text=faults[0] if faults else f"the fastest tried is {sweeps[-1].rate:.3g} {unit}",
+    )
 
 
 def _require_motion(motion: Motion, over: str, unit: str, least: float | None) -> Requirement:
@@ -663,27 +598,20 @@ def _require_motion(motion: Motion, over: str, unit: str, least: float | None) -
 
     What keeps its judgement at less than was asked is not met: nothing is known of the rate that was.
     """
-    asked = motion.rate if least is None else least
-    short = not motion.fault and motion.rate < asked
-    return Requirement(
-        name=MOTION_RATE,
-        limit=asked,
-        value=0.0 if motion.fault else motion.rate,
-        met=not motion.fault and not short,
-        sense="≥",
+    row = require_at_least(
+        MOTION_RATE,
+        0.0 if motion.fault else motion.rate,
+        motion.rate if least is None else least,
         unit=unit,
         plant=motion.plant,
         text=describe_motion(motion, over, unit),
-        remedy="ask a smaller min_rate, or give the command a higher limit" if short else "",
     )
+    if motion.fault or row.met:
+        return replace(row, met=not motion.fault)
+    return replace(row, remedy="ask a smaller min_rate, or give the command a higher limit")
 
 
 def _digest(schedule: ScheduledController) -> tuple[int, ...]:
     """Return numbers of the law's own, so that another law meets other draws at the same seed."""
     text = " ".join(f"{value:.6g}" for row in schedule.table.gains.values() for value in row)
     return tuple(int(word) for word in np.frombuffer(sha256(text.encode()).digest()[:16], dtype=np.uint32))
-
-
-def _round_up(value: float) -> str:
-    """Return a number with three decimals, rounded up."""
-    return f"{np.ceil(1e3 * value) / 1e3:.3f}"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
 from seaopt.bench import Sensors
+from seaopt.codec import to_content
 from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
@@ -21,11 +22,10 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
 from seaopt.progress import Progress, divide, ignore
 from seaopt.records import Result, record
-from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
-from seaopt.robustness.verification.scenarios import step_scenarios
 from seaopt.robustness.verification.verification import (
     Verification,
     check_plants,
@@ -79,16 +79,9 @@ class Simulated(Result):
     def simulation_dict(self) -> dict[str, Any]:
         """Return what goes into robustness.json under "simulation"."""
         played = {} if self.verification is None else self.verification.to_dict()
+        others = ("large_signal", "sensors", "current_step_A", "seed", "left_out")
         return (
-            {"met": self.met, "passed": self.met}
-            | played
-            | {
-                "large_signal": [sweep.to_dict() for sweep in self.large_signal],
-                "sensors": asdict(self.sensors),
-                "current_step_A": self.current_step_A,
-                "seed": self.seed,
-                "left_out": dict(self.left_out),
-            }
+            {"met": self.met, "passed": self.met} | played | {name: to_content(getattr(self, name)) for name in others}
         )
 
     def passivity_dict(self) -> dict[str, Any] | None:
@@ -98,7 +91,7 @@ class Simulated(Result):
         return self.passivity.to_dict() | {"environments": self.environments.to_dict()}
 
     def lines(self) -> list[str]:
-        """Return the findings in short, one line each; failed scenarios are not among them."""
+        """Return the findings in short, one line each; what failed or is left out is not among them."""
         out: list[str] = []
         if self.verification is not None:
             failed, count = len(self.verification.failures), len(self.verification.rows)
@@ -109,7 +102,7 @@ class Simulated(Result):
             out.append(f"port at link 2: passive {_format_bands(self.passivity)}")
         if self.environments is not None:
             out.append(f"environments at link 2: {_format_environments(self.environments)}")
-        return [*out, *(f"no {what}: {reason}" for what, reason in self.left_out.items())]
+        return out
 
     def __repr__(self) -> str:
         parts = (self.verification, *self.large_signal, self.passivity, self.environments)
@@ -162,39 +155,24 @@ def run_simulations(
         )
     check_plants(plants, draws or {}, {})
     check_sensors(sensors, controller, plants)
-    device = sensors or Sensors()
-    swept = _list_sweeps(controller, plants, parameters)
-    jobs: dict[str, Callable[[], Any]] = {what: partial(_sweep, controller, name, *on) for name, on, what in swept}
-    jobs |= _list_port_jobs(controller)
-    sweeping, playing = divide(progress, SWEEP * len(swept) + PORT, SCENARIOS * len(plants))
+    devices: dict[str, Any] = {"sensors": sensors or Sensors(), "current_step_A": current_step_A, "seed": seed}
+    sweeps = _list_sweeps(controller, plants, parameters)
+    jobs = sweeps | _list_port_jobs(controller)
+    sweeping, playing = divide(progress, SWEEP * len(sweeps) + PORT, SCENARIOS * len(plants))
     attempts = map_ordered(partial(_attempt_job, Shared(tuple(jobs.values()))), range(len(jobs)), executor)
     done: dict[str, tuple[Any, str]] = {}
     for number, what in enumerate(jobs):
         sweeping(what, number / len(jobs))
         done[what] = next(attempts)
-    done["simulation"] = verification, _ = _attempt(
-        lambda: verify(
-            controller,
-            plants,
-            parameters,
-            draws=draws,
-            sensors=device,
-            current_step_A=current_step_A,
-            seed=seed,
-            known=steps,
-            executor=executor,
-            progress=playing,
-        )
-    )
+    play = partial(verify, controller, plants, parameters, draws=draws, known=steps, executor=executor, **devices)
+    done["simulation"] = _attempt(partial(play, progress=playing))
     return Simulated(
-        verification=verification,
-        large_signal=tuple(done[what][0] for _, _, what in swept if not done[what][1]),
+        verification=done["simulation"][0],
+        large_signal=tuple(done[what][0] for what in sweeps if not done[what][1]),
         passivity=done["passivity"][0],
         environments=done["environments"][0],
         left_out={what: reason for what, (_, reason) in done.items() if reason},
-        sensors=device,
-        current_step_A=current_step_A,
-        seed=seed,
+        **devices,
     )
 
 
@@ -223,48 +201,24 @@ def _attempt(verb: Callable[[], Played]) -> tuple[Played | None, str]:
         return None, f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
 
 
-def simulate_steps(
-    controller: Controller,
-    plants: Mapping[str, Plant],
-    parameters: ParameterSet,
-    draws: Mapping[str, Sequence[ParameterSet]],
-    executor: Executor | None = None,
-    progress: Progress = ignore,
-    *,
-    sensors: Sensors | None = None,
-    current_step_A: float = 0.0,
-    seed: int = 1,
-) -> Verification | str:
-    """Play the steps of `step_scenarios` on every plant; return why not where that cannot be done."""
-    try:
-        return verify(
-            controller,
-            plants,
-            parameters,
-            scenarios=step_scenarios,
-            draws=draws,
-            executor=executor,
-            progress=progress,
-            sensors=sensors,
-            current_step_A=current_step_A,
-            seed=seed,
-        )
-    except SeaoptError as error:
-        return str(error)
-
-
 def require_runs(runs: Verification | str) -> list[Requirement]:
     """Return what the runs require: the same fault in many runs of a plant is one requirement, with the worst of them.
 
     A text says why nothing could be played.
     """
     if isinstance(runs, str):
-        return [Requirement(name=SIMULATION_FAILURES, limit=0.0, value=np.inf, met=False, text=runs)]
+        return [require_at_most(SIMULATION_FAILURES, np.inf, 0.0, text=runs)]
     requirements: list[Requirement] = []
     for plant in runs.stages:
         rows = [row for row in runs.rows if row.plant == plant]
         requirements += [*_list_failures(runs, rows), *_list_kept(runs, plant, rows)]
     return requirements
+
+
+def _require(runs: Verification, row: Outcome, name: str, value: float, limit: float, **fields: Any) -> Requirement:
+    """Return a requirement that a run decides."""
+    draw = DrawnAt(parameters=row.parameters, number=row.draw, seed=runs.seed)
+    return require_at_most(name, value, limit, plant=row.plant, scenario=row.scenario, draw=draw, **fields)
 
 
 def _list_failures(runs: Verification, rows: Sequence[Outcome]) -> list[Requirement]:
@@ -276,22 +230,11 @@ def _list_failures(runs: Verification, rows: Sequence[Outcome]) -> list[Requirem
     requirements: list[Requirement] = []
     for kind, cases in faults.items():
         fault, row = max(cases, key=lambda case: case[0].value / (case[0].limit or 1.0))
-        counted = kind not in NAMED_FAULTS
-        requirements.append(
-            Requirement(
-                name=NAMED_FAULTS.get(kind, SIMULATION_FAILURES),
-                met=False,
-                limit=fault.limit,
-                value=float(len(cases)) if counted else fault.value,
-                unit="" if counted else fault.unit,
-                plant=row.plant,
-                scenario=row.scenario,
-                draw=DrawnAt(parameters=row.parameters, number=row.draw, seed=runs.seed),
-                text=fault.text,
-                remedy=fault.remedy,
-                count=len(cases),
-            )
-        )
+        name, value, unit = SIMULATION_FAILURES, float(len(cases)), ""
+        if kind in NAMED_FAULTS:
+            name, value, unit = NAMED_FAULTS[kind], fault.value, fault.unit
+        words = {"text": fault.text, "remedy": fault.remedy, "count": len(cases), "unit": unit}
+        requirements.append(replace(_require(runs, row, name, value, fault.limit, **words), met=False))
     return requirements
 
 
@@ -302,7 +245,7 @@ def _list_kept(runs: Verification, plant: str, rows: Sequence[Outcome]) -> list[
     kept: list[Requirement] = []
     if all(row.met for row in rows):
         text = format_count(len(rows), "run")
-        kept.append(Requirement(name=SIMULATION_FAILURES, limit=0.0, value=0.0, met=True, plant=plant, text=text))
+        kept.append(require_at_most(SIMULATION_FAILURES, 0.0, 0.0, plant=plant, text=text))
     steps = [(row, runs.scenario(row)) for row in rows if row.overshoot is not None and row.settling_s is not None]
     peaks = [
         (1.0 + (row.overshoot or 0.0), scenario.max_overshoot, row)
@@ -313,33 +256,22 @@ def _list_kept(runs: Verification, plant: str, rows: Sequence[Outcome]) -> list[
     for name, unit, figures in ((STEP_OVERSHOOT, "", peaks), (STEP_SETTLING, "s", times)):
         if figures and all(value <= limit for value, limit, _ in figures):
             value, limit, row = max(figures, key=lambda figure: figure[0])
-            kept.append(
-                Requirement(
-                    name=name,
-                    limit=limit,
-                    value=value,
-                    met=True,
-                    unit=unit,
-                    plant=plant,
-                    scenario=row.scenario,
-                    draw=DrawnAt(parameters=row.parameters, number=row.draw, seed=runs.seed),
-                )
-            )
+            kept.append(_require(runs, row, name, value, limit, unit=unit))
     return kept
 
 
 def _list_sweeps(
     controller: Controller, plants: Mapping[str, Plant], parameters: ParameterSet
-) -> list[tuple[str, tuple[Plant, ParameterSet], str]]:
-    """Return what is swept: a name, plant and parameters, and what to call the sweep if it fails."""
+) -> dict[str, Callable[[], LargeSignal]]:
+    """Return the sweeps of amplitudes, by what to call them if they fail."""
     assert controller.design is not None
     design, values = controller.design
     rub = any(has_friction(plant, parameters) for plant in plants.values())
     if controller.command_limit is None and not rub:  # one reason for all of them
-        return [(design.name, (design, values), "large signals")]
-    known = next((name for name, plant in plants.items() if plant is design), design.name)
-    on = {known: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != known}
-    return [(name, pair, f"large signals on {name}") for name, pair in on.items()]
+        return {"large signals": partial(_sweep, controller, design.name, design, values)}
+    own = next((name for name, plant in plants.items() if plant is design), design.name)
+    on = {own: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != own}
+    return {f"large signals on {name}": partial(_sweep, controller, name, *pair) for name, pair in on.items()}
 
 
 def _sweep(controller: Controller, name: str, plant: Plant, parameters: ParameterSet) -> LargeSignal:

@@ -5,18 +5,14 @@ Null stands for what is infinite: the value of a requirement that an unstable pl
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import field, fields, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
-
 from seaopt.bench import Sensors
-from seaopt.codec import from_content
+from seaopt.codec import Limits, OrInfinite, from_content
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
-from seaopt.documents import Flag, NullIsInfinite, Number, ResultTable, Whole, check_table
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_seal, plain
 from seaopt.parameters import ParameterSet
@@ -26,6 +22,7 @@ from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.certificate import DESIGN_NAMES, NO_MODEL, Certificate
+from seaopt.robustness.certificate.certify import split_states
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
     CompensationDraws,
@@ -34,19 +31,18 @@ from seaopt.robustness.certificate.compensation import (
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
-from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
+from seaopt.robustness.certificate.requirement import KEPT_TO, DrawnAt, Requirement
 from seaopt.robustness.certificate.scheduled import (
     PlaceCertificate,
     ScheduleCertificate,
     Standing,
     list_held,
-    split_states,
 )
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
-from seaopt.robustness.uncertainty.worst import combine_worst, measure_worst
+from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
 from seaopt.robustness.verification.impedance_steps import ImpedanceStep
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.limit_cycles import FoundCycle
@@ -59,46 +55,38 @@ OF_ALL_PLACES = ("monte_carlo_failures", "worst_case", "limits_between_points") 
 OLDER_TOLERANCE = 0.5  # of a bandwidth, of which older files do not say whether a law was tuned for it
 
 
-class StoredDraw(ResultTable):
-    """The parameters that decide a requirement, and what its run needs besides."""
-
-    parameters: dict[str, Number] = {}
-    number: str = ""
-    seed: Whole | None = None
-
-
-class StoredRequirement(ResultTable):
+@record
+class StoredRequirement:
     """A figure against its limit; `where`, in words, is all that older files have of what follows it."""
 
     name: str
-    limit: NullIsInfinite
-    value: NullIsInfinite
-    met: Flag
+    limit: OrInfinite
+    value: OrInfinite
+    met: bool
     where: str
     sense: Literal["≤", "≥", "="] | None = None
-    tolerance: Annotated[Number, Field(ge=0.0, le=0.5)] | None = None
+    tolerance: Annotated[float, Limits(ge=0.0, le=0.5)] | None = None
     unit: str = ""
     plant: str | None = None
     state: str = ""
-    place: Annotated[dict[str, Number], Field(min_length=1, max_length=1)] | None = None
+    place: Annotated[dict[str, float], Limits(min_length=1, max_length=1)] | None = None
     scenario: str = ""
-    draw: StoredDraw | None = None
+    draw: DrawnAt | None = None
     text: str = ""
     remedy: str = ""
-    count: Annotated[Whole, Field(ge=1)] = 1
+    count: Annotated[int, Limits(ge=1)] = 1
 
     def build(self) -> Requirement:
         """Return the row; of an older file, which does not say it, one that is to be equal may be off by a half."""
-        row = Requirement(
-            **self.model_dump(exclude_none=True, exclude={"where", "place", "draw"}),
-            place=None if self.place is None else next(iter(self.place.items())),
-            draw=None if self.draw is None else DrawnAt(**self.draw.model_dump()),
-        )
-        if self.plant is None:
-            row = replace(row, text=self.where)
-        if self.sense is None:
-            row = replace(row, sense=find_sense(row.name))
-        return replace(row, tolerance=OLDER_TOLERANCE) if self.tolerance is None and row.sense == "=" else row
+        sense, known = self.sense or find_sense(self.name), {each.name for each in fields(Requirement)}
+        older: dict[str, Any] = {
+            "plant": self.plant or "",
+            "sense": sense,
+            "tolerance": (OLDER_TOLERANCE if sense == "=" else KEPT_TO) if self.tolerance is None else self.tolerance,
+            "place": None if self.place is None else next(iter(self.place.items())),
+            "text": self.where if self.plant is None else self.text,
+        }
+        return Requirement(**{name: getattr(self, name) for name in known - older.keys()}, **older)
 
 
 def find_sense(name: str) -> str:
@@ -108,37 +96,21 @@ def find_sense(name: str) -> str:
     return "≥" if name == FRICTION_COMPENSATION or name.startswith("min_") else "≤"
 
 
-class StoredLargest(ResultTable):
-    """The parameters at which a figure is largest."""
+@record
+class StoredWorst:
+    """The parameters of a worst case, and of the largest Ms and Mt."""
 
-    parameters: dict[str, Number]
+    parameters: dict[str, float]
+    largest: dict[str, DrawnAt] = field(default_factory=dict[str, DrawnAt])
 
-
-class StoredWorst(ResultTable):
-    """The parameters of a worst case and of the largest Ms and Mt and, where bounds were asked for, what they prove."""
-
-    parameters: dict[str, Number]
-    largest: dict[str, StoredLargest] = {}
-    ms_lower: NullIsInfinite = math.inf
-    ms_upper: NullIsInfinite = math.inf
-    mt_lower: NullIsInfinite = math.inf
-    mt_upper: NullIsInfinite = math.inf
-    bounded_stable: Flag = False
-    boxes: Whole = 0
-    left_out: str = ""
-
-    @property
-    def cases(self) -> list[dict[str, float]]:
-        """The parameters of the worst case, and those of the largest Ms and Mt."""
-        return [self.parameters, *(each.parameters for each in self.largest.values())]
-
-    @property
-    def bounds(self) -> dict[str, Any] | None:
-        """The fields of its `Bracket`; None if bounds were not asked for."""
-        return self.model_dump(exclude={"parameters", "largest"}) if "ms_upper" in self.model_fields_set else None
+    def measure(self, controller: Controller, plant: Plant, nominal: ParameterSet) -> Worst:
+        """Return the worst case, its loops closed again."""
+        drawn = (self.parameters, *(each.parameters for each in self.largest.values()))
+        return combine_worst([measure_worst(controller, plant, nominal, at) for at in drawn])
 
 
-class StoredPlant(ResultTable):
+@record
+class StoredPlant:
     """A plant: its worst case."""
 
     worst: StoredWorst
@@ -151,7 +123,7 @@ class StoredSimulation:
     sensors: Sensors
     current_step_A: float
     seed: int
-    large_signal: tuple[Mapping[str, Any], ...]
+    large_signal: tuple[LargeSignal, ...]
     left_out: Mapping[str, str]
 
 
@@ -160,7 +132,7 @@ class StoredFriction:
     """The margin of a plant with friction, of which all but draws and limit cycles is found again."""
 
     draws: FrictionDraws | None = None
-    limit_cycles: tuple[Mapping[str, Any], ...] = ()
+    limit_cycles: tuple[FoundCycle, ...] = ()
 
 
 @record
@@ -195,21 +167,15 @@ class StoredCertificate:
     constrained: ConstrainedRuns | None = None
 
 
-class StoredRequirements(ResultTable):
+@record
+class StoredRequirements:
     """The rows of a robustness.json, or of a schedule_robustness.json."""
 
     requirements: list[StoredRequirement]
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
-    """Return what a certificate needs of a robustness.json.
-
-    Raises
-    ------
-    FileError
-        A field is missing or malformed, or it was edited or written by hand.
-
-    """
+    """Return what a certificate needs of a robustness.json; one that was edited or written by hand is refused."""
     check_seal(content, FILE, CERTIFY_AGAIN)
     return from_content(StoredCertificate, content, FILE, remedy=CERTIFY_AGAIN)
 
@@ -232,27 +198,28 @@ def build_certificate(
     impedance = stored.impedance or StoredImpedance()
     try:
         linear = {name: known[name] for name in stored.plants}
-        bounds = {name: plant.worst.bounds for name, plant in stored.plants.items()}
+        worst = {name: content["plants"][name]["worst"] for name in linear}
         certificate = Certificate(
             requirements=requirements,
             plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
             margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
             worst={
-                name: combine_worst(
-                    [measure_worst(controller, plant, parameters, at) for at in stored.plants[name].worst.cases]
-                )
-                for name, plant in linear.items()
+                name: stored.plants[name].worst.measure(controller, plant, parameters) for name, plant in linear.items()
             },
             monte_carlo=stored.monte_carlo,
             controller=controller,
             models=models,
             parameters=parameters,
             varied=varied,
-            brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
+            brackets={
+                name: from_content(Bracket, case, FILE, remedy=CERTIFY_AGAIN)
+                for name, case in worst.items()
+                if "ms_upper" in case  # bounds were asked for
+            },
             friction=find_nominal_margins(controller, models, parameters),
-            friction_draws={name: one.draws for name, one in stored.friction.items() if one.draws is not None},
+            friction_draws={name: each.draws for name, each in stored.friction.items() if each.draws},
             compensation=find_nominal_compensation(controller, models, parameters),
-            compensation_draws={name: one.draws for name, one in stored.compensation.items() if one.draws is not None},
+            compensation_draws={name: each.draws for name, each in stored.compensation.items() if each.draws},
             impedance=certify_impedance(controller, models, parameters, impedance.draws, impedance.steps),
             constrained=stored.constrained,
             remarks=stored.remarks,
@@ -271,33 +238,25 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     runs, played = certificate.constrained, stored.simulation
     draws = {name: (certificate.parameters, *drawn) for name, drawn in certificate.list_draws().items()}
 
-    def restore(rows: Mapping[str, Any], sensors: Sensors | None, current_step_A: float) -> Verification:
+    def restore(rows: Mapping[str, Any], sensors: Sensors | None, current_step_A: float) -> Verification | None:
         stages = make_stages(certificate.controller, certificate.models, sensors, current_step_A)
-        return Verification.from_dict(rows, stages, draws, FILE, CERTIFY_AGAIN)
+        return Verification.from_dict(rows, stages, draws, FILE, CERTIFY_AGAIN) if "rows" in rows else None
 
-    if "rows" in stored.steps:
-        devices = (None, 0.0) if runs is None else (runs.sensors, runs.current_step_A)
-        steps = restore(stored.steps, *devices)
-    else:
-        steps = str(stored.steps.get("left_out", ""))
+    devices = (None, 0.0) if runs is None else (runs.sensors, runs.current_step_A)
     cycles = {
-        name: tuple(FoundCycle.from_dict(row, FILE, CERTIFY_AGAIN) for row in friction.limit_cycles)
+        name: friction.limit_cycles
         for name, friction in stored.friction.items()
         if friction.limit_cycles or not certificate.shows_friction_harmless(name)
     }
-    certificate = replace(certificate, steps=steps, cycles=cycles)
+    steps = restore(stored.steps, *devices)
+    left_out = str(stored.steps.get("left_out", ""))
+    certificate = replace(certificate, steps=left_out if steps is None else steps, cycles=cycles)
     if played is None:
         return certificate
     simulated = Simulated(
-        verification=restore(content["simulation"], played.sensors, played.current_step_A)
-        if "rows" in content["simulation"]
-        else None,
-        large_signal=tuple(LargeSignal.from_dict(row, FILE, CERTIFY_AGAIN) for row in played.large_signal),
+        verification=restore(content["simulation"], played.sensors, played.current_step_A),
+        **{each.name: getattr(played, each.name) for each in fields(played)},
         **find_port_figures(certificate.controller),
-        left_out=played.left_out,
-        sensors=played.sensors,
-        current_step_A=played.current_step_A,
-        seed=played.seed,
     )
     return replace(certificate, simulated=simulated)
 
@@ -308,7 +267,7 @@ class _StoredPlace:
 
     value: float
     point: bool
-    worst: Mapping[str, Mapping[str, Any]]
+    worst: Mapping[str, StoredWorst]
     draws: int
     unstable: int
     over_ms: int
@@ -320,7 +279,7 @@ class _StoredPlace:
 class _StoredSchedule:
     """A schedule_robustness.json."""
 
-    requirements: tuple[Mapping[str, Any], ...]
+    requirements: list[StoredRequirement]
     places: tuple[_StoredPlace, ...]
     monte_carlo: MonteCarlo
     stretches: tuple[StretchBound, ...]
@@ -329,28 +288,29 @@ class _StoredSchedule:
 
 
 def build_schedule_certificate(
-    content: Mapping[str, Any], schedule: ScheduledController, given: Standing
+    content: Mapping[str, Any], schedule: ScheduledController, standing: Standing
 ) -> ScheduleCertificate:
     """Return the certificate of a schedule_robustness.json, as `ScheduleCertificate.from_dict` does."""
     stored = from_content(_StoredSchedule, content, SCHEDULE_FILE, remedy=CERTIFY_AGAIN)
-    rows = list_requirements(content, SCHEDULE_FILE)
-    if tuple(place.value for place in stored.places) != given.values:
+    rows = read_requirements(stored.requirements, SCHEDULE_FILE)
+    if tuple(place.value for place in stored.places) != standing.values:
         raise FileError(f"{SCHEDULE_FILE}: places are at other values than the schedule's; {CERTIFY_AGAIN}")
     try:
-        return ScheduleCertificate(
-            schedule=schedule,
-            places=tuple(
-                _build_place(place, schedule, given.models, unknown, rows)
-                for place, unknown in zip(stored.places, given.unknowns, strict=True)
-            ),
-            monte_carlo=stored.monte_carlo,
-            stretches=stored.stretches,
-            sweeps=stored.sweeps,
-            motions=stored.motions,
-            requirements=rows,
+        places = tuple(
+            _build_place(place, schedule, standing.models, unknown, rows)
+            for place, unknown in zip(stored.places, standing.unknowns, strict=True)
         )
-    except (KeyError, TypeError) as error:  # of what the model leaves open: the parameters of worst cases
+    except KeyError as error:  # of what the model leaves open: the names of plants
         raise FileError(f"{SCHEDULE_FILE}: a worst case has no {error}; {CERTIFY_AGAIN}") from error
+    return ScheduleCertificate(
+        schedule=schedule,
+        places=places,
+        monte_carlo=stored.monte_carlo,
+        stretches=stored.stretches,
+        sweeps=stored.sweeps,
+        motions=stored.motions,
+        requirements=rows,
+    )
 
 
 def _build_place(
@@ -360,23 +320,15 @@ def _build_place(
     unknown: Uncertainty,
     rows: Sequence[Requirement],
 ) -> PlaceCertificate:
-    controller, plants = schedule.at(stored.value), split_states(models, unknown)
+    controller, plants, nominal = schedule.at(stored.value), split_states(models, unknown), unknown.nominal
     held = list_held(schedule, models, stored.value)
-    figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
-    worst = {
-        name: combine_worst(
-            [
-                measure_worst(controller, plants[name], unknown.nominal, at)
-                for at in (case["parameters"], *case["largest"].values())
-            ]
-        )
-        for name, case in stored.worst.items()
-    }
+    if not all(case.largest for case in stored.worst.values()):
+        raise FileError(f"{SCHEDULE_FILE}: a worst case has no 'largest'; {CERTIFY_AGAIN}")
     return PlaceCertificate(
         value=stored.value,
         point=stored.point,
-        plants=figures,
-        worst=worst,
+        plants={name: controller.close(plant, nominal).figures() for name, plant in plants.items()},
+        worst={name: case.measure(controller, plants[name], nominal) for name, case in stored.worst.items()},
         draws=stored.draws,
         unstable=stored.unstable,
         over_ms=stored.over_ms,
@@ -384,24 +336,20 @@ def _build_place(
         requirements=tuple(
             row for row in rows if row.place == (schedule.over, stored.value) and row.name not in OF_ALL_PLACES
         ),
-        simulated=build_certificate(stored.simulated, controller, held, unknown.nominal) if stored.simulated else None,
+        simulated=build_certificate(stored.simulated, controller, held, nominal) if stored.simulated else None,
     )
 
 
 def list_requirements(content: Mapping[str, Any], source: str) -> tuple[Requirement, ...]:
     """Return the rows of a certificate as it was read from a file, judged again as `read_requirements` does."""
-    stored = check_table(StoredRequirements, plain(content), source, remedy=CERTIFY_AGAIN)
+    stored = from_content(StoredRequirements, content, source, remedy=CERTIFY_AGAIN)
     return read_requirements(stored.requirements, source)
 
 
 def read_requirements(stored: Sequence[StoredRequirement], source: str = FILE) -> tuple[Requirement, ...]:
     """Return the rows of a certificate.
 
-    Raises
-    ------
-    FileError
-        There are none, which would pass whatever it is of; or a row is called met and its value breaks its limit.
-
+    Refuses one without any, which would pass whatever it is of, and a row that is called met but breaks its limit.
     """
     if not stored:
         raise FileError(f"{source}: requirements is empty, and a certificate requires something; {CERTIFY_AGAIN}")

@@ -26,7 +26,7 @@ from seaopt.robustness.certificate.scheduled import (
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
-from seaopt.robustness.verification import limit_cycles, schedule_motion, schedule_sweep, verification
+from seaopt.robustness.verification import limit_cycles, schedule_sweep, verification
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
 from tests.schedules import POINTS, read_knee, tune_knee
@@ -161,8 +161,9 @@ def test_a_rate_is_required_where_it_is_asked_and_the_slowest_sweep_always(certi
     some = replace(certificate, sweeps={"swing": (sweep(1.0), sweep(2.0), sweep(4.0, "is lost"))})
     none = replace(certificate, sweeps={"swing": (sweep(1.0, "is lost"),)})
     assert some.fastest == 2.0 and "up to 2 rad/s" in some.assumption
-    assert [row.met for row in _require_rate(some, None) + _require_rate(some, 1.5)] == [True, True]
-    assert not _require_rate(some, 3.0)[0].met and not _require_rate(none, None)[0].met
+    met = [_require_rate(some.sweeps["swing"], "rad/s", least).met for least in (None, 1.5, 3.0)]
+    assert met == [True, True, False]
+    assert not _require_rate(none.sweeps["swing"], "rad/s", None).met
 
 
 def test_a_motion_slower_than_the_rate_asked_is_not_met():
@@ -199,7 +200,7 @@ def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
     def refuse(*args, **keywords):
         raise AssertionError("reading a result must not simulate")
 
-    for module, name in ((verification, "play"), (schedule_sweep, "close_loop"), (schedule_motion, "close_loop"),
+    for module, name in ((verification, "play"), (schedule_sweep, "close_loop"),
                          (limit_cycles, "run_loop"), (scheduled, "bound_stretch")):  # fmt: skip
         monkeypatch.setattr(module, name, refuse)
     plants = {"stand": stand, "swing": swing}

@@ -164,9 +164,7 @@ def _describe_simulation(certificate: Certificate) -> Iterator[str]:
     if certificate.runs is not None:
         yield from certificate.runs.describe_steps()
     if certificate.simulated is not None:
-        left_out = len(certificate.simulated.left_out)
-        lines = certificate.simulated.lines()
-        yield from lines[: len(lines) - left_out]
+        yield from certificate.simulated.lines()
     if certificate.impedance is not None:
         yield from (f"impedance: {line}" for line in certificate.impedance.lines())
 
