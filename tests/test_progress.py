@@ -139,7 +139,7 @@ def test_a_certificate_tells_draws_searches_and_scenarios(heard, controller):
     )  # fmt: skip
     heard.check(
         "swing, 40 of 40 draws", "worst case, plant 2 of 2", "friction at the draws",
-        "design, scenario 1 of 4", "swing, scenario 4 of 4", "large signals", "passivity", "environments",
+        "design, scenario 1 of 8", "swing, scenario 8 of 8", "large signals", "passivity", "environments",
     )  # fmt: skip
     assert sum("scenario" in note for note in heard.notes) > 16
 

@@ -20,6 +20,7 @@ from seaopt.codec import OrInfinite
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.errors import ControlError
+from seaopt.options import check_options, option
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.impulse import ImpulseTransfer, enclose_plant
@@ -45,29 +46,21 @@ EASY = 0.9  # sum of the coordinates' hardness with which a box is worth boundin
 
 @record
 class Budget:
-    """When bounds are tight enough, and when to stop.
+    """When bounds are tight enough, and when to stop."""
 
-    Parameters
-    ----------
-    tolerance : float
-        Done when the bounds are within this fraction of the largest Ms and Mt measured.
-    boxes : int
-        Boxes after which to stop, for each plant.
-    seconds : float
-        The same in time, checked between blocks of boxes; the bounds then depend on the machine.
-
-    """
-
-    tolerance: float = 0.01
-    boxes: int = 1000
-    seconds: float = 60.0
+    tolerance: float = option(
+        "Done when the bounds are within this fraction of the largest Ms and Mt measured.", default=0.01, above=0.0
+    )
+    boxes: int = option("Boxes after which to stop, for each plant.", default=1000, above=0)
+    seconds: float = option(
+        "The same in time, checked between blocks of boxes; the bounds then depend on the machine.",
+        default=60.0,
+        unit="s",
+        above=0.0,
+    )
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "boxes", "seconds"):
-            if not getattr(self, name) > 0.0:
-                raise ControlError(
-                    f"{name} = {getattr(self, name):g} of a budget is not positive; give a positive number"
-                )
+        check_options(self, ControlError)
 
 
 @record
@@ -104,7 +97,7 @@ class Bracket:
 
     @property
     def statement(self) -> str:
-        """What is bounded, as text; its figures are rounded up."""
+        """The bounds as text; their figures are rounded up."""
         if self.left_out:
             return f"no bound: {self.left_out}"
         if not np.isfinite(self.ms_lower):
@@ -133,7 +126,6 @@ class _BranchAndBound:
 
     controller: Controller
     plant: Plant
-    unknown: Uncertainty
     within: Region
     tolerance: float
     boxes: Boxes
@@ -181,9 +173,9 @@ def bracket(
     """
     budget = budget or Budget()
     end = time.perf_counter() + budget.seconds
-    known = np.zeros(2) if worst is None else np.array([worst.ms, worst.mt])
+    peaks = np.zeros(2) if worst is None else np.array([worst.ms, worst.mt])
     try:
-        search = _start(controller, plant, unknown, budget.tolerance, known, 0.0 if worst is None else worst.severity)
+        search = _start(controller, plant, unknown, budget.tolerance, peaks, 0.0 if worst is None else worst.severity)
         while search.arcs.box.size and search.count < budget.boxes and time.perf_counter() < end:
             if not np.all(np.isfinite(search.lower)) or (search.count and not search.within.size):
                 break  # a plant is unstable, or there is nothing to halve
@@ -191,9 +183,9 @@ def bracket(
         search.stable &= bool(np.all(_measure(search, search.boxes.centre)))
     except ControlError as error:
         return Bracket(
-            ms_lower=float(known[0]),
+            ms_lower=float(peaks[0]),
             ms_upper=np.inf,
-            mt_lower=float(known[1]),
+            mt_lower=float(peaks[1]),
             mt_upper=np.inf,
             bounded_stable=False,
             boxes=0,
@@ -210,13 +202,13 @@ def _conclude(search: _BranchAndBound) -> Bracket:
     void = bool(search.boxes.centre.size and exceeded)
     upper = np.maximum(bound, search.lower)
     bounded = bool(np.all(np.isfinite(upper)) and search.stable) and not void
-    ms, mt = (float(value) if bounded else np.inf for value in upper)
+    lower, upper = search.lower.tolist(), upper.tolist() if bounded else [np.inf, np.inf]
     reason = "a plant of the set is worse than the bound, which is therefore void; the model was not enclosed"
     return Bracket(
-        ms_lower=float(search.lower[0]),
-        ms_upper=ms,
-        mt_lower=float(search.lower[1]),
-        mt_upper=mt,
+        ms_lower=lower[0],
+        ms_upper=upper[0],
+        mt_lower=lower[1],
+        mt_upper=upper[1],
         bounded_stable=bounded,
         boxes=search.count,
         parameters=search.parameters,
@@ -229,7 +221,7 @@ def _start(
     plant: Plant,
     unknown: Uncertainty,
     tolerance: float,
-    known: Float[np.ndarray, " 2"],
+    peaks: Float[np.ndarray, " 2"],
     severity: float,
 ) -> _BranchAndBound:
     within = build_region(plant, replace(unknown, nominal=controller.delay(unknown.nominal)))
@@ -239,37 +231,38 @@ def _start(
     while boxes.centre.shape[0] < BOX_BLOCK and np.sum(hardness * boxes.radius[0]) > EASY:
         axis = int(np.argmax(hardness * boxes.radius[0]))
         boxes = within.cut(boxes.halve(np.full(boxes.centre.shape[0], axis)))[0]
-    count = boxes.centre.shape[0]
+    return _BranchAndBound(
+        controller=controller,
+        plant=plant,
+        within=within,
+        tolerance=tolerance,
+        boxes=boxes,
+        arcs=_make_arcs(boxes.centre.shape[0]),
+        hardness=hardness,
+        lower=peaks.copy(),
+        upper=np.zeros(2),
+        severity=severity,
+    )
+
+
+def _make_arcs(count: int) -> Arcs:
+    """Return the arcs of the start, of so many boxes."""
     middle, half = 0.5 * (FIRST_EDGES[1:] + FIRST_EDGES[:-1]), 0.5 * np.diff(FIRST_EDGES)
     no_bound = np.full(count * half.size, np.inf)
-    arcs = Arcs(
+    return Arcs(
         box=np.repeat(np.arange(count), half.size),
         middle=np.tile(middle, count),
         half=np.tile(half, count),
         s=no_bound,
         t=no_bound,
     )
-    return _BranchAndBound(
-        controller=controller,
-        plant=plant,
-        unknown=unknown,
-        within=within,
-        tolerance=tolerance,
-        boxes=boxes,
-        arcs=arcs,
-        hardness=hardness,
-        lower=known.copy(),
-        upper=np.zeros(2),
-        severity=severity,
-    )
 
 
 def _check_digits(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> None:
     """Refuse a loop that loses so many digits that not even one plant can be bounded at single angles."""
     point = Boxes(centre=boxes.centre[:1], radius=np.zeros_like(boxes.radius[:1]))
-    theta = 0.5 * (FIRST_EDGES[1:] + FIRST_EDGES[:-1])
-    no_bound = np.full(theta.size, np.inf)
-    arcs = Arcs(box=np.zeros(theta.size, dtype=int), middle=theta, half=0.0 * theta, s=no_bound, t=no_bound)
+    arcs = _make_arcs(1)
+    arcs = replace(arcs, half=0.0 * arcs.half)
     enclosed = enclose_plant(controller, plant, within, point)
     if not np.all(np.isfinite(bound_arcs(controller, enclosed, point, within.ball, arcs).s)):
         raise ControlError(

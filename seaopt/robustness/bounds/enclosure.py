@@ -46,11 +46,11 @@ def _apply_operation(op: int, operands: list[Entry]) -> Entry:
     numbers = [ca.SX(entry) for entry in operands if not isinstance(entry, Taylor)]
     if len(numbers) == len(operands):
         return float((ca.SX.binary if len(numbers) == 2 else ca.SX.unary)(op, *numbers))
-    known = BINARY if len(operands) == 2 else UNARY
-    if op not in known:
+    enclosures = BINARY if len(operands) == 2 else UNARY
+    if op not in enclosures:
         names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == op]
         raise ControlError(f"the plant's equations have {names[0][3:].lower()}, which has no enclosure")
-    return known[op](*operands)
+    return enclosures[op](*operands)
 
 
 def _divide(a: Entry, b: Entry) -> Entry:

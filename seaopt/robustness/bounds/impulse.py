@@ -84,8 +84,8 @@ def _sample(
     over = a.basis
     left, right = _compute_bases(a.c)
     a, b = a.transform(left, right), b.transform(left, np.eye(1))
-    one = make_constant(np.broadcast_to(np.eye(n), a.c.shape).copy(), over)
-    x, series = _sum_series(a * period, one)
+    identity = make_constant(np.broadcast_to(np.eye(n), a.c.shape).copy(), over)
+    x, series = _sum_series(a * period, identity)
     f, gamma = x @ series, series @ b * period
     late = delay if isinstance(delay, Taylor) else make_constant(np.full(count, delay), over)
     least = 1e-9 * period if isinstance(delay, Taylor) else 0.0
@@ -95,7 +95,7 @@ def _sample(
     newer = gamma
     if split:
         remaining = (period - fraction)[:, None, None]
-        newer = (_sum_series(a * remaining, one)[1] @ b) * remaining
+        newer = (_sum_series(a * remaining, identity)[1] @ b) * remaining
     late_through = (fraction.c > least)[:, None]  # the output is read before the command changes
     heads, tails, denominator = list[Taylor](), list[Taylor](), None
     for c, d in read:
@@ -108,19 +108,19 @@ def _sample(
     return ImpulseTransfer(heads=tuple(heads), tails=tuple(tails), denominator=denominator, whole=whole)
 
 
-def _sum_series(x: Taylor, one: Taylor) -> tuple[Taylor, Taylor]:
+def _sum_series(x: Taylor, identity: Taylor) -> tuple[Taylor, Taylor]:
     """Return x and phi(x), for matrices."""
     norm = np.max(np.sum(np.abs(x.c) + x.reach, axis=2), axis=1)
     halvings = count_halvings(norm, REACH)
     small = x * 0.5**halvings
-    out = one
+    out = identity
     for k in range(DEGREE, 0, -1):
-        out = one + small @ out * (1.0 / (k + 1))
+        out = identity + small @ out * (1.0 / (k + 1))
     norm = np.where(np.isfinite(norm), norm * 0.5**halvings, np.inf)
     tail = norm ** (DEGREE + 1) / float(np.prod(np.arange(1.0, DEGREE + 3))) / (1.0 - np.minimum(norm, 0.5))
     out = out.with_remainder(out.r + tail[:, None, None])
     for _ in range(halvings):
-        out = out @ (one + small @ out * 0.5)
+        out = out @ (identity + small @ out * 0.5)
         small = small * 2.0
     return x, out
 
@@ -128,7 +128,7 @@ def _sum_series(x: Taylor, one: Taylor) -> tuple[Taylor, Taylor]:
 def _expand_polynomials(f: Taylor, c: Taylor, drives: list[Taylor]) -> tuple[Taylor, list[Taylor]]:
     """Return det(wI - f) and c adj(wI - f) drive, coefficients ascending along the last axis."""
     count, n = f.c.shape[:2]
-    one = np.eye(n)
+    identity = np.eye(n)
     unit = make_constant(np.ones(count), f.basis)
     coefficients, sensed = [unit], [c]
     term: Taylor | None = None  # M_j; the first is the identity
@@ -137,7 +137,7 @@ def _expand_polynomials(f: Taylor, c: Taylor, drives: list[Taylor]) -> tuple[Tay
         trace = _take_trace(product) * (-1.0 / j)
         coefficients.append(trace)
         if j < n:
-            term = product + trace[:, None, None] * one
+            term = product + trace[:, None, None] * identity
             sensed.append(c @ term)
     numerators = [
         stack_models([*((row @ drive)[:, 0, 0] for row in reversed(sensed)), make_constant(np.zeros(count), f.basis)])

@@ -143,8 +143,8 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     slopes[count:, ball:] = np.diag([0.5 * (high - low) for low, high in wide.values()])
     middle = [0.5 * (low + high) for low, high in wide.values()]
     nominal = plant.complete(unknown.nominal)
-    held = {name: value for name, value in read_conditions(plant, nominal).items() if name not in ends}
-    certain = held | pinned
+    resting = {name: value for name, value in read_conditions(plant, nominal).items() if name not in ends}
+    certain = resting | pinned
     return Region(
         names=(*names, *wide),
         centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),

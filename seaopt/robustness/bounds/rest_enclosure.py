@@ -90,9 +90,9 @@ def enclose_equilibrium(
     middle = equations.at_centre()
     centre = _solve_centre(middle, names[fixed[0]])
     inverse = np.linalg.inv(middle.jacobian(make_constant(centre, POINT_BASIS)).c)
-    y, one = make_constant(centre, over), np.eye(1)
+    y, scalar = make_constant(centre, over), np.eye(1)
     for _ in range(over.degree + 1):
-        y = y - equations.rates(y).transform(inverse, one)
+        y = y - equations.rates(y).transform(inverse, scalar)
         y = y.with_remainder(np.zeros_like(y.r))
     return equations.fill(_prove(equations, y, inverse))
 
@@ -114,13 +114,13 @@ def _solve_centre(equations: _RestEquations, where: str) -> Float[np.ndarray, "b
 def _prove(equations: _RestEquations, y: Taylor, inverse: Float[np.ndarray, "b n n"]) -> Taylor:
     """Return y with a remainder that Krawczyk's operator maps into itself; infinite where none is found."""
     first = equations.rates(y).transform(inverse, np.eye(1)).size
-    one = np.eye(inverse.shape[1])
+    identity = np.eye(inverse.shape[1])
     low, rough = equations.truncate(JACOBIAN_DEGREE), y.truncate(JACOBIAN_DEGREE)
     image, wide = first, first
     for _ in range(WIDENINGS):
         wide = 1.2 * image + 1e-14 * y.size + 1e-20
-        slopes = low.jacobian(rough.with_remainder(rough.r + wide)).transform(inverse, one)
-        off = make_constant(np.broadcast_to(one, inverse.shape).copy(), slopes.basis) - slopes
+        slopes = low.jacobian(rough.with_remainder(rough.r + wide)).transform(inverse, identity)
+        off = make_constant(np.broadcast_to(identity, inverse.shape).copy(), slopes.basis) - slopes
         image = first + off.size @ wide
         if np.all(image <= wide):
             break

@@ -36,7 +36,7 @@ BUDGET = Budget(tolerance=0.02, boxes=400, seconds=20.0)
 
 @record
 class StretchBound:
-    """What holds for every value of the variable on a stretch, at the nominal values of all else.
+    """A bound on Ms for every value of the variable on a stretch, at the nominal values of all else.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The certificate as data, JSON and text: what one controller does on many plants, for `certify` and its readers."""
+"""The certificate as data, JSON and text: one controller on many plants."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ _REPORTED = (
 
 @record(eq=False, repr=False)
 class Certificate(Result, Worded):
-    """What `certify` returns.
+    """The result of `certify`.
 
     Parameters
     ----------
@@ -267,12 +267,12 @@ class Certificate(Result, Worded):
 
     @property
     def draws(self) -> str:
-        """What draws showed, in one sentence."""
+        """The result of the draws, in one sentence."""
         return str(self.monte_carlo) if self.models else NO_MODEL
 
     @property
     def runs(self) -> Verification | None:
-        """What was simulated on the nonlinear plants: every scenario after `with_simulation`, else the steps."""
+        """The runs on the nonlinear plants: every scenario after `with_simulation`, else the steps."""
         if self.simulated is not None:
             return self.simulated.verification
         return self.steps if isinstance(self.steps, Verification) else None

@@ -12,6 +12,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from hashlib import sha256
 from types import NoneType
+from typing import Any
 
 import numpy as np
 
@@ -25,12 +26,14 @@ from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor
 from seaopt.formatting import format_count
 from seaopt.frequency import MeasuredResponse
+from seaopt.options import check_options, option
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, name_states, split_friction
 from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
+from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.certificate.certificate import (
     DESIGN_NAMES,
@@ -45,8 +48,7 @@ from seaopt.robustness.certificate.compensation import (
 )
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import IMPEDANCE_DRAWS, certify_impedance, draw_impedance
-from seaopt.robustness.certificate.measured_draws import Failures, Loops, measure_draws, search_worst
-from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
+from seaopt.robustness.certificate.measured_draws import Loops, measure_draws, search_worst
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, Spot
 from seaopt.robustness.certificate.requirements import (
     compensation_requirements,
@@ -59,16 +61,39 @@ from seaopt.robustness.certificate.requirements import (
     plant_requirements,
 )
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source, Uncertainty, check_ranges, combine_uncertainty
+from seaopt.robustness.uncertainty.failure_probability import count_failures
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
 from seaopt.robustness.verification.verification import check_sensors
 
+CONFIDENCE = 1.0 - 1e-6
 AMPLITUDES = 9  # looked at for the remark on bandwidth
 MOST_DELAY_SAMPLES = 20  # samples
 # Seconds that a part takes as a rule: of each draw and plant, or of each plant.
 DRAW, SEARCH, BOUND, FRICTION, IMPEDANCE, STEPS, SIMULATIONS = 1.5e-4, 0.3, 0.4, 0.3, 0.05, 1.0, 3.5
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
+
+
+@record
+class CertifyOptions:
+    """The numbers that `certify`, `certify_schedule`, `certify_mpc` and `tune_certified` take, with their ranges."""
+
+    samples: int = option("Draws.", default=1375, least=1)
+    seed: int = option("Of the draws and of simulated noise.", default=1, least=0)
+    confidence: float = option("Of the failure probability's bound.", default=CONFIDENCE, above=0.0, below=1.0)
+    max_failure_probability: float | None = option("Required of that bound.", default=None, above=0.0, most=1.0)
+    min_friction_margin: float | None = option("Slope, N s/m (N m s/rad).", default=None, above=0.0)
+    min_rate: float | None = option("Of the schedule's variable, in its unit per second.", default=None, above=0.0)
+    runs: int = option("Runs with limits active.", default=100, least=1)
+    bound_tolerance: float = option("Share of half the width of a signal's bounds.", default=0.1, least=0.0)
+    current_step_A: float = option("What the command is rounded to, in its unit.", default=0.0, least=0.0)
+    rounds: int = option("Of tuning and certifying.", default=6, least=1)
+
+
+def check_numbers(**numbers: Any) -> None:
+    """Refuse numbers that are out of the range of `CertifyOptions`."""
+    check_options(CertifyOptions(**numbers), ControlError)
 
 
 def certify(
@@ -220,9 +245,9 @@ def certify(
         SIMULATIONS * len(models) * simulations,
     )
     loops = Shared(Loops(controller=controller, models=models, plants=plants, unknown=unknown, bounds=bounds))
-    failures, drawn, drawn_ms = measure_draws(loops, samples, rng, executor, drawing)
+    failed, drawn, drawn_ms = measure_draws(loops, samples, rng, executor, drawing)
     worst, brackets = search_worst(loops, drawn, executor, searching)
-    monte_carlo = failures.bound(samples, seed, confidence)
+    monte_carlo = count_failures(failed, seed, confidence)
     rubbing("friction at the draws", 0.0)
     friction = find_nominal_margins(controller, models, nominal)
     friction_draws = find_margins_at_draws(loops, friction, samples, rng, min_friction_margin, executor)
@@ -274,7 +299,7 @@ def certify(
         certificate = certificate.with_simulation(
             sensors=sensors, current_step_A=current_step_A, seed=seed, executor=executor, progress=simulating
         )
-    progress(f"{samples} draws, {format_count(failures.count, 'failure')}", 1.0)
+    progress(f"{samples} draws, {format_count(monte_carlo.failures, 'failure')}", 1.0)
     return certificate
 
 
@@ -285,8 +310,8 @@ def _add_warm_winding(
     others: ParameterSet,
 ) -> dict[str, tuple[float, float]]:
     """Return the ranges with the temperatures of every winding that changes its loop, and those given for the air."""
-    known = parameters.parameters if isinstance(parameters, Fit) else parameters
-    values = others.with_parameters(*known.values())
+    fitted = parameters.parameters if isinstance(parameters, Fit) else parameters
+    values = others.with_parameters(*fitted.values())
     warm = [ends for plant in models.values() if (ends := find_warm_range(plant, values)) is not None]
     if not warm:
         return dict(ranges)
@@ -360,7 +385,7 @@ def _certify_points(
         plants={},
         margins={},
         worst={},
-        monte_carlo=Failures().bound(0, seed, confidence),
+        monte_carlo=count_failures(np.zeros((3, 0), dtype=bool), seed, confidence),
         controller=controller,
         models={},
         parameters=parameters.parameters if isinstance(parameters, Fit) else parameters,

@@ -98,14 +98,14 @@ def find_compensation_at_draws(
     if not enough or not count:
         return {}
     draws = loops.value.unknown.list_draws(count, rng)
-    found: dict[str, CompensationDraws] = {}
+    margins: dict[str, CompensationDraws] = {}
     for name, nominal_margin in enough.items():
         judge = partial(_find_margins, nominal_margin.multiplier)
         shown, margin, parameters = find_least_margin(judge, _take_slope, loops, name, draws, executor)
-        found[name] = CompensationDraws(
+        margins[name] = CompensationDraws(
             samples=count, shown=shown, least_slope=_take_slope(margin), parameters=parameters
         )
-    return found
+    return margins
 
 
 def _take_slope(margin: CompensationMargin) -> float:
@@ -198,8 +198,8 @@ def _find_worst(
 
 
 def _measure_draws(measure: Measure, loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[EigenvalueCase]:
-    known = loops.value
-    return [measure(known.controller, known.models[name], known.unknown.nominal, draw) for draw in draws]
+    at = loops.value
+    return [measure(at.controller, at.models[name], at.unknown.nominal, draw) for draw in draws]
 
 
 def choose_worst(cases: Iterable[EigenvalueCase]) -> EigenvalueCase:

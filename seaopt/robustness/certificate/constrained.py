@@ -143,7 +143,7 @@ class ConstrainedRuns(Result):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a certificate remarks of these runs."""
+        """The certificate's remarks on these runs."""
         return (
             "margins, worst cases and draws are of the linear region, in which no limit of the plan is active",
             str(self),
@@ -169,7 +169,7 @@ class _Outcome:
 
 @record(eq=False)
 class _Run:
-    """What is drawn for one run: parameters, the seed of its noise, its reference and its disturbance."""
+    """The draws of one run: parameters, the seed of its noise, its reference and its disturbance."""
 
     draw: dict[str, float]
     seed: int
@@ -179,7 +179,7 @@ class _Run:
 
 @record(eq=False)
 class _Bench:
-    """What every run has: the law, the same in its linear region, sensors, amplifier and the tolerance of bounds."""
+    """The parts that every run shares; `law` is the same in its linear region, `tolerance` is of bounds."""
 
     mpc: ForceMPC
     law: Controller

@@ -83,18 +83,18 @@ def find_margins_at_draws(
     if not count or not enough:
         return {}
     draws = unknown.list_draws(count, rng)
-    found: dict[str, FrictionDraws] = {}
+    margins: dict[str, FrictionDraws] = {}
     for name, nominal_margin in enough.items():
         judge = partial(_find_margins, nominal_margin)
         shown, margin, parameters = find_least_margin(judge, _take_slope, loops, name, draws, executor)
-        found[name] = FrictionDraws(
+        margins[name] = FrictionDraws(
             samples=count,
             shown=shown,
             least_slope=_take_slope(margin),
             factor=np.inf if margin is None else margin.factor,
             parameters=parameters,
         )
-    return found
+    return margins
 
 
 def _take_slope(margin: FrictionMargin | None) -> float:
@@ -115,13 +115,15 @@ def find_least_margin(
     executor: Executor | None,
 ) -> tuple[int, Margin, dict[str, float]]:
     """Return for how many draws of one plant stability is shown, the margin of the least slope, and its draw."""
-    own = select_own(loops, name, draws)
-    distinct = {tuple(draw.items()): draw for draw in own}  # draws that vary what this plant does not have are one loop
+    of_plant = select_own(loops, name, draws)
+    distinct = {
+        tuple(draw.items()): draw for draw in of_plant
+    }  # draws that vary what this plant does not have are one loop
     judged = judge_draws(judge, loops, name, list(distinct.values()), executor)
     of_draw = dict(zip(distinct, judged, strict=True))
-    margins = [of_draw[tuple(draw.items())] for draw in own]
+    margins = [of_draw[tuple(draw.items())] for draw in of_plant]
     least = int(np.argmin([slope(margin) for margin in margins]))
-    return sum(margin is None or margin.shown for margin in margins), margins[least], own[least]
+    return sum(margin is None or margin.shown for margin in margins), margins[least], of_plant[least]
 
 
 def _find_margins(
@@ -129,5 +131,5 @@ def _find_margins(
 ) -> list[FrictionMargin | None]:
     """Return the margins of one plant at draws, the multiplier that served at the nominal parameters tried first."""
     first, least = ("", 0.0) if nominal is None else (nominal.multiplier, 1.0 if nominal.shown else 0.0)
-    known = loops.value
-    return find_friction_margins(known.controller, known.models[name], known.place(name, draws), first, least)
+    at = loops.value
+    return find_friction_margins(at.controller, at.models[name], at.place(name, draws), first, least)

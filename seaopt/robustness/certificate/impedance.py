@@ -1,4 +1,4 @@
-"""What is certified of an impedance that a controller renders at the link of one of its plants."""
+"""The certificate of the impedance that a controller renders at the link of one of its plants."""
 
 from __future__ import annotations
 
@@ -139,10 +139,10 @@ def draw_impedance(
     progress: Progress = ignore,
 ) -> ImpedanceDraws | None:
     """Judge the impedance of a controller's outer loop at draws; None where it has none, or nothing is drawn."""
-    count, known = min(samples, IMPEDANCE_DRAWS), loops.value
-    if known.controller.outer is None or not count:
+    count, at = min(samples, IMPEDANCE_DRAWS), loops.value
+    if at.controller.outer is None or not count:
         return None
-    name, draws = _find_plant(known.controller, known.models), known.unknown.list_draws(count, rng)
+    name, draws = _find_plant(at.controller, at.models), at.unknown.list_draws(count, rng)
     cases = judge_draws(_judge_states, loops, name, draws, executor)
     stable = passive = 0
     least, worst = np.inf, dict[str, float]()
@@ -151,7 +151,10 @@ def draw_impedance(
         stable += rests
         passive += margin > 0.0
         if margin < least:
-            least, worst = margin, {key: value for key, value in draw.items() if key in known.models[name].parameters}
+            least, worst = (
+                margin,
+                {key: value for key, value in draw.items() if key in at.models[name].parameters},
+            )
     return ImpedanceDraws(samples=count, stable=stable, passive=passive, margin=float(least), parameters=worst)
 
 
@@ -161,12 +164,12 @@ def _judge_states(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> lis
     assert controller.outer is not None
     varied = [row.name for row in unknown.varied()]
     states = split_friction({name: loops.value.models[name]}, unknown.nominal, varied).values()
-    found: list[tuple[bool, float]] = []
+    judged: list[tuple[bool, float]] = []
     for draw in draws:
         placed = ((state, place_values(state, unknown.nominal, draw)) for state in states)
         rests, margins = zip(*(_judge(controller, *pair, controller.outer.impedance) for pair in placed), strict=True)
-        found.append((all(rests), min(margins)))
-    return found
+        judged.append((all(rests), min(margins)))
+    return judged
 
 
 def _judge(controller: Controller, plant: Plant, params: ParameterSet, impedance: Impedance) -> tuple[bool, float]:

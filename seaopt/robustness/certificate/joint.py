@@ -29,8 +29,7 @@ from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import Result, record
 from seaopt.robustness.certificate.certificate import Certificate
-from seaopt.robustness.certificate.certify import certify
-from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
+from seaopt.robustness.certificate.certify import CONFIDENCE, certify, check_numbers
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
@@ -69,7 +68,7 @@ class Round:
 
 @record(eq=False)
 class JointTuning(Result):
-    """What `tune_certified` returns.
+    """The result of `tune_certified`.
 
     Parameters
     ----------
@@ -200,7 +199,7 @@ def tune_certified(
     values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share = 1.0 - (1.0 - confidence) / rounds
-    done: list[Round] = []
+    finished: list[Round] = []
     for number, part in enumerate(divide(progress, *(1.0 for _ in range(rounds))), start=1):
         tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
         controller = tune(plant, values, spec, witnesses, draws=draws, progress=tuning)
@@ -223,7 +222,7 @@ def tune_certified(
         added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
         plants_met = 1 + len(witnesses)
         made: dict[str, Any] = {"controller": controller, "certificate": certificate}
-        done.append(Round(number=number, plants=plants_met, added=(*added,), **made))
+        finished.append(Round(number=number, plants=plants_met, added=(*added,), **made))
         if certificate is None:
             status = "infeasible"
         elif certificate.passed:
@@ -236,12 +235,12 @@ def tune_certified(
             witnesses |= added
             continue
         progress(f"{status} after {format_count(number, 'round')}", 1.0)
-        return JointTuning(status=status, rounds=tuple(done), robust_to=witnesses, **made)
+        return JointTuning(status=status, rounds=tuple(finished), robust_to=witnesses, **made)
     raise AssertionError("the last round has a status")
 
 
 def _list_new_witnesses(
-    certificate: Certificate | None, known: Sequence[tuple[Plant, ParameterSet]], number: int
+    certificate: Certificate | None, tuned_on: Sequence[tuple[Plant, ParameterSet]], number: int
 ) -> dict[str, tuple[Plant, ParameterSet]]:
     """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need.
 
@@ -261,14 +260,14 @@ def _list_new_witnesses(
     return {
         f"{name}, round {number}: {format_values(place, missing='nominal')}": (plant, values)
         for name, (plant, values, place) in cases.items()
-        if not any(plant is other and _agree(values, at, place) for other, at in known)
+        if not any(plant is other and _agree(values, at, place) for other, at in tuned_on)
     }
 
 
-def _agree(values: ParameterSet, others: ParameterSet, names: Iterable[str]) -> bool:
+def _agree(values: ParameterSet, other_values: ParameterSet, names: Iterable[str]) -> bool:
     """Tell whether two sets have the same values of some parameters."""
     return all(
-        name in others and np.isclose(values[name].value, others[name].value, rtol=SAME_WITNESS, atol=0.0)
+        name in other_values and np.isclose(values[name].value, other_values[name].value, rtol=SAME_WITNESS, atol=0.0)
         for name in names
     )
 

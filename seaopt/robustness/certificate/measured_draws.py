@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -25,7 +24,6 @@ from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Column, Points, Uncertainty
-from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, failure_bound
 from seaopt.robustness.uncertainty.rows import join_rows, take_rows
 from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, find_failures, severities
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, find_worst, measure_worst, place_values
@@ -41,7 +39,7 @@ Case = TypeVar("Case")
 
 @record(eq=False)
 class Loops:
-    """What is measured at draws: a controller on its plants, what is uncertain, and how much work to bound it."""
+    """A controller on its plants, their uncertainty, and how much work to spend on bounds."""
 
     controller: Controller
     models: Mapping[str, Plant]  # as they are, with their friction
@@ -67,64 +65,29 @@ class _Tally:
         return take_rows(both, np.argsort(both.severity)[::-1][:WORST_KEPT])
 
 
-@dataclass(slots=True, kw_only=True)  # counts up, block by block
-class Failures:
-    """Draws that are unstable on some plant; of the others, over Ms on one; of the others, over Mt on one."""
-
-    unstable: int = 0
-    over_ms: int = 0
-    over_mt: int = 0
-
-    def bound(self, samples: int, seed: int, confidence: float) -> MonteCarlo:
-        """Return what these failures among so many draws say of the probability of failure."""
-        return MonteCarlo(
-            samples=samples,
-            failures=self.count,
-            seed=seed,
-            confidence=confidence,
-            failure_probability_bound=failure_bound(samples, self.count, confidence),
-            unstable=self.unstable,
-            over_ms=self.over_ms,
-            over_mt=self.over_mt,
-        )
-
-    def add(self, failed: Bool[np.ndarray, "3 n"]) -> None:
-        """Count draws of a block, each failed on some plant as `find_failures` tells."""
-        unstable, over_ms, over_mt = failed
-        self.unstable += int(np.count_nonzero(unstable))
-        self.over_ms += int(np.count_nonzero(over_ms & ~unstable))
-        self.over_mt += int(np.count_nonzero(over_mt & ~over_ms & ~unstable))
-
-    @property
-    def count(self) -> int:
-        """How many draws fail."""
-        return self.unstable + self.over_ms + self.over_mt
-
-
 def measure_draws(
     loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None, progress: Progress
-) -> tuple[Failures, dict[str, Float[np.ndarray, "_ k"]], dict[str, Float[np.ndarray, " _"]]]:
-    """Draw and measure in blocks: the draws that fail on some plant, the worst of each plant, and Ms of the first."""
+) -> tuple[Bool[np.ndarray, "3 _"], dict[str, Float[np.ndarray, "_ k"]], dict[str, Float[np.ndarray, " _"]]]:
+    """Draw and measure in blocks: which draws fail on some plant, the worst of each plant, and Ms of the first."""
     controller, plants, unknown = loops.value.controller, loops.value.plants, loops.value.unknown
     none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
     tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
-    failures = Failures()
+    failed = [np.zeros((3, 0), dtype=bool)]
     sizes = [min(DRAWS_PER_BLOCK, samples - start) for start in range(0, samples, DRAWS_PER_BLOCK)]
     hooks = iter(divide(progress, *(float(size) for size in sizes)))
     first: dict[str, Column] = {}
     for size in sizes:
         points = unknown.draw(size, rng)
-        failed = np.zeros((3, size), dtype=bool)
+        failed.append(np.zeros((3, size), dtype=bool))
         for name, batch in _measure_block(loops, unknown.values(points), size, executor, next(hooks)):
-            failed |= find_failures(controller, batch)
+            failed[-1] |= find_failures(controller, batch)
             first.setdefault(name, batch.ms[:DRAWS_KEPT])
             tallies[name] = [
                 tally.add(points, severities(controller, batch, by))
                 for tally, by in zip(tallies[name], (LARGEST_MS, LARGEST_MT), strict=True)
             ]
-        failures.add(failed)
-    drawn = {name: np.unique(np.vstack([tally.points for tally in own]), axis=0) for name, own in tallies.items()}
-    return failures, drawn, first
+    drawn = {name: np.unique(np.vstack([tally.points for tally in both]), axis=0) for name, both in tallies.items()}
+    return np.hstack(failed), drawn, first
 
 
 def _measure_block(
@@ -153,8 +116,8 @@ def _measure_block(
 def _measure_part(loops: Shared[Loops], part: tuple[str, Mapping[str, Column], int]) -> BatchFigures:
     """Return the figures of one plant at some draws."""
     name, values, threads = part
-    known = loops.value
-    return batch_figures(known.controller, known.plants[name], known.unknown.nominal, values, threads=threads)
+    measured = loops.value
+    return batch_figures(measured.controller, measured.plants[name], measured.unknown.nominal, values, threads=threads)
 
 
 def search_worst(
@@ -166,8 +129,8 @@ def search_worst(
     searched = map_ordered(partial(_search_plant, loops), drawn.items(), executor)
     for number, (name, plant) in enumerate(loops.value.plants.items()):
         progress(f"worst case, plant {number + 1} of {len(drawn)}", number / len(drawn))
-        found, bounded = next(searched)
-        worst[name] = found.on(plant)
+        case, bounded = next(searched)
+        worst[name] = case.on(plant)
         if bounded is not None:
             brackets[name] = bounded
     return worst, brackets
@@ -189,8 +152,8 @@ def _search_plant(loops: Shared[Loops], part: tuple[str, Points]) -> tuple[Worst
 def select_own(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[dict[str, float]]:
     """Return of draws what the model of a name has of them."""
     model, nominal = loops.value.models[name], loops.value.unknown.nominal
-    own = [key for key in draws[0] if key in place_values(model, nominal, draws[0])] if draws else []
-    return [{key: draw[key] for key in own} for draw in draws]
+    names = [key for key in draws[0] if key in place_values(model, nominal, draws[0])] if draws else []
+    return [{key: draw[key] for key in names} for draw in draws]
 
 
 def judge_draws(

@@ -22,9 +22,8 @@ from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.progress import Progress, divide, ignore
 from seaopt.robustness.certificate.certificate import Certificate
-from seaopt.robustness.certificate.certify import STEPS, certify, find_own_drive
+from seaopt.robustness.certificate.certify import CONFIDENCE, STEPS, certify, check_numbers, find_own_drive
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, run_constrained
-from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source, combine_uncertainty
 from seaopt.robustness.verification.verification import check_sensors

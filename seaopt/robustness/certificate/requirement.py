@@ -116,9 +116,9 @@ class Requirement(Result):
         seed = "" if drawn.seed is None else f"seed {drawn.seed}"
         spot = ", ".join(filter(None, (self.subject, self.scenario, number, seed)))
         at = " at ".join(filter(None, (spot, format_values(drawn.parameters, missing=""))))
-        found = ": ".join(filter(None, (at, self.text)))
+        decided = ": ".join(filter(None, (at, self.text)))
         more = f"the worst of {self.count} such runs" if self.count > 1 else ""
-        return "; ".join(filter(None, (found, more, self.remedy)))
+        return "; ".join(filter(None, (decided, more, self.remedy)))
 
     def __str__(self) -> str:
         value, limit = (format_number(number, 6) for number in (self.value, self.limit))
@@ -158,7 +158,7 @@ class Failure:
 
     @property
     def consequence(self) -> str:
-        """What follows from it besides, after a semicolon; "" where nothing does."""
+        """How many requirements have no value because of it, after a semicolon; "" where none has."""
         return f"; {format_count(self.follows, 'more requirement')} cannot be met then" if self.follows else ""
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from seaopt.control import Controller, LoopFigures
+from seaopt.control import Controller, LoopFigures, ScheduledController
 from seaopt.control.laws.limits import BY_NAME, MeasuredLoop, PortFigures, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import judge
@@ -45,11 +45,14 @@ from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.impedance_steps import AT_REST
+from seaopt.robustness.verification.schedule_motion import Motion, describe_motion
+from seaopt.robustness.verification.schedule_sweep import Sweep, find_fastest
 
 NO_FRICTION = "no friction: any margin holds"
 WITNESS_REMEDY = "tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 PASSIVE = "passive_band_hz"
 UNSTABLE_LOOP = "the loop is UNSTABLE"
+MOTION_RATE = "min_motion_rate"
 
 
 def design_requirements(
@@ -207,16 +210,16 @@ def eigenvalue_requirements(
     ripple: Mapping[str, EigenvalueCase],
 ) -> list[Requirement]:
     """Return that neither a weight nor a ripple compensated makes a loop grow, at nominal values and over draws."""
-    terms, found = controller.compensation, list[tuple[str, str, EigenvalueCase, str]]()
+    terms, cases = controller.compensation, list[tuple[str, str, EigenvalueCase, str]]()
     if terms is not None and terms.gravity is not None:
         compensated = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
         for name, case in gravity.items():
             port = models[name].port
             unit = "" if port is None else models[name].states[str(port.coordinate)]
-            found.append((GRAVITY_COMPENSATION, name, case, f"{compensated}, at {case.at:.3g} {unit}".rstrip()))
+            cases.append((GRAVITY_COMPENSATION, name, case, f"{compensated}, at {case.at:.3g} {unit}".rstrip()))
     if terms is not None and terms.ripple is not None:
         unit = f"{controller.command.effort_unit}/{terms.ripple.unit}"
-        found += [
+        cases += [
             (RIPPLE_COMPENSATION, name, case, f"over the slopes, at {case.at:.3g} {unit}")
             for name, case in ripple.items()
         ]
@@ -229,7 +232,7 @@ def eigenvalue_requirements(
             draw=DrawnAt(parameters=case.parameters),
             text=f"the largest eigenvalue, {text}",
         )
-        for requirement, plant, case, text in found
+        for requirement, plant, case, text in cases
     ]
 
 
@@ -318,3 +321,50 @@ def _require_worst(spot: Spot, case: Worst) -> Requirement:
         **spot._asdict(),
     )
     return row if row.met else replace(row, remedy=WITNESS_REMEDY)
+
+
+def require_limits_between(schedule: ScheduledController) -> list[Requirement]:
+    """Return that the design plant's limits hold between the points, 0.9 of the bandwidth asked among them."""
+    return [
+        require_at_most(
+            "limits_between_points",
+            float(len(place.broken)),
+            0.0,
+            place=(schedule.over, place.value),
+            text=", ".join(place.broken),
+            remedy=schedule.remedy if place.broken else "",
+        )
+        for place in schedule.between
+    ]
+
+
+def require_rate(sweeps: Sequence[Sweep], unit: str, least: float | None) -> Requirement:
+    """Return that a plant's sweeps keep their judgement: the slowest at all, and as fast as asked."""
+    faults = [sweep.fault for sweep in sweeps if sweep.fault]
+    return require_at_least(
+        "min_schedule_rate",
+        find_fastest(sweeps),
+        sweeps[0].rate if least is None else least,
+        unit=unit,
+        plant=sweeps[0].plant,
+        scenario="sweep",
+        text=faults[0] if faults else f"the fastest tried is {sweeps[-1].rate:.3g} {unit}",
+    )
+
+
+def require_motion(motion: Motion, over: str, unit: str, least: float | None) -> Requirement:
+    """Return that a plant that moves the variable keeps its judgement: at the rate reached at all, or as asked.
+
+    What keeps its judgement at less than was asked is not met: nothing is known of the rate that was.
+    """
+    row = require_at_least(
+        MOTION_RATE,
+        0.0 if motion.fault else motion.rate,
+        motion.rate if least is None else least,
+        unit=unit,
+        plant=motion.plant,
+        text=describe_motion(motion, over, unit),
+    )
+    if motion.fault or row.met:
+        return replace(row, met=not motion.fault)
+    return replace(row, remedy="ask a smaller min_rate, or give the command a higher limit")

@@ -25,6 +25,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
@@ -43,22 +44,30 @@ from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import Result, Worded, record
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
 from seaopt.robustness.certificate.certificate import Certificate
-from seaopt.robustness.certificate.certify import add_design, certify, find_own_drive, name_spots, split_states
+from seaopt.robustness.certificate.certify import (
+    CONFIDENCE,
+    add_design,
+    certify,
+    check_numbers,
+    find_own_drive,
+    name_spots,
+    split_states,
+)
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
-from seaopt.robustness.certificate.measured_draws import Failures, Loops
-from seaopt.robustness.certificate.options import CONFIDENCE, check_numbers
+from seaopt.robustness.certificate.measured_draws import Loops
 from seaopt.robustness.certificate.requirement import (
     MIN_FRICTION_MARGIN,
     Requirement,
     Spot,
-    require_at_least,
-    require_at_most,
 )
 from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
     friction_requirements,
     plant_requirements,
+    require_limits_between,
+    require_motion,
+    require_rate,
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import (
@@ -70,7 +79,7 @@ from seaopt.robustness.uncertainty.draws import (
     combine_uncertainty,
     find_modes,
 )
-from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, count_failures
 from seaopt.robustness.uncertainty.severity import find_failures
 from seaopt.robustness.uncertainty.worst import Worst, find_worst
 from seaopt.robustness.verification.schedule_motion import Motion, describe_motion, move_schedule
@@ -78,13 +87,12 @@ from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps
 from seaopt.units import unit_after
 
 SCHEDULE_ROBUSTNESS_SCHEMA = "seaopt/schedule_robustness/1"
-MOTION_RATE = "min_motion_rate"
 POINT, BOUND, SWEEP = 4.0, 0.2, 5.0  # seconds that a part takes as a rule: of a point, a stretch, the sweeps of a plant
 
 
 @record(eq=False)
 class PlaceCertificate(Result):
-    """What was found with the variable standing at one value.
+    """The findings with the variable standing at one value.
 
     Parameters
     ----------
@@ -161,7 +169,7 @@ class PlaceCertificate(Result):
 
 @record(eq=False, repr=False)
 class ScheduleCertificate(Result, Worded):
-    """What `certify_schedule` returns.
+    """The result of `certify_schedule`.
 
     Parameters
     ----------
@@ -207,17 +215,17 @@ class ScheduleCertificate(Result, Worded):
 
     @property
     def assumption(self) -> str:
-        """What is assumed of the variable's motion, with the number that the simulations give it."""
+        """The assumption on the variable's motion, with the number that the simulations give it."""
         over = self.schedule.over
         if self.sweeps and not self.fastest:
             return f"{over} is assumed to stand still: the slowest sweep that was simulated does not keep its judgement"
         swept = f"sweeps of up to {self.fastest:.3g} {self.rate_unit} keep the judgement of a step in simulation"
-        found = swept if self.sweeps else "no sweep was simulated"
-        return f"{over} is assumed to move slowly: the limits hold with it standing still, and {found}"
+        motion = swept if self.sweeps else "no sweep was simulated"
+        return f"{over} is assumed to move slowly: the limits hold with it standing still, and {motion}"
 
     @property
     def proof(self) -> str:
-        """What is proved between the points, and what is not."""
+        """The statement that is proved between the points, or where none is."""
         over, first, last = self.schedule.over, self.schedule.points[0], self.schedule.points[-1]
         missing = [stretch for stretch in self.stretches if not stretch.shown]
         if not missing:
@@ -233,7 +241,7 @@ class ScheduleCertificate(Result, Worded):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is proved, assumed and simulated, one sentence each."""
+        """Proof, assumption, sweeps and motions, one sentence each."""
         unit, over = self.rate_unit, self.schedule.over
         swept = (f"{name}: {describe_sweeps(sweeps, unit)}" for name, sweeps in self.sweeps.items())
         moved = (f"{name}: {describe_motion(motion, over, unit)}" for name, motion in self.motions.items())
@@ -283,8 +291,8 @@ class ScheduleCertificate(Result, Worded):
         """
         from seaopt.robustness.certificate.stored import build_schedule_certificate  # deferred: pydantic
 
-        given = find_standing(schedule, plants, parameters, dict(ranges or {}), others or ParameterSet())
-        return build_schedule_certificate(content, schedule, given)
+        standing = find_standing(schedule, plants, parameters, dict(ranges or {}), others or ParameterSet())
+        return build_schedule_certificate(content, schedule, standing)
 
 
 def certify_schedule(
@@ -374,9 +382,11 @@ def certify_schedule(
     parts = zip(values, unknowns, drawn, rng.spawn(len(values)), strict=True)
     certified = map_ordered(partial(_certify_place, shared), parts, executor)
     places: list[PlaceCertificate] = []
-    worst: dict[Spot, Worst] = {}
+    worst, failed = dict[Spot, Worst](), list[Bool[np.ndarray, "3 n"]]()
     for number, value in enumerate(count_off(values, f"value of {over}", holding)):
-        place, spots = next(certified).on(split_states(models, unknowns[number])), name_spots(models, unknowns[number])
+        (place, fails), spots = next(certified), name_spots(models, unknowns[number])
+        place = place.on(split_states(models, unknowns[number]))
+        failed.append(fails)
         worst |= {spots[name]._replace(place=(over, value)): case for name, case in place.worst.items()}
         if held := list_held(schedule, models, value):
             source, other = standing.sources[number]
@@ -393,9 +403,9 @@ def certify_schedule(
                 current_step_A=current_step_A if simulations else 0.0,
                 executor=executor,
             )
-            known = {(row.name, row.plant, row.state) for row in place.requirements}
+            required = {(row.name, row.plant, row.state) for row in place.requirements}
             rows = _place(schedule, value, simulated.requirements)
-            new = (row for row in rows if (row.name, row.plant, row.state) not in known)
+            new = (row for row in rows if (row.name, row.plant, row.state) not in required)
             place = replace(place, simulated=simulated, requirements=(*place.requirements, *new))
         places.append(place)
     pairs = list(pairwise(values))
@@ -412,12 +422,7 @@ def certify_schedule(
         rate = min_rate or fastest or slowest
         moved = (move_schedule(schedule, name, plant, nominal, rate) for name, plant in models.items())
         motions = {motion.plant: motion for motion in moved if motion is not None}
-    failures = Failures(
-        unstable=sum(place.unstable for place in places),
-        over_ms=sum(place.over_ms for place in places),
-        over_mt=sum(place.over_mt for place in places),
-    )
-    draws, unit = failures.bound(sum(place.draws for place in places), seed, confidence), _rate_unit(schedule)
+    draws, unit = count_failures(np.hstack(failed), seed, confidence), _rate_unit(schedule)
     progress(f"{format_count(len(places), 'value')} of {over}", 1.0)
     return ScheduleCertificate(
         schedule=schedule,
@@ -428,17 +433,17 @@ def certify_schedule(
         motions=motions,
         requirements=(
             *(row for place in places for row in place.requirements),
-            *_require_limits_between(schedule),
+            *require_limits_between(schedule),
             *draw_requirements(draws, worst, max_failure_probability),
-            *(_require_rate(of_plant, unit, min_rate) for of_plant in sweeps.values()),
-            *(_require_motion(motion, over, unit, min_rate) for motion in motions.values()),
+            *(require_rate(of_plant, unit, min_rate) for of_plant in sweeps.values()),
+            *(require_motion(motion, over, unit, min_rate) for motion in motions.values()),
         ),
     )
 
 
 @record(eq=False)
 class Standing:
-    """What a schedule is certified at: plants, values of its variable, and at each what is known and uncertain."""
+    """Plants and values of the variable at which a schedule is certified, with the parameters at each."""
 
     models: dict[str, Plant]
     values: tuple[float, ...]
@@ -478,31 +483,35 @@ def _place_source(
 def _certify_place(
     shared: Shared[tuple[ScheduledController, dict[str, Plant]]],
     part: tuple[float, Uncertainty, Points, np.random.Generator],
-) -> PlaceCertificate:
-    """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case."""
+) -> tuple[PlaceCertificate, Bool[np.ndarray, "3 n"]]:
+    """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case.
+
+    Also return which draws fail in which way.
+    """
     (schedule, models), (value, unknown, points, rng) = shared.value, part
     controller, point, plants = schedule.at(value), value in schedule.points, split_states(models, unknown)
     figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}
-    failed, drawn, failures = np.zeros((3, len(points)), dtype=bool), unknown.values(points), Failures()
+    failed, drawn = np.zeros((3, len(points)), dtype=bool), unknown.values(points)
     for plant in plants.values() if len(points) else ():
         failed |= find_failures(controller, batch_figures(controller, plant, unknown.nominal, drawn))
-    failures.add(failed)
+    counts = count_failures(failed, 0, CONFIDENCE)
     spots = name_spots(models, unknown)
     rows = [row for name, spot in spots.items() for row in plant_requirements(controller, spot, figures[name])]
     rows += _require_friction(schedule, models, value, unknown, len(points), rng)
     if point:
         rows += design_requirements(controller, schedule.design[0], unknown.nominal)
-    return PlaceCertificate(
+    place = PlaceCertificate(
         value=value,
         point=point,
         plants=figures,
         worst={name: find_worst(controller, plant, unknown, points) for name, plant in plants.items()} if point else {},
-        draws=len(points),
-        unstable=failures.unstable,
-        over_ms=failures.over_ms,
-        over_mt=failures.over_mt,
+        draws=counts.samples,
+        unstable=counts.unstable,
+        over_ms=counts.over_ms,
+        over_mt=counts.over_mt,
         requirements=_place(schedule, value, rows),
     )
+    return place, failed
 
 
 def list_held(schedule: ScheduledController, models: Plants, value: float) -> dict[str, Plant]:
@@ -545,10 +554,10 @@ def _place(schedule: ScheduledController, value: float, rows: Sequence[Requireme
 
 def _choose_ranges(ranges: Ranges, plants: Plants) -> dict[str, tuple[float, float]]:
     """Return the ranges of what some of these plants have."""
-    known = {*conditions(tuple(plants.values())), *find_modes(plants)}.union(
-        *(one.parameters for one in plants.values())
+    names = {*conditions(tuple(plants.values())), *find_modes(plants)}.union(
+        *(plant.parameters for plant in plants.values())
     )
-    return {name: ends for name, ends in ranges.items() if name in known}
+    return {name: ends for name, ends in ranges.items() if name in names}
 
 
 def _bound_plants(
@@ -562,53 +571,6 @@ def _bound_plants(
         values = place_variable(plant, nominal, schedule.over, 0.5 * (low + high))
         out.append(bound_stretch(name, middle, schedule.table, plant, values, low, high))
     return out
-
-
-def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
-    """Return that the design plant's limits hold between the points, 0.9 of the bandwidth asked among them."""
-    return [
-        require_at_most(
-            "limits_between_points",
-            float(len(place.broken)),
-            0.0,
-            place=(schedule.over, place.value),
-            text=", ".join(place.broken),
-            remedy=schedule.remedy if place.broken else "",
-        )
-        for place in schedule.between
-    ]
-
-
-def _require_rate(sweeps: Sequence[Sweep], unit: str, least: float | None) -> Requirement:
-    """Return that a plant's sweeps keep their judgement: the slowest at all, and as fast as asked."""
-    faults = [sweep.fault for sweep in sweeps if sweep.fault]
-    return require_at_least(
-        "min_schedule_rate",
-        find_fastest(sweeps),
-        sweeps[0].rate if least is None else least,
-        unit=unit,
-        plant=sweeps[0].plant,
-        scenario="sweep",
-        text=faults[0] if faults else f"the fastest tried is {sweeps[-1].rate:.3g} {unit}",
-    )
-
-
-def _require_motion(motion: Motion, over: str, unit: str, least: float | None) -> Requirement:
-    """Return that a plant that moves the variable keeps its judgement: at the rate reached at all, or as asked.
-
-    What keeps its judgement at less than was asked is not met: nothing is known of the rate that was.
-    """
-    row = require_at_least(
-        MOTION_RATE,
-        0.0 if motion.fault else motion.rate,
-        motion.rate if least is None else least,
-        unit=unit,
-        plant=motion.plant,
-        text=describe_motion(motion, over, unit),
-    )
-    if motion.fault or row.met:
-        return replace(row, met=not motion.fault)
-    return replace(row, remedy="ask a smaller min_rate, or give the command a higher limit")
 
 
 def _digest(schedule: ScheduledController) -> tuple[int, ...]:

@@ -15,7 +15,7 @@ from seaopt.codec import to_content
 from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
-from seaopt.executors import Shared, map_ordered
+from seaopt.executors import map_ordered
 from seaopt.formatting import format_band, format_count, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -132,7 +132,7 @@ def run_simulations(
     controller, plants, parameters, draws, sensors, current_step_A, seed
         As in `verify`; the controller knows its design plant.
     steps : Verification, optional
-        What `simulate_steps` played: on the same devices it is not played again.
+        Runs of steps that were played before: on the same devices they are not played again.
     executor : concurrent.futures.Executor, optional
         As in `verify`.
     progress : callable, optional
@@ -159,7 +159,7 @@ def run_simulations(
     sweeps = _list_sweeps(controller, plants, parameters)
     jobs = sweeps | _list_port_jobs(controller)
     sweeping, playing = divide(progress, SWEEP * len(sweeps) + PORT, SCENARIOS * len(plants))
-    attempts = map_ordered(partial(_attempt_job, Shared(tuple(jobs.values()))), range(len(jobs)), executor)
+    attempts = map_ordered(_attempt, jobs.values(), executor)
     done: dict[str, tuple[Any, str]] = {}
     for number, what in enumerate(jobs):
         sweeping(what, number / len(jobs))
@@ -185,10 +185,6 @@ def _list_port_jobs(controller: Controller) -> dict[str, Callable[[], Any]]:
     assert controller.design is not None
     verbs = {"passivity": passivity, "environments": coupled_stability}
     return {what: partial(measure, controller, *controller.design) for what, measure in verbs.items()}
-
-
-def _attempt_job(jobs: Shared[tuple[Callable[[], Any], ...]], number: int) -> tuple[Any, str]:
-    return _attempt(jobs.value[number])
 
 
 def _attempt(verb: Callable[[], Played]) -> tuple[Played | None, str]:
@@ -269,8 +265,8 @@ def _list_sweeps(
     rub = any(has_friction(plant, parameters) for plant in plants.values())
     if controller.command_limit is None and not rub:  # one reason for all of them
         return {"large signals": partial(_sweep, controller, design.name, design, values)}
-    own = next((name for name, plant in plants.items() if plant is design), design.name)
-    on = {own: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != own}
+    label = next((name for name, plant in plants.items() if plant is design), design.name)
+    on = {label: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != label}
     return {f"large signals on {name}": partial(_sweep, controller, name, *pair) for name, pair in on.items()}
 
 

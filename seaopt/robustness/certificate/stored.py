@@ -1,4 +1,4 @@
-"""What a certificate needs of its robustness.json; all other figures are computed again.
+"""Certificates read from robustness.json and schedule_robustness.json; linear figures are computed again.
 
 Null stands for what is infinite: the value of a requirement that an unstable plant breaks, a bound that there is not.
 """
@@ -78,7 +78,7 @@ class StoredRequirement:
 
     def build(self) -> Requirement:
         """Return the row; of an older file, which does not say it, one that is to be equal may be off by a half."""
-        sense, known = self.sense or find_sense(self.name), {each.name for each in fields(Requirement)}
+        sense, names = self.sense or find_sense(self.name), {each.name for each in fields(Requirement)}
         older: dict[str, Any] = {
             "plant": self.plant or "",
             "sense": sense,
@@ -86,7 +86,7 @@ class StoredRequirement:
             "place": None if self.place is None else next(iter(self.place.items())),
             "text": self.where if self.plant is None else self.text,
         }
-        return Requirement(**{name: getattr(self, name) for name in known - older.keys()}, **older)
+        return Requirement(**{name: getattr(self, name) for name in names - older.keys()}, **older)
 
 
 def find_sense(name: str) -> str:
@@ -118,7 +118,7 @@ class StoredPlant:
 
 @record
 class StoredSimulation:
-    """What the scenarios were played with, sweeps of amplitudes, and why something is missing."""
+    """The devices of the scenarios, sweeps of amplitudes, and why something is missing."""
 
     sensors: Sensors
     current_step_A: float
@@ -137,7 +137,7 @@ class StoredFriction:
 
 @record
 class StoredImpedance:
-    """What is rendered at the link, of which all but draws and simulated steps is found again."""
+    """The impedance at the link; all but draws and simulated steps is computed again."""
 
     draws: ImpedanceDraws | None = None
     steps: tuple[ImpedanceStep, ...] = ()
@@ -191,13 +191,13 @@ def build_certificate(
     varied, names = stored.varied, [row.name for row in stored.varied]
     states = {name: split_friction({name: plant}, parameters, names) for name, plant in models.items()}
     models = {name: plant for name, plant in models.items() if any(state in stored.plants for state in states[name])}
-    known = {state: plant for name in models for state, plant in states[name].items()}
+    plants = {state: plant for name in models for state, plant in states[name].items()}
     for name in stored.plants:
-        if name not in known:
+        if name not in plants:
             raise FileError(f'{FILE}: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
     impedance = stored.impedance or StoredImpedance()
     try:
-        linear = {name: known[name] for name in stored.plants}
+        linear = {name: plants[name] for name in stored.plants}
         worst = {name: content["plants"][name]["worst"] for name in linear}
         certificate = Certificate(
             requirements=requirements,
@@ -263,7 +263,7 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
 
 @record(eq=False)
 class _StoredPlace:
-    """What a file has of the variable standing at one value."""
+    """The variable standing at one value, as a file holds it."""
 
     value: float
     point: bool
@@ -355,10 +355,10 @@ def read_requirements(stored: Sequence[StoredRequirement], source: str = FILE) -
         raise FileError(f"{source}: requirements is empty, and a certificate requires something; {CERTIFY_AGAIN}")
     rows = tuple(row.build() for row in stored)
     for row in rows:
-        known = find_sense(row.name)
-        if row.sense not in (known, "≥" if known == "=" else known):  # a law that is given may have more
+        sense = find_sense(row.name)
+        if row.sense not in (sense, "≥" if sense == "=" else sense):  # a law that is given may have more
             raise FileError(
-                f"{source}: requirements: {row.name} has the sense {row.sense}, and must be {known} its limit; "
+                f"{source}: requirements: {row.name} has the sense {row.sense}, and must be {sense} its limit; "
                 f"{CERTIFY_AGAIN}"
             )
         if row.met and not row.keeps:

@@ -92,8 +92,8 @@ def batch_figures(
     columns = np.vstack([values, *extra.values()])
     if count > 1 and np.array_equal(columns, np.repeat(columns[:, :1], count, axis=1)):
         # Nothing that is drawn concerns this plant: all draws are one loop.
-        one = {name: column[:1] for name, column in draws.items()}
-        single = batch_figures(controller, plant, nominal, one, ignore, threads, peaks)
+        first = {name: column[:1] for name, column in draws.items()}
+        single = batch_figures(controller, plant, nominal, first, ignore, threads, peaks)
         progress(f"{count} of {count} draws", 1.0)
         return take_rows(single, np.zeros(count, dtype=int))
     parts: list[BatchFigures] = []
@@ -123,11 +123,11 @@ def expand_draws(
     for row, name in enumerate(plant.parameters):
         if name in draws:
             values[row] = draws[name]
-    known = read_conditions(plant, nominal)
+    at_rest = read_conditions(plant, nominal)
     extra = {
-        name: draws[name] if name in draws else np.full(count, known[name])
+        name: draws[name] if name in draws else np.full(count, at_rest[name])
         for name in conditions((plant,))
-        if name in draws or name in known
+        if name in draws or name in at_rest
     }
     return values, extra
 

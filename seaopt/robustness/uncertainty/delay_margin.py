@@ -94,7 +94,15 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     @cache
     def delay_loop(part: float) -> _DelayedLoop:
         (sampled,) = sample_linear(linear, before + part * period, period, controller.compute_delay_samples)
-        return _measure_delayed(Loop(plant=sampled, law=controller.law), part)
+        system = Loop(plant=sampled, law=controller.law).system()
+        angles, phases = find_crossovers(system)
+        return _DelayedLoop(
+            part=part,
+            angles=angles,
+            phases=np.mod(phases, FULL_TURN),
+            loud=bool(system.curves(np.array([np.pi]))[0, 0].real < 0.5),
+            outside=int(np.sum(~(np.abs(system.poles) < STABLE))),
+        )
 
     grid = _build_grid(delay_loop)
     samples = np.arange(int(np.ceil(reach_s / period)) + 1)
@@ -109,19 +117,6 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
             delay = (w + part) * period
             return float(delay) if delay <= reach_s else None
     return None
-
-
-def _measure_delayed(loop: Loop, part: float) -> _DelayedLoop:
-    system = loop.system()
-    angles, phases = find_crossovers(system)
-    nyquist = system.curves(np.array([np.pi]))[0, 0]
-    return _DelayedLoop(
-        part=part,
-        angles=angles,
-        phases=np.mod(phases, FULL_TURN),
-        loud=bool(nyquist.real < 0.5),
-        outside=int(np.sum(~(np.abs(system.poles) < STABLE))),
-    )
 
 
 def _build_grid(delay_loop: Callable[[float], _DelayedLoop]) -> list[_DelayedLoop]:

@@ -1,4 +1,4 @@
-"""What is uncertain of the parameters, and draws of it: the fit's joint distribution and the declared ranges.
+"""The uncertainty of the parameters, and draws of it: the fit's joint distribution and the declared ranges.
 
 A range may name a parameter of a plant, a condition (`seaopt.control.loops.sampled_plant`: an angle such as phi,
 delay_s), or the frequency of a mode that a plant declares, such as ``screw_mode_hz``: one parameter sets it, the
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import block_diag
 
 from seaopt.codec import OrInfinite, OrMinusInfinite
 from seaopt.control.laws.delay import Drive
@@ -78,7 +79,7 @@ class ModeTable:
 
 @record(eq=False)
 class Uncertainty:
-    """What is uncertain of the parameters.
+    """The uncertainty of the parameters: a Gaussian part, and ranges.
 
     Parameters
     ----------
@@ -109,12 +110,14 @@ class Uncertainty:
 
     def varied(self) -> tuple[Varied, ...]:
         """Return what is drawn and how, the Gaussian part first."""
-        stds, known = np.sqrt(np.diag(self.covariance)).tolist(), {**self.absent, **self.nominal}
-        quantities = [(name, std, known[name].min, known[name].max) for name, std in zip(self.names, stds, strict=True)]
+        stds, parameters = np.sqrt(np.diag(self.covariance)).tolist(), {**self.absent, **self.nominal}
+        quantities = [
+            (name, std, parameters[name].min, parameters[name].max) for name, std in zip(self.names, stds, strict=True)
+        ]
         quantities += [(name, None, low, high) for name, (low, high) in self.ranges.items()]
         varied: list[Varied] = []
         for name, std, low, high in quantities:
-            unit, value = (known[name].unit, known[name].value) if name in known else ("Hz", None)
+            unit, value = (parameters[name].unit, parameters[name].value) if name in parameters else ("Hz", None)
             varied.append(Varied(name=name, unit=unit, value=value, std=std, low=low, high=high))
         return tuple(varied)
 
@@ -220,7 +223,7 @@ def combine_uncertainty(
         The fit leaves a parameter undetermined, or a range is empty or names nothing.
 
     """
-    known = {name for plant in plants.values() for name in plant.parameters}
+    plant_names = {name for plant in plants.values() for name in plant.parameters}
     check_ranges(ranges, plants)
     if isinstance(source, Fit):
         covariance = source.covariance if drive is None else drive.take_covariance(source)
@@ -243,12 +246,12 @@ def combine_uncertainty(
         nominal, names, matrix = ParameterSet(), (), np.zeros((0, 0))
         others = others.with_parameters(*source.values())
     stds = {name: p.prior_std for name, p in others.items() if p.prior_std is not None}
-    whole = np.zeros((len(names) + len(stds),) * 2)
-    whole[: len(names), : len(names)] = matrix
-    whole[len(names) :, len(names) :] = np.diag(np.square(list(stds.values())))
+    whole = np.asarray(block_diag(matrix, np.diag(np.square(list(stds.values())))))
     uncertain = (*names, *stds)
-    known.add(DRIVE_DELAY)
-    used = [i for i, name in enumerate(uncertain) if name not in ranges and name in known and np.isfinite(whole[i, i])]
+    plant_names.add(DRIVE_DELAY)
+    used = [
+        i for i, name in enumerate(uncertain) if name not in ranges and name in plant_names and np.isfinite(whole[i, i])
+    ]
     nominal = nominal.with_parameters(*others.values())
     if drive is not None:
         nominal = nominal.with_parameters(Parameter(name=DRIVE_DELAY, value=drive.delay_s, unit="s", min=0.0))
@@ -302,13 +305,13 @@ def check_ranges(ranges: Ranges, plants: Plants) -> None:
     extra = conditions(tuple(plants.values()))
     parameters = {name: plant.defaults.get(name) for plant in plants.values() for name in plant.parameters}
     modes = {name: _mode(plant).parameter for name, plant in find_modes(plants).items()}
-    known = [*parameters, *extra, *modes]
+    allowed = [*parameters, *extra, *modes]
     if not isinstance(ranges, Mapping):
         raise ControlError(f"ranges is a {type(ranges).__name__}; give a mapping of name to (low, high)")
     for name, ends in ranges.items():
-        if name not in known:
+        if name not in allowed:
             part = str(name).removesuffix("_hz")
-            remedy = f'add parts = ["{part}"] to one' if part in PARTS else suggestion(str(name), known)
+            remedy = f'add parts = ["{part}"] to one' if part in PARTS else suggestion(str(name), allowed)
             raise ControlError(f'range of "{name}": no plant has it; {remedy}')
         low, high = _read_ends(name, ends)
         for wrong, what in ((not np.isfinite(high - low), "not finite"), (low > high, "empty")):
@@ -332,10 +335,10 @@ def check_ranges(ranges: Ranges, plants: Plants) -> None:
 
 def _read_ends(name: str, value: Any) -> tuple[float, float]:
     """Return low and high of a value that should be a pair of numbers."""
-    pair = list(value) if isinstance(value, (list, tuple, np.ndarray)) else []
-    if len(pair) != 2 or any(isinstance(end, bool) or not isinstance(end, (int, float, np.number)) for end in pair):
+    ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else []
+    if len(ends) != 2 or any(isinstance(end, bool) or not isinstance(end, (int, float, np.number)) for end in ends):
         raise ControlError(f"range of {name} = {' '.join(repr(value).split())} is not a range; give (low, high)")
-    return float(pair[0]), float(pair[1])
+    return float(ends[0]), float(ends[1])
 
 
 def place_value(plant: Plant, params: ParameterSet, name: str, value: float, plants: Plants) -> ParameterSet | None:

@@ -1,8 +1,11 @@
-"""What failures among independent draws say of the probability of failure."""
+"""The probability of failure, bounded from failures among independent draws."""
 
 from __future__ import annotations
 
 from dataclasses import fields
+
+import numpy as np
+from jaxtyping import Bool
 
 from seaopt.formatting import html_table
 from seaopt.records import record
@@ -64,6 +67,18 @@ def failure_bound(samples: int, failures: int, confidence: float) -> float:
     from scipy.special import betaincinv
 
     return float(betaincinv(failures + 1, samples - failures, confidence))
+
+
+def count_failures(failed: Bool[np.ndarray, "3 n"], seed: int, confidence: float) -> MonteCarlo:
+    """Return what draws say of which `find_failures` tells how each failed on some plant."""
+    unstable, over_ms, over_mt = failed
+    kinds = (unstable, over_ms & ~unstable, over_mt & ~over_ms & ~unstable)
+    counts = {name: int(np.sum(kind)) for name, kind in zip(("unstable", "over_ms", "over_mt"), kinds, strict=True)}
+    samples, failures = unstable.size, sum(counts.values())
+    bound = failure_bound(samples, failures, confidence)
+    return MonteCarlo(
+        samples=samples, failures=failures, seed=seed, confidence=confidence, failure_probability_bound=bound, **counts
+    )
 
 
 def format_draws(draws: MonteCarlo) -> str:

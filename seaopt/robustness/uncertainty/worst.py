@@ -195,8 +195,8 @@ def place_values(plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -
     extra = conditions((plant,))
     values = plant.complete(nominal)
     changed = {name: value for name, value in at.items() if name in values}
-    known = read_conditions(plant, nominal) | {name: value for name, value in at.items() if name in extra}
-    return values.update(**changed).with_parameters(*(replace(extra[name], value=known[name]) for name in known))
+    placed = read_conditions(plant, nominal) | {name: value for name, value in at.items() if name in extra}
+    return values.update(**changed).with_parameters(*(replace(extra[name], value=placed[name]) for name in placed))
 
 
 def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:

@@ -55,9 +55,9 @@ def predict_gain(
     a = amplitude[None, :, None]
     fed_back = np.sum(c_y * friction.on_outputs, axis=0)  # of a unit of friction
     w = friction.effort(sigma, closed, c_r, fed_back, a)  # (s, a, f)
-    asked = closed * (c_r * a - fed_back * w)
-    force = p * sigma * asked + friction.on_outputs[0] * w
-    share = np.minimum(most / np.maximum(np.abs(asked), 1e-300), 1.0)
+    effort = closed * (c_r * a - fed_back * w)
+    force = p * sigma * effort + friction.on_outputs[0] * w
+    share = np.minimum(most / np.maximum(np.abs(effort), 1e-300), 1.0)
     met = 2.0 / np.pi * (np.arcsin(share) + share * np.sqrt(1.0 - share**2))
     first = np.argmax(met >= sigma, axis=0)  # from no saturation downwards
     return np.take_along_axis(force, first[None], axis=0)[0] / amplitude[:, None]
@@ -106,10 +106,10 @@ class _Friction:
         v = AMPLITUDES[:, None, None, None]
         # Rising, so that the smallest V is taken where several will do.
         needed = np.maximum.accumulate(v * np.abs(1.0 + self.gains[:, None, None, None] * h), axis=0)[:, :, 0]
-        asked = np.abs(t) * amplitude
-        above = np.clip(np.count_nonzero(needed[:, :, None] < asked, axis=0), 1, AMPLITUDES.size - 1)
+        driven = np.abs(t) * amplitude
+        above = np.clip(np.count_nonzero(needed[:, :, None] < driven, axis=0), 1, AMPLITUDES.size - 1)
         rows, _, columns = np.ogrid[: above.shape[0], :1, : above.shape[2]]
         low, high = (np.log(needed[above - step, rows, columns]) for step in (1, 0))
-        share = np.clip((np.log(np.maximum(asked, 1e-300)) - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
+        share = np.clip((np.log(np.maximum(driven, 1e-300)) - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
         gain = (1.0 - share) * self.gains[above - 1] + share * self.gains[above]
         return -gain * t * amplitude / (1.0 + gain * h)

@@ -255,8 +255,8 @@ def _take_bare(coupled: Plant, parameters: ParameterSet) -> CompletedParameters:
     """Return a coupled plant's values; the inertia on its port is the environment's, without the link's own bounds."""
     (name,) = coupled.ports[0].payload
     bare = Parameter(name=name, value=1.0, unit=coupled.parameter_unit(name))
-    given = parameters.given if isinstance(parameters, CompletedParameters) else parameters
-    return coupled.complete(given.with_parameters(bare)).drop_conditions()
+    stated = parameters.given if isinstance(parameters, CompletedParameters) else parameters
+    return coupled.complete(stated.with_parameters(bare)).drop_conditions()
 
 
 def close_on_environment(
@@ -319,13 +319,12 @@ def _find_boundary(
 ) -> Float[np.ndarray, "_ 2"]:
     """Return points of the edge between neighbours of the grid, one of them stable, by bisection in logarithms."""
     grid = np.stack(np.meshgrid(np.log(mass), np.log(stiffness), indexing="ij"), axis=-1)
+    below, above, left, right = np.s_[:-1], np.s_[1:], np.s_[:, :-1], np.s_[:, 1:]
     ends: list[tuple[Any, Any]] = []
-    for axis in (0, 1):
-        first, second = (np.take(stable, range(i, stable.shape[axis] - 1 + i), axis=axis) for i in (0, 1))
-        left, right = (np.take(grid, range(i, stable.shape[axis] - 1 + i), axis=axis) for i in (0, 1))
-        for inside, a, b in ((first & ~second, left, right), (second & ~first, right, left)):
-            ends.append((a[inside], b[inside]))
-    good, bad = (np.concatenate([pair[i] for pair in ends]) for i in (0, 1))
+    for inner, outer in ((below, above), (above, below), (left, right), (right, left)):
+        edge = stable[inner] & ~stable[outer]
+        ends.append((grid[inner][edge], grid[outer][edge]))
+    good, bad = (np.concatenate(points) for points in zip(*ends, strict=True))
     for _ in range(EDGE_BISECTIONS if len(good) else 0):
         middle = 0.5 * (good + bad)
         at = np.exp(middle)

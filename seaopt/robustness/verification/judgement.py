@@ -147,7 +147,7 @@ class Outcome(Result):
 
     @property
     def reason(self) -> str:
-        """What failed; empty if nothing did."""
+        """The faults in words; empty if there is none."""
         return "; ".join(map(str, self.faults))
 
     @property
@@ -179,17 +179,17 @@ class _Run:
 
     @property
     def regulated(self) -> str:
-        """The output that the law regulates."""
+        """Name of the output that the law regulates."""
         return self.stage.controller.spec.regulated
 
     @property
     def unit(self) -> str:
-        """Of that output."""
+        """Unit of that output."""
         return self.stage.controller.command.reference_unit
 
     @property
     def force(self) -> Signal:
-        """That output."""
+        """The regulated output."""
         return self.trace.outputs[self.regulated][self.index]
 
     @property

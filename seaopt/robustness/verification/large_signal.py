@@ -47,7 +47,7 @@ PREDICTED_POINTS = 80
 
 @record(eq=False)
 class _StoredSweep:
-    """What a file has of a sweep of amplitudes."""
+    """A sweep of amplitudes as its file holds it."""
 
     plant: str
     unit: str

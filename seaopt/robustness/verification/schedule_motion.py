@@ -47,7 +47,7 @@ LOST_SHARE = 4.0  # of what is allowed, that a push is taken to take which is lo
 
 @record
 class Motion:
-    """What the simulation of a plant that moves the variable found."""
+    """The findings on a plant that moves the variable, by simulation."""
 
     plant: str
     asked: float  # the rate of the variable that was to be reached, in its unit per second
@@ -138,9 +138,12 @@ def move_schedule(
     pushing = _make_pushing(schedule, plant, params, rate)
     push = pushing.find_push(rate, FIRST_SHARE * find_least_effort(schedule))
     if push is None:
-        still, lost = dict.fromkeys(("low", "high"), pushing.middle), dict.fromkeys(("left", "ringing"), math.inf)
+        middle, lost = (
+            dict.fromkeys(("low", "high"), pushing.middle),
+            dict.fromkeys(("left", "ringing"), math.inf),
+        )
         fault = "is lost under any push, small ones too"
-        return Motion(plant=name, asked=rate, rate=0.0, size=0.0, fault=fault, **still, **lost)
+        return Motion(plant=name, asked=rate, rate=0.0, size=0.0, fault=fault, **middle, **lost)
     if push.rate < rate:
         pushing, push = _change_length(pushing, push, rate)
     place, size = pushing.follow(push.run), push.size
@@ -214,7 +217,7 @@ def describe_motion(motion: Motion, over: str, unit: str) -> str:
     """Return what was found where a plant moves the variable `over`, in one line; rates are in `unit`."""
     ends = f"{motion.low:.3g} and {motion.high:.3g}"
     head = f"moves {over} by itself between {ends} at up to {motion.rate:.3g} {unit}"
-    found = f"{head}, pushed to and fro, and {motion.fault or 'neither rings nor departs'}"
+    moves = f"{head}, pushed to and fro, and {motion.fault or 'neither rings nor departs'}"
     if motion.rate >= motion.asked:
-        return found
-    return f"{found}; {motion.asked:.3g} {unit} is not reached within the table and the command's limit"
+        return moves
+    return f"{moves}; {motion.asked:.3g} {unit} is not reached within the table and the command's limit"

@@ -56,7 +56,7 @@ SWEEP = ("sweep_from", "sweep_to", "sweep_rad_s")  # parameters of a swept plant
 
 @record
 class Sweep:
-    """What one sweep found.
+    """The findings of one sweep.
 
     Parameters
     ----------
@@ -171,10 +171,10 @@ def _choose_pulses(schedule: ScheduledController, plant: Plant, params: Paramete
 
 def find_least_effort(schedule: ScheduledController) -> float:
     """Return what the command's limit leaves of the output at every point, at rest and at the bandwidth."""
-    limits = [one.force_limit(0.0) for one in schedule.controllers]
-    fast = [one.force_limit(one.spec.bandwidth_hz) for one in schedule.controllers]
-    known = [abs(value) for value in (*limits, *fast) if value is not None and math.isfinite(value)]
-    return min(known, default=1.0 / STEP_SHARE)
+    limits = [controller.force_limit(0.0) for controller in schedule.controllers]
+    fast = [controller.force_limit(controller.spec.bandwidth_hz) for controller in schedule.controllers]
+    efforts = [abs(value) for value in (*limits, *fast) if value is not None and math.isfinite(value)]
+    return min(efforts, default=1.0 / STEP_SHARE)
 
 
 def _run_sweep(
@@ -204,11 +204,11 @@ def _run_sweep(
         return command, (number + 1, after)
 
     reset = 0, law.reset(start.output, start.output, low, start.command)
-    found = partial(Sweep, plant=name, rate=0.5 * (high - low) * omega, frequency_hz=frequency_hz)
+    make_sweep = partial(Sweep, plant=name, rate=0.5 * (high - low) * omega, frequency_hz=frequency_hz)
     try:
         calm, moved = (start.run(step, reset, swept, values, size * pulse) for size in (0.0, pulses.size))
     except (ControlError, SimulationError) as error:
-        return found(peak=math.inf, left=math.inf, fault=f"is lost: {error}")
+        return make_sweep(peak=math.inf, left=math.inf, fault=f"is lost: {error}")
     response = (moved.force - calm.force) / pulses.size
     peak = float(max(np.max(response), 1.0 - np.min(response)))
     ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
@@ -220,7 +220,7 @@ def _run_sweep(
         fault = f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
     elif not left <= pulses.allowed_left:
         fault = f"a step is still {100 * left:.3g} % off at its end, {100 * pulses.allowed_left:.3g} % allowed"
-    return found(peak=peak, left=left, fault=fault)
+    return make_sweep(peak=peak, left=left, fault=fault)
 
 
 @record(eq=False)

@@ -28,7 +28,7 @@ from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
-from seaopt.units import LINEAR, Mechanics, unit_after
+from seaopt.units import Mechanics, unit_after
 
 ChooseScenarios = Callable[[Controller, Plant, Sequence[ParameterSet]], Sequence[Scenario]]
 TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it is played as friction that sticks"
@@ -87,11 +87,8 @@ class Verification(Result):
 
     @property
     def command(self) -> Command:
-        """What the controller commands."""
-        stage = next(iter(self.stages.values()), None)
-        if stage is None:
-            return Command(input="I", unit="A", per_effort=1.0, effort_unit=LINEAR.unit)
-        return stage.controller.command
+        """The controller's command: its input, unit and limit."""
+        return next(iter(self.stages.values())).controller.command
 
     def scenario(self, row: Outcome) -> Scenario:
         """Return the scenario of a row."""
@@ -173,7 +170,7 @@ class Verification(Result):
 
     @property
     def skipped_rows(self) -> tuple[Mapping[str, str], ...]:
-        """What is skipped, as a file has it."""
+        """The skipped runs as a file holds them."""
         keys = ("scenario", "plant", "reason")
         return tuple(dict(zip(keys, row, strict=True)) for row in self.skipped)
 
@@ -405,13 +402,13 @@ def _run_scenario(stage: Stage, name: str, scenario: Scenario, sets: Sequence[Pa
     unlimited = None
     if overshoots_at_limit(stage, scenario, ideal):
         unlimited = play(stage.ideal.unlimited, scenario, sets, seed=seed)
-    traces = {id(trace): trace, id(ideal): ideal}.values()
+    traces = [trace] if ideal is trace else [trace, ideal]
     return _Runs(
         actual=scenario,
         outcomes=[judge_run(stage, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))],
-        simulated_s=sum(len(sets) * one.time.size * stage.controller.sample_time_s for one in traces),
-        wall_s=sum(one.wall_s for one in traces),
-        error=max(one.error for one in traces),
+        simulated_s=sum(len(sets) * played.time.size * stage.controller.sample_time_s for played in traces),
+        wall_s=sum(played.wall_s for played in traces),
+        error=max(played.error for played in traces),
     )
 
 

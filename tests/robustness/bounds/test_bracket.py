@@ -263,7 +263,7 @@ def test_figures_are_rounded_up():
 
 @pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"boxes": 0}, {"seconds": -1.0}])
 def test_bad_budgets(wrong):
-    with pytest.raises(ControlError, match="not positive"):
+    with pytest.raises(ControlError, match="is not above 0"):
         Budget(**wrong)
 
 

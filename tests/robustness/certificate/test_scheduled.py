@@ -18,14 +18,14 @@ from seaopt.robustness import ScheduleCertificate, certify_schedule
 from seaopt.robustness.certificate import scheduled
 from seaopt.robustness.certificate.certify import add_design, find_own_drive
 from seaopt.robustness.certificate.measured_draws import Loops, measure_draws
+from seaopt.robustness.certificate.requirements import require_motion, require_rate
 from seaopt.robustness.certificate.scheduled import (
     _certify_place,
     _require_friction,
-    _require_motion,
-    _require_rate,
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
+from seaopt.robustness.uncertainty.failure_probability import count_failures
 from seaopt.robustness.verification import limit_cycles, schedule_sweep, verification
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
@@ -111,8 +111,9 @@ def test_a_draw_that_lies_on_its_limit_keeps_it_as_in_the_certificate_of_one_law
     for beyond, fails in ((5e-7, False), (5e-6, True)):
         asked = ask(schedule, max_sensitivity=float(largest / (1.0 + beyond)))
         loops = Loops(controller=asked.at(value), models=models, plants=models, unknown=unknown, bounds=None)
-        alone, _, _ = measure_draws(Shared(loops), 4, np.random.default_rng(1), None, lambda *_: None)
-        place = _certify_place(Shared((asked, models)), (value, unknown, points, np.random.default_rng(2)))
+        failed, _, _ = measure_draws(Shared(loops), 4, np.random.default_rng(1), None, lambda *_: None)
+        alone = count_failures(failed, 1, 0.99)
+        place, _ = _certify_place(Shared((asked, models)), (value, unknown, points, np.random.default_rng(2)))
         assert (place.over_ms > 0, alone.over_ms > 0) == (fails, fails)
         assert place.over_ms == alone.over_ms
 
@@ -161,23 +162,23 @@ def test_a_rate_is_required_where_it_is_asked_and_the_slowest_sweep_always(certi
     some = replace(certificate, sweeps={"swing": (sweep(1.0), sweep(2.0), sweep(4.0, "is lost"))})
     none = replace(certificate, sweeps={"swing": (sweep(1.0, "is lost"),)})
     assert some.fastest == 2.0 and "up to 2 rad/s" in some.assumption
-    met = [_require_rate(some.sweeps["swing"], "rad/s", least).met for least in (None, 1.5, 3.0)]
+    met = [require_rate(some.sweeps["swing"], "rad/s", least).met for least in (None, 1.5, 3.0)]
     assert met == [True, True, False]
-    assert not _require_rate(none.sweeps["swing"], "rad/s", None).met
+    assert not require_rate(none.sweeps["swing"], "rad/s", None).met
 
 
 def test_a_motion_slower_than_the_rate_asked_is_not_met():
     slow = Motion(
         plant="swing", asked=3.0, rate=1.5, low=0.1, high=0.5, size=4.5, left=0.3, ringing=0.01, fault="",
     )  # fmt: skip
-    short = _require_motion(slow, "phi", "rad/s", 3.0)
+    short = require_motion(slow, "phi", "rad/s", 3.0)
     assert (short.met, short.limit, short.value, short.sense) == (False, 3.0, 1.5, "≥")
     assert "3 rad/s is not reached within the table and the command's limit; ask a smaller min_rate" in short.where
-    assert _require_motion(slow, "phi", "rad/s", 1.5).met
-    tried = _require_motion(slow, "phi", "rad/s", None)  # nothing was asked: what is shown is stated
+    assert require_motion(slow, "phi", "rad/s", 1.5).met
+    tried = require_motion(slow, "phi", "rad/s", None)  # nothing was asked: what is shown is stated
     assert tried.met and tried.limit == tried.value == 1.5 and "is not reached" in tried.where
     for least in (None, 1.0):
-        rings = _require_motion(replace(slow, fault="rings"), "phi", "rad/s", least)
+        rings = require_motion(replace(slow, fault="rings"), "phi", "rad/s", least)
         assert not rings.met and rings.value == 0.0
 
 

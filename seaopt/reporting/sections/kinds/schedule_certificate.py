@@ -7,7 +7,7 @@ from seaopt.reporting.sections.data import Commands, Item, Section, Table, Verdi
 from seaopt.reporting.sections.kinds.certificate import explain_failure
 from seaopt.robustness import ScheduleCertificate
 from seaopt.robustness.certificate.requirement import group_failures
-from seaopt.robustness.certificate.scheduled import MOTION_RATE
+from seaopt.robustness.certificate.requirements import MOTION_RATE
 from seaopt.units import unit_after
 
 
