@@ -24,9 +24,19 @@ JsonEntry = Mapping[str, Any]
 
 def open_json(path: Path) -> Source:
     """List the keys of a JSON log; nested objects become dotted paths, lists carry an index."""
-    header: dict[str, Any] = {}
-    columns, length = _list_columns(path, header)
-    fields = tuple(Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items())
+    header, entries = _read_entries(path)
+    columns: dict[str, str] = {}
+    length = 0
+    with closing(entries):
+        for _, entry in entries:
+            length += 1
+            for name, value in flatten(entry):
+                if value is not None and columns.get(name, "empty") == "empty":
+                    columns[name] = name_kind(value)
+                else:
+                    columns.setdefault(name, "empty")
+    if not length:
+        raise LogError(f"{path}: holds no entries; record the log again")
     listed = ", ".join(f"{key} = {value}" for key, value in header.items())
     constants = {
         key: (float(value), header_unit(key))
@@ -36,35 +46,20 @@ def open_json(path: Path) -> Source:
     return Source(
         path=path,
         format="JSON",
-        fields=fields,
+        fields=tuple(
+            Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items()
+        ),
         load=partial(_load, path),
         constants=constants,
         notes=(f"header: {listed}"[:400],) if header else (),
     )
 
 
-def _list_columns(path: Path, header: dict[str, Any]) -> tuple[dict[str, str], int]:
-    """Return each key with its kind, and the number of entries; what the header says goes into `header`."""
-    columns: dict[str, str] = {}
-    length = 0
-    with closing(_read_entries(path, header)) as records:
-        for _, record in records:
-            length += 1
-            for name, value in flatten(record):
-                if value is not None and columns.get(name, "empty") == "empty":
-                    columns[name] = name_kind(value)
-                else:
-                    columns.setdefault(name, "empty")
-    if not length:
-        raise LogError(f"{path}: holds no entries; record the log again")
-    return columns, length
-
-
 def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     columns: dict[str, list[float]] = {name: [] for name in names}
-    with closing(_read_entries(path, {})) as records:
-        for place, record in records:
-            row = dict(flatten(record))
+    with closing(_read_entries(path)[1]) as entries:
+        for place, entry in entries:
+            row = dict(flatten(entry))
             for name, values in columns.items():
                 values.append(_to_number(path, place, name, row.get(name)))
     return {name: np.array(values) for name, values in columns.items()}
@@ -85,18 +80,20 @@ def _to_number(path: Path, place: str, name: str, value: Any) -> float:
     return float(value)
 
 
-def _read_entries(path: Path, header: dict[str, Any]) -> Generator[tuple[str, JsonEntry]]:
-    """Return the entries with their places; what stands beside them goes into `header`."""
+def _read_entries(path: Path) -> tuple[dict[str, Any], Generator[tuple[str, JsonEntry]]]:
+    """Return what stands beside the entries, and the entries with their places."""
     with path.open("rb") as stream:
         first = _read_line(path, stream, 1)
-        if not _is_entry(first) or not any(line.strip() for line in stream):
-            yield from _read_whole(path, header)
-            return
-        stream.seek(0)
-        number = 1
+        in_lines = _is_entry(first) and any(line.strip() for line in stream)
+    return ({}, _walk_lines(path)) if in_lines else _read_whole(path)
+
+
+def _walk_lines(path: Path) -> Generator[tuple[str, JsonEntry]]:
+    number = 1
+    with path.open("rb") as stream:
         while line := _read_line(path, stream, number):
             if line.strip():
-                yield f"line {number}", _check_object(path, _parse(path, line.rstrip(), number), f"line {number}")
+                yield _check_object(path, _parse(path, line.rstrip(), number), f"line {number}")
             number += 1
 
 
@@ -115,21 +112,20 @@ def _is_entry(line: bytes) -> bool:
         return False
 
 
-def _read_whole(path: Path, header: dict[str, Any]) -> Iterator[tuple[str, JsonEntry]]:
+def _read_whole(path: Path) -> tuple[dict[str, Any], Generator[tuple[str, JsonEntry]]]:
     size = path.stat().st_size
     if size > MAX_WHOLE:
         raise LogError(f"{path}: is {size >> 20} MiB of JSON in one piece; save it as JSON lines, one entry per line")
-    content = _parse(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
-    entries = content
+    content = entries = _parse(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
+    header: dict[str, Any] = {}
     if isinstance(content, dict):
         entries = content["entries"] if "entries" in content else _transpose(path, content)
-        header |= {key: value for key, value in content.items() if isinstance(value, str | int | float)}
+        header = {key: value for key, value in content.items() if isinstance(value, str | int | float)}
     if not isinstance(entries, list):
         raise LogError(
             f'{path}: holds no list of entries; write {{"entries": [{{"time": 0.0, ...}}, ...]}} or JSON lines'
         )
-    for number, entry in enumerate(entries, start=1):
-        yield f"entry {number}", _check_object(path, entry, f"entry {number}")
+    return header, (_check_object(path, entry, f"entry {number}") for number, entry in enumerate(entries, start=1))
 
 
 def _transpose(path: Path, content: dict[str, Any]) -> list[JsonEntry]:
@@ -167,10 +163,10 @@ def _check_unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return entry
 
 
-def _check_object(path: Path, entry: Any, place: str) -> JsonEntry:
+def _check_object(path: Path, entry: Any, place: str) -> tuple[str, JsonEntry]:
     if not isinstance(entry, dict):
         raise LogError(f"{path}: {place} is not an object but {json.dumps(entry)[:40]}; write one with named values")
-    return entry
+    return place, entry
 
 
 def flatten(record: JsonEntry, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:

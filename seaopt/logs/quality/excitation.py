@@ -126,9 +126,9 @@ class InputExcitation:
         elif half is not None:
             sentence += f"; the response of {self.output} has fallen to half near {half:.2g} Hz, without a peak"
         elif self.bands[0].gain is not None:
-            sentence += "; no response falls to half in there: inertia and stiffness (J and k) cannot be identified"
+            sentence += "; no response falls to half in there: inertia and stiffness cannot be identified"
         if low > 4.0 * self.bands[0].low_hz:
-            sentence += f"; nothing below {low:.3g} Hz: static gain and friction (eta, b_r) cannot be separated there"
+            sentence += f"; nothing below {low:.3g} Hz: static gain and friction cannot be separated there"
         return sentence
 
 
