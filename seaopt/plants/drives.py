@@ -79,27 +79,6 @@ class _Drive:
     largest: Callable[[Any], Any] | None = None  # of the new input
 
 
-def check(parts: Collection[str]) -> None:
-    """Refuse parts that do not go together.
-
-    Raises PlantError: one excludes another, or needs one that is not there.
-    """
-    electric = [part for part in INPUTS if part in parts]
-    if len(electric) > 1:
-        raise PlantError('parts "voltage_input" and "duty_input" are both given; the motor has one input: give one')
-    if electric and "current_loop" in parts:
-        raise PlantError(f'parts "{electric[0]}" and "current_loop" are both given; a current loop takes a current')
-    needs = {
-        "inductance": tuple(INPUTS),
-        "servo_integral": ("position_servo",),
-        "servo_limit": ("position_servo",),
-        "servo_delay": ("position_servo",),
-    }
-    for part, needed in needs.items():
-        if part in parts and not any(helper in parts for helper in needed):
-            raise PlantError(f'part "{part}" needs {" or ".join(needed)}; add it')
-
-
 def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
     """Return a plant whose input is the voltage or the duty of its motor.
 

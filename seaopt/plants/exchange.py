@@ -18,7 +18,7 @@ from seaopt.errors import PlantError
 from seaopt.files import write_bytes
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import can_stick, list_smoothing
-from seaopt.plants.plant import DRIVE_DELAY, CompletedParameters, Plant, refuse_samples
+from seaopt.plants.plant import DRIVE_DELAY, CompletedParameters, Plant, output_function, refuse_samples
 from seaopt.units import factor
 
 DESCRIPTION = "modelDescription.xml"
@@ -34,7 +34,7 @@ def to_control(plant: Plant, params: ParameterSet) -> Any:
     refuse_samples(plant)
     p = plant.complete(params).vector
     f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
-    h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
+    h = output_function(plant)
 
     def update(t: float, x: Any, u: Any, _: Any) -> Any:
         return np.array(f(t, x, u, p)).ravel()

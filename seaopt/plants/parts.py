@@ -160,7 +160,12 @@ INSIDE: tuple[Part, ...] = (
     "spring_damping", "screw_mode",
 )  # fmt: skip
 BREAKAWAY = 1.5  # of Coulomb friction, where bristles need a default
-NEEDS = {"load_stribeck": ("stribeck", "load_friction"), "load_square": ("stribeck", "load_friction")}
+# What a part needs beside it: one part of each group.
+NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
+    **dict.fromkeys(("load_stribeck", "load_square"), (("stribeck",), ("load_friction",))),
+    **dict.fromkeys(("servo_integral", "servo_limit", "servo_delay"), (("position_servo",),)),
+    "inductance": (tuple(drives.INPUTS),),
+}
 LOADS = {"motor": 0.0, "output": 0.0}  # of friction that grows with them, as linear analysis takes it
 
 
@@ -178,10 +183,7 @@ def parameters(parts: Sequence[str], of_part: Mapping[str, tuple[Parameter, ...]
 
 
 def check_parts(parts: Sequence[str]) -> None:
-    """Refuse an unknown part, and a part given twice.
-
-    Raises PlantError: a part is unknown, or given twice.
-    """
+    """Refuse an unknown part, one given twice, and parts that exclude each other or need one that is not there."""
     if isinstance(parts, str) or not isinstance(parts, Sequence):
         raise PlantError(f"parts = {parts!r} is not a list of names; give a list such as ['load_cell']")
     for part in parts:
@@ -189,9 +191,14 @@ def check_parts(parts: Sequence[str]) -> None:
             raise PlantError(f'part "{part}" is not known; {suggestion(str(part), PARTS)}')
         if list(parts).count(part) > 1:
             raise PlantError(f'part "{part}" is given twice; each part goes on once')
-        missing = [needed for needed in NEEDS.get(part, ()) if needed not in parts]
+        missing = [" or ".join(group) for group in NEEDS.get(part, ()) if not set(group) & set(parts)]
         if missing:
-            raise PlantError(f'part "{part}" needs {" and ".join(missing)}; add what is missing')
+            raise PlantError(f'part "{part}" needs {" and ".join(missing)}; add it')
+    electric = [part for part in drives.INPUTS if part in parts]
+    if len(electric) > 1:
+        raise PlantError('parts "voltage_input" and "duty_input" are both given; the motor has one input: give one')
+    if electric and "current_loop" in parts:
+        raise PlantError(f'parts "{electric[0]}" and "current_loop" are both given; a current loop takes a current')
 
 
 def play(deflection: Any, p: Any) -> Any:
@@ -346,7 +353,6 @@ def wrapped(
             raise PlantError(
                 f'part "{part}" sits inside an actuator; give it to two_link, high_impedance, moving_output or rotary'
             )
-    drives.check(parts)
     if "thermal" in parts:
         plant = add_heat(plant)
     if "voltage_input" in parts or "duty_input" in parts:
