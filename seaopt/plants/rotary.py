@@ -31,6 +31,7 @@ from seaopt.plants.parts import INSIDE, PARTS, Part, check_parts
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import GRAVITY
 from seaopt.plants.roles import Port, Sensing
+from seaopt.records import record
 
 RotaryLink = Literal["free", "locked", "pendulum"]
 LINKS = ("free", "locked", "pendulum")
@@ -125,6 +126,17 @@ _LINK_OF = {
 _PAYLOAD = {"free": ("J_l",), "pendulum": ("J_l", "m"), "bare": ("J_l",)}
 
 
+@record
+class _Build:
+    """The choices of which an actuator is built."""
+
+    link: str
+    drive: Drive
+    spring: Spring
+    parts: tuple[Part, ...]
+    external: bool
+
+
 def rotary_parameters() -> tuple[Parameter, ...]:
     """Return the parameters that some `rotary` has, with their defaults."""
     return (*(parameter for added in _PARTS.values() for parameter in added), *_DRIVE, _HOUSING, *_LINK, *_PENDULUM)
@@ -201,76 +213,76 @@ def rotary(
     if "screw_mode" in parts:
         raise PlantError('part "screw_mode" is the axial mode of a ball screw; a gear\'s elasticity is part of k_s')
     name = f"rotary({link}, {drive})" if (link, drive) != ("free", "unlumped") else "rotary"
-    return _actuator(name, link, drive, spring, tuple(parts), external)
+    return _actuator(name, _Build(link=link, drive=drive, spring=spring, parts=tuple(parts), external=external))
 
 
-def _actuator(name: str, link: str, drive: Drive, spring: Spring, parts: tuple[Part, ...], external: bool) -> Plant:
-    """Return the plant of options that are checked; its link may be the probe's bare one."""
+def _actuator(name: str, build: _Build) -> Plant:
+    """Return the plant of choices that are checked; its link may be the probe's bare one."""
+    hanging, moves = build.spring == "link1", build.link != "locked"
     actuator = Actuator(
-        transmission=_GEAR if spring == "link2" else _HANGING_GEAR,
-        links=(Link(), _LINK_OF[link]),
-        drive=drive,
-        spring=spring,
-        parts=parts,
+        transmission=_HANGING_GEAR if hanging else _GEAR,
+        links=(Link(), _LINK_OF[build.link]),
+        drive=build.drive,
+        spring=build.spring,
+        parts=build.parts,
     )
-    moves = link != "locked"
     outputs: dict[str, tuple[str, Any]] = {
         "tau_s": ("N m", lambda motion, x: motion.spring_force),
         "theta_m": ("rad", lambda motion, x: x.theta_m),
         **({"theta_l": ("rad", lambda motion, x: x.theta_l)} if moves else {}),
         "tau_h": ("N m", lambda motion, x: -motion.forces[0]),
         "deflection": ("rad", lambda motion, x: motion.deflection),
-        **({"tau_l": ("N m", lambda motion, x: motion.forces[1])} if spring == "link1" else {}),
+        **({"tau_l": ("N m", lambda motion, x: motion.forces[1])} if hanging else {}),
     }
     return make_plant(
         actuator,
         name=name,
         outputs=outputs,
-        derived=partial(_derive_figures, link=link, drive=drive, spring=spring),
+        derived=partial(_derive_figures, build=build),
         sensing=Sensing(
-            regulated=("tau_s", "tau_l") if spring == "link1" else ("tau_s",),
+            regulated=("tau_s", "tau_l") if hanging else ("tau_s",),
             motor_position="theta_m",
             motor_speed="thetad_m",
             link_position="theta_l" if moves else None,
         ),
         second_order=("reflected_inertia", "reflected_damping"),
-        inputs=("tau_e",) if external else (),
-        ports=(_port(name, link, drive, spring, parts, external),),
+        inputs=("tau_e",) if build.external else (),
+        ports=(_port(name, build),),
     )
 
 
-def _derive_figures(p: Any, link: str, drive: Drive, spring: Spring) -> dict[str, tuple[Any, str]]:
+def _derive_figures(p: Any, build: _Build) -> dict[str, tuple[Any, str]]:
     """Return what swings on the spring with the link held, and the frequencies with it free."""
     inertia, damping = p.N**2 * p.J_m, p.N**2 * p.b_r
-    if spring == "link1":  # a rotor on the housing turns N - 1 times as fast as the housing, backwards
-        inertia = p.J_h + ((p.N - 1) ** 2 * p.J_m if drive == "unlumped" else inertia)
+    if build.spring == "link1":  # a rotor on the housing turns N - 1 times as fast as the housing, backwards
+        inertia = p.J_h + ((p.N - 1) ** 2 * p.J_m if build.drive == "unlumped" else inertia)
     figures = {
         "reflected_inertia": (inertia, "kg m^2"),
         "reflected_damping": (damping, "N m s/rad"),
         "natural_frequency_hz": (ca.sqrt(p.k_s / inertia) / (2 * math.pi), "Hz"),
         "damping_ratio": ((damping + p.c_s) / (2 * ca.sqrt(p.k_s * inertia)), "-"),
     }
-    if spring == "link2" and link in ("free", "pendulum"):
-        weight = p.m * p.g * p.L if link == "pendulum" else 0.0
+    if build.spring == "link2" and build.link in ("free", "pendulum"):
+        weight = p.m * p.g * p.L if build.link == "pendulum" else 0.0
         figures["antiresonance_hz"] = (ca.sqrt((p.k_s + weight) / p.J_l) / (2 * math.pi), "Hz")
-    if spring == "link2" and link == "free":
+    if build.spring == "link2" and build.link == "free":
         figures["resonance_hz"] = (ca.sqrt(p.k_s * (1 / p.J_l + 1 / inertia)) / (2 * math.pi), "Hz")
     return figures
 
 
-def _port(name: str, link: str, drive: Drive, spring: Spring, parts: tuple[Part, ...], external: bool) -> Port:
+def _port(name: str, build: _Build) -> Port:
     """Return the port at the link: of a held one only its probe."""
-    inside: tuple[Part, ...] = tuple(part for part in parts if part in INSIDE)
-    probe = partial(_actuator, f"port of {name}", "bare", drive, spring, inside, True)
-    if link == "locked":
+    inside = replace(build, parts=tuple(part for part in build.parts if part in INSIDE))
+    probe = partial(_actuator, f"port of {name}", replace(inside, link="bare", external=True))
+    if build.link == "locked":
         return Port(probe=probe)
     return Port(
         motion="theta_l",
         coordinate="theta_l",
         rate="thetad_l",
-        effort="tau_e" if external else None,
-        payload=_PAYLOAD[link],
-        held=partial(_actuator, f"{name}, link held", "locked", drive, spring, inside, external),
+        effort="tau_e" if build.external else None,
+        payload=_PAYLOAD[build.link],
+        held=partial(_actuator, f"{name}, link held", replace(inside, link="locked")),
         drive="theta_m",
         ratio=lambda p: -p.N,  # the spring's deflection is theta_m/N - theta_l
         probe=probe,
