@@ -138,21 +138,19 @@ class Plant:
     def __post_init__(self) -> None:
         check_names(self)
         put = object.__setattr__
-        symbols = {
-            key: {name: ca.SX.sym(name) for name in names}
-            for key, names in (("x", self.states), ("u", self.inputs), ("p", self.parameters))
-        }
-        time = ca.SX.sym("t")
-        spaces = [SimpleNamespace(**symbols[key]) for key in "xup"]
+        spaces: list[SimpleNamespace] = []
+        for key, names in (("x", self.states), ("u", self.inputs), ("p", self.parameters)):
+            symbols = {name: ca.SX.sym(name) for name in names}
+            spaces.append(SimpleNamespace(**symbols))
+            put(self, key, ca.vertcat(*symbols.values()) if symbols else ca.SX(0, 1))
         x, u, p = spaces
         for name, friction in self.friction.items():
             check_loads(self, name, friction, spaces)
             setattr(u, name, friction.force_at(x, u, p))
-        put(self, "t", time)
-        for key, named in symbols.items():
-            put(self, key, ca.vertcat(*named.values()) if named else ca.SX(0, 1))
-        put(self, "dynamics", stack_rows(self, "f", evaluate_equations(self, "f", self.f, time, *spaces), self.states))
-        put(self, "output", stack_rows(self, "h", evaluate_equations(self, "h", self.h, time, *spaces), self.outputs))
+        put(self, "t", ca.SX.sym("t"))
+        for key, what, names in (("dynamics", "f", self.states), ("output", "h", self.outputs)):
+            expressions = evaluate_equations(self, what, getattr(self, what), self.t, *spaces)
+            put(self, key, stack_rows(self, what, expressions, names))
         check_structure(self)
         check_roles(self)
         check_bristles(self, spaces)
@@ -195,13 +193,14 @@ class Plant:
             if params.plant is self:
                 return params
             params = params.given
-        missing = [
-            n for n, default in self.parameters.items() if n not in params and not isinstance(default, Parameter)
-        ]
+        missing = {
+            name: unit_after(unit)
+            for name, unit in self.parameters.items()
+            if name not in params and not isinstance(unit, Parameter)
+        }
         if missing:
             names = join_words([f'"{name}"' for name in missing])
-            in_units = {name: unit_after(self.parameter_unit(name)) for name in missing}
-            units = join_words([f"{name} in{unit}" if unit else name for name, unit in in_units.items()])
+            units = join_words([f"{name} in{unit}" if unit else name for name, unit in missing.items()])
             what, have = ("parameter", "has") if len(missing) == 1 else ("parameters", "have")
             raise ParameterError(f"{what} {names} of plant {self.name} {have} no value, and no default; give {units}")
         completed: list[Parameter] = []
@@ -356,10 +355,9 @@ def find_range(plant: Plant, params: ParameterSet) -> float | None:
 
     Raises PlantError: it is not a positive number.
     """
-    expression = None if plant.actuation is None else plant.actuation.largest
-    if expression is None:
+    if plant.actuation is None or plant.actuation.largest is None:
         return None
-    values = plant.complete(params)
+    expression, values = plant.actuation.largest, plant.complete(params)
     largest = evaluate(expression, values)
     if not 0.0 < largest < math.inf:
         raise PlantError(
@@ -473,11 +471,11 @@ def fill_vector(kind: str, names: Mapping[str, str], values: Mapping[str, float]
     """
     if values is not None and not isinstance(values, Mapping):
         raise PlantError(f"{kind}s are given as a {type(values).__name__}; give a mapping of {kind} name to value")
-    numbers = dict(values or {})
-    for name in numbers:
+    values = values or {}
+    for name in values:
         if name not in names:
             raise PlantError(f'"{name}" is not a {kind} of this plant; {suggestion(name, names)}')
-    return np.array([require_number(numbers.get(name, 0.0), f"{kind} {name}", PlantError) for name in names])
+    return np.array([require_number(values.get(name, 0.0), f"{kind} {name}", PlantError) for name in names])
 
 
 def _convert_unit(parameter: Parameter, unit: str, plant: str) -> Parameter:

@@ -271,7 +271,7 @@ def test_the_probe_of_a_port_warms_up_too():
     values = plant.defaults.update(T_ambient=ambient)
     by_hand = without.defaults.update(R=values["R"].value * (1.0 + values["alpha_cu"].value * (ambient - 25.0)))
     one, other = (port_of(plant, values, "tau_s", 1.0), port_of(without, by_hand, "tau_s", 1.0))
-    for name in ("a", "motor", "force", "feedback"):
+    for name in ("a", "motor", "force", "read"):
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-12, abs=1e-12)
     assert "rise_winding" in plant.port.probe().states
     assert list(attach_environment(plant).states) == list(attach_environment(without).states)

@@ -76,6 +76,7 @@ class Difference:
         return (1.0 - back**self.samples) / (self.samples * period_s) * share / (1.0 - (1.0 - share) * back)
 
 
+@memo
 def add_difference(plant: Plant, name: str, difference: Difference, period_s: float) -> Plant:
     """Return a plant with one more output: the speed that a device which samples with this period computes.
 
@@ -85,11 +86,6 @@ def add_difference(plant: Plant, name: str, difference: Difference, period_s: fl
         raise PlantError(f'plant {plant.name} has an output "{name}" of its own; name the difference otherwise')
     if plant.sampling is not None and plant.sampling.period_s != period_s:
         raise PlantError(f"plant {plant.name} samples every {plant.sampling.period_s:g} s, not {period_s:g} s")
-    return _add(plant, name, difference, period_s)
-
-
-@memo
-def _add(plant: Plant, name: str, difference: Difference, period_s: float) -> Plant:
     position = find_state(plant, difference.of)
     unit = f"{plant.states[position]}/s"
     memories = [f"{name}_held_{i}" for i in range(1, difference.samples + 1)]
