@@ -67,11 +67,7 @@ def check_folder(path: Path) -> None:
 def check_name(path: Path | str, remedy: str, error: type[SeaoptError] = FileError) -> None:
     """Refuse a name that is not UTF-8: it is one of a file, but none that Polars, a table or a problem file can hold.
 
-    Raises
-    ------
-    SeaoptError
-        Of the kind that is asked for.
-
+    Raises SeaoptError: of the kind `error`.
     """
     try:
         str(path).encode()

@@ -33,37 +33,16 @@ Where = Mapping[str, str | float]  # column to the value that its rows have
 
 @record
 class Field:
-    """One column of a file.
+    """One column of a file."""
 
-    Parameters
-    ----------
-    name : str
-        Its header or path, as `Column(column=...)` takes it.
-    kind : str
-        Type of its numbers, such as "float64"; "text" or another word where it holds no numbers.
-    length : int or None
-        Samples; None where the format tells it only on reading.
-    unit : str or None
-        As the file says it.
-    clock : str or None
-        Name of the field that is its clock, where the format says so.
-    remedy : str
-        What to do where it holds no numbers.
-    header : str or None
-        Its header where that is not its name, because other columns have it too.
-    position : int or None
-        Number of its column, from 1, where that is not its place among the fields.
-
-    """
-
-    name: str
-    kind: str
-    length: int | None
-    unit: str | None = None
-    clock: str | None = None
-    remedy: str = "choose another column"
-    header: str | None = None
-    position: int | None = None
+    name: str  # its header or path, as `Column(column=...)` takes it
+    kind: str  # type of its numbers, such as "float64"; "text" or another word where it holds no numbers
+    length: int | None  # samples; None where the format tells it only on reading
+    unit: str | None = None  # as the file says it
+    clock: str | None = None  # name of the field that is its clock, where the format says so
+    remedy: str = "choose another column"  # where it holds no numbers
+    header: str | None = None  # its header where that is not its name, because other columns have it too
+    position: int | None = None  # number of its column, from 1, where that is not its place among the fields
 
     @property
     def numeric(self) -> bool:
@@ -82,45 +61,25 @@ class Window:
 
 @record
 class Source:
-    """A file that has been opened and listed.
-
-    Parameters
-    ----------
-    path : Path
-    format : str
-        Its name, for messages.
-    fields : tuple of Field
-    load : function of (names, window)
-        Returns float arrays by name, for fields that share a clock. With a window it may return more samples than lie
-        in it, but the same ones for every name.
-    notes : tuple of str
-        What was found on listing.
-    constants : mapping of name to (number, unit or None)
-        What the file's header says besides its columns.
-    load_where : function of (names, where), optional
-        As `load`, of the rows in which columns, of text too, have given values.
-    rows : str
-        Which rows are read, where not all are.
-
-    """
+    """A file that has been opened and listed."""
 
     path: Path
-    format: str
+    format: str  # its name, for messages
     fields: tuple[Field, ...]
+    # Of (names, window): float arrays by name, for fields that share a clock. With a window it may return more samples
+    # than lie in it, but the same ones for every name.
     load: Callable[[Sequence[str], Window | None], dict[str, Float[np.ndarray, " _"]]]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what was found on listing
+    # what the header says besides columns: number and unit by name
     constants: Mapping[str, tuple[float, str | None]] = field(default_factory=dict[str, tuple[float, str | None]])
+    # Of (names, where): as `load`, of the rows in which columns, of text too, have given values.
     load_where: Callable[[Sequence[str], Where], dict[str, Float[np.ndarray, " _"]]] | None = None
-    rows: str = ""
+    rows: str = ""  # which rows are read, where not all are
 
     def read(self, names: Sequence[str], window: Window | None = None) -> dict[str, Float[np.ndarray, " _"]]:
         """Return the data of fields that share a clock.
 
-        Raises
-        ------
-        LogError
-            The file is damaged, or a cell is not a number.
-
+        Raises LogError: the file is damaged, or a cell is not a number.
         """
         with translate_errors(self.path, self.format):
             return self.load(list(dict.fromkeys(names)), window)
@@ -129,11 +88,7 @@ class Source:
 def keep_rows(source: Source, where: Where) -> Source:
     """Return a source of the rows in which columns have given values: one signal of a table of (name, value, time).
 
-    Raises
-    ------
-    LogError
-        A column is not there, or (outside text files) holds no numbers.
-
+    Raises LogError: a column is not there, or (outside text files) holds no numbers.
     """
     rows = ", ".join(f"{name} = {value}" for name, value in where.items())
     listed = {field.name: field for field in source.fields}
