@@ -27,25 +27,22 @@ FORGOTTEN = 1e-24  # of a state, in any units: far below rounding
 LOSSES = ("square", "huber", "soft_l1")
 
 
-_LONGS = (
-    *("from", "to", "length", "lead", "shared", "drift_terms", "v_columns", "lag_a", "lag_b", "lag_c"),
-    *("settle", "start", "output_rows", "sections", "loss", "warm"),
+_FIELDS = (  # of seaopt_pass_args behind its channels; pointers are whole numbers
+    (np.int64, ("from", "to", "length", "lead", "shared", "drift_terms", "v_columns", "lag_a", "lag_b", "lag_c")),
+    (np.int64, ("settle", "start", "output_rows", "sections", "loss", "warm")),
+    (np.float64, ("t0", "tau0", "dtau")),
+    (np.uint64, ("model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count")),
+    (np.uint64, ("outputs", "columns", "states", "carry")),
+    (np.int64, ("lags", "parts", "outputs_of", "columns_in")),  # and of the influences in it
+    (np.uint64, ("into", "correlation", "ring", "form")),
 )
-_DOUBLES = ("t0", "tau0", "dtau")
-_POINTERS = (
-    *("model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count"),
-    *("outputs", "columns", "states", "carry"),
-)
-_INFLUENCES = ("lags", "parts", "outputs_of", "columns_in"), ("into", "correlation", "ring", "form")
 
 
 @lru_cache(maxsize=32)
 def _arguments(nu: int, ny: int) -> np.dtype[Any]:
-    """Return seaopt_pass_args of pass.c, field by field; pointers are whole numbers."""
+    """Return seaopt_pass_args of pass.c."""
     channels = [("u", np.uint64, (nu,)), ("y", np.uint64, (ny,)), ("keep", np.uint64, (ny,))]
-    kinds = (np.int64, _LONGS), (float, _DOUBLES), (np.uint64, _POINTERS), (np.int64, _INFLUENCES[0])
-    fields = [(name, kind) for kind, names in (*kinds, (np.uint64, _INFLUENCES[1])) for name in names]
-    return np.dtype([*channels, *fields])
+    return np.dtype([*channels, *((name, kind) for kind, names in _FIELDS for name in names)])
 
 
 @memo
@@ -66,9 +63,16 @@ def _count_delayed(model: Model, point: Point) -> int:
 def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
     """Return the C source of the passes of a model, over data with measured outputs or of simulations alone."""
     constants = {
-        **{"NX": model.nx, "NU": model.nu, "NY": model.ny, "DELAYED": delayed, "MEASURED": int(measured)},
-        **{"NJP": _pad_to_vectors(layout.states), "NCP": _pad_to_vectors(layout.columns)},
-        **{"LINEAR": int(model.linear), "STEPPED": int(model.sticks), "CORRECT": int(layout.corrected)},
+        "NX": model.nx,
+        "NU": model.nu,
+        "NY": model.ny,
+        "NJP": _pad_to_vectors(layout.states),
+        "NCP": _pad_to_vectors(layout.columns),
+        "LINEAR": int(model.linear),
+        "STEPPED": int(model.sticks),
+        "CORRECT": int(layout.corrected),
+        "DELAYED": delayed,
+        "MEASURED": int(measured),
     }
     generated = _write_sampling(model)
     if model.linear:
@@ -199,12 +203,7 @@ class Program:
         self.memory: list[Any] = []  # arrays that stay alive while their addresses are in use
         data, ny = _linear_data(model, point, layout) if model.linear else _settings(model, point), model.ny
         base = np.zeros(1, dtype=_arguments(model.nu, ny))
-        base["length"], base["lead"], base["settle"], base["t0"] = (
-            segment.n,
-            segment.lead,
-            weights.settle,
-            segment.start_s,
-        )
+        base["length"], base["lead"], base["t0"] = segment.n, segment.lead, segment.start_s
         base["u"] = [self._address(channel) + 8 * segment.lead for channel in segment.u]
         base["y"] = [self._address(channel) for channel in segment.y] or 0
         base["keep"] = [self._address(mask, np.uint8) for mask in segment.keep] or 0
@@ -213,10 +212,8 @@ class Program:
         base["tau0"], base["dtau"] = segment.drift_span
         base["settle"], base["sections"] = weights.settle, len(weights.sections)
         base["loss"] = LOSSES.index(weights.loss)
-        pointed = {
-            **{"model": data, "offset": point.offset, "gain": point.gain, "drift": point.drift},
-            **{"sos": weights.sections, "knee": weights.knee},
-        }
+        pointed = {"model": data, "sos": weights.sections, "knee": weights.knee}
+        pointed |= {name: getattr(point, name) for name in ("offset", "gain", "drift")}
         if point.correction is not None:
             pointed["correction"] = np.zeros((model.nx, ny, _pad_to_vectors(layout.states)))
             pointed["correction"][:, :, : len(point.correction)] = point.correction.transpose(1, 2, 0)

@@ -29,16 +29,12 @@ def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]
     Raises LogError: an input is missing from the log, or has missing samples.
     """
     columns: list[Float[np.ndarray, " n"]] = []
-    if plant.inputs and not any(name in log.signals for name in plant.inputs):
-        raise LogError(
-            f'{log.source}: no input of {plant.name} has a channel: no channel "{next(iter(plant.inputs))}"; '
-            f"{suggestion(next(iter(plant.inputs)), log.signals)}"
-        )
+    driven = any(name in log.signals for name in plant.inputs)  # by one at least, though all may be optional
     for name in plant.inputs:
-        if name not in log.signals and name in plant.optional_inputs:
-            columns.append(np.zeros(len(log)))
-            continue
         if name not in log.signals:
+            if driven and name in plant.optional_inputs:
+                columns.append(np.zeros(len(log)))
+                continue
             raise LogError(
                 f'{log.source}: no channel "{name}" for the input of {plant.name}; {suggestion(name, log.signals)}'
             )

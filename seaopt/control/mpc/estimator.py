@@ -191,18 +191,16 @@ class Estimator:
 
     def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
         """Process one sample: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
-        applied = self.list_acting(np.vstack([state.past, u]))
-        return self.go_on(state, u, *self.correct(state, y, applied))
+        line = np.vstack([state.past, u])
+        return self.go_on(line, *self.correct(state, y, self.list_acting(line)))
 
     def go_on(
         self,
-        state: EstimatorState,
-        u: Float[np.ndarray, " nu"],
+        line: Float[np.ndarray, "m nu"],
         corrected: Float[np.ndarray, " n"],
         innovation: Float[np.ndarray, " ny"],
     ) -> EstimatorState:
-        """Return the state after a sample: the inputs u commanded at it, and what `correct` gave."""
-        line = np.vstack([state.past, u])
+        """Return the state after a sample: the inputs before it and its own, and what `correct` gave."""
         return EstimatorState(
             predicted=self.advance(corrected, line[0], line[1]),
             corrected=corrected,

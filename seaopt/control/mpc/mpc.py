@@ -400,7 +400,9 @@ class ForceMPC(LoopDelays, Result, Worded):
         current: float,
     ) -> EstimatorState:
         """Return the filter's state after a sample at which a current was commanded."""
-        return self.kalman.go_on(kalman, current * np.eye(self.kalman.B.shape[1])[0], corrected, innovation)
+        line = np.vstack([kalman.past, np.zeros(self.kalman.B.shape[1])])
+        line[-1, 0] = current
+        return self.kalman.go_on(line, corrected, innovation)
 
     def unlimited(self) -> Law:
         """Return what the controller is as long as no limit is active: from reference and measurement to current."""

@@ -102,12 +102,8 @@ class NoiseModel:
 
     def check(self, plant: Plant, outputs: tuple[str, ...]) -> None:
         """Refuse names that the plant lacks, and a measured output without a sensor."""
-        for field, names in (
-            ("sensor_std", plant.outputs),
-            ("offset", plant.outputs),
-            ("input_noise", plant.inputs),
-            ("input_drift", plant.inputs),
-        ):
+        for field in ("sensor_std", "offset", "input_noise", "input_drift"):
+            names = plant.inputs if field.startswith("input") else plant.outputs
             for name in getattr(self, field):
                 if name not in names:
                     raise ControlError(f'noise: {field} names "{name}"; {suggestion(name, names)}')

@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.mpc.force_plant import ForcePlant
 from seaopt.control.mpc.knots import interpolate_knots
 from seaopt.control.mpc.output_bounds import OutputBounds
@@ -96,10 +97,16 @@ def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
 
     def tracking(candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
-        z = np.exp(2j * np.pi * f * plant.sample_time_s)[:, None, None]
-        drive = (b * (candidate.K_x @ resting + candidate.K_u / plant.gain)).astype(complex)[:, None]
-        closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))
-        return np.abs(np.linalg.solve(z * np.eye(b.size) - closed, drive)[:, :, 0] @ np.append(plant.c, 0.0))
+        loop = DigitalPlant(
+            a=A - np.outer(b, np.append(candidate.K_x, candidate.K_u)),
+            b=b * (candidate.K_x @ resting + candidate.K_u / plant.gain),
+            c=np.append(plant.c, 0.0),
+            d=0.0,
+            sample_time_s=plant.sample_time_s,
+            delay_samples=0,
+            static_gain=1.0,
+        )
+        return np.abs(loop.response(f))
 
     def excess(log_rho: float) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth; it falls with the weight."""

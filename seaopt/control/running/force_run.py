@@ -178,8 +178,10 @@ def close_loop(
     newer, n, p = delay_samples + whole, reference.size, values.vector
     output, integrator = DirectCall(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
     idle = [0.0] * (len(plant.inputs) - 1)
-    reading = _place_sensor(sensors or Sensors(), plant, values, measured)
-    noise = reading.noise_std * np.random.default_rng(require_seed(seed, ControlError)).normal(size=n)
+    devices, row = sensors or Sensors(), list(plant.outputs).index(measured)
+    read = _place_sensor(devices, plant, values, measured)
+    noise_std, _ = devices.combine_errors(plant, values, measured)
+    noise = noise_std * np.random.default_rng(require_seed(seed, ControlError)).normal(size=n)
     if not current_step_A >= 0.0:
         raise ControlError(f"current_step_A = {current_step_A:g} is negative; give the amplifier's step, 0 for none")
     most = largest_current(current_limit_A, current_step_A)
@@ -202,10 +204,10 @@ def close_loop(
     for k in range(n):
         older = k - newer - (rest_s > 0.0)
         outputs = output(time_s[k], x, inputs(k, min(older, k - 1)), p)[0][:, 0]
-        force[k] = outputs[reading.row]
+        force[k] = outputs[row]
         call_start_s = time.perf_counter()
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
-        command, law = step(law, coming, reading.read(outputs, float(noise[k])), *x[seen].tolist())
+        command, law = step(law, coming, read(outputs, float(noise[k])), *x[seen].tolist())
         law_time_s[k] = time.perf_counter() - call_start_s
         current[k] = _convert_command(command, current_step_A, most)
         states[k] = x
@@ -232,37 +234,23 @@ def _convert_command(command: float, step_A: float, most_A: float) -> float:
     return min(max(rounded, -most_A), most_A)
 
 
-@record(eq=False)
-class _Reading:
-    """A sensor with what it reads: rows among the outputs, its noise, and the encoders that err with their weights."""
-
-    sensors: Sensors
-    name: str
-    row: int
-    noise_std: float
-    encoders: tuple[tuple[str, int, float], ...]
-
-    def read(self, outputs: Float[np.ndarray, " ny"], noise: float) -> float:
-        """Return the reading of a sample's outputs."""
-        value = float(outputs[self.row]) + noise
-        for name, row, weight in self.encoders:
-            true = float(outputs[row])
-            value += weight * (self.sensors.convert(name, true) - true)
-        return self.sensors.convert(self.name, value)
-
-
-def _place_sensor(sensors: Sensors, plant: Plant, values: CompletedParameters, measured: str) -> _Reading:
-    """Return the sensor of an output, with the encoders that it is computed from."""
+def _place_sensor(
+    sensors: Sensors, plant: Plant, values: CompletedParameters, measured: str
+) -> Callable[[Float[np.ndarray, " ny"], float], float]:
+    """Return what reads an output, given all outputs and noise, with the errors of the encoders it comes from."""
     sensors.refuse_negative(sensors.names, ControlError)
     names, erring = list(plant.outputs), sensors.erring & plant.outputs.keys()
     weights = evaluate_weights(plant, values, measured)
-    return _Reading(
-        sensors=sensors,
-        name=measured,
-        row=names.index(measured),
-        noise_std=sensors.combine_errors(plant, values, measured)[0],
-        encoders=tuple((name, names.index(name), weights[name]) for name in weights if name in erring),
-    )
+    encoders = [(name, names.index(name), weight) for name, weight in weights.items() if name in erring]
+
+    def read(outputs: Float[np.ndarray, " ny"], noise: float) -> float:
+        value = float(outputs[names.index(measured)]) + noise
+        for name, row, weight in encoders:
+            true = float(outputs[row])
+            value += weight * (sensors.convert(name, true) - true)
+        return sensors.convert(measured, value)
+
+    return read
 
 
 def _check(plant: Plant, params: CompletedParameters, measured: str, delay_samples: int) -> float:
@@ -272,7 +260,7 @@ def _check(plant: Plant, params: CompletedParameters, measured: str, delay_sampl
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
     conditions = read_conditions(plant, params)
-    moved = [name for name, value in conditions.items() if name not in DELAYS and value]
+    moved = [name for name, value in conditions.items() if value and name not in DELAYS]
     if moved:
         raise ControlError(
             f"the parameters hold {', '.join(moved)}, but close_loop starts at rest at zero; leave it out"

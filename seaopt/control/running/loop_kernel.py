@@ -259,6 +259,7 @@ def _allocate(loop: SampledLoop, job: Job) -> LoopArrays:
     )
 
 
+_CARRIED = ("x", "z", "peak", "error", "size")  # from sample to sample
 _POINTERS = ("p", "c", "lag", "r", "w", "e", "x", "z", "peak", "error", "size", "y", "applied", "states")
 _ARGUMENTS = np.dtype(
     [
@@ -297,26 +298,18 @@ def _run_interpreted(loop: SampledLoop, c: Float[np.ndarray, " m"], job: Job, su
     chain = _chain(loop.plant, _structure_of(loop), loop.law.sample_time_s, substeps, chunk, split)
     times = job.start_s + loop.law.sample_time_s * np.arange(n)
     for run in range(runs):
-        state = np.concatenate([getattr(arrays, name)[run] for name in ("x", "z", "peak", "error", "size")])
-        shared = [
-            np.repeat(constant[:, None], chunk, axis=1)
-            for constant in (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
-        ]
-        signals = np.vstack([times, job.external.T, job.reference[run], job.noise[run].T])
-        split_at = len(signals) - job.noise.shape[2]
+        state = np.concatenate([getattr(arrays, name)[run] for name in _CARRIED])
+        constants = (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
+        shared = [np.repeat(constant[:, None], chunk, axis=1) for constant in constants]
+        signals = (times[None], job.external.T, job.reference[run, None], job.noise[run].T)
         for first in range(0, n, chunk):
-            count = min(chunk, n - first)
-            piece = signals[:, np.minimum(np.arange(first, first + chunk), n - 1)]  # the last one is filled up
-            after, y, applied, states = (
-                np.array(part)[:, :count]
-                for part in chain(
-                    state, piece[:1], piece[1 : split_at - 1], piece[split_at - 1 : split_at], piece[split_at:], *shared
-                )
-            )
-            rows = slice(first, first + count)
+            at = np.minimum(np.arange(first, first + chunk), n - 1)  # the last chunk is filled up
+            results = chain(state, *(signal[:, at] for signal in signals), *shared)
+            rows = slice(first, min(first + chunk, n))
+            after, y, applied, states = (np.array(part)[:, : rows.stop - first] for part in results)
             arrays.y[run, rows], arrays.applied[run, rows], arrays.states[run, rows] = y.T, applied[0], states.T
             state = after[:, -1]
-        for name in ("x", "z", "peak", "error", "size"):
+        for name in _CARRIED:
             width = getattr(arrays, name).shape[1]
             getattr(arrays, name)[run], state = state[:width], state[width:]
     return arrays

@@ -81,10 +81,9 @@ class SampledLoop:
                 f"measured = {list(self.fed_back)} are {len(self.fed_back)} outputs, and the law reads "
                 f"{self.law.measured}; give as many"
             )
-        if self.law.gate is not None:
-            raise SimulationError("law has a plausibility gate, which this simulation leaves out; use close_loop")
-        if self.law.heat is not None:
-            raise SimulationError("law has a heat guard, which this simulation leaves out; use close_loop")
+        for part, name in ((self.law.gate, "plausibility gate"), (self.law.heat, "heat guard")):
+            if part is not None:
+                raise SimulationError(f"law has a {name}, which this simulation leaves out; use close_loop")
         if self.sticks and not can_stick(plant):
             raise SimulationError(
                 f"sticks = True, but {plant.name} has no friction that jumps at rest; give its Friction a jump"

@@ -118,14 +118,10 @@ class GainTable:
         i = min(max(bisect_right(points, inside) - 1, 0), points.size - 2)
         return i, (inside - float(points[i])) / (float(points[i + 1]) - float(points[i]))
 
-    def draw_line(self, row: Float[np.ndarray, " n"], value: float) -> float:
-        """Return a row of numbers, one per point, interpolated at a finite value."""
+    def interpolate(self, value: float, **more: Float[np.ndarray, " n"]) -> dict[str, float]:
+        """Return the gains at a finite value, by name, and of `more` rows of numbers at the points."""
         i, t = self.find_stretch(value)
-        return float(row[i] + t * (row[i + 1] - row[i]))
-
-    def interpolate(self, value: float) -> dict[str, float]:
-        """Return the gains at a finite value, by name."""
-        return {name: self.draw_line(row, value) for name, row in self.gains.items()}
+        return {name: float(row[i] + t * (row[i + 1] - row[i])) for name, row in {**self.gains, **more}.items()}
 
     def law(self, value: float) -> Law:
         """Return the law while the variable stands at a value."""

@@ -135,19 +135,19 @@ class RunnableSchedule:
         )
         if not self.table.integrates:
             return at_rest
-        effort, _, _ = self._find_effort(at_rest, reference, measurement, at_rest.place)
+        effort, *_ = self._find_effort(at_rest, reference, measurement, at_rest.place)
         return replace(at_rest, effort=command / self.per_effort - effort)
 
     def _find_effort(
         self, state: ScheduleState, reference: float, measurement: float, place: float
-    ) -> tuple[float, float, float]:
-        """Return the effort, not limited, what half a sample adds to the integral, and alpha."""
-        g, ts = self.table.interpolate(place), self.table.sample_time_s
+    ) -> tuple[float, float, float, float]:
+        """Return the effort, not limited, what half a sample adds to the integral, alpha, and K."""
+        g, ts = self.table.interpolate(place, K=self.anti_windup), self.table.sample_time_s
         alpha = 1.0 / (g["T_f"] + ts)
         half = 0.5 * ts * g["k_i"] * (reference - measurement) if self.table.integrates else 0.0
         rate = g["c"] * (reference - state.reference) - (measurement - state.measurement)
         effort = g["k_r"] * reference - g["k_p"] * measurement + state.effort + half + g["k_d"] * alpha * rate
-        return effort, half, alpha
+        return effort, half, alpha, g["K"]
 
     def step(
         self, state: ScheduleState, reference: float, measurement: float, place: float
@@ -161,13 +161,10 @@ class RunnableSchedule:
         at = state.place if missing else place
         misplaced = state.misplaced + 1 if missing else 0
         with np.errstate(all="ignore"):
-            effort, half, alpha = self._find_effort(state, reference, measurement, at)
+            effort, half, alpha, share = self._find_effort(state, reference, measurement, at)
             most = self.limit / self.per_effort
             applied = min(max(effort, -most), most)
-            pull, turn = (
-                self.table.draw_line(self.anti_windup, at) * (applied - effort),
-                alpha * self.table.sample_time_s,
-            )
+            pull, turn = share * (applied - effort), alpha * self.table.sample_time_s
             following = ScheduleState(
                 effort=state.effort + 2.0 * half + pull,
                 reference=state.reference + turn * (reference - state.reference),
