@@ -245,7 +245,9 @@ class Experiment:
                 raise self._refuse(f'{what} = "{value}" is not known; use {use}')
         if isinstance(self.drift, bool) or not isinstance(self.drift, int) or not 0 <= self.drift <= MAX_DRIFT:
             raise self._refuse(f"drift = {self.drift!r} is not the order of a polynomial; give 0 (none) to {MAX_DRIFT}")
-        delay = self.delay_s.value if isinstance(self.delay_s, Parameter) else self.delay_s
+        delay = self.delay_s
+        if isinstance(delay, Parameter):
+            delay = delay.value * (factor(delay.unit, "s") if same_dimension(delay.unit, "s") else 1.0)
         if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
             raise self._refuse(f"delay_s = {delay!r} is not a time; give seconds, 0 or more")
         if delay > self.log.duration_s:

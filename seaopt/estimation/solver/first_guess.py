@@ -59,10 +59,9 @@ def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple
     targets = [target for target in usable if target is not None]
     if not targets:
         return [], False
-    start = unknowns.start[: unknowns.shared]
-    low, high = unknowns.low[: unknowns.shared], unknowns.high[: unknowns.shared]
-    prior = unknowns.prior_std[: unknowns.shared]
-    spread = np.isinf(prior) & (start != 0.0)
+    every = (unknowns.start, unknowns.low, unknowns.high, unknowns.prior_std)
+    start, low, high, prior_std = (values[: unknowns.shared] for values in every)
+    spread = np.isinf(prior_std) & (start != 0.0)
     refined = [_refine(targets, start, low, high, spread)]
     enough = 0.5 * EXPLAINED_MISFIT**2 * 2 * sum(int(np.count_nonzero(target.weight)) for target in targets)
     if refined[0][0] > enough:

@@ -8,6 +8,8 @@ import pytest
 import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.errors import EstimationError, LogError
+from seaopt.estimation.problem.fit_problem import pose_problem
+from seaopt.estimation.problem.losses import Squares
 from tests.words import flatten
 
 FREE = ("J", "b_r", "eta")
@@ -142,3 +144,10 @@ def test_a_sample_that_no_sensor_gives_is_refused_where_no_range_masks_it(stand,
     if channel == "F1":
         masked = so.Experiment(plant=stand, log=log, saturation={"F1": (-1e4, 1e4)})
         assert np.flatnonzero(np.isnan(masked.log["F1"])).tolist() == [70]
+
+
+def test_a_delay_in_ms_is_compared_with_the_log_in_seconds(stand, thor, short_log):
+    delay = so.Parameter(name="delay_s", value=500.0 * short_log.duration_s, unit="ms", free=True)
+    bench = so.Experiment(plant=stand, log=short_log, outputs=("F1",), delay_s=delay)
+    problem = pose_problem((bench,), thor.free("J"), loss=Squares())
+    assert problem.experiments[0].slots.delay.value == pytest.approx(0.5 * short_log.duration_s)
