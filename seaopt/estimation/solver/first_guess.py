@@ -88,7 +88,7 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
         estimated = responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)
     except LogError:
         return None
-    chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, " m"]]] = {}
+    chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, "..."]]] = {}
     low, high = band_hz if band_hz is not None else (0.0, np.inf)
     for o, estimate in zip(whole, estimated, strict=True):
         f = estimate.frequency_hz
@@ -97,9 +97,9 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
             chosen[o] = estimate, _space_by_logarithm(f, good)
     if not chosen:
         return None
-    rows = np.unique(np.concatenate([places for _, places in chosen.values()]))
-    estimates = [estimate for estimate, _ in chosen.values()]
-    used = np.column_stack([np.isin(rows, places) for _, places in chosen.values()])
+    estimates, places = zip(*chosen.values(), strict=True)
+    rows = np.unique(np.concatenate(places))
+    used = np.column_stack([np.isin(rows, each) for each in places])
     response = np.column_stack([estimate.response[rows] for estimate in estimates])
     spread = np.column_stack([np.maximum(estimate.relative_std[rows], 0.02) for estimate in estimates])
     delay = experiment.slots.delay.value + (0.5 * log.period if data.hold == "zero" else 0.0)

@@ -175,7 +175,9 @@ def bootstrap(
     names = problem.shared_names
     blocks: dict[str, _Blocks] = {}
     for name, residual in residuals.items():
-        pool, length = _make_pool(residual, problem, refit), _choose_length(residual, block)
+        used = _find_used_rows(residual)
+        pool, count = _make_pool(residual, problem, refit), int(np.count_nonzero(used))
+        length = min(block or estimate_block_length(residual.weighted[used]), max(count // 2, 1))
         starts = rng.integers(0, len(pool), size=(draws, -(-len(residual.raw) // length)))
         blocks[name] = _Blocks(pool=pool, length=length, starts=starts)
     if refit:
@@ -204,11 +206,6 @@ def _check(fit: Fit, problem: FitProblem, draws: int, refit: bool, block: int | 
         raise EstimationError(
             "bootstrap: refit=True needs a simulation's residuals, and this fit has errors of prediction: leave it out"
         )
-
-
-def _choose_length(residuals: ExperimentResiduals, block: int | None) -> int:
-    used = residuals.weighted[_find_used_rows(residuals)]
-    return min(block or estimate_block_length(used), max(len(used) // 2, 1))
 
 
 def _find_used_rows(residuals: ExperimentResiduals) -> Bool[np.ndarray, " n"]:
