@@ -146,9 +146,7 @@ class PlaceCertificate(Result):
                     "parameters": case.parameters,
                     "ms": case.ms,
                     "mt": case.mt,
-                    "largest": dict(
-                        zip(("ms", "mt"), ({"parameters": at.parameters} for at in case.largest), strict=True)
-                    ),
+                    "largest": {"ms": case.largest[0].parameters, "mt": case.largest[1].parameters},
                 }
                 for name, case in self.worst.items()
             },

@@ -103,10 +103,10 @@ class StoredWorst:
     parameters: dict[str, float]
     largest: dict[str, DrawnAt] = field(default_factory=dict[str, DrawnAt])
 
-    def measure(self, controller: Controller, plant: Plant, nominal: ParameterSet) -> Worst:
-        """Return the worst case, its loops closed again."""
-        drawn = (self.parameters, *(each.parameters for each in self.largest.values()))
-        return combine_worst([measure_worst(controller, plant, nominal, at) for at in drawn])
+    @property
+    def cases(self) -> list[Mapping[str, float]]:
+        """The parameters of the worst case, and those of the largest Ms and Mt."""
+        return [self.parameters, *(each.parameters for each in self.largest.values())]
 
 
 @record
@@ -204,7 +204,8 @@ def build_certificate(
             plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
             margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
             worst={
-                name: stored.plants[name].worst.measure(controller, plant, parameters) for name, plant in linear.items()
+                name: _measure_again(controller, plant, parameters, stored.plants[name].worst.cases)
+                for name, plant in linear.items()
             },
             monte_carlo=stored.monte_carlo,
             controller=controller,
@@ -261,13 +262,26 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     return replace(certificate, simulated=simulated)
 
 
+@record
+class _StoredCase:
+    """The parameters of a worst case at one value of the variable, and of the largest Ms and Mt there."""
+
+    parameters: dict[str, float]
+    largest: dict[str, dict[str, float]]
+
+    @property
+    def cases(self) -> list[Mapping[str, float]]:
+        """All of these parameters."""
+        return [self.parameters, *self.largest.values()]
+
+
 @record(eq=False)
 class _StoredPlace:
     """The variable standing at one value, as a file holds it."""
 
     value: float
     point: bool
-    worst: Mapping[str, StoredWorst]
+    worst: Mapping[str, _StoredCase]
     draws: int
     unstable: int
     over_ms: int
@@ -322,13 +336,13 @@ def _build_place(
 ) -> PlaceCertificate:
     controller, plants, nominal = schedule.at(stored.value), split_states(models, unknown), unknown.nominal
     held = list_held(schedule, models, stored.value)
-    if not all(case.largest for case in stored.worst.values()):
-        raise FileError(f"{SCHEDULE_FILE}: a worst case has no 'largest'; {CERTIFY_AGAIN}")
     return PlaceCertificate(
         value=stored.value,
         point=stored.point,
         plants={name: controller.close(plant, nominal).figures() for name, plant in plants.items()},
-        worst={name: case.measure(controller, plants[name], nominal) for name, case in stored.worst.items()},
+        worst={
+            name: _measure_again(controller, plants[name], nominal, case.cases) for name, case in stored.worst.items()
+        },
         draws=stored.draws,
         unstable=stored.unstable,
         over_ms=stored.over_ms,
@@ -338,6 +352,13 @@ def _build_place(
         ),
         simulated=build_certificate(stored.simulated, controller, held, nominal) if stored.simulated else None,
     )
+
+
+def _measure_again(
+    controller: Controller, plant: Plant, nominal: ParameterSet, cases: Sequence[Mapping[str, float]]
+) -> Worst:
+    """Return a worst case from parameters that a file keeps, its loops closed again."""
+    return combine_worst([measure_worst(controller, plant, nominal, at) for at in cases])
 
 
 def list_requirements(content: Mapping[str, Any], source: str) -> tuple[Requirement, ...]:

@@ -197,6 +197,9 @@ def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
                                  ringing=0.01, fault="")},
     )  # fmt: skip
     content = json.loads(to_json(found.to_dict()))
+    worst = found.places[0].worst["stand"]
+    kept = content["places"][0]["worst"]["stand"]["largest"]
+    assert kept == {"ms": worst.largest[0].parameters, "mt": worst.largest[1].parameters}
 
     def refuse(*args, **keywords):
         raise AssertionError("reading a result must not simulate")
@@ -214,7 +217,7 @@ def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
     assert again.notes == found.notes
     content = json.loads(to_json(found.to_dict()))
     del content["places"][0]["worst"]["stand"]["largest"]
-    with pytest.raises(FileError, match="a worst case has no 'largest'; certify again"):
+    with pytest.raises(FileError, match=r"key places.1.worst.stand.largest is missing; certify again"):
         ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
 
 
