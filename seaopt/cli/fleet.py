@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from seaopt.cli.progress import show_progress
-from seaopt.cli.show import SCREEN, heading, show_verdicts
+from seaopt.cli.show import SCREEN, show_sections, show_verdicts
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
 from seaopt.formatting import format_count, printable
 from seaopt.records import record
-from seaopt.reporting.sections.data import Reason, Verdict
+from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.data import Commands
 
 if TYPE_CHECKING:
     from seaopt.fleet import Drift, Fleet, FleetLog, Population
@@ -152,9 +153,8 @@ def _write(fleet: Fleet, drift: Drift, population: Population | None, folder: Pa
 
 def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> None:
     """Print the verdict on the logs, and which actuators have an alarm."""
-    reasons = tuple(Reason(what=f"{text} ({log})", where="", count=count) for text, count, log in fleet.reasons)
-    verdict = Verdict(met=fleet.met, text=f"Fleet: {fleet.verdict}", reasons=reasons, next=_advise(fleet))
-    show_verdicts(console, [verdict], verbose=verbose)
+    verdict = judge(fleet, Commands(fit="seaopt fleet"))
+    show_verdicts(console, [] if verdict is None else [verdict], verbose=verbose)
     if fleet.short:
         count = format_count(len(fleet.short), "log")
         console.wrap(printable(f"much shorter than the others: {count} ({fleet.short[0]})"), indent=9)
@@ -178,27 +178,9 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
         console.wrap(f"warning: {drift.history.warning}", indent=9)
 
 
-def _advise(fleet: Fleet) -> tuple[str, ...]:
-    """Return what to do about logs that failed or are not met: the latter stay as they are until something changes."""
-    from seaopt.fleet.worker import FAILED, NOT_MET
-
-    counts = fleet.counts
-    failed = ("mend what failed, then type the same command: only that is fitted again",) if counts[FAILED] else ()
-    not_met = (
-        "what is not met is fitted again when its log or the problem changes; a changed problem fits every log anew",
-    )
-    return failed + (not_met if counts[NOT_MET] else ())
-
-
 def _show_tables(console: Terminal, fleet: Fleet, population: Population | None, missing: str) -> None:
-    from seaopt.fleet.population import ALIGN as POPULATION_ALIGN
-    from seaopt.fleet.population import HEAD as POPULATION_HEAD
-    from seaopt.fleet.result import ALIGN, HEAD, list_cells
-
-    heading(console, "Fleet", f"{format_count(len(fleet.rows), 'log')}, {fleet.unchanged} done before")
-    console.tabulate(list_cells(fleet.spreads), HEAD, ALIGN)
+    show_sections(console, fleet)
     if population is None:
         console.wrap(f"no population: {missing}", indent=2)
-        return
-    heading(console, "Population", format_count(len(population.table), "actuator"))
-    console.tabulate(population.describe(), POPULATION_HEAD, POPULATION_ALIGN)
+    else:
+        show_sections(console, population)

@@ -51,10 +51,3 @@ def show_verdicts(console: Terminal, verdicts: Sequence[Verdict], *, verbose: bo
 def show_sections(console: Terminal, result: object, *, verbose: bool = False) -> None:
     """Print what a result has to say, on a screen or all of it."""
     console.write(render_sections(describe(result), console.width, ALL if verbose else SCREEN))
-
-
-def heading(console: Terminal, title: str, text: str) -> None:
-    """Print the line above a result's tables."""
-    console.say("")
-    console.say(title, style="bold", end="  ")
-    console.say(text, style="dim")

@@ -23,7 +23,6 @@ from seaopt.fleet.cusum import ALLOWANCE, Charts, alarm_probabilities, chart_run
 from seaopt.fleet.history import LABEL, TIME, History, check_names, format_time, leave_out, order_runs, parse_time
 from seaopt.fleet.result import Fleet
 from seaopt.fleet.scatter import (
-    BETWEEN_HEAD,
     FEWEST_ACTUATORS,
     FEWEST_PAIRS,
     MOST_OF_TAILS,
@@ -35,8 +34,8 @@ from seaopt.fleet.scatter import (
     wander,
 )
 from seaopt.fleet.worker import FAILED, MET
-from seaopt.formatting import format_count, format_number, format_table, html_text, join_words
-from seaopt.records import record
+from seaopt.formatting import format_count, format_number, join_words
+from seaopt.records import Worded, record
 
 FALSE_ALARMS, PER_RUNS = 0.01, 100  # per actuator, within so many runs
 LOW_CHANCE = 0.25  # of an alarm at the threshold by which it is seen whether healthy actuators scatter as assumed
@@ -98,7 +97,7 @@ class Alarm:
 
 
 @record(eq=False, repr=False)
-class Drift:
+class Drift(Worded):
     """What `find_drift` returns; ``print(drift)`` is a summary.
 
     Parameters
@@ -190,16 +189,6 @@ class Drift:
                 {name: getattr(alarm, name) for name in names} | {"text": alarm.describe()} for alarm in self.alarms
             ],
         }
-
-    def __repr__(self) -> str:
-        lines = [f"Drift: {self.verdict}", *(f"  {alarm.actuator}: {alarm.describe()}" for alarm in self.alarms[:20])]
-        if len(self.alarms) > 20:
-            lines.append(f"  and {len(self.alarms) - 20} more: drift.alarms")
-        cells = [(name, *spread.describe()) for name, spread in self.between.items()]
-        table = format_table(cells, ("parameter", *BETWEEN_HEAD), "<>>>>") if cells else []
-        return "\n".join([*lines, *(f"  {line}" for line in table)])
-
-    _repr_html_ = html_text
 
 
 @record(eq=False)

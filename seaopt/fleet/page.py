@@ -11,26 +11,15 @@ from typing import Any
 import polars as pl
 
 from seaopt.fleet.actuators import tabulate_actuators
-from seaopt.fleet.cusum import ALLOWANCE
-from seaopt.fleet.drift import PER_RUNS, Drift
+from seaopt.fleet.drift import Drift
 from seaopt.fleet.history import LABEL, TIME
-from seaopt.fleet.population import ALIGN as POPULATION_ALIGN
-from seaopt.fleet.population import HEAD as POPULATION_HEAD
 from seaopt.fleet.population import Population
-from seaopt.fleet.result import ALIGN, HEAD, Fleet, list_cells
-from seaopt.fleet.scatter import BETWEEN_HEAD
+from seaopt.fleet.result import Fleet
+from seaopt.fleet.words import describe
 from seaopt.fleet.worker import FAILED, MET, NOT_MET
-from seaopt.formatting import MISSING, format_count, format_number, join_words
-from seaopt.reporting.page.fleet import (
-    AlarmLine,
-    Cell,
-    FleetPage,
-    PageTable,
-    Row,
-    VerdictLine,
-    draw_trend,
-    write_page,
-)
+from seaopt.formatting import MISSING, format_number, join_words
+from seaopt.reporting.page.fleet import ActuatorTable, Cell, Row, draw_trend, write_page
+from seaopt.reporting.sections.data import Item, Mark, Section, Table, mark_met
 from seaopt.units import unit_after
 
 MOST_DRAWN = 300  # actuators with drawings: the worst
@@ -95,45 +84,65 @@ def write_fleet_page(
     'fleet.html'
 
     """
-    return write_page(_compose(fleet, drift, population, title), path, files=files, command=command)
-
-
-def _compose(fleet: Fleet, drift: Drift, population: Population | None, title: str) -> FleetPage:
-    """Return what the page shows."""
     table = tabulate_actuators(fleet, drift, population)
-    names = fleet.fitted or tuple(fleet.units)
-    timed = not drift.missing
-    return FleetPage(
+    names, timed = fleet.fitted or tuple(fleet.units), not drift.missing
+    drift_mark = Mark(text="alarm", style="bad") if drift.alarms else Mark(text="steady", style="good")
+    return write_page(
+        path,
         title=title,
-        verdicts=_judge(fleet, drift),
+        verdicts=(
+            (mark_met(fleet.met), f"Fleet: {fleet.verdict}"),
+            (drift_mark if timed else Mark(text="no charts", style="note"), f"Drift: {drift.verdict}"),
+        ),
         glance=_glance(fleet, drift),
-        alarms=tuple(
-            AlarmLine(actuator=alarm.actuator, text=alarm.describe(), since=alarm.since, raised=alarm.raised)
-            for alarm in drift.alarms[:MOST_ALARMS]
+        table=ActuatorTable(
+            heads=(
+                *(["off siblings"] if population else []),
+                *(f"{name}{unit_after(fleet.units[name])}" for name in names),
+            ),
+            rows=_list_rows(table.head(MOST_ROWS), names, drift, population is not None),
+            timed=timed,
+            notes=_note_table(table, timed, population),
         ),
-        more_alarms=max(len(drift.alarms) - MOST_ALARMS, 0),
-        remedies=REMEDIES,
-        heads=(
-            *(["off siblings"] if population else []),
-            *(f"{name}{unit_after(fleet.units[name])}" for name in names),
-        ),
-        rows=_list_rows(table.head(MOST_ROWS), names, drift, population is not None),
-        timed=timed,
-        table_notes=_note_table(table, timed, population),
-        reasons=fleet.reasons,
-        tables=_list_tables(fleet, drift, population),
-        judged=_explain(drift),
+        sections=[
+            *_list_alarms(drift),
+            *_list_reasons(fleet),
+            *describe(fleet),
+            *(describe(population) if population is not None else ()),
+            *describe(drift),
+        ],
+        files=files,
+        command=command,
     )
 
 
-def _judge(fleet: Fleet, drift: Drift) -> tuple[VerdictLine, ...]:
-    logs = VerdictLine(
-        word="met" if fleet.met else "not met", tone="good" if fleet.met else "bad", text=f"Fleet: {fleet.verdict}"
+def _list_alarms(drift: Drift) -> list[Section]:
+    """Return the alarms that are written out, how many are not, and what to do about them."""
+    if not drift.alarms:
+        return []
+    items = tuple(
+        Item(
+            severity="error",
+            text=f"{alarm.actuator}: {alarm.describe()}. First in {alarm.since}, certain with {alarm.raised}.",
+        )
+        for alarm in drift.alarms[:MOST_ALARMS]
     )
-    if drift.missing:
-        return logs, VerdictLine(word="no charts", tone="note", text=f"Drift: {drift.verdict}")
-    word, tone = ("alarm", "bad") if drift.alarms else ("steady", "good")
-    return logs, VerdictLine(word=word, tone=tone, text=f"Drift: {drift.verdict}")
+    more = len(drift.alarms) - MOST_ALARMS
+    remarks = (f"And {more} more, of actuators in the table below.",) if more > 0 else ()
+    return [
+        Section(title="Parameters that have changed", part="alarms", remarks=remarks, items=items),
+        Section(title="What to do", part="alarms", sentences=REMEDIES),
+    ]
+
+
+def _list_reasons(fleet: Fleet) -> list[Section]:
+    rows = tuple((str(count), text, log) for text, count, log in fleet.reasons)
+    remark = (
+        "Mend what failed, or take it out, and type the same command: only what is new, changed or failed is fitted. "
+        "seaopt inspect LOG shows what is wrong with one."
+    )
+    table = Table(head=("logs", "why", "one of them"), rows=rows, align="><<")
+    return [Section(title="Reasons", part="reasons", tables=(table,), remarks=(remark,))] if rows else []
 
 
 def _glance(fleet: Fleet, drift: Drift) -> tuple[tuple[str, str, str], ...]:
@@ -157,31 +166,22 @@ def _list_rows(table: pl.DataFrame, names: Sequence[str], drift: Drift, siblings
     begun = {(alarm.actuator, alarm.parameter): alarm.begun for alarm in drift.alarms}
     rows: list[Row] = []
     for row in table.iter_rows(named=True):
-        state, tone = _name_state(row)
         cells = [_show(row["off"], format_number(row["off"], 2))] if siblings else []
         cells += [_show_parameter(row, name, runs.get(row["label"]), begun) for name in names]
+        shared = {key: row[key] for key in ("logs", "met", "level")}
         rows.append(
-            Row(
-                name=row["label"],
-                state=state,
-                tone=tone,
-                logs=row["logs"],
-                met=row["met"],
-                last=row["last"] or "",
-                level=row["level"],
-                cells=tuple(cells),
-            )
+            Row(name=row["label"], state=_name_state(row), last=row["last"] or "", cells=tuple(cells), **shared)
         )
     return tuple(rows)
 
 
-def _name_state(row: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the state of an actuator, and the class of its colour."""
+def _name_state(row: Mapping[str, Any]) -> Mark:
+    """Return the state of an actuator."""
     if row["alarm"]:
-        return "alarm", "bad"
+        return Mark(text="alarm", style="bad")
     if row["met"] == row["logs"]:
-        return "met", "good"
-    return ("not met", "bad") if not row["met"] else ("in part", "warning")
+        return Mark(text="met", style="good")
+    return Mark(text="in part", style="warning") if row["met"] else Mark(text="not met", style="bad")
 
 
 def _group_runs(drift: Drift, actuators: Sequence[str]) -> dict[str, pl.DataFrame]:
@@ -243,58 +243,3 @@ def _note_table(table: pl.DataFrame, timed: bool, population: Population | None)
     if len(table) > MOST_ROWS:
         notes.append(f"The {MOST_ROWS} worst of {len(table)} actuators are listed; actuators.parquet has all.")
     return tuple(notes)
-
-
-def _list_tables(fleet: Fleet, drift: Drift, population: Population | None) -> tuple[PageTable, ...]:
-    """Return the tables of the parameters: over logs, over actuators, from run to run."""
-    tables = [
-        PageTable(
-            heading="Over the logs that are met",
-            heads=tuple(zip(HEAD, ALIGN, strict=True)),
-            rows=tuple(list_cells(fleet.spreads)),
-        )
-    ]
-    if population is not None:
-        tables.append(
-            PageTable(
-                heading="Over actuators",
-                heads=tuple(zip(POPULATION_HEAD, POPULATION_ALIGN, strict=True)),
-                rows=tuple(population.describe()),
-                note="Stds beyond those of the fits, by restricted likelihood.",
-            )
-        )
-    if drift.between:
-        tables.append(
-            PageTable(
-                heading="From run to run",
-                heads=(("parameter", "<"), *((head, ">") for head in BETWEEN_HEAD)),
-                rows=tuple(
-                    (f"{name}{unit_after(fleet.units[name])}", *between.describe())
-                    for name, between in drift.between.items()
-                ),
-            )
-        )
-    return tuple(tables)
-
-
-def _explain(drift: Drift) -> tuple[str, ...]:
-    """Return how drift is told, in sentences."""
-    if drift.missing:
-        return (f"Drift was {drift.verdict}.",)
-    charts = join_words(list(drift.between))
-    texts = [
-        f"Each actuator has a chart of {charts} (CUSUM of innovations, k = {ALLOWANCE:g}, h = {drift.threshold:.2f}): "
-        "it adds up by how much each run lies off the mean of those before it, in stds of its fit and between runs. "
-        f"The threshold is where at most {100 * drift.false_alarms:g} % of healthy actuators raise an alarm within "
-        f"{PER_RUNS} runs. Of the {drift.actuators} here: {drift.describe_expected()}.",
-        f"Time: {drift.history.source}." + (f" Careful: {drift.history.warning}." if drift.history.warning else ""),
-    ]
-    if drift.left_out:
-        total = format_count(len(drift.history.rows), "log")
-        texts.append(f"Left out, of {total}: {drift.describe_left_out()}.")
-    texts.append(
-        "This holds where the runs of a healthy actuator scatter around a mean of its own as those of its siblings do: "
-        "as widely, with such tails, and as alike in runs that follow each other, which are estimated over the whole "
-        "fleet. A temperature that comes and goes over many runs raises alarms, too."
-    )
-    return tuple(texts)

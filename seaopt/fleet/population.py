@@ -41,8 +41,8 @@ from seaopt.fleet.history import LABEL, check_names, leave_out, order_runs
 from seaopt.fleet.plan import name_correlation
 from seaopt.fleet.result import Fleet
 from seaopt.fleet.worker import FAILED, MET
-from seaopt.formatting import format_count, format_number, format_table, html_text
-from seaopt.records import record
+from seaopt.formatting import format_count, format_number
+from seaopt.records import Worded, record
 
 CONFIDENT = 1.959964  # standard deviations of a 95 % interval
 RELATIVE = 0.25  # std over value, up to which a positive parameter is taken by its logarithm
@@ -53,7 +53,7 @@ ITERATIONS, SETTLED = 2000, 1e-5  # of expectation maximisation; relative change
 
 
 @record(eq=False, repr=False)
-class Population:
+class Population(Worded):
     """What `estimate_population` returns; ``print(population)`` is a summary.
 
     Parameters
@@ -105,16 +105,8 @@ class Population:
         """Return the content of the part population of fleet.json."""
         return to_content(self)
 
-    def __repr__(self) -> str:
-        counts = (len(self.table), "actuator"), (int(self.table["logs"].sum()), "log")
-        head = "Population: " + ", ".join(format_count(*count) for count in counts)
-        return "\n".join([head, *(f"  {line}" for line in format_table(self.describe(), HEAD, ALIGN))])
-
-    _repr_html_ = html_text
-
 
 PARTS = ("", "_std", "_low", "_high", "_own", "_own_std")  # columns of a parameter
-HEAD, ALIGN = ("parameter", "unit", "mean", "std of actuators", "std of runs"), "<<>>>"
 
 
 @record(eq=False)

@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from seaopt.estimation.result.findings import GUESS
 from seaopt.fleet.worker import FAILED, GAP, MET, NOT_MET
-from seaopt.formatting import format_count, format_number, format_table, html_text
+from seaopt.formatting import format_count
 from seaopt.problem.problem import name_after
-from seaopt.records import Result, record
+from seaopt.records import Result, Worded, record
 
 FLEET_SCHEMA = "seaopt/fleet/1"
 SHORT = "short"  # kind of finding of a log that is much shorter than its siblings
@@ -46,7 +46,7 @@ class Spread:
 
 
 @record(eq=False, repr=False)
-class Fleet(Result):
+class Fleet(Result, Worded):
     """What `fit_fleet` returns; ``print(fleet)`` is a summary.
 
     Parameters
@@ -160,34 +160,6 @@ class Fleet(Result):
                 for spread in self.spreads
             },
         }
-
-    def __repr__(self) -> str:
-        lines = [f"Fleet: {self.verdict}"]
-        lines += [f"  {count} x {text} ({log})" for text, count, log in self.reasons[:10]]
-        return "\n".join([*lines, *(f"  {line}" for line in tabulate_spreads(self.spreads))])
-
-    _repr_html_ = html_text
-
-
-HEAD, ALIGN = ("parameter", "unit", "logs", "median", "10 %", "90 %", "std of one"), "<<>>>>>"
-
-
-def list_cells(spreads: Sequence[Spread]) -> list[list[str]]:
-    """Return the rows of a table of spreads."""
-    return [
-        [
-            spread.name,
-            spread.unit,
-            str(spread.logs),
-            *map(format_number, (spread.median, spread.low, spread.high, spread.std)),
-        ]
-        for spread in spreads
-    ]
-
-
-def tabulate_spreads(spreads: Sequence[Spread]) -> list[str]:
-    """Return the lines of a table of spreads."""
-    return format_table(list_cells(spreads), HEAD, ALIGN) if spreads else []
 
 
 def count_reasons(

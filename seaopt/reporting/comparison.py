@@ -187,8 +187,8 @@ def survey_panels(
     return panels
 
 
-def sentence(measured: Survey, fit: Fit, experiment: str) -> str:
-    """Say in plain words how the frequency responses of the experiment of a name compare with the fit."""
+def describe_responses(measured: Survey, fit: Fit, experiment: str) -> str:
+    """Return how an experiment's frequency responses compare with the fit, in sentences."""
     usable = [pair for pair in measured.pairs if pair.second_order is not None]
     if not usable:
         return "The log is not coherent enough for a comparison in frequency."

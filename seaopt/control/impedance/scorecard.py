@@ -17,11 +17,11 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.passivity import passivity
 from seaopt.control.loops.port import hold_response, port_of
 from seaopt.errors import ControlError, require_type
-from seaopt.formatting import format_number, html_table
+from seaopt.formatting import format_number
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
-from seaopt.records import record
+from seaopt.records import Worded, record
 from seaopt.units import mechanics_of
 
 LOWEST_HZ, POINTS = 0.1, 600
@@ -93,8 +93,8 @@ HEADS = (
 )  # fmt: skip
 
 
-@record
-class Scorecard:
+@record(repr=False)
+class Scorecard(Worded):
     """Scores of controllers by name, side by side.
 
     Parameters
@@ -116,15 +116,6 @@ class Scorecard:
     def unit(self) -> str:
         """The unit of impedance and damping."""
         return next(iter(self.scores.values())).unit
-
-    def __repr__(self) -> str:
-        rows = [("", *HEADS), *((name, *score.cells()) for name, score in self.scores.items())]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-        return "\n".join([f"Scorecard (impedance and damper in {self.unit})", *lines])
-
-    def _repr_html_(self) -> str:
-        return html_table(("controller", *HEADS), [(name, *score.cells()) for name, score in self.scores.items()])
 
 
 def scorecard(

@@ -44,8 +44,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.fit_result import Fit
-from seaopt.formatting import format_table, html_list, html_table
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Worded, record
 
 MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0  # differences of BIC (Kass and Raftery)
 CONTRADICTION = 1.02  # ratio of held-out residuals that contradicts the likelihood
@@ -86,11 +85,8 @@ class OctavePower:
         return f"({self.unit})^2"
 
 
-_HEAD = ("", "effective BIC", "BIC", "AIC", "unknowns", "free run (held out) [%]")
-
-
 @record(eq=False, repr=False)
-class Ranking:
+class Ranking(Worded):
     """Fits ranked by how well they explain the same logs; ``print(ranking)`` is a report.
 
     Parameters
@@ -139,25 +135,6 @@ class Ranking:
             "ranking": to_content(self.rows),
             "bands": to_content(self.bands),
         }
-
-    def __repr__(self) -> str:
-        rows = format_table((self._cells(row) for row in self.rows), _HEAD, "<>>>>")
-        return "\n  ".join([f"Ranking: {self.sentences[0]}", *self.sentences[1:], *rows])
-
-    def _cells(self, row: Ranked) -> list[str]:
-        """Return a row of the table; the criteria are counted from those of the best fit."""
-        first = self.rows[0]
-        percents = ", ".join(
-            f"{name}.{output} {p.used:.2f}" + ("" if p.held_out is None else f" ({p.held_out:.2f})")
-            for name, outputs in row.free_run.items()
-            for output, p in outputs.items()
-        )
-        away = (row.effective_bic - first.effective_bic, row.bic - first.bic, row.aic - first.aic)
-        return [row.name, *(f"{value:+.6g}" for value in away), str(row.unknowns), percents]
-
-    def _repr_html_(self) -> str:
-        rows = html_table(("fit", *_HEAD[1:]), map(self._cells, self.rows))
-        return html_list(self.sentences) + rows + self.plot.to_html()
 
 
 def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:

@@ -40,9 +40,7 @@ from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import describe_outputs
 from seaopt.estimation.uncertainty.leverage import PRIORS, Leverage, measure_leverage
-from seaopt.formatting import html_text
-from seaopt.records import PlotAccessor, record
-from seaopt.units import unit_after
+from seaopt.records import PlotAccessor, Worded, record
 
 SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
 LARGE = 0.05  # of an output's rms: a residual that is worth words for its colour alone
@@ -64,7 +62,7 @@ class OutputDiagnostics:
 
 
 @record(eq=False, repr=False)
-class Diagnostics:
+class Diagnostics(Worded):
     """Tests of a fit; ``print(diagnostics)`` is a report.
 
     Parameters
@@ -109,32 +107,6 @@ class Diagnostics:
     def to_dict(self) -> dict[str, Any]:
         """Return the content as numbers, lists and text."""
         return to_content(self)
-
-    def __repr__(self) -> str:
-        lines = ["Diagnostics: " + ("no problem found" if self.ok else f"{len(self.sentences)} to look at")]
-        lines += [f"  - {sentence}" for sentence in self.sentences]
-        for name, row in self.outputs.items():
-            for output, figures in row.items():
-                percents = f"simulated {figures.free_run}, one sample ahead {figures.one_step}"
-                lines.append(f"  {name}.{output}: whiteness p {figures.whiteness_p:.2g}; {percents}")
-                lines += [
-                    f"    against {u}: {cross.worst:.2g} of the 99 % bound, at lag {cross.worst_lag}"
-                    for u, cross in figures.inputs.items()
-                ]
-        lines += [
-            f"  {name} = {test.value:.6g}{unit_after(test.unit)} held fixed: chi-square {test.chi2:.3g}, one step with "
-            f"it free goes to {test.preferred:.4g}"
-            for name, test in self.held.items()
-            if test.p < SIGNIFICANCE
-        ]
-        for name, source in self.leverage.items():
-            shares = ", ".join(f"{parameter} {100 * share:.3g} %" for parameter, share in source.parameters.items())
-            lines.append(f"  {name} brings {100 * source.whole:.3g} % of the information: {shares}")
-        lines.append(f"  AIC {self.aic:.6g}, BIC {self.bic:.6g}")
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return html_text(self) + self.plot.to_html()
 
 
 def diagnose(fit: Fit) -> Diagnostics:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
@@ -14,35 +14,25 @@ from seaopt.files import write_text
 from seaopt.formatting import format_number, printable
 from seaopt.records import record
 from seaopt.reporting.page.provenance import describe_provenance
-from seaopt.reporting.page.render import render_template
+from seaopt.reporting.page.render import render_parts, render_template
+from seaopt.reporting.sections.data import Mark, Section
 
 WIDTH, HEIGHT, EDGE = 132.0, 30.0, 3.0  # of a drawing, in its units
 MOST_POINTS = 40  # of a drawing; runs beyond are averaged, those that follow each other
 MOST_DIGITS = 1  # of coordinates
-
-
-@record
-class VerdictLine:
-    """A verdict: a word, the class of its colour ("good", "bad", "note"), and a line."""
-
-    word: str
-    tone: str
-    text: str
-
-
-@record
-class AlarmLine:
-    """An alarm in words, and the logs where it began and was sure."""
-
-    actuator: str
-    text: str
-    since: str
-    raised: str
+PARTS = {
+    "alarms": "Alarms",
+    "actuators": "Actuators",
+    "reasons": "Logs that are not met",
+    "parameters": "Parameters",
+    "judged": "How drift is told",
+    "provenance": "Provenance",
+}
 
 
 @record
 class Cell:
-    """A value of the table: its text, what it is sorted by, its trend in words, and its drawing, if there are such."""
+    """A value of the table: its text, the key it is sorted by, its trend in words, and its drawing."""
 
     text: str
     sort: str
@@ -52,11 +42,10 @@ class Cell:
 
 @record
 class Row:
-    """An actuator: its state, with the class of its colour, its logs, the last one's time, its chart, its values."""
+    """An actuator: its state, its logs, the last one's time, its chart, its values."""
 
     name: str
-    state: str
-    tone: str
+    state: Mark
     logs: int
     met: int
     last: str
@@ -65,78 +54,40 @@ class Row:
 
 
 @record
-class PageTable:
-    """A table with its heading: titles of columns with "<" or ">", rows of texts."""
+class ActuatorTable:
+    """The table of the actuators, the worst first, with the titles of the columns of values."""
 
-    heading: str
-    heads: tuple[tuple[str, str], ...]
-    rows: tuple[Sequence[str], ...]
-    note: str = ""
-
-
-@record
-class FleetPage:
-    """What the page of a fleet shows.
-
-    Parameters
-    ----------
-    title : str
-    verdicts : tuple of VerdictLine
-    glance : tuple of (name, figure, what it is compared with)
-    alarms, more_alarms, remedies
-        Alarms that are written out, how many are not, and what to do about them.
-    heads : tuple of str
-        Titles of the columns of values.
-    rows : tuple of Row
-        The worst first.
-    timed : bool
-        Whether actuators have a history, and so a last time and a chart.
-    table_notes, judged : tuple of str
-        What to say below the table, and of how drift is told.
-    reasons : tuple of (reason, count, a log)
-        Why logs are not met.
-    tables : tuple of PageTable
-        Of the parameters.
-
-    """
-
-    title: str
-    verdicts: tuple[VerdictLine, ...]
-    glance: tuple[tuple[str, str, str], ...]
-    alarms: tuple[AlarmLine, ...]
-    more_alarms: int
-    remedies: tuple[str, ...]
     heads: tuple[str, ...]
     rows: tuple[Row, ...]
-    timed: bool
-    table_notes: tuple[str, ...]
-    reasons: tuple[tuple[str, int, str], ...]
-    tables: tuple[PageTable, ...]
-    judged: tuple[str, ...]
+    timed: bool  # whether actuators have a history, and so a last time and a chart
+    notes: tuple[str, ...]  # below the table
 
 
-def write_page(page: FleetPage, path: Path | str, *, files: Sequence[Path | str] = (), command: str = "") -> Path:
-    """Write a page that needs no network and no other file.
+def write_page(
+    path: Path | str,
+    *,
+    title: str,
+    verdicts: Iterable[tuple[Mark, str]],
+    glance: Iterable[tuple[str, str, str]],
+    table: ActuatorTable,
+    sections: Sequence[Section],
+    files: Sequence[Path | str] = (),
+    command: str = "",
+) -> Path:
+    """Write a page that needs no network and no other file; sections stand in their `PARTS`.
 
-    Parameters
-    ----------
-    page : FleetPage
-        What it shows.
-    path : path
-        The file.
-    files : sequence of path
-        What it was made of, besides the logs: named with their hashes.
-    command : str
-        What was typed to make it.
-
-    Raises
-    ------
-    FileError
-        The folder cannot be written.
-
+    `glance`: name, figure, and what it is compared with. `files`, `command`: what it was made of, besides the logs, and
+    what was typed to make it. Raises FileError: the folder cannot be written.
     """
-    provenance = describe_provenance((), files, command)
-    html = render_template("fleet.html.jinja", page=page, title=page.title, provenance=provenance)
+    html = render_template(
+        "fleet.html.jinja",
+        title=title,
+        parts=PARTS,
+        verdicts=verdicts,
+        glance=glance,
+        table=table,
+        described=render_parts([*sections, describe_provenance((), files, command)], PARTS),
+    )
     return write_text(Path(path), html)
 
 
@@ -150,14 +101,7 @@ def draw_trend(
 ) -> Markup:
     """Return values over time as a small SVG: points joined by a line, one std up and down, and where a change began.
 
-    Parameters
-    ----------
-    times, values, stds : array
-        Of at least two runs, in order of time.
-    label : str
-        What is read out.
-    since : float, optional
-        Time from which on the drawing is marked.
+    `times`: in order, of at least two runs. `label`: what a screen reader says. `since`: from when on it is shaded.
 
     Examples
     --------
@@ -178,10 +122,10 @@ def draw_trend(
 
     x = across(at)
     bars = "".join(
-        f"M{_digits(place)} {_digits(top)}V{_digits(bottom)}"
-        for place, top, bottom in zip(x, down(level + spread), down(level - spread), strict=True)
+        f"M{_digits(left)} {_digits(top)}V{_digits(bottom)}"
+        for left, top, bottom in zip(x, down(level + spread), down(level - spread), strict=True)
     )
-    line = "L".join(f"{_digits(place)} {_digits(height)}" for place, height in zip(x, down(level), strict=True))
+    line = "L".join(f"{_digits(left)} {_digits(height)}" for left, height in zip(x, down(level), strict=True))
     mark = ""
     if since is not None:
         start = float(np.clip(across(np.array([since]))[0], EDGE, WIDTH - EDGE))

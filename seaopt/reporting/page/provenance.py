@@ -5,72 +5,46 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
 from seaopt.estimation import Experiment
-from seaopt.records import record
+from seaopt.reporting.sections.data import Section, Table
 
-PACKAGES = ("numpy", "scipy", "casadi", "matplotlib", "python-control")
-_DISTRIBUTIONS = {"python-control": "control"}
-
-
-@record
-class Source:
-    """A file, its SHA-256, and what was taken from it."""
-
-    file: str
-    sha256: str
-    use: str
+PACKAGES = {name: name for name in ("numpy", "scipy", "casadi", "matplotlib")} | {"python-control": "control"}
 
 
-@record
-class Provenance:
-    """Rows of name and value, and the files."""
-
-    rows: tuple[tuple[str, str], ...]
-    sources: tuple[Source, ...]
-
-
-def describe_provenance(experiments: Iterable[Experiment], files: Sequence[Path | str], command: str) -> Provenance:
-    """Return what a report made here and now is made with and of.
-
-    Parameters
-    ----------
-    experiments : iterable of Experiment
-        Whose logs name their files.
-    files : sequence of path
-        Others that were read, such as the problem file.
-    command : str
-        What was typed; empty where nothing was.
-
-    """
-    packages = ", ".join(f"{name} {version(_DISTRIBUTIONS.get(name, name))}" for name in PACKAGES)
-    now = datetime.now(tz=UTC)
+def describe_provenance(experiments: Iterable[Experiment], files: Sequence[Path | str], command: str) -> Section:
+    """Return what a report made now is made with, and of which files: those of `experiments`' logs, and `files`."""
     rows = [
-        ("written", now.strftime("%Y-%m-%d %H:%M:%S UTC")),
+        ("written", datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")),
         ("command", command),
         ("seaopt", version("seaopt")),
         ("Python", f"{platform.python_version()} ({platform.python_implementation()})"),
-        ("libraries", packages),
+        ("libraries", ", ".join(f"{name} {version(package)}" for name, package in PACKAGES.items())),
         ("machine", f"{platform.platform()}, {platform.machine()}, {os.cpu_count() or 1} processors"),
     ]
-    return Provenance(
-        rows=tuple(row for row in rows if row[1]), sources=(*_hash_files(files), *_list_logs(experiments))
+    sources = (*_hash_files(files), *_list_logs(experiments))
+    return Section(
+        title="What made this report",
+        part="provenance",
+        tables=(
+            Table(head=("", ""), rows=tuple(row for row in rows if row[1])),
+            Table(head=("file", "use", "SHA-256"), rows=sources, label="Files"),
+        ),
+        remarks=("The page is complete in this one file. Without scripts its figures cannot be zoomed.",),
     )
 
 
-def _hash_files(files: Sequence[Path | str]) -> list[Source]:
-    return [
-        Source(file=str(file), sha256=hashlib.sha256(Path(file).read_bytes()).hexdigest(), use="problem file")
-        for file in files
-        if Path(file).is_file()
-    ]
+def _hash_files(files: Sequence[Path | str]) -> Iterator[tuple[str, ...]]:
+    for file in map(Path, files):
+        if file.is_file():
+            yield str(file), "problem file", hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def _list_logs(experiments: Iterable[Experiment]) -> list[Source]:
+def _list_logs(experiments: Iterable[Experiment]) -> list[tuple[str, ...]]:
     """Return each log's file, or that it has none, with its channels."""
     sources: dict[tuple[str, str], list[str]] = {}
     for experiment in experiments:
@@ -78,6 +52,6 @@ def _list_logs(experiments: Iterable[Experiment]) -> list[Source]:
             origin = signal.origin
             column = "" if not origin.column or origin.column == name else f" from {origin.column}"
             conversion = f" ({origin.conversion})" if origin.conversion else ""
-            key = (origin.file or experiment.log.source, origin.sha256)
+            key = (origin.file or experiment.log.source, origin.sha256 or "no file")
             sources.setdefault(key, []).append(f"{experiment.name}: {name}{column}{conversion}")
-    return [Source(file=file, sha256=digest, use="; ".join(use)) for (file, digest), use in sources.items()]
+    return [(file, "; ".join(uses), digest) for (file, digest), uses in sources.items()]

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from markupsafe import Markup
 
-from seaopt.estimation.advice.forecasts import Percent
-from seaopt.formatting import MISSING, format_band, format_number, printable
-from seaopt.units import unit_after
+from seaopt.formatting import format_number, printable
+from seaopt.reporting.sections.data import Section
+from seaopt.reporting.sections.html import render_section
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -24,11 +24,19 @@ def render_template(name: str, **values: Any) -> str:
     return _make_environment().get_template(name).render(values)
 
 
+def render_parts(sections: Iterable[Section], headings: Mapping[str, str]) -> dict[str, list[Markup]]:
+    """Return sections as HTML, by the part of the page where they stand, whose heading is not repeated."""
+    parts: dict[str, list[Markup]] = {}
+    for section in sections:
+        html = render_section(section, title=bool(section.aside) or section.title != headings[section.part])
+        parts.setdefault(section.part, []).append(Markup(html))  # noqa: S704 - escaped there
+    return parts
+
+
 @cache
 def _make_environment() -> Environment:
     """Return what keeps the templates that it has compiled, with the filters and the files that all of them take."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
 
     environment = Environment(
         loader=PackageLoader("seaopt.reporting.page", "templates"),
@@ -38,14 +46,7 @@ def _make_environment() -> Environment:
         undefined=StrictUndefined,
         finalize=_show,
     )
-    environment.filters |= {
-        "number": format_number,
-        "band": _format_band,
-        "interval": _format_interval,
-        "percent": _format_percent,
-        "unit": _format_unit,
-        "slug": make_slug,
-    }
+    environment.filters["number"] = format_number
     folder = files("seaopt.reporting.page").joinpath("templates")
     fixed: dict[str, Any] = {
         name: Markup(folder.joinpath(file).read_text(encoding="utf-8"))  # noqa: S704
@@ -55,35 +56,6 @@ def _make_environment() -> Environment:
     return environment
 
 
-def make_slug(text: str) -> str:
-    """Return a text as an id.
-
-    Examples
-    --------
-    >>> make_slug("Margins on every plant")
-    'margins-on-every-plant'
-
-    """
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
-
-
 def _show(value: Any) -> Any:
     """Return a text with its control characters shown, markup as it is."""
     return printable(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
-
-
-def _format_unit(unit: str) -> str:
-    return unit_after(unit).strip()
-
-
-def _format_band(ends: tuple[float, float] | None) -> str:
-    return format_band(ends, missing=MISSING)
-
-
-def _format_interval(ends: tuple[float, float] | None) -> str:
-    return " to ".join(format_number(end, 6) for end in ends) if ends and np.all(np.isfinite(ends)) else "unknown"
-
-
-def _format_percent(percent: Percent) -> str:
-    held_out = "" if percent.held_out is None else f" ({format_number(percent.held_out)})"
-    return format_number(percent.used) + held_out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -11,38 +11,35 @@ from typing import Any
 
 from markupsafe import Markup
 
-from seaopt.control import Controller, ForceMPC, ScheduledController, Scorecard, scorecard
+from seaopt.control import Controller, ForceMPC, Passivity, ScheduledController, Scorecard, scorecard
 from seaopt.control.deploy.export import export
-from seaopt.control.impedance.scorecard import HEADS
 from seaopt.errors import FileError, SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.files import read_json, write_json, write_text
 from seaopt.formatting import format_count, format_figure, format_number
-from seaopt.frequency import Survey
 from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
-from seaopt.reporting.comparison import fit_surveys, response_panels, sentence
+from seaopt.reporting.comparison import describe_responses, fit_surveys, response_panels
 from seaopt.reporting.drawing import write_figure
 from seaopt.reporting.figures import certificate as certificates
 from seaopt.reporting.figures import fit as fits
-from seaopt.reporting.figures import log as logs
 from seaopt.reporting.figures import loop as loops
 from seaopt.reporting.figures import simulation as simulations
 from seaopt.reporting.figures.impedance import region_panel
+from seaopt.reporting.figures.log import log_panels
 from seaopt.reporting.figures.panel import Panel, compose_sheet
 from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
 from seaopt.reporting.figures.schedule import schedule_panels
-from seaopt.reporting.page.chart import Chart, make_chart
+from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
-from seaopt.reporting.page.render import render_template
+from seaopt.reporting.page.render import render_parts, render_template
 from seaopt.reporting.sections import describe
-from seaopt.reporting.sections.html import render_section
-from seaopt.reporting.sections.verdict import UNMET, judge_results
+from seaopt.reporting.sections.data import Section
+from seaopt.reporting.sections.verdict import UNMET, describe_expectations, judge_results
 from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.robustness.verification.environments import StabilityMap
-from seaopt.robustness.verification.judgement import Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal
-from seaopt.robustness.verification.verification import Verification, describe_witness
+from seaopt.robustness.verification.verification import Verification
 
 Result = (
     Fit
@@ -56,61 +53,66 @@ Result = (
     | ScheduleCertificate
     | LargeSignal
 )
-KINDS = (
-    Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, ScheduledController,
-    ScheduleCertificate,
-)  # fmt: skip
-# Parts with figures as files.
-FILED = (
-    "controller",
-    "schedule",
-    "fit",
-    "ranking",
-    "certificate",
-    "amplitude",
-    "contact",
-)
+KINDS: dict[str, type[Any]] = {
+    "fit": Fit,
+    "ranking": Ranking,
+    "controller": Controller,
+    "mpc": ForceMPC,
+    "certificate": Certificate,
+    "verification": Verification,
+    "coupled": StabilityMap,
+    "schedule": ScheduledController,
+    "swept": ScheduleCertificate,
+}
+PARTS = {
+    "expectations": "What the problem file expects",
+    "controller": "Controller",
+    "schedule": "Schedule",
+    "mpc": "Predictive control",
+    "fit": "How well the model fits",
+    "diagnostics": "Diagnostics",
+    "ranking": "Which model",
+    "certificate": "What is certified",
+    "simulation": "Simulation of the nonlinear plants",
+    "amplitude": "Bandwidth against amplitude",
+    "contact": "Contact with an environment",
+    "parameters": "Parameters",
+    "logs": "Quality of the logs",
+    "findings": "Findings",
+    "provenance": "Provenance",
+}
+FILED = ("controller", "schedule", "fit", "ranking", "certificate", "amplitude", "contact")  # with figures as files
 FIGURES_SCHEMA = "seaopt/figures/1"
 LAW_NAME = "force_law"  # of the C header that can be copied
 
 
 @record(eq=False)
 class Material:
-    """What a report is made of; what was not given is None or empty."""
+    """The results that a report is made of, those that there are."""
 
-    fit: Fit | None
-    ranking: Ranking | None
-    controller: Controller | None
-    mpc: ForceMPC | None
-    certificate: Certificate | None
-    verification: Verification | None
-    coupled: StabilityMap | None
-    large: tuple[LargeSignal, ...]
-    surveys: Mapping[str, Survey]
-    diagnostics: Diagnostics | None
+    fit: Fit | None = None
+    ranking: Ranking | None = None
+    controller: Controller | None = None
+    mpc: ForceMPC | None = None
+    certificate: Certificate | None = None
+    verification: Verification | None = None
+    coupled: StabilityMap | None = None
     schedule: ScheduledController | None = None
     swept: ScheduleCertificate | None = None
+    large: tuple[LargeSignal, ...] = ()
+    passivity: Passivity | None = None
+    diagnostics: Diagnostics | None = None
 
 
 @record(eq=False)
 class Plate:
-    """Panels that stand together on the page, and in one file: the section's part that they belong to, and a text."""
+    """Panels that stand together on the page, and in one file: the part that they belong to, a heading and a text."""
 
     name: str
     part: str
-    heading: str
-    panels: tuple[Panel, ...]
+    panels: Sequence[Panel]
+    heading: str = ""
     text: str = ""
-
-
-@record(eq=False)
-class DrawnPlate:
-    """A plate with its charts, for the page."""
-
-    name: str
-    heading: str
-    charts: tuple[Chart, ...]
-    text: str
 
 
 def write_report(
@@ -170,19 +172,20 @@ def write_report(
     require_type(title, str, "title", "give the page's heading")
     for result in results:
         require_type(
-            result, (*KINDS, LargeSignal), "results", "give what fit, tune, certify, verify or compare returned"
+            result,
+            (*KINDS.values(), LargeSignal),
+            "results",
+            "give what fit, tune, certify, verify or compare returned",
         )
     material, target = _sort_results(results), Path(path)
-    plates = list_plates(material)
-    drawn: dict[str, list[DrawnPlate]] = {}
+    plates = list(_list_plates(material))
+    drawn: dict[str, list[dict[str, Any]]] = {}
     figures: list[Path] = []
     for plate in count_off(plates, "figure", progress):
         if plate.part in FILED:
             figures += write_figure(compose_sheet(plate.panels), target.parent / "figures" / plate.name)
-        charts = tuple(make_chart(panel) for panel in plate.panels)
-        drawn.setdefault(plate.part, []).append(
-            DrawnPlate(name=plate.name, heading=plate.heading, charts=charts, text=plate.text)
-        )
+        charts = [make_chart(panel) for panel in plate.panels]
+        drawn.setdefault(plate.part, []).append({"heading": plate.heading, "text": plate.text, "charts": charts})
     page = write_text(target, _render(material, drawn, title, files, command, expectations))
     _list_figures(target, figures)
     progress(format_count(len(plates), "figure"), 1.0)
@@ -206,192 +209,129 @@ def _list_figures(page: Path, figures: Sequence[Path]) -> None:
 
 def _sort_results(results: Sequence[Result]) -> Material:
     """Return the results by their kind, with what a certificate brings besides."""
-    fit, ranking, controller, mpc, certificate, verification, coupled, schedule, swept = (
-        _select(results, kind) for kind in KINDS
-    )
-    large = tuple(result for result in results if isinstance(result, LargeSignal))
     if not results:
         raise SeaoptError(
             "write_report got no result; give a Fit, a Ranking, a Controller, a Certificate or a Verification"
         )
+    by_kind: dict[str, Any] = {}
+    for name, kind in KINDS.items():
+        matches = [result for result in results if isinstance(result, kind)]
+        if len(matches) > 1:
+            raise SeaoptError(
+                f"write_report got {len(matches)} results of kind {kind.__name__}; give one, or write two pages"
+            )
+        if matches:
+            by_kind[name] = matches[0]
+    large = tuple(result for result in results if isinstance(result, LargeSignal))
+    certificate: Certificate | None = by_kind.get("certificate")
     if certificate is not None:
-        controller = certificate.controller if controller is None else controller
-        simulation, verification = certificate.simulated, certificate.runs if verification is None else verification
-        if simulation is not None:
-            coupled = coupled or simulation.environments
-            large = large or simulation.large_signal
-    return Material(
-        fit=fit,
-        ranking=ranking,
-        controller=controller,
-        mpc=mpc,
-        certificate=certificate,
-        verification=verification,
-        coupled=coupled,
-        large=large,
-        surveys=fit_surveys(fit) if fit is not None else {},
-        diagnostics=diagnose(fit) if fit is not None and fit.minimum is not None else None,
-        schedule=schedule if swept is None else swept.schedule,
-        swept=swept,
-    )
+        brought: dict[str, Any] = {"controller": certificate.controller, "verification": certificate.runs}
+        if certificate.simulated is not None:
+            brought |= {"coupled": certificate.simulated.environments, "passivity": certificate.simulated.passivity}
+            large = large or certificate.simulated.large_signal
+        by_kind = brought | by_kind
+    if "swept" in by_kind:
+        by_kind["schedule"] = by_kind["swept"].schedule
+    if "fit" in by_kind and by_kind["fit"].minimum is not None:
+        by_kind["diagnostics"] = diagnose(by_kind["fit"])
+    return Material(**by_kind, large=large)
 
 
-def _select(results: Sequence[Result], kind: type) -> Any:
-    matches = [result for result in results if isinstance(result, kind)]
-    if len(matches) > 1:
-        raise SeaoptError(
-            f"write_report got {len(matches)} results of kind {kind.__name__}; give one, or write two pages"
-        )
-    return matches[0] if matches else None
-
-
-def list_plates(material: Material) -> list[Plate]:
-    """Return every figure that the results allow, in the order of the page."""
-    return [
-        *_plates_of_controller(material),
-        *_plates_of_schedule(material),
-        *_plates_of_fit(material),
-        *_plates_of_certificate(material),
-        *_plates_of_simulation(material),
-        *_plates_of_parameters(material),
-        *_plates_of_logs(material),
-    ]
-
-
-def _plates_of_controller(material: Material) -> list[Plate]:
-    controller, certificate = material.controller, material.certificate
-    if controller is None or (controller.design is None and (certificate is None or not certificate.models)):
-        return []
-    plants = certificates.plants_of(certificate) if certificate is not None else None
-    panels = tuple(loops.LOOP_PANELS[name](controller, plants) for name in loops.MAIN)
-    return [Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)]
-
-
-def _plates_of_schedule(material: Material) -> list[Plate]:
-    if material.schedule is None:
-        return []
-    panels = schedule_panels(material.schedule, material.swept)
-    return [Plate(name="schedule", part="schedule", heading="", panels=tuple(panels))]
-
-
-def _plates_of_fit(material: Material) -> list[Plate]:
-    fit, plates = material.fit, list[Plate]()
-    for experiment in fit.experiments if fit is not None else ():
-        assert fit is not None
-        name, prediction = experiment.name, fit.predict(experiment)
-        panels = [fits.outputs_panel(prediction), fits.residuals_panel(prediction), fits.spectrum_panel(prediction)]
-        plates.append(Plate(name=f"time_{name}", part="fit", heading=f"{name} in time", panels=tuple(panels)))
-        if name in material.surveys:
-            responses = response_panels(experiment, material.surveys[name], _models(material))
-            text = sentence(material.surveys[name], fit, name)
-            plates.append(
-                Plate(
-                    name=f"response_{name}",
-                    part="fit",
-                    heading=f"{name} in frequency",
-                    panels=tuple(responses),
-                    text=text,
-                )
-            )
-    if material.diagnostics is not None:
-        for name in material.diagnostics.outputs:
-            panels = [fits.autocorrelation_panel(material.diagnostics, name)]
-            panels.append(fits.input_correlation_panel(material.diagnostics, name))
-            plates.append(
-                Plate(name=f"residual_{name}", part="diagnostics", heading=f"What {name} leaves", panels=tuple(panels))
-            )
+def _list_plates(material: Material) -> Iterator[Plate]:
+    """Yield every figure that the results allow; figures of a part in the order of the page."""
+    controller, certificate, fit = material.controller, material.certificate, material.fit
+    if controller is not None and (controller.design is not None or (certificate is not None and certificate.models)):
+        plants = None if certificate is None else certificates.plants_of(certificate)
+        panels = [loops.LOOP_PANELS[name](controller, plants) for name in loops.MAIN]
+        yield Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)
+    if material.schedule is not None:
+        yield Plate(name="schedule", part="schedule", panels=schedule_panels(material.schedule, material.swept))
+    if fit is not None:
+        yield from _list_plates_of_fit(fit, material.ranking, material.diagnostics)
     if material.ranking is not None:
         panels = [evidence_panel(material.ranking), *octave_panels(material.ranking)]
-        plates.append(Plate(name="ranking", part="ranking", heading="", panels=tuple(panels)))
-    return plates
+        yield Plate(name="ranking", part="ranking", panels=panels)
+    if certificate is not None:
+        yield Plate(name="certificate", part="certificate", panels=_list_certificate_panels(certificate))
+    yield from _list_plates_of_simulation(material)
 
 
-def _models(material: Material) -> dict[str, Fit]:
-    """Return the fits that are drawn over measured responses: those that are compared, or the only one."""
-    if material.ranking is not None:
-        return {f"model, {row.name}": material.ranking.fits[row.name] for row in material.ranking.rows}
-    return {} if material.fit is None else {"model, fitted": material.fit}
+def _list_plates_of_fit(fit: Fit, ranking: Ranking | None, diagnostics: Diagnostics | None) -> Iterator[Plate]:
+    models = {"model, fitted": fit}
+    if ranking is not None:  # the fits that are compared
+        models = {f"model, {row.name}": ranking.fits[row.name] for row in ranking.rows}
+    surveys = fit_surveys(fit)
+    for experiment in fit.experiments:
+        name, prediction = experiment.name, fit.predict(experiment)
+        panels = [fits.outputs_panel(prediction), fits.residuals_panel(prediction), fits.spectrum_panel(prediction)]
+        yield Plate(name=f"time_{name}", part="fit", heading=f"{name} in time", panels=panels)
+        if name in surveys:
+            yield Plate(
+                name=f"response_{name}",
+                part="fit",
+                heading=f"{name} in frequency",
+                panels=response_panels(experiment, surveys[name], models),
+                text=describe_responses(surveys[name], fit, name),
+            )
+        panels = [
+            replace(panel, name=f"log_{name}_{panel.name}", link=f"{name}, {panel.link}")
+            for panel in log_panels(experiment.log, experiment.log.quality)
+        ]
+        yield Plate(name=f"log_{name}", part="logs", heading=name, panels=panels)
+    for name in diagnostics.outputs if diagnostics is not None else ():
+        assert diagnostics is not None
+        panels = [fits.autocorrelation_panel(diagnostics, name), fits.input_correlation_panel(diagnostics, name)]
+        yield Plate(name=f"residual_{name}", part="diagnostics", heading=f"Residuals of {name}", panels=panels)
+    panels: list[Panel] = []
+    for make in (fits.parameters_panel, fits.correlation_panel):
+        with suppress(SeaoptError):  # nothing is free, or nothing is known of it
+            panels.append(make(fit))
+    if panels:
+        yield Plate(name="parameters", part="parameters", panels=panels)
 
 
-def _plates_of_certificate(material: Material) -> list[Plate]:
-    certificate = material.certificate
-    if certificate is None:
-        return []
+def _list_certificate_panels(certificate: Certificate) -> list[Panel]:
     panels = [certificates.worst_panel(certificate)] if certificate.models else []
     if certificate.drawn_ms:
         panels.append(certificates.draws_panel(certificate))
     panels.append(certificates.requirements_panel(certificate))
     if certificate.friction or certificate.friction_draws:
         panels.append(certificates.friction_panel(certificate))
-    return [Plate(name="certificate", part="certificate", heading="", panels=tuple(panels))]
+    return panels
 
 
-def _plates_of_simulation(material: Material) -> list[Plate]:
-    plates: list[Plate] = []
-    played = material.verification
-    for name in dict.fromkeys(row.plant for row in played.rows) if played is not None else ():
-        assert played is not None
-        panels = [simulations.simulation_panel(played, row) for row in played.worst() if row.plant == name]
-        plates.append(
-            Plate(name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=tuple(panels))
-        )
+def _list_plates_of_simulation(material: Material) -> Iterator[Plate]:
+    by_plant: dict[str, list[Panel]] = {}
+    if material.verification is not None:
+        for row in material.verification.worst():
+            panel = simulations.simulation_panel(material.verification, row)
+            by_plant.setdefault(row.plant, []).append(panel)
+    for name, panels in by_plant.items():
+        yield Plate(name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=panels)
     if material.large:
-        panels = [simulations.bandwidth_panel(material.large)]
-        plates.append(Plate(name="bandwidth", part="amplitude", heading="", panels=tuple(panels)))
-        panels = [
-            each
-            for sweep in material.large
-            for each in (simulations.amplitude_panel(sweep), simulations.saturation_panel(sweep))
-        ]
-        plates.append(Plate(name="amplitude", part="amplitude", heading="", panels=tuple(panels)))
+        yield Plate(name="bandwidth", part="amplitude", panels=[simulations.bandwidth_panel(material.large)])
+        makers = simulations.amplitude_panel, simulations.saturation_panel
+        panels = [make(sweep) for sweep in material.large for make in makers]
+        yield Plate(name="amplitude", part="amplitude", panels=panels)
     if material.coupled is not None:
         panels = simulations.environment_panels(material.coupled)
-        simulated = material.certificate.simulated if material.certificate is not None else None
-        if simulated is not None and simulated.passivity is not None and material.controller is not None:
+        if material.passivity is not None and material.controller is not None:
             panels.insert(0, certificates.impedance_panel(material.controller))
-        plates.append(Plate(name="environments", part="contact", heading="", panels=tuple(panels)))
+        yield Plate(name="environments", part="contact", panels=panels)
     rendered = None if material.certificate is None else material.certificate.impedance
     if rendered is not None:
-        panels = [region_panel(rendered.region, rendered.rendering.impedance)]
-        plates.append(
-            Plate(
-                name="impedance_region",
-                part="contact",
-                heading="Stiffness and damping at the link",
-                panels=tuple(panels),
-                text=". ".join(rendered.lines()) + ".",
-            )
+        yield Plate(
+            name="impedance_region",
+            part="contact",
+            heading="Stiffness and damping at the link",
+            panels=[region_panel(rendered.region, rendered.rendering.impedance)],
+            text=". ".join(rendered.lines()) + ".",
         )
-    return plates
-
-
-def _plates_of_parameters(material: Material) -> list[Plate]:
-    fit = material.fit
-    if fit is None:
-        return []
-    panels: list[Panel] = []
-    for make in (fits.parameters_panel, fits.correlation_panel):
-        try:
-            panels.append(make(fit))
-        except SeaoptError:  # nothing is free, or nothing is known of it
-            continue
-    return [Plate(name="parameters", part="parameters", heading="", panels=tuple(panels))] if panels else []
-
-
-def _plates_of_logs(material: Material) -> list[Plate]:
-    plates: list[Plate] = []
-    for one in material.fit.experiments if material.fit is not None else ():
-        panels = tuple(
-            replace(panel, name=f"log_{one.name}_{panel.name}", link=f"{one.name}, {panel.link}")
-            for panel in logs.log_panels(one.log, one.log.quality)
-        )
-        plates.append(Plate(name=f"log_{one.name}", part="logs", heading=one.name, panels=panels))
-    return plates
 
 
 def _render(
     material: Material,
-    drawn: Mapping[str, Sequence[DrawnPlate]],
+    drawn: Mapping[str, Sequence[Mapping[str, Any]]],
     title: str,
     files: Sequence[Path | str],
     command: str,
@@ -401,66 +341,60 @@ def _render(
     fit, controller, certificate = material.fit, material.controller, material.certificate
     experiments = fit.experiments if fit is not None else ()
     runs = material.verification
-    apart = runs if certificate is None or runs is not certificate.runs else None  # else the certificate speaks of them
     judged = judge_results(
         fit=fit,
         controller=material.schedule if controller is None else controller,
         mpc=material.mpc,
         certificate=material.swept if certificate is None else certificate,
-        verification=apart,
+        # the certificate speaks of its own runs
+        verification=None if certificate is not None and runs is certificate.runs else runs,
         expectations=expectations,
     )
+    results = (
+        controller,
+        material.schedule,
+        material.swept,
+        material.mpc,
+        fit,
+        material.diagnostics,
+        material.ranking,
+        certificate,
+        runs,
+        *material.large,
+        material.passivity,
+        material.coupled,
+        None if material.coupled is None and material.passivity is None else _score(controller),
+        *(experiment.log.quality for experiment in experiments),
+    )
+    sections: list[Section] = [
+        *describe_expectations(expectations),
+        *(section for result in results if result is not None for section in describe(result)),
+        describe_provenance(experiments, files, command),
+    ]
+    described = render_parts(sections, PARTS)
+    described.setdefault("findings", [Markup("<p>None.</p>")])
     sound = fit is None or fit.met
     return render_template(
         "page.html.jinja",
         title=title,
+        parts=PARTS,
         verdicts=judged,
         glance=list_figures(material),
-        expectations=expectations,
-        described=describe_parts(
-            controller,
-            material.schedule,
-            material.swept,
-            material.mpc,
-            fit,
-            certificate,
-            *(e.log.quality for e in experiments),
-        ),
-        doubt="" if sound else UNMET,
+        described=described,
         plates=drawn,
-        fit=fit,
-        diagnostics=material.diagnostics,
-        ranking=material.ranking,
+        doubt="" if sound else UNMET,
         controller=controller,
-        certificate=certificate,
-        verification=material.verification,
-        large=material.large,
-        coupled=material.coupled,
-        simulated=None if certificate is None else certificate.simulated,
-        card=_score(controller),
-        card_heads=HEADS,
         header=None if controller is None else write_header(controller, fit_met=sound),
-        failures=[] if material.verification is None else list_failed_runs(material.verification),
-        provenance=describe_provenance(experiments, files, command),
     )
-
-
-def describe_parts(*results: object) -> dict[str, list[Markup]]:
-    """Return the sections of results, those that there are, by the part of the page where they stand."""
-    parts: dict[str, list[Markup]] = {}
-    for section in (each for result in results if result is not None for each in describe(result)):
-        parts.setdefault(section.part, []).append(Markup(render_section(section)))  # noqa: S704 - escaped there
-    return parts
 
 
 def _score(controller: Controller | None) -> Scorecard | None:
     """Return the score of a controller on its design plant; None where that has no port, or is not known."""
     if controller is None or controller.design is None:
         return None
-    try:
+    with suppress(SeaoptError):
         return scorecard({controller.structure: controller})
-    except SeaoptError:
-        return None
+    return None
 
 
 def list_figures(material: Material) -> list[tuple[str, str, str]]:
@@ -500,18 +434,6 @@ def list_figures(material: Material) -> list[tuple[str, str, str]]:
         failed, count = len(material.verification.failures), len(material.verification.rows)
         figures.append(("runs failed", f"{failed} of {count}", "simulated, nonlinear"))
     return figures
-
-
-def list_failed_runs(verification: Verification) -> list[str]:
-    """Return what failed in simulation: the same kind of fault on a plant once, with its first run and a count."""
-    kinds: dict[tuple[str, str], list[Outcome]] = {}
-    for row in verification.failures:
-        kinds.setdefault((row.plant, row.faults[0].kind if row.faults else row.reason), []).append(row)
-    return [
-        f"{row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{describe_witness(row)}"
-        + (f" (and {format_count(len(more), 'more such run')})" if more else "")
-        for row, *more in kinds.values()
-    ]
 
 
 def write_header(controller: Controller, *, fit_met: bool = True) -> tuple[bool, str]:

@@ -25,12 +25,21 @@ KINDS = {
     "Certificate": "certificate",
     "ScheduleCertificate": "schedule_certificate",
     "Verification": "verification",
+    "Diagnostics": "diagnostics",
+    "Ranking": "ranking",
+    "Scorecard": "scorecard",
+    "LargeSignal": "lines",
+    "StabilityMap": "lines",
+    "Passivity": "lines",
+    "Fleet": "seaopt.fleet.words",
+    "Drift": "seaopt.fleet.words",
+    "Population": "seaopt.fleet.words",
 }
 
 
 def _find_module(result: object) -> Any:
     name = next((KINDS[kind.__name__] for kind in type(result).__mro__ if kind.__name__ in KINDS), None)
-    return None if name is None else import_module(f"seaopt.reporting.sections.kinds.{name}")
+    return None if name is None else import_module(name if "." in name else f"{__name__}.kinds.{name}")
 
 
 def describe(result: object) -> list[Section]:

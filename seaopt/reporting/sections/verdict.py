@@ -8,7 +8,7 @@ from dataclasses import replace
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.estimation import Fit
 from seaopt.reporting.sections import judge
-from seaopt.reporting.sections.data import Reason, Verdict
+from seaopt.reporting.sections.data import Reason, Section, Table, Verdict, mark_met
 from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.robustness.verification.verification import Verification
 
@@ -41,13 +41,12 @@ def judge_results(
     ['Controller: pid on F1, 30 Hz, every limit met']
 
     """
-    made = (controller, mpc, certificate, verification)
-    designs = [one for result in made if result is not None and (one := judge(result)) is not None]
-    verdict = None if fit is None else judge(fit)
-    sound = fit is None or fit.met
-    judged = [*([] if verdict is None else [verdict]), *(designs if sound else map(doubt_design, designs))]
-    guesses = "" if fit is None else fit.guesses
-    return [*(name_guesses(one, guesses) for one in judged), *judge_expectations(expectations)]
+    designs = (controller, mpc, certificate, verification)
+    judged = [verdict for design in designs if design is not None and (verdict := judge(design)) is not None]
+    if fit is not None:
+        judged = judged if fit.met else list(map(doubt_design, judged))
+        judged = [name_guesses(verdict, fit.guesses) for verdict in (judge(fit), *judged) if verdict is not None]
+    return [*judged, *judge_expectations(expectations)]
 
 
 def name_guesses(verdict: Verdict, guesses: str) -> Verdict:
@@ -58,6 +57,13 @@ def name_guesses(verdict: Verdict, guesses: str) -> Verdict:
 def doubt_design(verdict: Verdict) -> Verdict:
     """Return the verdict on a design as it is where the fit that it was made with is not met."""
     return replace(verdict, met=False, text=f"{verdict.text}, {UNMET}")
+
+
+def describe_expectations(outcomes: Sequence[tuple[bool, str]]) -> list[Section]:
+    """Return the table of what a problem file expects; none where it expects nothing."""
+    rows = tuple((mark_met(met), text) for met, text in outcomes)
+    table = Table(head=("verdict", "expectation"), rows=rows)
+    return [Section(title="Expectations", part="expectations", tables=(table,))] if rows else []
 
 
 def judge_expectations(outcomes: Sequence[tuple[bool, str]]) -> list[Verdict]:

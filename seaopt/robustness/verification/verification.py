@@ -15,7 +15,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.command import Command
 from seaopt.errors import ControlError, StepSizeError, suggestion
 from seaopt.executors import Shared, map_ordered
-from seaopt.formatting import format_number, format_table, format_values, html_text
+from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
@@ -23,19 +23,19 @@ from seaopt.plants.impacts import check_held
 from seaopt.plants.plant import share_drive
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.progress import Progress, ignore
-from seaopt.records import PlotAccessor, Result, record
+from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
-from seaopt.units import Mechanics, unit_after
+from seaopt.units import Mechanics
 
 ChooseScenarios = Callable[[Controller, Plant, Sequence[ParameterSet]], Sequence[Scenario]]
 TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it is played as friction that sticks"
 
 
-@record(eq=False)
-class Verification(Result):
+@record(eq=False, repr=False)
+class Verification(Result, Worded):
     """The runs of all scenarios, their judgement, and the data to simulate them again.
 
     Parameters
@@ -199,23 +199,6 @@ class Verification(Result):
         stored["rows"] = tuple(map(_restore_settling, stored["rows"]))
         skipped = tuple((row["scenario"], row["plant"], row["reason"]) for row in content["skipped"])
         return cls(skipped=skipped, real_time_factor={}, stages=stages, draws=draws, **stored)
-
-    def __repr__(self) -> str:
-        failed = len(self.failures)
-        verdict = "passed" if self.met else (f"FAILED in {failed} of {len(self.rows)} runs" if failed else "EMPTY")
-        lines = [f"Verification by simulation: {verdict}"]
-        lines += [f"  {line}" for line in (*_format_worst(self), *self.describe_draws(), *self.describe_tracking())]
-        lines += [
-            f"  FAILED {row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{describe_witness(row)}"
-            for row in self.failures
-        ]
-        lines += [f"  not played: {scenario} on {plant}, {reason}" for scenario, plant, reason in self.skipped]
-        speed = ", ".join(f"{name} {value:.0f}" for name, value in self.real_time_factor.items())
-        speed = f"simulated seconds per second: {speed}; " if speed else ""  # a file does not keep it
-        return "\n".join([*lines, f"  {speed}seed {self.seed}"])
-
-    def _repr_html_(self) -> str:
-        return html_text(self) + self.plot.to_html()
 
 
 def _restore_settling(row: Outcome) -> Outcome:
@@ -460,34 +443,3 @@ def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
 def describe_witness(row: Outcome) -> str:
     """Return where a row's draw differs from nominal, as text that follows its reason."""
     return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
-
-
-def _format_worst(verification: Verification) -> list[str]:
-    called, command = verification.mechanics, verification.command
-    unit = called.unit
-    head = (
-        "plant", "scenario", "size", "", f"{called.word} {unit}", "overshoot", "settles s",
-        f"{command.word}{unit_after(command.unit)}", "angle deg", "energy J", "at limit", f"ends off {unit}",
-        f"allowed {unit}", "draw",
-    )  # fmt: skip
-    cells: list[tuple[str, ...]] = []
-    for row in verification.worst():
-        angle = None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad)
-        scenario = verification.scenario(row)
-        cells.append(
-            (
-                row.plant,
-                row.scenario,
-                scenario.describe_size(called),
-                "passed" if row.met else "FAILED",
-                f"{row.peak_force_N:.4g}",
-                "" if row.overshoot is None else f"{100 * row.overshoot:.3g} %",
-                format_number(row.settling_s, 3, ""),
-                *(format_number(value, 3, "") for value in (row.peak_current_A, angle, row.peak_energy_J)),
-                f"{100 * row.saturated:.3g} %",
-                format_number(row.final_error_N, 3, ""),
-                format_number(scenario.final_error, 3, ""),
-                row.draw,
-            )
-        )
-    return format_table(cells, head)

@@ -214,7 +214,7 @@ def test_it_can_be_written_and_read_by_people(stand, thor, log):
     fit = fitted(stand, log, thor)
     found = diagnose(fit)
     assert json.loads(to_json(found.to_dict()))["outputs"]["stand"]["F1"]["inputs"]["I"]["outside"] in (True, False)
-    assert "no problem found" in repr(found)
-    assert found._repr_html_().startswith("<pre>Diagnostics")
+    assert repr(found).startswith("Diagnostics\n  No problem found")
+    assert found._repr_html_().startswith("<h3>Diagnostics</h3>")
     with pytest.raises(EstimationError, match="diagnose needs the fit itself"):
         diagnose(replace(fit, minimum=None))
