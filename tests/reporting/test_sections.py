@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from seaopt.cli.terminal import Terminal
 from seaopt.estimation.result.findings import DerivedFigure
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Item, Mark, Reason, Section, Table, Verdict
+from seaopt.reporting.sections.glossary import GLOSSARY
 from seaopt.reporting.sections.html import render_section
 from seaopt.reporting.sections.text import Most, join, render_sections, render_table, render_verdict
 
@@ -96,3 +98,14 @@ def test_a_new_requirement_of_a_certificate_appears_everywhere(certificate, tmp_
     page = so.write_report([found], tmp_path / "r.html").read_text(encoding="utf-8")
     for text in (str(found), found._repr_html_(), capsys.readouterr().out, page):
         assert {"invented_limit", "4.25", "3.5", "moon"} <= set(re.split(r"[<>\s:,]+", text))
+
+
+def test_terms_are_explained_under_the_pointer(fitted, certificate, tmp_path, without_drawing):
+    page = so.write_report([fitted, certificate], tmp_path / "r.html").read_text(encoding="utf-8")
+    explained = re.findall(r'<abbr title="([^"]+)">([^<]+)</abbr>', page)
+    assert {"Ms", "Mt", "disk", "disk margin", "phase °", "noise gain", "std", "whiteness p"} <= {
+        term for _, term in explained
+    }
+    assert all(html.unescape(meaning) == GLOSSARY[term] for meaning, term in explained)
+    section = Section(title="", tables=(Table(head=("<Ms>", "Mss"), rows=(("worst Ms", "a"),)),))
+    assert re.findall(r"<abbr[^>]*>(\w+)</abbr>", render_section(section)) == ["Ms", "Ms"]

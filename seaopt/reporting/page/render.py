@@ -7,10 +7,11 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from seaopt.formatting import format_number, printable
 from seaopt.reporting.sections.data import Section
+from seaopt.reporting.sections.glossary import explain_terms
 from seaopt.reporting.sections.html import render_section
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def _make_environment() -> Environment:
         finalize=_show,
     )
     environment.filters["number"] = format_number
+    environment.filters["explain"] = lambda text: Markup(explain_terms(escape(text)))  # noqa: S704
     folder = files("seaopt.reporting.page").joinpath("templates")
     fixed: dict[str, Any] = {
         name: Markup(folder.joinpath(file).read_text(encoding="utf-8"))  # noqa: S704

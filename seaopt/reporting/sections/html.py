@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 from seaopt.formatting import printable
 from seaopt.reporting.sections.data import Cell, Mark, Section, Table, Verdict
+from seaopt.reporting.sections.glossary import explain_terms
 
 
 def render_section(section: Section, *, title: bool = True) -> str:
@@ -46,7 +47,8 @@ def _render_list(items: Iterable[tuple[Mark, str]]) -> str:
 
 def _render_table(table: Table, label: str) -> str:
     sides = [' class="n"' if side == ">" else "" for side in table.align.ljust(len(table.head), "<")]
-    head = "".join(f'<th scope="col"{side}>{_escape(text)}</th>' for text, side in zip(table.head, sides, strict=True))
+    heads = zip(map(_escape, table.head), sides, strict=True)
+    head = "".join(f'<th scope="col"{side}>{explain_terms(text)}</th>' for text, side in heads)
     rows = "".join(
         "<tr>"
         + "".join(f"<td{side}>{_render_cell(cell)}</td>" for cell, side in zip(row, sides, strict=True))
@@ -59,7 +61,9 @@ def _render_table(table: Table, label: str) -> str:
 
 
 def _render_cell(cell: Cell) -> str:
-    return f'<b class="{cell.style}">{_escape(cell.text)}</b>' if isinstance(cell, Mark) else _escape(cell)
+    return (
+        f'<b class="{cell.style}">{_escape(cell.text)}</b>' if isinstance(cell, Mark) else explain_terms(_escape(cell))
+    )
 
 
 def _escape(text: str) -> str:
