@@ -34,8 +34,8 @@ def test_the_page_names_what_failed_and_shows_every_figure(stand, swing, thor, t
     assert page.count('<figure class="chart"') == 6 + 1 + 1 + 2 + 3
     assert "&lt;knock&gt;" in page and "<knock>" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
     assert re.search(r"Simulation: \d+ of \d+ runs? failed", page) and "are allowed" in page
-    assert "Not played: &lt;knock&gt; on stand" in page
-    assert '<td class="s">1 N s</td>' in page
+    assert "not played: &lt;knock&gt; on stand" in page
+    assert "<td>1 N s</td>" in page
     assert "swing tracks no reference" in page and page.count("swinging output") == 1  # the stand does not swing
     with pytest.raises(SeaoptError, match="2 results of kind Verification"):
         so.write_report([found, found], tmp_path / "s.html")
