@@ -26,17 +26,12 @@ LOOK_S = 1.0  # between looks at what is in flight, where nothing is said to be 
 COUNT_S = 5.0  # between counts of the workers
 DEATHS = 2  # of a worker that works on one log alone, until that log is given up
 PATIENCE_S, AGAIN_S = 120.0, 1.0  # how long, and how often, work is offered to an executor that takes none
-REMEDIES = {
+REMEDIES: dict[int | None, str] = {
     errno.EMFILE: "allow more open files (ulimit -n 1024)",
     errno.ENFILE: "close what holds files open on this machine",
     errno.EAGAIN: "allow more processes (ulimit -u)",
     errno.ENOMEM: "give it more memory (ulimit -v)",
 }
-
-
-def _propose_remedy(error: Exception) -> str:
-    remedy = REMEDIES.get(error.errno or 0) if isinstance(error, OSError) else None
-    return remedy or "start the workers again"
 
 
 class Dispatcher:
@@ -105,8 +100,9 @@ class Dispatcher:
                 return
             except Exception as error:  # each engine has its own
                 if monotonic() >= end:
+                    remedy = REMEDIES.get(getattr(error, "errno", None), "start the workers again")
                     raise SeaoptError(
-                        f"the executor takes no more work ({type(error).__name__}: {error}); {_propose_remedy(error)}"
+                        f"the executor takes no more work ({type(error).__name__}: {error}); {remedy}"
                     ) from error
                 sleep(AGAIN_S)
 

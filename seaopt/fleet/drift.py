@@ -19,6 +19,7 @@ import numpy as np
 import polars as pl
 from jaxtyping import Float, Int
 
+from seaopt.codec import to_content
 from seaopt.fleet.cusum import ALLOWANCE, Charts, alarm_probabilities, chart_runs, choose_threshold, find_change
 from seaopt.fleet.history import LABEL, TIME, History, check_names, format_time, leave_out, order_runs, parse_time
 from seaopt.fleet.result import Fleet
@@ -71,6 +72,11 @@ class Alarm:
 
     """
 
+    json_keys = (
+        *("actuator", "parameter", "unit", "since", "raised", "since_time", "raised_time", "begun", "before"),
+        *("before_std", "after", "after_std", "runs", "level", "text"),
+    )
+
     actuator: str
     identity: Mapping[str, str]
     parameter: str
@@ -86,6 +92,11 @@ class Alarm:
     after_std: float
     runs: int
     level: float
+
+    @property
+    def text(self) -> str:
+        """What has changed, as `describe` returns it."""
+        return self.describe()
 
     def describe(self) -> str:
         """Return what has changed, in one sentence without an end."""
@@ -160,7 +171,6 @@ class Drift(Worded):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the part drift of fleet.json."""
-        names = [name for name in Alarm.__dataclass_fields__ if name != "identity"]
         return {
             "verdict": self.verdict,
             "actuators": self.actuators,
@@ -174,20 +184,8 @@ class Drift(Worded):
             "expected": self.expected,
             "doubt": self.doubt,
             "left_out": dict(self.left_out),
-            "between_runs": {
-                name: {
-                    "std": spread.std,
-                    "pairs": spread.pairs,
-                    "dof": spread.dof,
-                    "correlation": spread.correlation,
-                    "tails": spread.tails if np.isfinite(spread.tails) else None,
-                    "scale": spread.scale,
-                }
-                for name, spread in self.between.items()
-            },
-            "alarms": [
-                {name: getattr(alarm, name) for name in names} | {"text": alarm.describe()} for alarm in self.alarms
-            ],
+            "between_runs": to_content(self.between),
+            "alarms": to_content(self.alarms),
         }
 
 

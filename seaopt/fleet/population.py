@@ -275,7 +275,7 @@ def _infer(logs: _Logs, between: Float[np.ndarray, "p p"], within: Float[np.ndar
     mean = mean_covariance @ _times(precisions, own).sum(axis=0)
     shrinkage = between @ precisions
     remaining = np.eye(len(mean)) - shrinkage
-    covariances = between - shrinkage @ between + remaining @ mean_covariance @ _turn(remaining)
+    covariances = between - shrinkage @ between + remaining @ mean_covariance @ remaining.mT
     return _Posterior(
         mean=mean,
         mean_covariance=mean_covariance,
@@ -294,7 +294,7 @@ def _estimate_covariances(logs: _Logs) -> tuple[Float[np.ndarray, "p p"], Float[
     between, within = 0.5 * np.eye(size), 0.5 * np.eye(size) * repeated
     for _ in range(ITERATIONS):
         posterior = _infer(logs, between, within)
-        turned = posterior.shrinkage @ posterior.mean_covariance @ _turn(posterior.shrinkage)
+        turned = posterior.shrinkage @ posterior.mean_covariance @ posterior.shrinkage.mT
         spread = between - posterior.shrinkage @ between + turned + _square(posterior.values - posterior.mean)
         new = _mirror(spread.sum(axis=0) / (count - ADJUSTED))
         within_new = _renew_within(logs, posterior, within) if repeated else within
@@ -309,7 +309,7 @@ def _renew_within(logs: _Logs, posterior: _Posterior, within: Float[np.ndarray, 
     """Return the next R: the expected square of what each log differs by from its actuator."""
     gain = within @ np.linalg.inv(logs.covariances + within)
     away = _square(logs.values - posterior.values[logs.whose]) + posterior.covariances[logs.whose]
-    spread = within - gain @ within + gain @ away @ _turn(gain)
+    spread = within - gain @ within + gain @ away @ gain.mT
     return _mirror(spread.sum(axis=0) / (logs.whose.size - ADJUSTED))
 
 
@@ -331,7 +331,7 @@ def _propagate_sampling(
     sampling = np.linalg.inv(information)
     remaining = np.eye(size) - posterior.shrinkage
     slopes = np.einsum("kij,ajl,kl->kia", remaining, derivatives, _times(precisions, posterior.own - posterior.mean))
-    return slopes @ sampling @ _turn(slopes)
+    return slopes @ sampling @ slopes.mT
 
 
 def _restore(
@@ -352,12 +352,8 @@ def _square(vectors: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n p p"]:
     return vectors[:, :, None] * vectors[:, None, :]
 
 
-def _turn(matrices: Float[np.ndarray, "... p q"]) -> Float[np.ndarray, "... q p"]:
-    return np.swapaxes(matrices, -1, -2)
-
-
 def _mirror(matrices: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p p"]:
-    return (matrices + _turn(matrices)) / 2
+    return (matrices + matrices.mT) / 2
 
 
 def _compare(new: Float[np.ndarray, "p p"], old: Float[np.ndarray, "p p"]) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 from jaxtyping import Float
 
+from seaopt.codec import Key, to_content
 from seaopt.estimation.result.findings import GUESS
 from seaopt.fleet.worker import FAILED, GAP, MET, NOT_MET
 from seaopt.formatting import format_count
@@ -35,6 +36,13 @@ class Spread:
         Median of the stated standard deviations.
 
     """
+
+    json_keys = (
+        *("unit", "logs", "median"),
+        Key(field="low", name="p10"),
+        Key(field="high", name="p90"),
+        Key(field="std", name="median_std"),
+    )
 
     name: str
     unit: str
@@ -148,17 +156,7 @@ class Fleet(Result, Worded):
             "identity": list(self.identity),
             "fitted": list(self.fitted),
             "free": list(self.free),
-            "spreads": {
-                spread.name: {
-                    "unit": spread.unit,
-                    "logs": spread.logs,
-                    "median": spread.median,
-                    "p10": spread.low,
-                    "p90": spread.high,
-                    "median_std": spread.std,
-                }
-                for spread in self.spreads
-            },
+            "spreads": {spread.name: to_content(spread) for spread in self.spreads},
         }
 
 

@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float
 from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import chi2, norm, t
 
+from seaopt.codec import OrInfinite
 from seaopt.formatting import format_number
 from seaopt.records import record
 
@@ -73,11 +74,13 @@ class Between:
 
     """
 
+    json_keys = ("std", "pairs", "dof", "correlation", "tails", "scale")
+
     std: float
     pairs: int
     dof: float
     correlation: float = 0.0
-    tails: float = np.inf
+    tails: OrInfinite = np.inf
     scale: float = 1.0
     shaped: bool = False
 

@@ -67,7 +67,9 @@ def _fit_log(plan: Plan, log: FleetLog, known: str | None) -> Row:
     row: Row = {"log": log.path, **log.identity}
     try:
         if plan.version != VERSION:
-            return row | {"status": FAILED, "reason": describe_versions(plan), "total_s": 0.0}
+            where = socket.gethostname()
+            reason = f"the worker on {where} has seaopt {VERSION}, the client {plan.version}; install the same"
+            return row | {"status": FAILED, "reason": reason, "total_s": 0.0}
         _load(plan)  # once, and not in the log's time
         with _limit_time(plan):
             row |= _describe_fit(plan, log, known)
@@ -80,11 +82,6 @@ def _fit_log(plan: Plan, log: FleetLog, known: str | None) -> Row:
     except Exception as error:  # whatever is wrong with one log, the others go on
         row |= {"status": FAILED, "reason": f"{type(error).__name__}: {error}"}
     return row | {"total_s": time.perf_counter() - started}
-
-
-def describe_versions(plan: Plan) -> str:
-    """Return the reason of a log that a worker of another version was given."""
-    return f"the worker on {socket.gethostname()} has seaopt {VERSION}, the client {plan.version}; install the same"
 
 
 def describe_limit(plan: Plan) -> str:

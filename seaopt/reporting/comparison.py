@@ -208,17 +208,13 @@ def describe_responses(measured: Survey, fit: Fit, experiment: str) -> str:
     if spring is not None and spring.mass is not None and spring.damping is not None:
         figures = (spring.mass, spring.damping)
         derived = {name: fit.derived.get(f"{experiment}.{name}") or fit.derived[name] for name in figures}
-        parts += [_reading(pair, drive, derived) for pair, drive in _drives(measured, fit)[:1]]
+        drives = ((pair, measured.drive(pair, fit.parameters)) for pair in measured.pairs)
+        parts += [_read_drive(pair, drive, derived) for pair, drive in drives if drive is not None][:1]
     return "".join(parts).strip()
 
 
-def _drives(measured: Survey, fit: Fit) -> list[tuple[Pair, DriveEstimate]]:
-    pairs = [(pair, measured.drive(pair, fit.parameters)) for pair in measured.pairs]
-    return [(pair, drive) for pair, drive in pairs if drive is not None]
-
-
-def _reading(pair: Pair, drive: DriveEstimate, derived: Mapping[str, DerivedFigure]) -> str:
-    """Say what (16) gives for the sprung mass and the damping, and what the fit gives; `derived` is these two."""
+def _read_drive(pair: Pair, drive: DriveEstimate, derived: Mapping[str, DerivedFigure]) -> str:
+    """Return the sprung mass and the damping by (16), and by the fit, which `derived` holds."""
     (m_k, mass), (b_m, damping) = derived.items()
     words = f"{_gap(m_k, drive.m_k, mass)} and {_gap(b_m, drive.b_m, damping)}"
     averaged = ""

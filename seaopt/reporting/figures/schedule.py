@@ -58,7 +58,9 @@ def _draw_bandwidth(schedule: ScheduledController, axis: Axes) -> None:
     tuned = zip(schedule.points, schedule.controllers, strict=True)
     reached = [(point, controller.achieved.bandwidth_hz) for point, controller in tuned]
     reached += [(place.value, place.bandwidth_hz) for place in schedule.between]
-    alone = [(value, _measure_alone(schedule, value)) for value in schedule.points]
+    fallback = schedule.controllers[schedule.points.index(schedule.fallback)]
+    plants = [(value, schedule.at(value).design or schedule.design) for value in schedule.points]
+    alone = [(value, fallback.close(*plant).figures().bandwidth_hz) for value, plant in plants]
     curves = [sorted((x, y) for x, y in curve if y) for curve in (reached, alone)]
     labels = "schedule", f"the law of {schedule.over} = {schedule.fallback:g} everywhere"
     for curve, style, colour, label in zip(curves, ("o-", "s--"), (BLUE, VERMILION), labels, strict=True):
@@ -66,12 +68,6 @@ def _draw_bandwidth(schedule: ScheduledController, axis: Axes) -> None:
     asked = [schedule.asked_hz(x) for x in schedule.points]
     axis.plot(schedule.points, asked, ":", color=MEASURED, label="asked")
     axis.set_ylim(0.0, 1.15 * max([*asked, *(y for curve in curves for _, y in curve)]))
-
-
-def _measure_alone(schedule: ScheduledController, value: float) -> float | None:
-    """Return the bandwidth on the design plant at a value of the law of the fallback."""
-    law = schedule.controllers[schedule.points.index(schedule.fallback)]
-    return law.close(*(schedule.at(value).design or schedule.design)).figures().bandwidth_hz
 
 
 def _draw_sensitivity(schedule: ScheduledController, certificate: ScheduleCertificate | None, axis: Axes) -> None:

@@ -27,13 +27,13 @@ KINDS = {
     "Verification": "verification",
     "Diagnostics": "diagnostics",
     "Ranking": "ranking",
-    "Scorecard": "scorecard",
+    "Scorecard": "lines",
     "LargeSignal": "lines",
     "StabilityMap": "lines",
     "Passivity": "lines",
-    "Fleet": "seaopt.fleet.words",
-    "Drift": "seaopt.fleet.words",
-    "Population": "seaopt.fleet.words",
+    "Fleet": "seaopt.fleet.page",
+    "Drift": "seaopt.fleet.page",
+    "Population": "seaopt.fleet.page",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import field, replace
 from typing import Literal
 
@@ -81,6 +82,12 @@ class Section:
     part: str = ""  # of the page
     screen: bool = True  # whether it stands on one screen of a terminal, or with --verbose
     folded: bool = False  # detail: on a terminal with --verbose, on a page when opened
+
+
+def list_notes(of: str, notes: Iterable[str], items: Iterable[Item] = ()) -> list[Section]:
+    """Return the section of the findings of a result; none where there are none."""
+    items = (*items, *(Item(severity="note", text=note) for note in notes))
+    return [Section(title=f"Findings of {of}", part="findings", items=items)] if items else []
 
 
 @record

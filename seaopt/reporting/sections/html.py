@@ -6,7 +6,7 @@ import html
 from collections.abc import Iterable
 
 from seaopt.formatting import printable
-from seaopt.reporting.sections.data import Cell, Mark, Section, Table, Verdict
+from seaopt.reporting.sections.data import Cell, Item, Section, Table, Verdict, mark_met
 from seaopt.reporting.sections.glossary import explain_terms
 
 
@@ -21,7 +21,7 @@ def render_section(section: Section, *, title: bool = True) -> str:
                 if table.rows
             ),
             *(f'<p class="note">{_escape(text)}</p>' for text in section.remarks),
-            _render_list((Mark(text=item.severity, style=item.severity), item.text) for item in section.items),
+            _render_items(section.items),
         ]
     )
     head = _escape(section.title)
@@ -33,15 +33,14 @@ def render_section(section: Section, *, title: bool = True) -> str:
 
 def render_verdict(verdict: Verdict) -> str:
     """Return a verdict with its reasons and what comes next."""
-    yes, no = verdict.words
-    mark = Mark(text=yes, style="good") if verdict.met else Mark(text=no, style="bad")
+    mark = mark_met(verdict.met, *verdict.words)
     lines = [*map(str, verdict.reasons), *(f"next: {text}" for text in verdict.next)]
     reasons = "".join(f"<li>{_escape(line)}</li>" for line in lines)
     return f"<p>{_render_cell(mark)} {_escape(verdict.text)}</p>" + (f"<ul>{reasons}</ul>" if reasons else "")
 
 
-def _render_list(items: Iterable[tuple[Mark, str]]) -> str:
-    lines = "".join(f"<li>{_render_cell(mark)} {_escape(text)}</li>" for mark, text in items)
+def _render_items(items: Iterable[Item]) -> str:
+    lines = "".join(f'<li><b class="{item.severity}">{item.severity}</b> {_escape(item.text)}</li>' for item in items)
     return f'<ul class="findings">{lines}</ul>' if lines else ""
 
 
@@ -62,7 +61,9 @@ def _render_table(table: Table, label: str) -> str:
 
 def _render_cell(cell: Cell) -> str:
     return (
-        f'<b class="{cell.style}">{_escape(cell.text)}</b>' if isinstance(cell, Mark) else explain_terms(_escape(cell))
+        f'<b class="{cell.style}">{_escape(cell.text)}</b>'
+        if not isinstance(cell, str)
+        else explain_terms(_escape(cell))
     )
 
 

@@ -12,7 +12,7 @@ from itertools import zip_longest
 
 from seaopt.formatting import printable
 from seaopt.records import record
-from seaopt.reporting.sections.data import Cell, Mark, Section, Table, Verdict
+from seaopt.reporting.sections.data import Cell, Mark, Section, Table, Verdict, mark_met
 
 WIDTH = 80
 LEAST = 20  # characters of a wrapped text
@@ -64,9 +64,7 @@ def render_sections(sections: Iterable[Section], width: int = WIDTH, most: Most 
 def render_verdict(verdict: Verdict, width: int = WIDTH, most: Most | None = None) -> list[Line]:
     """Return the lines of a verdict: what it is, each reason once, and what comes next."""
     most = most or Most()
-    yes, no = verdict.words
-    mark = Mark(text=yes, style="good") if verdict.met else Mark(text=no, style="bad")
-    lines = _wrap_label(mark, verdict.text, width)
+    lines = _wrap_label(mark_met(verdict.met, *verdict.words), verdict.text, width)
     for reason in verdict.reasons[: most.reasons]:
         lines += wrap(str(reason), width, indent=LABEL)
     lines += _count_hidden(len(verdict.reasons), most.reasons, LABEL)
@@ -107,8 +105,11 @@ def wrap(text: str, width: int = WIDTH, *, indent: int = 0, style: str = "") -> 
 
 def break_text(text: str, width: int) -> list[str]:
     """Return a text as lines broken at blanks; words stay whole, to be copied."""
-    room = max(width, LEAST)
-    return textwrap.wrap(printable(text), room, break_long_words=False, break_on_hyphens=False) or [""]
+    return _break(printable(text), max(width, LEAST))
+
+
+def _break(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, max(width, 1), break_long_words=False, break_on_hyphens=False) or [""]
 
 
 def _wrap_title(section: Section, width: int) -> list[Line]:
@@ -174,7 +175,7 @@ def _lay_out(table: Table, widths: Sequence[int], indent: int, most: int | None)
     if any(table.head):
         rows.insert(0, (table.head, "dim"))
     for row, style in rows:
-        cells = [break_cell(_text(cell), width) for cell, width in zip(row, widths, strict=True)]
+        cells = [_break(_text(cell), width) for cell, width in zip(row, widths, strict=True)]
         styles = [COLOURS[cell.style] if isinstance(cell, Mark) else style for cell in row]
         for line in zip_longest(*cells, fillvalue=""):
             spans: list[tuple[str, str]] = [(" " * indent, "")]
@@ -183,11 +184,6 @@ def _lay_out(table: Table, widths: Sequence[int], indent: int, most: int | None)
                 side = part.rjust(width) if _align(table, at) == ">" else part if last else part.ljust(width)
                 spans += [(side, shade), ("" if last else " " * GAP, "")]
             yield tuple(spans)
-
-
-def break_cell(text: str, width: int) -> list[str]:
-    """Return the lines of a cell."""
-    return textwrap.wrap(text, max(width, 1), break_long_words=False, break_on_hyphens=False) or [""]
 
 
 def _measure(widths: Sequence[int]) -> int:

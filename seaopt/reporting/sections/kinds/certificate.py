@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.formatting import MISSING, format_band, format_count, format_number, format_values
 from seaopt.reporting.figures.certificate import label_requirement
-from seaopt.reporting.sections.data import Cell, Commands, Item, Mark, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import Cell, Commands, Mark, Reason, Section, Table, Verdict, list_notes, mark_met
 from seaopt.reporting.sections.kinds.controller import show_costs
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
@@ -101,10 +101,7 @@ def explain_failure(failure: Failure) -> Reason:
 
 def describe(certificate: Certificate) -> list[Section]:
     """Return the margins of every plant, the requirements, the worst cases, the draws, and the findings."""
-    findings = [Item(severity="note", text=note) for note in certificate.notes]
-    if certificate.simulated is not None:
-        for what, reason in certificate.simulated.left_out.items():
-            findings.append(Item(severity="note", text=f"no {what}: {reason}"))
+    left_out = {} if certificate.simulated is None else certificate.simulated.left_out
     return [
         _list_requirements(certificate),
         Section(
@@ -120,7 +117,7 @@ def describe(certificate: Certificate) -> list[Section]:
             ),
         ),
         *(_describe_uncertainty(certificate) if certificate.models else ()),
-        *([Section(title="Findings of the certificate", part="findings", items=tuple(findings))] if findings else []),
+        *list_notes("the certificate", [*certificate.notes, *(f"no {what}: {why}" for what, why in left_out.items())]),
     ]
 
 

@@ -10,7 +10,7 @@ from seaopt.control.laws.command import describe_cascade, name_gain_units
 from seaopt.control.laws.verdict import join_labels, list_design_figures
 from seaopt.control.loops.law import describe_integrators
 from seaopt.formatting import MISSING, format_band, format_count, format_figure, format_number
-from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict
+from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes
 
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
@@ -65,7 +65,6 @@ def describe(controller: Controller) -> list[Section]:
         f"{command.mechanics.word.capitalize()} of the motor F_m = C_r F_ref − C_y {spec.regulated}; {command.input} = "
         f"{command.per_effort:.6g} {command.per_effort_unit} × F_m."
     )
-    findings = tuple(Item(severity="note", text=note) for note in controller.notes)
     active = join_labels(controller.active_constraints) or "none"
     return [
         Section(
@@ -90,7 +89,7 @@ def describe(controller: Controller) -> list[Section]:
                 *_describe_surroundings(controller),
             ),
         ),
-        *([Section(title="Findings of the controller", part="findings", items=findings)] if findings else []),
+        *list_notes("the controller", controller.notes),
     ]
 
 

@@ -9,7 +9,7 @@ from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import DerivedFigure, FitFinding
 from seaopt.formatting import MISSING, format_count, format_number
 from seaopt.parameters import Parameter
-from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict
+from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict, list_notes
 from seaopt.units import unit_after
 
 RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be proposed
@@ -46,7 +46,6 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
 def describe(fit: Fit) -> list[Section]:
     """Return the sections of a fit."""
     size = f"{fit.samples} samples, {format_count(fit.iterations, 'iteration')}, {fit.wall_s:.1f} s"
-    items = tuple(_list_findings(fit))
     return [
         Section(
             title="Parameters",
@@ -61,7 +60,7 @@ def describe(fit: Fit) -> list[Section]:
             tables=(_tabulate_outputs(fit),),
             remarks=(EXPLAINED,) if fit.outputs else (),
         ),
-        *([Section(title="Findings of the fit", part="findings", items=items)] if items else []),
+        *list_notes("the fit", fit.notes, _list_findings(fit)),
         *_describe_details(fit),
     ]
 
@@ -141,8 +140,6 @@ def _list_findings(fit: Fit) -> Iterator[Item]:
     for name, own in fit.nuisance.items():
         if len(own.initial_state) > 1:
             yield Item(severity="note", text=f"{name}: {len(own.initial_state)} segments, each with its initial state")
-    for note in fit.notes:
-        yield Item(severity="note", text=note)
 
 
 def _describe_details(fit: Fit) -> Iterator[Section]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from seaopt.control import ForceMPC
 from seaopt.control.laws.verdict import join_labels
 from seaopt.formatting import format_count, format_number
-from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met
 
 
 def judge(mpc: ForceMPC, commands: Commands) -> Verdict:
@@ -40,7 +38,6 @@ def describe(mpc: ForceMPC) -> list[Section]:
         )
         for verdict in mpc.verdicts
     )
-    findings = tuple(Item(severity="note", text=note) for note in mpc.notes)
     return [
         Section(
             title="Predictive control",
@@ -63,16 +60,13 @@ def describe(mpc: ForceMPC) -> list[Section]:
                 f"The figures hold while no limit of the {mpc.actuation.word} is active.",
                 f"Bandwidth {format_number(mpc.achieved.bandwidth_hz, missing='none')} Hz, asked "
                 f"{spec.bandwidth_hz:g} Hz.",
-                *_describe_loops(mpc),
+                # the margins of each loop of the design plant: with friction sliding and stuck
+                *(
+                    f"{loop.name}: bandwidth {format_number(loop.figures.bandwidth_hz, missing='none')} Hz, "
+                    f"{loop.figures.describe_peaks()}; {loop.figures.describe_margins()}."
+                    for loop in mpc.measured_loops
+                ),
             ),
         ),
-        *([Section(title="Findings of predictive control", part="findings", items=findings)] if findings else []),
+        *list_notes("predictive control", mpc.notes),
     ]
-
-
-def _describe_loops(mpc: ForceMPC) -> Iterator[str]:
-    """Yield the margins of each loop of the design plant: with friction sliding and stuck."""
-    for loop in mpc.measured_loops:
-        figures = loop.figures
-        bandwidth = format_number(figures.bandwidth_hz, missing="none")
-        yield f"{loop.name}: bandwidth {bandwidth} Hz, {figures.describe_peaks()}; {figures.describe_margins()}."

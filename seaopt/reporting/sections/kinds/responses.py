@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from seaopt.formatting import MISSING, format_number
 from seaopt.frequency import DriveEstimate, Pair, Survey
 from seaopt.reporting.responses import Responses
@@ -31,7 +29,12 @@ def describe(responses: Responses) -> list[Section]:
                         align="<<".ljust(len(HEAD), ">"),
                     ),
                 ),
-                remarks=tuple(_describe_drives(responses, survey)),
+                remarks=tuple(
+                    line
+                    for pair in survey.pairs
+                    if (drive := survey.drive(pair, responses.guess)) is not None
+                    for line in _describe_drive(survey, pair, drive)
+                ),
             )
         )
     forms = tuple(line.strip() for form in responses.list_forms() for line in repr(form).splitlines())
@@ -58,13 +61,6 @@ def _format_pair(responses: Responses, name: str, survey: Survey, pair: Pair) ->
         *([MISSING] * (3 - len(figures))),
         *(format_number(misfit, 3) for misfit in misfits),
     )
-
-
-def _describe_drives(responses: Responses, survey: Survey) -> Iterator[str]:
-    for pair in survey.pairs:
-        drive = survey.drive(pair, responses.guess)
-        if drive is not None:
-            yield from _describe_drive(survey, pair, drive)
 
 
 def _describe_drive(survey: Survey, pair: Pair, drive: DriveEstimate) -> tuple[str, ...]:

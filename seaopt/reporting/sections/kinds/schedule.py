@@ -6,7 +6,7 @@ from seaopt.control import ScheduledController
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.structures import LAW_GAINS
 from seaopt.formatting import format_count, format_number
-from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met
 from seaopt.units import unit_after
 
 
@@ -46,7 +46,6 @@ def describe(schedule: ScheduledController) -> list[Section]:
         )
         for point, controller in zip(schedule.points, schedule.controllers, strict=True)
     )
-    findings = tuple(Item(severity="note", text=note) for note in schedule.notes)
     return [
         Section(
             title="Schedule",
@@ -57,7 +56,7 @@ def describe(schedule: ScheduledController) -> list[Section]:
             tables=(Table(label="Gains at the points", head=head, rows=rows, align=">" * (len(head) - 1) + "<"),),
             remarks=(_describe_between(schedule),),
         ),
-        *([Section(title="Findings of the schedule", part="findings", items=findings)] if findings else []),
+        *list_notes("the schedule", schedule.notes),
     ]
 
 

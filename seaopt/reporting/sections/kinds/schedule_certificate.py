@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from seaopt.formatting import format_count
-from seaopt.reporting.sections.data import Commands, Item, Section, Table, Verdict
+from seaopt.reporting.sections.data import Commands, Section, Table, Verdict, list_notes
 from seaopt.reporting.sections.kinds.certificate import explain_failure
 from seaopt.robustness import ScheduleCertificate
 from seaopt.robustness.certificate.requirement import group_failures
@@ -54,7 +54,6 @@ def describe(certificate: ScheduleCertificate) -> list[Section]:
         )
     variable = f"{certificate.schedule.over}{unit_after(certificate.schedule.unit)}"
     head = (variable, "", "Ms", "Mt", "worst Ms", "draws that fail")
-    notes = tuple(Item(severity="note", text=note) for note in certificate.notes)
     return [
         Section(
             title="What is certified",
@@ -63,5 +62,5 @@ def describe(certificate: ScheduleCertificate) -> list[Section]:
             tables=(Table(head=head, rows=tuple(rows), align="><>>>>"),),
             remarks=(f"{certificate.monte_carlo}.",),
         ),
-        *([Section(title="Findings of the schedule's certificate", part="findings", items=notes)] if notes else []),
+        *list_notes("the schedule's certificate", certificate.notes),
     ]
