@@ -156,8 +156,8 @@ class Drift(Worded):
         if self.missing:
             return f"not looked for: {self.missing}"
         count = len({alarm.actuator for alarm in self.alarms})
-        found = f"{count or 'none'} of {format_count(self.actuators, 'actuator')} with an alarm"
-        return f"{found}; {self.describe_expected()}"
+        alarmed = f"{count or 'none'} of {format_count(self.actuators, 'actuator')} with an alarm"
+        return f"{alarmed}; {self.describe_expected()}"
 
     def describe_expected(self) -> str:
         """Return how many actuators would have an alarm if all were healthy, or why that is not known."""

@@ -168,12 +168,12 @@ def _expand(name: str) -> list[str]:
         return [name if address else _absolute(name)]
     if address:
         files = _open_filesystem(name)
-        found = [files.unstrip_protocol(path) for path in files.glob(name)]
+        paths = [files.unstrip_protocol(path) for path in files.glob(name)]
     else:
-        found = [_absolute(path) for path in glob.iglob(name, recursive=True) if not Path(path).is_dir()]  # noqa: PTH207
-    if not found:
+        paths = [_absolute(path) for path in glob.iglob(name, recursive=True) if not Path(path).is_dir()]  # noqa: PTH207
+    if not paths:
         raise LogError(f"{name}: matches no file; check the pattern")
-    return found
+    return paths
 
 
 def _absolute(path: str | Path) -> str:

@@ -87,10 +87,10 @@ def list_columns(problem: Problem) -> Columns:
         for name in problem.parameters.free_names
         if name in plant.parameters and name not in template.parameters
     }
-    units |= {name: plant.parameter_unit(name) for name, given in template.parameters.items() if _is_free(given)}
+    units |= {name: plant.parameter_unit(name) for name, value in template.parameters.items() if _is_free(value)}
     free = tuple(units)
     units |= {"delay_s": "s"} if _is_free(template.delay_s) else {}
-    units |= {f"gain_{name}": "-" for name, given in template.gain.items() if _is_free(given)}
+    units |= {f"gain_{name}": "-" for name, value in template.gain.items() if _is_free(value)}
     fitted = tuple(units)
     units |= {name: unit for name, (_, unit) in plant.derived_values().items() if name not in units}
     return Columns(units=units, outputs=tuple(template.outputs), fitted=fitted, free=free)

@@ -110,7 +110,7 @@ class Fleet(Result, Worded):
     @property
     def guesses(self) -> str:
         """What to say of the guesses that its fits rest on, "on 2 guesses: N_p, l"; empty where there are none."""
-        findings = (finding for found in self.rows["findings"].drop_nulls() for finding in found)
+        findings = (finding for row in self.rows["findings"].drop_nulls() for finding in row)
         return next((finding["where"] for finding in findings if finding["kind"] == GUESS), "")
 
     @property

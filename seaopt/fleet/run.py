@@ -205,11 +205,11 @@ def _keep_summary(path: Path, content: dict[str, Any], fleet: Fleet) -> dict[str
 
 def _choose_logs(logs: Sequence[str | Path | FleetLog], identity: str | None) -> tuple[FleetLog, ...]:
     """Return the logs with their identities."""
-    given = [logs] if isinstance(logs, str | Path) else list(logs)
-    listed = tuple(log for log in given if isinstance(log, FleetLog))
+    sources = [logs] if isinstance(logs, str | Path) else list(logs)
+    listed = tuple(log for log in sources if isinstance(log, FleetLog))
     if not listed:
-        return find_logs([log for log in given if not isinstance(log, FleetLog)], identity)
-    if len(listed) < len(given) or identity is not None:
+        return find_logs([log for log in sources if not isinstance(log, FleetLog)], identity)
+    if len(listed) < len(sources) or identity is not None:
         raise LogError("logs has some that are FleetLog, with identities of their own; give all so, without identity")
     if len({log.path for log in listed}) < len(listed) or len({tuple(log.identity) for log in listed}) > 1:
         raise LogError("logs has one twice, or identities of different names; give each once, with the same names")

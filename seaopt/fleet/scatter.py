@@ -216,11 +216,11 @@ def estimate_tails(ratios: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
     solver: Any = minimize
     bounds = [(1.0 / LIGHTEST, 1.0 / HEAVIEST), (-3.0, 3.0)]
-    found = solver(miss, np.array([0.1, 0.0]), bounds=bounds, method="L-BFGS-B")
+    solution = solver(miss, np.array([0.1, 0.0]), bounds=bounds, method="L-BFGS-B")
     normal = chosen.size * np.log(np.std(chosen)) - float(np.sum(norm.logpdf(chosen / np.std(chosen))))
-    if 2.0 * (normal - found.fun) < CHANCE:
+    if 2.0 * (normal - solution.fun) < CHANCE:
         return np.inf, 1.0
-    return float(1.0 / found.x[0]), float(np.exp(found.x[1]))
+    return float(1.0 / solution.x[0]), float(np.exp(solution.x[1]))
 
 
 def differ_in_scatter(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bool:

@@ -199,14 +199,14 @@ class FleetTable:
         waiting = self._list_newer()
         if not waiting:
             return
-        newer, found = self._read_newer(), pl.DataFrame(schema={"log": pl.String})
+        newer, replaced = self._read_newer(), pl.DataFrame(schema={"log": pl.String})
         for path in self.parts():
             rows = _read(path)
             logs = rows.select("log")
             if len(mine := newer.join(logs, on="log", how="semi")):
                 self._write_merged(_put(rows, mine), [path])
-                found = pl.concat([found, mine.select("log")])
-        orphans = newer.join(found, on="log", how="anti")
+                replaced = pl.concat([replaced, mine.select("log")])
+        orphans = newer.join(replaced, on="log", how="anti")
         if len(orphans):  # somebody has deleted the file with the older ones
             self._write_merged(orphans, [])
         for path in waiting:

@@ -61,8 +61,8 @@ def view_sensors(experiment: Experiment, fit: Fit | None = None) -> Survey:
     nuisance = fit.nuisance.get(experiment.name) if fit is not None else None
     delay = experiment.delay_s
     free = isinstance(delay, Parameter) and delay.free and nuisance is None
-    known = nuisance.delay_s if nuisance is not None else _value(delay)
-    clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known, delay_free=free)
+    delay_s = nuisance.delay_s if nuisance is not None else _value(delay)
+    clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=delay_s, delay_free=free)
     gain = nuisance.gain if nuisance is not None else {name: _value(gain) for name, gain in experiment.gain.items()}
     return Survey(plant=experiment.plant, clock=clock, gain=gain, pairs=(), adapt=experiment.apply_own)
 
@@ -101,22 +101,22 @@ def response_panels(
     """
     views: dict[str, tuple[Survey, Fit]] = {}
     for label, fit in fits.items():
-        own = next((one for one in fit.experiments if one.name == experiment.name), None)
-        if own is not None:
-            views[label] = (view_sensors(own, fit), fit)
+        counterpart = next((each for each in fit.experiments if each.name == experiment.name), None)
+        if counterpart is not None:
+            views[label] = (view_sensors(counterpart, fit), fit)
     panels: list[Panel] = []
-    for one in (*measured.pairs, *_pair_outputs(experiment.log, measured)):
-        if pair not in (None, one.name):
+    for measurement in (*measured.pairs, *_pair_outputs(experiment.log, measured)):
+        if pair not in (None, measurement.name):
             continue
         curves = [
-            Curve(label=label, response=_respond(view, one, measured, fit), colour=colour, style=style)
+            Curve(label=label, response=_respond(view, measurement, measured, fit), colour=colour, style=style)
             for (label, (view, fit)), (colour, style) in zip(views.items(), _LOOKS * 3, strict=False)
         ]
-        if one.second_order is not None:
-            form = one.second_order.response
+        if measurement.second_order is not None:
+            form = measurement.second_order.response
             curves.append(Curve(label="second-order fit", response=form, colour=FORM, style="--"))
-        name = f"response_{experiment.name}_{one.output}_{one.source}"
-        panels.append(response_panel(name, f"{experiment.name}: {one.name}", one, curves))
+        name = f"response_{experiment.name}_{measurement.output}_{measurement.source}"
+        panels.append(response_panel(name, f"{experiment.name}: {measurement.name}", measurement, curves))
     return panels
 
 
@@ -149,7 +149,7 @@ def _respond(view: Survey, pair: Pair, measured: Survey, fit: Fit) -> ResponseFu
     """Return a model's response from input to output, or from one output to another, both of them from the input."""
     if pair.source in view.plant.inputs:
         return view.model(pair, fit.parameters)
-    by_output = {one.output: view.model(one, fit.parameters) for one in measured.pairs}
+    by_output = {each.output: view.model(each, fit.parameters) for each in measured.pairs}
     return lambda f: by_output[pair.output](f) / by_output[pair.source](f)
 
 

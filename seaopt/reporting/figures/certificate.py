@@ -151,7 +151,7 @@ def friction_panel(certificate: Certificate) -> Panel:
         raise ControlError("no plant of this certificate has friction, so that there is no friction margin to draw")
 
     def draw(axis: Axes) -> None:
-        factors = [one.factor for one in (*margins.values(), *draws.values())]
+        factors = [margin.factor for margin in (*margins.values(), *draws.values())]
         finite = [factor for factor in factors if np.isfinite(factor) and factor > 0.0]
         low, high = 0.5 * min([1.0, *finite]), 4.0 * max([1.0, *finite])
         rows = {name: row for row, name in enumerate(reversed(names))}
@@ -159,7 +159,7 @@ def friction_panel(certificate: Certificate) -> Panel:
             ("nominal", margins, BLUE, "o"),
             ("least of the draws", draws, ORANGE, "D"),
         ):
-            points = [(float(np.clip(one.factor, low, high)), rows[name]) for name, one in values.items()]
+            points = [(float(np.clip(margin.factor, low, high)), rows[name]) for name, margin in values.items()]
             if points:
                 axis.plot(*zip(*points, strict=True), marker, color=colour, markersize=8, label=label)
         draw_level(axis, 1.0, "its own friction", side="x")
@@ -176,7 +176,7 @@ def friction_panel(certificate: Certificate) -> Panel:
         heights=(0.5 + 0.12 * len(names),),
         left=NAMES_LEFT,
         hover="",
-        caption=f"{margins_text} A margin without a bound is drawn at the right edge, none at the left one.",
+        caption=f"{margins_text} A margin without a bound is drawn at the right edge, none at the left edge.",
     )
 
 

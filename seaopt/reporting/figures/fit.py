@@ -221,7 +221,7 @@ def _lag_panel(diagnostics: Diagnostics, experiment: str, *, name: str, title: s
 
 def parameters_panel(fit: Fit) -> Panel:
     """Draw the 95 % interval of each free parameter in percent of its value, and what was known before."""
-    free = [one for one in fit.parameters.values() if one.free and one.value and one.std and np.isfinite(one.std)]
+    free = [each for each in fit.parameters.values() if each.free and each.value and each.std and np.isfinite(each.std)]
     if not free:
         raise EstimationError("no free parameter has a standard deviation, so that there is no interval to draw")
     widths, before = (

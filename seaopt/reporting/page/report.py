@@ -401,11 +401,13 @@ def list_figures(material: Material) -> list[tuple[str, str, str]]:
     """Return what to see at a glance: a name, a figure with its unit, and what it is compared with."""
     figures: list[tuple[str, str, str]] = []
     if material.fit is not None and material.fit.outputs:
-        name, output, one = min(
-            ((name, output, one) for name, row in material.fit.outputs.items() for output, one in row.items()),
-            key=lambda each: each[2].fit_percent,
-        )
-        figures.append(("fit", f"{one.fit_percent:.2f} %", f"least of the outputs: {name}.{output}"))
+        percents = {
+            f"{name}.{output}": output_fit.fit_percent
+            for name, row in material.fit.outputs.items()
+            for output, output_fit in row.items()
+        }
+        least = min(percents, key=percents.__getitem__)
+        figures.append(("fit", f"{percents[least]:.2f} %", f"least of the outputs: {least}"))
     controller, certificate = material.controller, material.certificate
     if controller is not None:
         a, spec = controller.achieved, controller.spec
@@ -417,7 +419,7 @@ def list_figures(material: Material) -> list[tuple[str, str, str]]:
             ("noise gain", format_figure(a.noise_gain, controller.command.gain_unit, 3), "design plant"),
         ]
     if certificate is not None and certificate.models:
-        worst = max(certificate.worst.values(), key=lambda one: one.ms)
+        worst = max(certificate.worst.values(), key=lambda worst: worst.ms)
         level = certificate.controller.spec.level("max_sensitivity")
         allowed = "" if level is None else f", at most {level:g}"
         draws = certificate.monte_carlo

@@ -55,7 +55,7 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
         text = f"Certificate: passed, {format_count(draws.failures, 'failure')} in {draws.samples} draws{bound}{runs}"
         return Verdict(met=True, text=text)
     broken = [row for row in certificate.requirements if not row.met]
-    reasons = [explain_failure(one) for one in group_failures(broken)]
+    reasons = [explain_failure(failure) for failure in group_failures(broken)]
     remedies = [_advise(row.name) for row in broken]
     if certificate.constrained is not None:
         remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]

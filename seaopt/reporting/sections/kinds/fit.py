@@ -24,13 +24,13 @@ EXPLAINED = (
 def judge(fit: Fit, commands: Commands) -> Verdict:
     """Return the verdict on a fit: what forbids its use, each reason once with its places."""
     size = f"{fit.samples} samples"
-    percents = [one.fit_percent for row in fit.outputs.values() for one in row.values()]
+    percents = [each.fit_percent for row in fit.outputs.values() for each in row.values()]
     if fit.met:
         ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
         outputs = f", outputs fit to {' to '.join(ends)} %" if ends else ""
         return Verdict(met=True, text=f"Fit: converged, {size}{outputs}")
     status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
-    errors = [(one.text, one.where) for one in fit.errors]
+    errors = [(each.text, each.where) for each in fit.errors]
     if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
         errors.insert(0, (fit.message, ""))
     reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit.errors))
@@ -76,16 +76,16 @@ def _list_caveats(fit: Fit) -> Iterator[str]:
 def _tabulate_parameters(fit: Fit) -> Table:
     rows = [
         (
-            one.name,
-            f"{one.value:.6g}",
-            _spread(one.std),
-            _interval(one.ci95),
-            _unit(one.unit),
-            _remark(one),
-            one.description,
+            parameter.name,
+            f"{parameter.value:.6g}",
+            _spread(parameter.std),
+            _interval(parameter.ci95),
+            _unit(parameter.unit),
+            _remark(parameter),
+            parameter.description,
         )
-        for one in fit.parameters.values()
-        if one.free
+        for parameter in fit.parameters.values()
+        if parameter.free
     ]
     for remark, figures in (("of one log", fit.own_unknowns), ("derived", fit.derived)):
         rows += [_tabulate_figure(name, figure, remark) for name, figure in figures.items()]
@@ -107,20 +107,20 @@ def _tabulate_outputs(fit: Fit) -> Table:
     rows = [
         (
             f"{name}.{output}",
-            f"{one.fit_percent:.2f}",
-            format_number(one.holdout_fit_percent),
-            format_number(one.one_step_fit_percent),
-            format_number(one.band_fit_percent),
-            _percent(one.explained),
-            _percent(one.explainable),
-            f"{one.rms_residual:.4g}",
-            _unit(one.unit),
-            format_number(one.sigma),
+            f"{figures.fit_percent:.2f}",
+            format_number(figures.holdout_fit_percent),
+            format_number(figures.one_step_fit_percent),
+            format_number(figures.band_fit_percent),
+            _percent(figures.explained),
+            _percent(figures.explainable),
+            f"{figures.rms_residual:.4g}",
+            _unit(figures.unit),
+            format_number(figures.sigma),
             format_number(fit.nuisance[name].offset.get(output), 3) if name in fit.nuisance else MISSING,
-            format_number(one.whiteness_p, 2),
+            format_number(figures.whiteness_p, 2),
         )
         for name, row in fit.outputs.items()
-        for output, one in row.items()
+        for output, figures in row.items()
     ]
     columns = ("fit %", "held out", "one step", "in the band", "explained", "of at most", "residual", "")
     return Table(
@@ -134,18 +134,25 @@ def _tabulate_outputs(fit: Fit) -> Table:
 
 def _list_findings(fit: Fit) -> Iterator[Item]:
     """Yield what whoever uses the fit should know; errors stand in the verdict."""
-    for one in fit.findings:
-        if one.severity != "error":
-            yield Item(severity=one.severity, text=f"{one.where}: {one.text}" if one.where else one.text)
-    for name, own in fit.nuisance.items():
-        if len(own.initial_state) > 1:
-            yield Item(severity="note", text=f"{name}: {len(own.initial_state)} segments, each with its initial state")
+    for finding in fit.findings:
+        if finding.severity != "error":
+            yield Item(
+                severity=finding.severity, text=f"{finding.where}: {finding.text}" if finding.where else finding.text
+            )
+    for name, nuisance in fit.nuisance.items():
+        if len(nuisance.initial_state) > 1:
+            yield Item(
+                severity="note", text=f"{name}: {len(nuisance.initial_state)} segments, each with its initial state"
+            )
 
 
 def _describe_details(fit: Fit) -> Iterator[Section]:
-    fixed = [one for one in fit.parameters.values() if not one.free]
+    fixed = [parameter for parameter in fit.parameters.values() if not parameter.free]
     if fixed:
-        rows = tuple((one.name, f"{one.value:.6g}", _unit(one.unit), one.description) for one in fixed)
+        rows = tuple(
+            (parameter.name, f"{parameter.value:.6g}", _unit(parameter.unit), parameter.description)
+            for parameter in fixed
+        )
         yield Section(
             title=f"{format_count(len(fixed), 'parameter')} not fitted",
             part="parameters",
@@ -174,7 +181,7 @@ def _list_cures(errors: Sequence[FitFinding]) -> tuple[str, ...]:
 
     What is not told from zero is not to be freed: a search for how sharp friction is takes long and ends nowhere.
     """
-    cause = next((one for one in errors if one.kind == "cause" and one.preferred), None)
+    cause = next((finding for finding in errors if finding.kind == "cause" and finding.preferred), None)
     if cause is None:
         return ()
     apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
@@ -190,12 +197,12 @@ def spell_cure(name: str, value: float) -> str:
     ('delay_s = { value = 0.004, free = true, max = 0.02 } in the [[experiment]] chirp', 'f_c = { value = 12, free = true } in [parameters]')
 
     """  # noqa: E501
-    *of, own = name.split(".")
-    if not of:
-        return f"{own} = {{ value = {value:.4g}, free = true }} in [parameters]"
-    if own == "delay_s" and value > 0.0:
-        longest = DELAY_ROOM * value
-        return f"delay_s = {{ value = {value:.4g}, free = true, max = {longest:.2g} }} in the [[experiment]] {of[0]}"
+    *experiment, parameter = name.split(".")
+    if not experiment:
+        return f"{parameter} = {{ value = {value:.4g}, free = true }} in [parameters]"
+    if parameter == "delay_s" and value > 0.0:
+        settings = f"value = {value:.4g}, free = true, max = {DELAY_ROOM * value:.2g}"
+        return f"delay_s = {{ {settings} }} in the [[experiment]] {experiment[0]}"
     return ""
 
 
@@ -209,8 +216,8 @@ def _spread(std: float | None) -> str:
 
 
 def _interval(ends: tuple[float, float] | None) -> str:
-    known = ends is not None and all(map(math.isfinite, ends))
-    return " to ".join(format_number(end, 6) for end in ends) if ends is not None and known else MISSING
+    finite = ends is not None and all(map(math.isfinite, ends))
+    return " to ".join(format_number(end, 6) for end in ends) if ends is not None and finite else MISSING
 
 
 def _percent(share: float | None) -> str:

@@ -25,7 +25,7 @@ def judge(certificate: ScheduleCertificate, commands: Commands) -> Verdict:
         still = f"{certificate.schedule.over} standing still"
         return Verdict(met=True, text=f"Certificate: passed with {still}, {drawn}{swept}")
     broken = [row for row in certificate.requirements if not row.met]
-    reasons = tuple(explain_failure(one) for one in group_failures(broken))
+    reasons = tuple(explain_failure(failure) for failure in group_failures(broken))
     command = f"type {commands.certify}" if commands.certify else "tune again"
     slow = all(row.name == MOTION_RATE and row.value > 0.0 for row in broken)  # 0 where it rings or departs
     change = "ask a smaller min_rate, or allow more current" if slow else "raise reserve, or add points"
