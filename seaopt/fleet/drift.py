@@ -1,4 +1,4 @@
-"""What the parameters of each actuator do over time: their trends, and an alarm where one has changed.
+"""The trend of each actuator's parameters over time, and an alarm where one has changed.
 
 A value differs from run to run by more than the std of its fit: the actuator is warmer, screwed down again, run in. By
 how much, how alike in runs that follow each other, and with what tails is estimated over all actuators
@@ -95,7 +95,7 @@ class Alarm:
 
     @property
     def text(self) -> str:
-        """What has changed, as `describe` returns it."""
+        """The change in words, as `describe` returns it."""
         return self.describe()
 
     def describe(self) -> str:
@@ -109,7 +109,7 @@ class Alarm:
 
 @record(eq=False, repr=False)
 class Drift(Worded):
-    """What `find_drift` returns; ``print(drift)`` is a summary.
+    """The result of `find_drift`; ``print(drift)`` is a summary.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class Drift(Worded):
 
     @property
     def verdict(self) -> str:
-        """What to say of it in one line."""
+        """The verdict in one line."""
         if self.missing:
             return f"not looked for: {self.missing}"
         count = len({alarm.actuator for alarm in self.alarms})

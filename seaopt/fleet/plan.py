@@ -1,4 +1,4 @@
-"""What is the same for all logs of a fleet: the problem as data, and the columns of its table."""
+"""The problem of a fleet as data, the same for all its logs, and the columns of its table."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PARTS = {"version", "guessed", "parameters", "plant", "fit"}  # of a problem, t
 
 @record
 class Plan:
-    """What a worker is told once: data only, no code."""
+    """The task of the workers, sent once: data only, no code."""
 
     problem: str  # the problem file as JSON, with the one experiment that says how a log is read
     # source, folder: the problem file, for messages, and where relative paths start

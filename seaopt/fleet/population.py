@@ -54,7 +54,7 @@ ITERATIONS, SETTLED = 2000, 1e-5  # of expectation maximisation; relative change
 
 @record(eq=False, repr=False)
 class Population(Worded):
-    """What `estimate_population` returns; ``print(population)`` is a summary.
+    """The result of `estimate_population`; ``print(population)`` is a summary.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class _Logs:
 
 @record(eq=False)
 class _Posterior:
-    """What is known of actuators, given T and R."""
+    """The posterior of the actuators, given T and R."""
 
     mean: Float[np.ndarray, " p"]  # mu
     mean_covariance: Float[np.ndarray, "p p"]  # W

@@ -55,7 +55,7 @@ class Spread:
 
 @record(eq=False, repr=False)
 class Fleet(Result, Worded):
-    """What `fit_fleet` returns; ``print(fleet)`` is a summary.
+    """The result of `fit_fleet`; ``print(fleet)`` is a summary.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Fleet(Result, Worded):
 
     @property
     def verdict(self) -> str:
-        """What to say of it in one line."""
+        """The verdict in one line."""
         counts = self.counts
         if self.met:
             guesses = f", {self.guesses}" if self.guesses else ""
@@ -109,7 +109,7 @@ class Fleet(Result, Worded):
 
     @property
     def guesses(self) -> str:
-        """What to say of the guesses that its fits rest on, "on 2 guesses: N_p, l"; empty where there are none."""
+        """The guesses that its fits rest on, as "on 2 guesses: N_p, l"; empty without guesses."""
         findings = (finding for row in self.rows["findings"].drop_nulls() for finding in row)
         return next((finding["where"] for finding in findings if finding["kind"] == GUESS), "")
 

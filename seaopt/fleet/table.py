@@ -80,21 +80,9 @@ def make_frame(rows: Sequence[Row], schema: Mapping[str, Any], plan: Plan) -> pl
 
 
 class FleetTable:
-    """A table that rows are added to.
+    """A table that rows are added to: the folder ``fleet`` in that of the results, for the problem of a plan.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the results: the table is the folder ``fleet`` in it.
-    schema : mapping of name to type
-    plan : Plan
-        Which problem its rows are of.
-
-    Raises
-    ------
-    FileError
-        The folder cannot be made, another client has it, or a file of it is damaged.
-
+    Raises FileError: the folder cannot be made, another client has it, or a file of it is damaged.
     """
 
     def __init__(self, folder: Path, schema: Mapping[str, Any], plan: Plan) -> None:

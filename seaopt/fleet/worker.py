@@ -1,4 +1,4 @@
-"""What a worker does: fit a batch of logs, one after another, and return a row for each.
+"""Fit a batch of logs in a worker process, one after another, and return a row for each.
 
 A log that cannot be read or fitted is a row with its reason. One that takes longer than the time limit is interrupted,
 by a signal in a process's main thread, by an exception in another one; where neither gets through, in compiled code or

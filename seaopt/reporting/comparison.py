@@ -87,17 +87,8 @@ def response_panels(
 ) -> list[Panel]:
     """Return a panel for every pair of an experiment, and for outputs of one unit over each other, with models on top.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Of the first fit.
-    measured : Survey
-        Of that experiment.
-    fits : mapping of label to Fit
-        What is drawn over the measurement; each has an experiment of that name.
-    pair : str, optional
-        The only pair wanted, by its name.
-
+    `experiment`: of the first fit, with its measurement. `fits`: drawn over it, each has an experiment of that name.
+    `pair`: the only one wanted, by its name.
     """
     views: dict[str, tuple[Survey, Fit]] = {}
     for label, fit in fits.items():
@@ -112,12 +103,16 @@ def response_panels(
             Curve(label=label, response=_respond(view, measurement, measured, fit), colour=colour, style=style)
             for (label, (view, fit)), (colour, style) in zip(views.items(), _LOOKS * 3, strict=False)
         ]
-        if measurement.second_order is not None:
-            form = measurement.second_order.response
-            curves.append(Curve(label="second-order fit", response=form, colour=FORM, style="--"))
+        curves += _list_forms(measurement)
         name = f"response_{experiment.name}_{measurement.output}_{measurement.source}"
         panels.append(response_panel(name, f"{experiment.name}: {measurement.name}", measurement, curves))
     return panels
+
+
+def _list_forms(pair: Pair) -> list[Curve]:
+    if pair.second_order is None:
+        return []
+    return [Curve(label="second-order fit", response=pair.second_order.response, colour=FORM, style="--")]
 
 
 def _pair_outputs(log: Log, measured: Survey) -> list[Pair]:
@@ -160,15 +155,7 @@ def survey_panels(
 ) -> list[Panel]:
     """Return a panel for every pair of the surveys with its second-order fit, the plant as given, and as fitted.
 
-    Parameters
-    ----------
-    surveys : mapping of experiment to Survey
-        What to draw.
-    given : ParameterSet, optional
-        Values before a fit.
-    fitted : mapping of experiment to (Survey, Fit), optional
-        The survey under the fit's delay and gains, and the fit.
-
+    `given`: values before a fit. `fitted`: by experiment the survey under the fit's delay and gains, and the fit.
     """
     panels: list[Panel] = []
     for name, measured in surveys.items():
@@ -180,9 +167,7 @@ def survey_panels(
             if given is not None:
                 model = measured.model(pair, given)
                 curves.append(Curve(label="model, the file's values", response=model, colour=GIVEN, style="-."))
-            if pair.second_order is not None:
-                form = pair.second_order.response
-                curves.append(Curve(label="second-order fit", response=form, colour=FORM, style="--"))
+            curves += _list_forms(pair)
             panels.append(response_panel(f"{name}_{pair.name}", f"{name}: {pair.name}", pair, curves))
     return panels
 

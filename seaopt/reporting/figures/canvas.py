@@ -1,4 +1,4 @@
-"""What figures are drawn on: figures that pyplot does not keep, axes with a light grid, scales and legends."""
+"""Figures that pyplot does not keep, axes with a light grid, scales and legends."""
 
 from __future__ import annotations
 

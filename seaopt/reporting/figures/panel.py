@@ -26,7 +26,7 @@ LEFT, NAMES_LEFT = 0.78, 1.75  # inches beside axes with numbers, and with names
 
 @record(eq=False)
 class Panel:
-    """What draws one figure, and the labels of its axes."""
+    """A function that draws one figure, with the labels and scales of its axes."""
 
     name: str  # for files; unique on a page
     title: str

@@ -16,19 +16,9 @@ METHOD = "least and largest sample of each of {} stretches (min-max)"
 def thin_series(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], stretches: int = STRETCHES
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return a series of at most two samples per stretch, and its ends; one that is short enough as it is.
+    """Return a series of at most two samples per stretch, and its ends; a short one as it is.
 
-    Parameters
-    ----------
-    time, values : arrays, shape (n,)
-        NaN where a sample is missing.
-    stretches : int
-        Into how many, of equally many samples, the series is cut.
-
-    Returns
-    -------
-    time, values : arrays, shape (m,)
-        A stretch without a sample gives NaN.
+    `values`: NaN where a sample is missing; a stretch without a sample gives NaN. `stretches`: of equally many samples.
 
     Examples
     --------

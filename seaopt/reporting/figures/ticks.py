@@ -59,16 +59,10 @@ class Side:
 
 
 def simplify_ticks(axes: Iterable[Axes]) -> None:
-    """Replace the ticks of finished axes by a few artists that look the same, and do not follow the limits any more.
+    """Replace the ticks of finished axes by a few artists that look the same, and no longer follow the limits.
 
-    They have ids, which the script of a page knows: ``xtick_0_grid``, ``xtick_0_marks`` and ``xtick_0_3`` on the first
-    axes.
-
-    Parameters
-    ----------
-    axes : iterable of Axes
-        All that are finished; of axes that share a side all or none.
-
+    Of axes that share a side give all or none. The artists have ids, which the script of a page knows:
+    ``xtick_0_grid``, ``xtick_0_marks`` and ``xtick_0_3`` on the first axes.
     """
     finished = list(axes)
     for each in finished:

@@ -42,29 +42,14 @@ class KeyEntry:
 
 @record
 class Chart:
-    """A panel on a page.
-
-    Parameters
-    ----------
-    name, title, caption, link : str
-        As of the panel; the name is made an id.
-    svg : str
-        The drawing, an <svg> element whose ids begin with the name.
-    axes : str
-        JSON for the script: of each axes its box in the drawing, its sides, and its curves. Empty where there is
-        nothing to read or to zoom.
-    hover : str
-        As of the panel.
-    key : tuple of KeyEntry
-
-    """
+    """A panel on a page; name, title, caption, link and hover are those of the panel, the name made an id."""
 
     name: str
     title: str
     caption: str
     link: str
-    svg: str
-    axes: str
+    svg: str  # the drawing, an <svg> element whose ids begin with the name
+    axes: str  # JSON for the script: the box, sides and curves of each axes; empty where there is nothing to read
     hover: str
     key: tuple[KeyEntry, ...]
 

@@ -48,16 +48,7 @@ def describe(result: object) -> list[Section]:
 
 
 def judge(result: object, commands: Commands | None = None) -> Verdict | None:
-    """Return the verdict on a result; None on those that have none.
-
-    Parameters
-    ----------
-    result : Fit, Controller, Certificate, ...
-        What a stage returned.
-    commands : Commands, optional
-        What to type next, where the result was made on the command line.
-
-    """
+    """Return the verdict on a result, with the commands to type next; None for results without a verdict."""
     judged = getattr(_find_module(result), "judge", None)
     return None if judged is None else judged(result, commands or Commands())
 

@@ -1,4 +1,4 @@
-"""What results are said with: sections of tables, sentences and figures, and verdicts; no renderer is known here."""
+"""The parts that describe a result, however it is rendered: sections of tables and sentences, and verdicts."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Verdict:
 
 @record
 class Commands:
-    """What to type, where a result was made on the command line; empty elsewhere."""
+    """Commands to type next, for a result of the command line; empty elsewhere."""
 
     fit: str = ""
     tune: str = ""

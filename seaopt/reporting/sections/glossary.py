@@ -1,4 +1,4 @@
-"""What the terms of tables mean: on a page they show it under the pointer, without a script or a network."""
+"""The meaning of terms in tables, which a page shows under the pointer without a script or a network."""
 
 from __future__ import annotations
 
