@@ -154,13 +154,13 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
 
 
 def limit_notes(command: Command, requested: float | None, *, in_amperes: bool = True) -> tuple[str, ...]:
-    """Say what a limit is of where no current is commanded, and where the command's own range is narrower."""
+    """Say which quantity a limit holds where no current is commanded, and where the command's own range is narrower."""
     notes: list[str] = []
     key = "current_limit_A" if in_amperes else "command_limit"
     if requested is not None and in_amperes and command.unit != "A":
         notes.append(
-            f"current_limit_A = {requested:g} is of what is commanded, {requested:g}{unit_after(command.unit)} of "
-            f"{command.input}: the current itself is not limited; command_limit is the same under its own name"
+            f"current_limit_A = {requested:g} limits the command, {requested:g}{unit_after(command.unit)} of "
+            f"{command.input}, not the current itself; command_limit is the same under its own name"
         )
     if command.largest is not None and (requested is None or requested > command.largest):
         reason = "no limit is given" if requested is None else f"{key} = {requested:g} is more than acts"

@@ -11,9 +11,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
 
-def find_friction_margin(
-    controller: Controller, plant: Plant, params: ParameterSet, first: str = "", least: float = 0.0
-) -> FrictionMargin | None:
+def find_friction_margin(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
     """Return how much steeper friction may be with stability shown, between the samples too; None without friction.
 
     The linear plant of the test is the sliding one; what a curve's slope is above its flattest is in the sector.
@@ -32,13 +30,16 @@ def find_friction_margin(
     True
 
     """
-    return find_friction_margins(controller, plant, [params], first, least)[0]
+    return find_friction_margins(controller, plant, [params])[0]
 
 
 def find_friction_margins(
     controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
 ) -> list[FrictionMargin | None]:
-    """Return `find_friction_margin` at several sets of parameters, all with the same conditions among them."""
+    """Return `find_friction_margin` at several sets of parameters, all with the same conditions among them.
+
+    `first` and `least`: as in `friction_margin`.
+    """
     return [
         None if loop is None else friction_margin(loop, first, least)
         for loop in take_friction_out(controller, plant, sets)

@@ -105,9 +105,8 @@ class RippleTerm:
 
     """
 
-    cycles: Annotated[
-        tuple[Cycles, ...], Limits(min_length=1, max_length=MOST_CYCLES)
-    ]  # harmonics, in cycles per revolution
+    # harmonics, in cycles per revolution
+    cycles: Annotated[tuple[Cycles, ...], Limits(min_length=1, max_length=MOST_CYCLES)]
     cos: tuple[float, ...]  # cos, sin: of each, the fraction in them, in the command's unit of effort
     sin: tuple[float, ...]
     period: Annotated[float, Limits(gt=0.0)]  # what the reading moves in one revolution, in its unit

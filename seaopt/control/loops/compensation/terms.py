@@ -111,9 +111,8 @@ class GravityTerm:
 
     """
 
-    coefficients: Annotated[
-        tuple[float, ...], Limits(min_length=1, max_length=100)
-    ]  # of Chebyshev's polynomials, the fraction in them, in the unit of the reference
+    # of Chebyshev's polynomials, the fraction in them, in the unit of the reference
+    coefficients: Annotated[tuple[float, ...], Limits(min_length=1, max_length=100)]
     low: float  # low, high: the range of the link's position in which they hold, in its unit
     high: float
     reads: Annotated[str, Limits(min_length=1)]  # the output that is the link's position
