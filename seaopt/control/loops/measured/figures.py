@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from seaopt.codec import OrInfinite, OrNaN, to_content
+from seaopt.codec import OrInfinite, OrNaN
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import ASSUMED, MeasuredPlant
@@ -46,10 +45,6 @@ class MeasuredFigures:
             f"{head}: bandwidth {least} to {most} Hz, Ms {self.ms:.4g}, Mt {self.mt:.4g}, noise gain "
             f"{self.noise_gain:.4g}; assumed: {self.assumed}"
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return to_content(self)
 
 
 def measure_discs(plant: MeasuredPlant, law: Law, bandwidth_hz: float) -> MeasuredFigures:
