@@ -1,4 +1,4 @@
-"""What `seaopt new` does: show what is in some logs, ask what they do not say, write a problem file."""
+"""`seaopt new`: show the columns of some logs, ask what they do not say, write a problem file."""
 
 from __future__ import annotations
 
@@ -16,17 +16,14 @@ from seaopt.files import check_regular, describe_os_error, exists, to_json, writ
 from seaopt.problem import read_problem
 from seaopt.problem.proposal import Proposal, Question, propose
 
-COLUMN_HEAD = ("column", "is", "unit", "")
+COLUMN_HEAD = ("column", "role", "unit", "meaning")
+GUESS_HEAD = ("guess", "value", "why")
 
 
 def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force: bool, json: bool) -> Path:
     """Write a problem file for logs and return its path; without `yes` what they leave open is asked.
 
-    Raises
-    ------
-    SeaoptError
-        A log cannot be read, a file is there already, or an answer is missing.
-
+    Raises SeaoptError: a log cannot be read, a file is there already, or an answer is missing.
     """
     target = _choose_target(logs, output, force=force)
     folder, answers = target.parent, dict[str, str]()
@@ -37,19 +34,15 @@ def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force
         proposal = _interview(console, logs, answers, folder, proposal, target.stem)
     _write_checked(target, proposal.text)
     if json:
-        rows = [asdict(column) for column in proposal.columns]
-        sys.stdout.write(
-            to_json(
-                {
-                    "schema": "seaopt/new/1",
-                    "file": str(target),
-                    "columns": rows,
-                    "guesses": {one.key: one.guess for one in proposal.guesses},
-                    "guessed": list(proposal.guessed),
-                    "notes": list(proposal.notes),
-                }
-            )
-        )
+        content = {
+            "schema": "seaopt/new/1",
+            "file": str(target),
+            "columns": [asdict(column) for column in proposal.columns],
+            "guesses": {question.key: question.guess for question in proposal.guesses},
+            "guessed": list(proposal.guessed),
+            "notes": list(proposal.notes),
+        }
+        sys.stdout.write(to_json(content))
         return target
     if yes:
         _print_columns(console, proposal)
@@ -97,9 +90,9 @@ def _interview(
     console: Terminal, logs: Sequence[Path], answers: dict[str, str], folder: Path, proposal: Proposal, title: str
 ) -> Proposal:
     """Ask question by question; an empty answer takes the guess, which stays marked as one unless it was a choice."""
-    asked: set[str] = set()
-    while question := next((one for one in proposal.questions if one.key not in asked), None):
-        asked.add(question.key)
+    done: set[str] = set()
+    while question := next((question for question in proposal.questions if question.key not in done), None):
+        done.add(question.key)
         if question.key == "roles":
             _print_columns(console, proposal)
         answer = _ask(console, question)
@@ -112,11 +105,7 @@ def _interview(
 def _ask(console: Terminal, question: Question) -> str:
     """Return an answer that counts, "" for the guess.
 
-    Raises
-    ------
-    ProblemError
-        Nobody answers.
-
+    Raises ProblemError: nobody answers.
     """
     choices = f" ({', '.join(question.choices)})" if question.choices else ""
     console.say(f"{question.text}{choices}", style="bold")
@@ -135,21 +124,22 @@ def _ask(console: Terminal, question: Question) -> str:
 
 
 def _print_columns(console: Terminal, proposal: Proposal) -> None:
-    """Print what was made of each column."""
+    """Print the role of each column."""
     for log in dict.fromkeys(column.log for column in proposal.columns):
-        rows = [
-            (one.column, one.role or "–", one.unit, one.description + (" (guessed)" if one.doubt else ""))
-            for one in proposal.columns
-            if one.log == log
-        ]
         console.say(f"{log}:")
+        rows = [
+            (row.column, row.role or "–", row.unit, row.description + (" (guessed)" if row.doubt else ""))
+            for row in proposal.columns
+            if row.log == log
+        ]
         console.tabulate(rows, COLUMN_HEAD)
 
 
 def _describe_guesses(proposal: Proposal) -> list[tuple[str, str, str]]:
     """Return a row for each of the guesses that results rest on: what it is, what was taken, and why."""
-    rows = {one.entry: (one.label, one.guess, one.why) for one in proposal.questions}
-    rows |= {f"role of {one.column}": (f'Column "{one.column}"', one.role, one.doubt) for one in proposal.columns}
+    rows = {question.entry: (question.label, question.guess, question.why) for question in proposal.questions}
+    for row in proposal.columns:
+        rows[f"role of {row.column}"] = (f'Column "{row.column}"', row.role, row.doubt)
     return [rows.get(name, (name.capitalize(), "", "see its line in the file")) for name in proposal.guessed]
 
 
@@ -158,12 +148,13 @@ def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
     console.say(f"wrote {target}", soft_wrap=True)
     if proposal.guessed:
         count = len(proposal.guessed)
-        are = "is a guess" if count == 1 else "are guesses"
-        console.wrap(f'{count} of its values {are}, which verdicts name until they are out of "guessed":')
-        console.tabulate(_describe_guesses(proposal))
+        values = "1 value is a guess" if count == 1 else f"{count} values are guesses"
+        console.wrap(f'{values}, listed in every verdict until removed from "guessed":')
+        console.tabulate(_describe_guesses(proposal), GUESS_HEAD)
     if proposal.open:
-        console.say("Left to the fit, or for you to choose:")
-        console.tabulate([(one.label, one.guess, one.why) for one in proposal.open])
+        console.say("To be fitted, or for you to choose:")
+        rows = [(question.label, question.guess, question.why) for question in proposal.open]
+        console.tabulate(rows, ("quantity", "value", "why"))
     for note in proposal.notes:
         console.wrap(f"note: {note}")
     out = shlex.quote(str(target.with_suffix("")))

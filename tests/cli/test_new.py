@@ -81,8 +81,8 @@ def test_json_has_the_columns_and_the_guesses(folder, seaopt, held):
 def test_as_many_guesses_are_printed_as_the_file_names(folder, seaopt, held):
     out = seaopt("new", "knee.csv", "--yes").stdout
     guessed = so.read_problem(folder / "knee.toml").table.guessed
-    printed, rest = out.split("Left to the fit")
-    head, rows = re.search(r"\n(\d+) of its values are guesses, .*\n((?:  .*\n)+)$", printed).groups()
+    printed, rest = out.split("To be fitted")
+    head, rows = re.search(r"\n(\d+) values are guesses, .*\n  guess .*\n((?:  .*\n)+)$", printed).groups()
     assert int(head) == len(guessed) == len(rows.splitlines()) and "Bandwidth of the controller" in rest
 
 

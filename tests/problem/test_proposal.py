@@ -226,7 +226,7 @@ def test_a_fit_of_what_was_proposed_recovers_a_knee(tmp_path):
         write_csv(tmp_path / f"{name}.csv", columns)
     paths = [tmp_path / "held.csv", tmp_path / "free.csv"]
     proposal = propose(paths, {"K_tau": "0.037"}, tmp_path)
-    assert not any(line.startswith("N ") and "usual" in line for line in proposal.text.splitlines())
+    assert not any(line.startswith("N ") and "typical" in line for line in proposal.text.splitlines())
     problem = write(tmp_path, proposal.text)
     assert problem.parameters["N"].value == 100.0  # from the two encoders
     fit = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
@@ -282,6 +282,16 @@ def test_a_turned_sensor_and_one_behind_the_gear_are_set_right(tmp_path, logs):
     assert "behind the gear" in proposal.text
 
 
+def test_a_noise_limit_is_written_and_grows_with_the_bandwidth_beyond_the_resonance(tmp_path):
+    t, current = drive(10.0, RATE, 2.0)
+    log = knee(current, RATE, locked=True)
+    path = write_csv(tmp_path / "a.csv", {"t [s]": t, "I [A]": log["I"], "tau_s [N m]": log["tau_s"]})
+    usual, fast = (write(tmp_path, propose([path], answers, tmp_path).text) for answers in ({}, {"bandwidth_hz": "60"}))
+    assert usual.spec.max_noise_gain == 50
+    resonance = math.sqrt(KNEE["k_s"] / KNEE["J_m"]) / KNEE["N"] / (2 * math.pi)
+    assert fast.spec.max_noise_gain == pytest.approx(50 * (60 / (4 * resonance)) ** 2, rel=0.5)
+
+
 def test_answers_take_the_place_of_guesses(tmp_path, logs):
     held = logs["held"]
     path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"]})
@@ -316,7 +326,7 @@ def test_what_results_rest_on_and_nobody_knew_is_data(tmp_path, logs):
         "unit of b", "unit of tau", "link of a.csv", "k_s", "sample_rate_hz", "current_limit_A",
     }  # fmt: skip
     assert next(line for line in propose([path], known, tmp_path).text.splitlines() if line.startswith("k_s ")).count(
-        "guessed: no log tells it"
+        "guessed: cannot be identified from the log"
     )
 
 

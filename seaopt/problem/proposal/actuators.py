@@ -1,4 +1,4 @@
-"""What is known and what is fitted of the actuator that some logs are of: parameters, plants and their options.
+"""The parameters, plants and options of an actuator that logs were recorded on: which are known, and which are fitted.
 
 A log of an effort (force, torque) with the motor's motion tells the spring; one of an effort alone knows the inertia
 only over the stiffness, and one of angles alone only over the torque constant. What no log can tell has to be known: it
@@ -22,7 +22,13 @@ from seaopt.units import unit_after
 PRIOR = 0.05  # share that a data sheet's value may be off
 WIDE = (0.5, 2.0)  # of an inertia that somebody estimated: its range
 INERTIA_OVER_POINT = 4.0 / 3.0  # of a slender link about its end
+DESIGN = "held"  # the plant that controllers are designed on
+MOVING = ("hanging", "swing")  # plants that a controller must hold on besides
 _DRIVES: dict[str, tuple[str, ...]] = {"V": ("voltage_input",), "duty": ("duty_input",), "goal": ("position_servo",)}
+_LINKS = {"held": "locked", "free": "free", "hanging": "pendulum"}
+_SCREWS = {"held": "high_impedance", "swing": "moving_output"}
+_SCALES = "cannot be identified from the log; {} with it"
+_ALL_SCALE = _SCALES.format("all torques scale")
 
 
 @record
@@ -36,7 +42,7 @@ class ParameterLine:
 
 @record
 class Facts:
-    """What the logs have: the input, the outputs of them all, and the places (held, free, ...) of their links."""
+    """The input of the logs, all their outputs, and the places (held, free, ...) of their links."""
 
     input: str
     outputs: frozenset[str]
@@ -49,263 +55,212 @@ class Proposed:
     """An actuator as it goes into a problem file."""
 
     lines: tuple[ParameterLine, ...]
-    plants: Mapping[str, Mapping[str, object]]  # of each [plant.NAME]
+    plants: Mapping[str, Mapping[str, object]]  # the options of each [plant.NAME]
     measured: str  # what a controller regulates; "" where nothing can be
-    design: str  # the plant that it is designed on
-    robust_to: tuple[str, ...]  # the plants that it must hold on besides
     ranges: Mapping[str, tuple[float, float]]  # of what nobody measured
+
+    @property
+    def robust_to(self) -> tuple[str, ...]:
+        """The plants that a controller must hold on besides."""
+        return tuple(name for name in self.plants if name in MOVING)
 
 
 class _Lines:
     """Lines of [parameters], each with what it is and what of it is a guess."""
 
-    def __init__(self, interview: Interview, defaults: Mapping[str, Parameter]) -> None:
-        self.interview, self.defaults = interview, defaults
+    def __init__(self, interview: Interview, facts: Facts, own: Mapping[str, Parameter], stiffness: str) -> None:
+        """Take the parameters of an actuator, of the parts around it, and of a sensor that computes its effort."""
+        self.interview = interview
+        self.parts = _DRIVES.get(facts.input, ())
+        (nominal,) = PARTS["deflection_sensor"]
+        around = {parameter.name: parameter for part in self.parts for parameter in PARTS[part]}
+        self.defaults = {**own, **around, nominal.name: replace(nominal, unit=stiffness)}
         self.lines: list[ParameterLine] = []
 
-    def add(self, name: str, value: str, *marks: str) -> None:
+    def value(self, name: str) -> float:
+        """Return the number of a line that is there."""
+        return next(float(re.findall(r"\d[\d.e+-]*", line.value)[0]) for line in self.lines if line.name == name)
+
+    def add(self, name: str, value: str, mark: str = "") -> None:
         parameter = self.defaults[name]
         about = ", ".join(text for text in (parameter.description, unit_after(parameter.unit).strip("- ")) if text)
-        guess = self.interview.mark(*marks)
-        self.lines.append(ParameterLine(name=name, value=value, comment="; ".join(t for t in (about, guess) if t)))
+        comment = "; ".join(filter(None, (about, self.interview.mark(mark or name))))
+        self.lines.append(ParameterLine(name=name, value=value, comment=comment))
 
     def free(self, name: str, start: float | None = None, **bounds: float) -> None:
         value = self.defaults[name].value if start is None else start
         more = "".join(f", {key} = {number:.10g}" for key, number in bounds.items())
-        self.add(name, f"{{ value = {value:.10g}, free = true{more} }}", name)
+        self.add(name, f"{{ value = {value:.10g}, free = true{more} }}")
 
-    def known(self, name: str, text: str, guess: float | None = None, why: str = "a usual one") -> float:
+    def known(self, name: str, text: str, guess: float | None = None, why: str = "a typical value") -> float:
         """Ask for a value that no log can tell, and write it."""
         start = self.defaults[name].value if guess is None else guess
-        value = self.interview.number(name, _with_unit(text, self.defaults[name]), start, why)
-        self.add(name, f"{value:.10g}", name)
+        value = self.interview.number(name, self._add_unit(text, name), start, why)
+        self.add(name, f"{value:.10g}")
         return value
 
-    def perhaps(self, name: str, text: str, *, told: bool, why: str) -> float | None:
+    def perhaps(self, name: str, text: str, *, identified: bool, why: str) -> None:
         """Ask for a value that the logs may tell: known, it is a prior; unknown, free if they tell, else a guess."""
-        parameter = self.defaults[name]
-        value = self.interview.optional(name, f"{_with_unit(text, parameter)}, or unknown", why)
+        value = self.optional(name, text, "it is fitted" if identified else why)
         if value is not None:
-            self.add(name, f"{{ value = {value:.10g}, prior_std = {PRIOR * value:.3g} }}", name)
-        elif told:
+            self.add(name, f"{{ value = {value:.10g}, prior_std = {PRIOR * value:.3g} }}")
+        elif identified:
             self.free(name)
         else:
             self.interview.assume(name)
-            self.add(name, f"{parameter.value:.10g}", name)
-        return value
+            self.add(name, f"{self.defaults[name].value:.10g}")
 
+    def optional(self, name: str, text: str, why: str) -> float | None:
+        """Ask for a value that may be unknown."""
+        return self.interview.optional(name, f"{self._add_unit(text, name)}, or unknown", why)
 
-def _with_unit(text: str, parameter: Parameter) -> str:
-    unit = unit_after(parameter.unit).strip()
-    return f"{text}, in {unit}" if unit not in ("", "-") else text
+    def _add_unit(self, text: str, name: str) -> str:
+        unit = unit_after(self.defaults[name].unit).strip()
+        return f"{text}, in {unit}" if unit not in ("", "-") else text
 
 
 def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     """Return a gear's actuator."""
-    parts = _DRIVES.get(facts.input, ())
-    pendulum = rotary(link="pendulum")
-    lines = _Lines(interview, _list_defaults(pendulum.defaults, parts, "N m/rad"))
+    lines = _Lines(interview, facts, rotary(link="pendulum").defaults, "N m/rad")
     effort, motor, link = (name in facts.outputs for name in ("tau_s", "theta_m", "theta_l"))
     moves = any(place != "held" for place in facts.places)
-    ratio, why = facts.gear_ratio, "the gear ratio of a module; take it from the data sheet"
-    if ratio is not None:
-        why = "the motor turns so many times as far as the link"
-    lines.known("N", "Gear ratio N (turns of the motor for one of the output)", ratio, why)
-    _add_torque_constant(lines, facts, effort=effort)
-    _add_drive(lines, facts)
+    why = "typical of a module; take it from the data sheet"
+    if facts.gear_ratio is not None:
+        why = "the motor turns this many times as far as the link"
+    lines.known("N", "Gear ratio N (turns of the motor for one of the output)", facts.gear_ratio, why)
+    _add_drive(lines, facts, effort=effort)
     lines.free("J_m")
     lines.free("b_r")
     lines.free("f_c", 0.2 * lines.defaults["J_m"].value * 100.0, max=10.0)
-    seen = (effort and (motor or "deflection" in facts.outputs)) or (moves and (motor or link))
-    lines.perhaps(
-        "k_s",
-        "Stiffness of the spring k_s",
-        told=seen,
-        why="fitted" if seen else "no log tells it: J_m, b_r and f_c are right only in their ratio to it",
-    )
+    identified = (effort and (motor or "deflection" in facts.outputs)) or (moves and (motor or link))
+    why = _SCALES.format("J_m, b_r and f_c scale")
+    lines.perhaps("k_s", "Stiffness of the spring k_s", identified=identified, why=why)
     if moves:
         lines.free("J_l")
         lines.free("d_l", 0.1)
     if "hanging" in facts.places:
-        lines.known("m", "Mass of the hanging link", why="a usual one; only m L counts, and L is fitted")
+        lines.known("m", "Mass of the hanging link", why="a typical value; only m L matters, and L is fitted")
         lines.free("L", max=2.0)
-    plants: dict[str, Mapping[str, object]] = {}
-    options: dict[str, object] = {"parts": list(parts)} if parts else {}
-    for place in facts.places:
-        plants.setdefault(place, {"kind": "rotary", "link": _LINKS[place], **options})
-    return _finish_rotary(lines, facts, plants, options, effort=effort, both=motor and link)
+    places = list(facts.places)
+    measured = "tau_s" if effort else "tau_d" if motor and link else ""
+    if facts.input == "goal":  # the firmware's loop is closed already
+        measured = ""
+    parts, ranges = list(lines.parts), dict[str, tuple[float, float]]()
+    if measured:
+        places.append(DESIGN)
+        if "hanging" not in places:
+            ranges = _add_payload(lines, places)
+    if measured == "tau_d":  # the torque of two encoders, by a constant of the firmware's
+        text = "Stiffness k_n that the firmware multiplies the deflection by"
+        lines.known("k_n", text, lines.value("k_s"), "that of the spring")
+        parts.append("deflection_sensor")
+    options = {"parts": parts} if parts else {}
+    plants = {place: {"kind": "rotary", "link": _LINKS[place], **options} for place in dict.fromkeys(places)}
+    return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
 
 
-def _list_defaults(own: Mapping[str, Parameter], parts: Sequence[str], stiffness: str) -> dict[str, Parameter]:
-    """Return the parameters of an actuator with parts around it, and of a sensor that computes its effort."""
-    (nominal,) = PARTS["deflection_sensor"]
-    around = {parameter.name: parameter for part in parts for parameter in PARTS[part]}
-    return {**own, **around, nominal.name: replace(nominal, unit=stiffness)}
+def _add_drive(lines: _Lines, facts: Facts, *, effort: bool) -> None:
+    """Add K_tau and eta, of which a log tells the product at most, and what stands between command and current.
 
-
-_LINKS = {"held": "locked", "free": "free", "hanging": "pendulum"}
-
-
-def _add_torque_constant(lines: _Lines, facts: Facts, *, effort: bool) -> None:
-    """Add K_tau and eta, of which a log tells the product at most; a commanded torque makes them one."""
+    A commanded torque makes K_tau and eta one.
+    """
+    scaled = "Torque constant K_tau of the motor"
     if facts.input == "torque":
         side = lines.interview.ask(
             "torque_at",
             "Is the commanded torque that of the motor or of the output, behind the gear?",
             "output",
-            "as drives of robots take it",
+            "as most robot drives take it",
             ("output", "motor"),
         )
-        gear = float(lines.lines[0].value)
-        lines.add("K_tau", f"{1.0 / gear if side == 'output' else 1.0:.10g}", "torque_at")
+        lines.add("K_tau", f"{1.0 / lines.value('N') if side == 'output' else 1.0:.10g}", "torque_at")
         if effort:
             lines.free("eta", max=2.0)
-        return
-    if not effort:
-        lines.known("K_tau", "Torque constant K_tau of the motor", why="no log tells it: all torques are in its ratio")
-        return
-    value = lines.interview.optional(
-        "K_tau", "Torque constant K_tau of the motor, in N m/A, or unknown", "fitted, with the losses in it"
-    )
-    if value is None:
-        lines.free("K_tau")
-        return
-    lines.add("K_tau", f"{value:.10g}", "K_tau")
-    lines.free("eta", 0.9, max=1.5)
-
-
-def _add_drive(lines: _Lines, facts: Facts) -> None:
-    """Add what stands between the command and the current."""
+    elif not effort:
+        lines.known("K_tau", scaled, why=_ALL_SCALE)
+    else:
+        value = lines.optional("K_tau", scaled, "it is fitted, and includes the losses of the drive")
+        if value is None:
+            lines.free("K_tau")
+        else:
+            lines.add("K_tau", f"{value:.10g}")
+            lines.free("eta", 0.9, max=1.5)
     if facts.input in ("V", "duty"):
-        lines.known("R", "Winding resistance R", why="a usual one; take it from the data sheet")
+        lines.known("R", "Winding resistance R", why="a typical value; take it from the data sheet")
     if facts.input == "duty":
-        lines.known("V_s", "Supply voltage V_s", why="a usual one")
+        lines.known("V_s", "Supply voltage V_s")
     if facts.input == "goal":
-        lines.known(
-            "k_p",
-            "Gain k_p of the position loop: current in A for one rad of error at the motor",
-            10.0,
-            "no log tells it: all torques are in its ratio",
-        )
+        lines.known("k_p", "Gain k_p of the position loop: current for one rad of error at the motor", 10.0, _ALL_SCALE)
 
 
-def _finish_rotary(
-    lines: _Lines,
-    facts: Facts,
-    plants: dict[str, Mapping[str, object]],
-    options: Mapping[str, object],
-    *,
-    effort: bool,
-    both: bool,
-) -> Proposed:
-    """Return the actuator with the plants that its controller is for: the link held, and as it hangs from the joint."""
-    measured = "tau_s" if effort else "tau_d" if both else ""
-    if facts.input == "goal" or not measured:  # a firmware's loop is closed already
-        return Proposed(lines=tuple(lines.lines), plants=plants, measured="", design="", robust_to=(), ranges={})
-    plants.setdefault("held", {"kind": "rotary", "link": "locked", **options})
-    ranges = _add_payload(lines, plants, options)
-    if measured == "tau_d":  # the torque of two encoders, by a constant of the firmware's
-        spring = next(line.value for line in lines.lines if line.name == "k_s")
-        nominal = float(re.findall(r"\d[\d.e+-]*", spring)[0])
-        lines.known("k_n", "Stiffness k_n by which torque is computed of the two encoders", nominal, "the spring's")
-        parts = [*_DRIVES.get(facts.input, ()), "deflection_sensor"]
-        plants = {name: {**table, "parts": parts} for name, table in plants.items()}
-    robust_to = tuple(name for name in plants if name == "hanging")
-    return Proposed(
-        lines=tuple(lines.lines), plants=plants, measured=measured, design="held", robust_to=robust_to, ranges=ranges
-    )
-
-
-def _add_payload(
-    lines: _Lines, plants: dict[str, Mapping[str, object]], options: Mapping[str, object]
-) -> dict[str, tuple[float, float]]:
+def _add_payload(lines: _Lines, places: list[str]) -> dict[str, tuple[float, float]]:
     """Add the link that will hang from the joint, where no log had it, and return the range of its inertia.
 
     A link without gravity is no plant to certify on: under a torque controller its angle drifts.
     """
-    if "hanging" in plants:
-        return {}
-    ranges: dict[str, tuple[float, float]] = {}
-    mass = lines.interview.optional(
+    mass = lines.optional(
         "m",
-        "Mass of the link that will hang from the joint, in kg, or unknown",
-        "the controller is then certified with the link held, and not on one that moves",
+        "Mass of the link that will hang from the joint",
+        "without it the certificate covers the held link only, not a moving one",
     )
     if mass is None:
-        return ranges
-    lines.add("m", f"{mass:.10g}", "m")
-    reach = lines.known("L", "Distance L from its centre of mass to the joint", why="a usual one; measure it")
-    if "free" not in plants:
-        inertia = lines.known(
-            "J_l",
-            "Its inertia J_l about the joint",
-            float(f"{INERTIA_OVER_POINT * mass * reach**2:.3g}"),
-            "a third more than that of a point mass",
-        )
-        lines.known("d_l", "Damping d_l at the joint", 0.1, "a usual one")
-        ranges["J_l"] = (WIDE[0] * inertia, WIDE[1] * inertia)
-    plants["hanging"] = {"kind": "rotary", "link": _LINKS["hanging"], **options}
-    return ranges
+        return {}
+    lines.add("m", f"{mass:.10g}")
+    reach = lines.known("L", "Distance L from its centre of mass to the joint", why="a typical value; measure it")
+    places.append("hanging")
+    if "free" in places:
+        return {}
+    point = float(f"{INERTIA_OVER_POINT * mass * reach**2:.3g}")
+    inertia = lines.known("J_l", "Its inertia J_l about the joint", point, "a third more than that of a point mass")
+    lines.known("d_l", "Damping d_l at the joint", 0.1)
+    return {"J_l": (WIDE[0] * inertia, WIDE[1] * inertia)}
 
 
 def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     """Return a ball screw's actuator."""
-    parts = _DRIVES.get(facts.input, ())
-    lines = _Lines(interview, _list_defaults(thor(), parts, "N/m"))
-    forces = facts.outputs & {"F1", "F2"}
-    placed = bool(facts.outputs & {"q", "screw"})
-    lines.known("l", "Lead of the screw l (travel for one turn)", why="a usual one; take it from the data sheet")
+    lines = _Lines(interview, facts, thor(), "N/m")
+    forces, moves = facts.outputs & {"F1", "F2"}, "swing" in facts.places
+    why = "a typical value; take it from the data sheet"
+    lines.known("l", "Lead of the screw l (travel for one turn)", why=why)
     lines.known("N_p", "Reduction N_p between motor and screw", 1.0, "driven directly")
-    _add_torque_constant(lines, facts, effort=bool(forces))
-    _add_drive(lines, facts)
+    _add_drive(lines, facts, effort=bool(forces))
     lines.free("J", 1e-5)
     lines.free("b_r")
     lines.free("f_c", 5.0)
-    seen = bool(forces) and placed
-    lines.perhaps(
-        "k",
-        "Stiffness of the spring k",
-        told=seen,
-        why="fitted" if seen else "no log tells it: J, b_r and f_c are right only in their ratio to it",
-    )
+    identified = bool(forces) and bool(facts.outputs & {"q", "screw"})
+    lines.perhaps("k", "Stiffness of the spring k", identified=identified, why=_SCALES.format("J, b_r and f_c scale"))
     if len(forces) == 2:
         lines.free("m_l", min=1e-3)
-    moves = "swing" in facts.places
     if moves:
-        lines.known("L_a", "Lever arm L_a of the force about the pivot", why="a usual one; measure it")
-        lines.known("m", "Mass of the pendulum", why="a usual one; weigh it")
-        lines.known("L", "Distance L from its centre of mass to the pivot", why="a usual one; measure it")
+        _add_pendulum(lines, "pendulum")
         lines.free("I_p")
         lines.free("d", 0.1)
-    options: dict[str, object] = {"drive": "unlumped", **({"parts": list(parts)} if parts else {})}
-    kinds = {"held": "high_impedance", "swing": "moving_output"}
-    plants: dict[str, Mapping[str, object]] = {place: {"kind": kinds[place], **options} for place in facts.places}
-    if facts.input == "goal" or not forces:
-        return Proposed(lines=tuple(lines.lines), plants=plants, measured="", design="", robust_to=(), ranges={})
-    plants.setdefault("held", {"kind": "high_impedance", **options})
+    places, measured = list(facts.places), "F1" if "F1" in forces else "F2" if forces else ""
+    if facts.input == "goal":
+        measured = ""
     ranges: dict[str, tuple[float, float]] = {}
-    if not moves:
-        inertia = interview.optional(
+    if measured:
+        places.append(DESIGN)
+    if measured and not moves:
+        inertia = lines.optional(
             "I_p",
-            "Inertia of the link that the actuator will swing, about its pivot, in kg m^2, or unknown",
-            "the output was held; without it the certificate says nothing of a link that moves",
+            "Inertia of the link that the actuator will swing, about its pivot",
+            "without it the certificate covers the held link only, not a moving one",
         )
         if inertia is not None:
-            lines.known("L_a", "Lever arm L_a of the force about the pivot", why="a usual one; measure it")
-            lines.known("m", "Mass of the link", why="a usual one; weigh it")
-            lines.known("L", "Distance L from its centre of mass to the pivot", why="a usual one; measure it")
-            lines.add("I_p", f"{inertia:.10g}", "I_p")
-            plants["swing"] = {"kind": "moving_output", **options}
+            _add_pendulum(lines, "link")
+            lines.add("I_p", f"{inertia:.10g}")
+            places.append("swing")
             ranges["I_p"] = (WIDE[0] * inertia, WIDE[1] * inertia)
-    measured = "F1" if "F1" in forces else "F2"
-    return Proposed(
-        lines=tuple(lines.lines),
-        plants=plants,
-        measured=measured,
-        design="held",
-        robust_to=tuple(name for name in plants if name == "swing"),
-        ranges=ranges,
-    )
+    options = {"drive": "unlumped", **({"parts": list(lines.parts)} if lines.parts else {})}
+    plants = {place: {"kind": _SCREWS[place], **options} for place in dict.fromkeys(places)}
+    return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
+
+
+def _add_pendulum(lines: _Lines, noun: str) -> None:
+    lines.known("L_a", "Lever arm L_a of the force about the pivot", why="a typical value; measure it")
+    lines.known("m", f"Mass of the {noun}", why="a typical value; weigh it")
+    lines.known("L", "Distance L from its centre of mass to the pivot", why="a typical value; measure it")
 
 
 def screw_travel(lines: Sequence[ParameterLine]) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from seaopt.formatting import printable
 from seaopt.logs import assess_quality
 from seaopt.logs.quality.clock import JITTER_LIMIT
-from seaopt.problem.proposal.actuators import ParameterLine, Proposed, screw_travel
+from seaopt.problem.proposal.actuators import DESIGN, ParameterLine, Proposed, screw_travel
 from seaopt.problem.proposal.described_log import GEARED, SI_UNITS, DescribedLog, doubt_clock, make_table
 from seaopt.problem.proposal.questions import Interview
 from seaopt.problem.proposal.roles import DESCRIPTIONS, FOLLOWS
@@ -25,6 +25,8 @@ ABOVE_RESONANCE = 2.5  # bandwidth over resonance that is asked for first
 DEFAULT_BANDWIDTH_HZ = 20.0
 LEAST_RATE_HZ = 500.0  # of a controller; a slower log was not its clock
 HOLDOUT_S = 10.0  # a log from which a fifth can be kept back
+NOISE_GAIN = 50.0  # that is allowed up to WIDEST times the resonance, and by the square of the bandwidth above
+WIDEST = 4.0
 BRIDGE = 5.0  # periods that an irregular clock may skip
 RETUNE = 4
 COMMENT_AT = 56  # column of the comments
@@ -33,13 +35,13 @@ COMMENT_AT = 56  # column of the comments
 def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview) -> str:
     """Return the text of the problem file."""
     head = [
-        "# Written by seaopt new. What a comment calls guessed was not asked, or nobody knew it: look at that first.",
+        "# Written by seaopt new. Check every value marked as guessed before you run.",
         "schema = 1",
         f"title = {_quote(title)}",
     ]
     lines = [
         "",
-        _comment("[parameters]", "SI units; what is free is fitted"),
+        _comment("[parameters]", "SI units; free = true is fitted"),
         *_align([(f"{line.name} = {line.value}", line.comment) for line in actuator.lines]),
     ]
     sticks = any(log.traits.standing for log in logs)
@@ -67,10 +69,10 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
         lines += ["", "[controller]", *_align(_describe_controller(logs, actuator, interview))]
         lines += ["", "[robustness]", *_align(_describe_robustness(logs, actuator))]
     else:
-        lines += ["", "# No [controller]: these logs have neither a torque or force, nor both encoders of the spring."]
+        lines += ["", "# No [controller]: these logs have no torque or force, and not both encoders of the spring."]
     if guessed := interview.list_guessed():
         head += [
-            "# What was guessed, named in every verdict; take a name out once you know its value and have written it.",
+            "# Guesses; every verdict lists them. Once you have measured one, correct it and remove it here.",
             f"guessed = {_value(guessed)}",
         ]
     return "\n".join([*head, *lines]) + "\n"
@@ -192,36 +194,45 @@ def _lasts(log: DescribedLog) -> bool:
 def _describe_controller(
     logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview
 ) -> list[tuple[str, str]]:
-    rows = [
-        (f"plant = {_quote(actuator.design)}", ""),
-        (f"measured = {_quote(actuator.measured)}", "what is regulated"),
-    ]
-    rows.append(('structure = "pid"', ""))
-    guess, why = _guess_bandwidth(logs)
-    band = interview.number("bandwidth_hz", "Bandwidth of the controller, in Hz", guess, why)
-    rows.append((f"bandwidth_hz = {band:.10g}", interview.mark("bandwidth_hz")))
+    resonance, why = _find_resonance(logs)
     low, high = USUAL_BANDWIDTHS_HZ
+    guess = min(max(5.0 * round(ABOVE_RESONANCE * resonance / 5.0), low), high) if resonance else DEFAULT_BANDWIDTH_HZ
+    band = interview.number("bandwidth_hz", "Bandwidth of the controller, in Hz", guess, why)
+    rows = [
+        (f"plant = {_quote(DESIGN)}", ""),
+        (f"measured = {_quote(actuator.measured)}", "what is regulated"),
+        ('structure = "pid"', ""),
+        (f"bandwidth_hz = {band:.10g}", interview.mark("bandwidth_hz")),
+    ]
     if not low <= band <= high:
         rows.append((f"bandwidth_range_hz = [{min(low, band / 4.0):.3g}, {max(high, band):.3g}]", ""))
     rate = logs[0].rate_hz
-    usual = float(f"{rate:.4g}") if rate >= LEAST_RATE_HZ else 1000.0
-    why = "that of the log" if rate >= LEAST_RATE_HZ else "a usual one"
+    usual, why = (float(f"{rate:.4g}"), "that of the log") if rate >= LEAST_RATE_HZ else (1000.0, "a typical value")
     sampled = interview.number("sample_rate_hz", "Rate at which the controller will run, in Hz", usual, why)
     rows.append((f"sample_rate_hz = {sampled:.10g}", interview.mark("sample_rate_hz")))
-    rows.append(_describe_compute_delay(logs))
+    delayed = any(log.traits.delay_s for log in logs)
+    default = "0, as for the program that logged" if delayed else "1"
+    delay = f"from a reading to its command, besides the drive's fitted delay; {default} if left out"
+    rows.append(("# compute_delay_samples = 1", delay))
     rows.append(_describe_limit(logs, interview))
+    gain = NOISE_GAIN * max(1.0, band / (WIDEST * resonance)) ** 2 if resonance else NOISE_GAIN
+    noise = _find_noise(logs, actuator.measured)
+    unit = SI_UNITS.get(actuator.measured, "N m")
+    example = f": {noise:.3g} {unit} make up to {gain * noise:.3g} {unit}" if noise else ""
+    rows.append((f"max_noise_gain = {gain:.3g}", f"motor effort over sensor noise, at its peak{example}"))
     if actuator.robust_to:
         rows.append((f"robust_to = {_value(list(actuator.robust_to))}", "Ms and Mt hold there too"))
     return rows
 
 
-def _describe_compute_delay(logs: Sequence[DescribedLog]) -> tuple[str, str]:
-    """Return the line of the program's delay, to be taken in where the program is not the one that logged."""
-    shown = "0: as the program that logged" if any(log.traits.delay_s for log in logs) else "1"
-    return (
-        "# compute_delay_samples = 1",
-        f"from a reading to the command being put out; left out {shown}. The drive's delay is the fit's",
-    )
+def _find_noise(logs: Sequence[DescribedLog], output: str) -> float:
+    """Return the standard deviation of an output's noise from sample to sample, in SI; 0 where no log has it."""
+    levels = [
+        log.roles.columns[output].noise * factor(log.units[output], SI_UNITS[output])
+        for log in logs
+        if output in log.roles.columns
+    ]
+    return max(levels, default=0.0)
 
 
 def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple[str, str]:
@@ -238,46 +249,34 @@ def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple
 
 
 def _describe_robustness(logs: Sequence[DescribedLog], actuator: Proposed) -> list[tuple[str, str]]:
-    rows = [
-        (
-            f"plants = {_value([actuator.design, *actuator.robust_to])}",
-            "what is certified, besides what the fit leaves open",
-        )
-    ]
+    plants = _value([DESIGN, *actuator.robust_to])
+    rows = [(f"plants = {plants}", "certified, over the uncertainty of the fit")]
     if actuator.ranges:
         ranges = ", ".join(f"{name} = [{low:.4g}, {high:.4g}]" for name, (low, high) in actuator.ranges.items())
-        rows.append((f"parameters = {{ {ranges} }}", "half to twice what was given"))
+        rows.append((f"parameters = {{ {ranges} }}", "half to twice the value given"))
     if actuator.ranges or any("prior_std" in line.value for line in actuator.lines):
         rows.append((f"retune = {RETUNE}", "rounds of tuning for the worst case that the certificate finds"))
-    noise = [
-        log.roles.columns[actuator.measured].noise * factor(log.units[actuator.measured], SI_UNITS[actuator.measured])
-        for log in logs
-        if actuator.measured in log.roles.columns
-    ]
-    if noise and max(noise) > 0.0:
-        level = f"{{ {actuator.measured} = {max(noise):.3g} }}"
+    noise = _find_noise(logs, actuator.measured)
+    if noise > 0.0:
+        level = f"{{ {actuator.measured} = {noise:.3g} }}"
         rows.append((f"sensors = {{ noise_std = {level} }}", "of the log, from sample to sample"))
     return rows
 
 
-def _guess_bandwidth(logs: Sequence[DescribedLog]) -> tuple[float, str]:
-    """Return a bandwidth above where the effort's response peaks, or falls off, in the first log that shows it."""
+def _find_resonance(logs: Sequence[DescribedLog]) -> tuple[float | None, str]:
+    """Return where the effort's response peaks or falls off, in the first log that shows it, and why to go above it."""
     for log in logs:
-        signals = log.signals
-        role = next((role for role in ("tau_s", "F1", "F2") if role in signals), None)
-        if role is None or log.survey.clock is None:
+        role = next((role for role in ("tau_s", "F1", "F2") if role in log.signals), None)
+        table = make_table(log, [role]) if role is not None else None
+        if table is None:
             continue
-        table = make_table(log, [role])
-        assert table is not None
-        excitation = assess_quality(table, inputs=[log.roles.input]).excitation
-        for one in excitation.values():
-            if one.rolls_off_hz is not None:
-                place = one.peak_hz or one.rolls_off_hz
-                low, high = USUAL_BANDWIDTHS_HZ
-                guess = min(max(5.0 * round(ABOVE_RESONANCE * place / 5.0), low), high)
-                shown = f"above the resonance, which the log has near {place:.2g} Hz"
-                return guess, shown if one.peak_hz else f"above {place:.2g} Hz, where the response has fallen to half"
-    return DEFAULT_BANDWIDTH_HZ, "a usual one"
+        for band in assess_quality(table, inputs=[log.roles.input]).excitation.values():
+            if band.peak_hz is not None and band.rolls_off_hz is not None:
+                return band.peak_hz, f"above the resonance, which the log has near {band.peak_hz:.2g} Hz"
+            if band.rolls_off_hz is not None:
+                why = f"above {band.rolls_off_hz:.2g} Hz, where the response has fallen to half"
+                return band.rolls_off_hz, why
+    return None, "a typical value"
 
 
 def _spell_column(name: str, unit: str, scale: float) -> str:

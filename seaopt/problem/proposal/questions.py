@@ -1,4 +1,4 @@
-"""Questions that logs leave open, and the answers to them: those that were given, and the guesses for the others."""
+"""Questions that logs leave open, with the answers given, and guesses for the others."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from seaopt.formatting import printable
 from seaopt.records import record
 
 UNKNOWN = "unknown"
-WISHES = (
-    "roles",
-    "bandwidth_hz",
-)  # questions whose guesses are no facts: the one sums others up, the other is asked for
+# Questions whose guesses are no facts: the first sums up others, the second is a requirement.
+WISHES = ("roles", "bandwidth_hz")
 THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})")  # or a German decimal
 
 
 @record
 class Question:
-    """What the logs do not say."""
+    """A question that the logs leave open."""
 
     key: str  # for the answers
     text: str  # in words, with the unit
@@ -41,19 +39,17 @@ class Question:
         return name_entry(self.key)
 
     def read(self, answer: str) -> str:
-        """Return an answer as it counts.
+        """Return an answer as it counts: a choice or the beginning of one, or a number.
 
         Raises ProblemError: it is none of the choices, or no positive number.
         """
         text = answer.strip()
         if self.choices:
-            found = [choice for choice in self.choices if choice.casefold() == text.casefold()]
-            found = found or [
-                choice for choice in self.choices if text and choice.casefold().startswith(text.casefold())
-            ]
-            if len(found) != 1:
+            begins = [choice for choice in self.choices if text and choice.casefold().startswith(text.casefold())]
+            exact = [choice for choice in begins if len(choice) == len(text)]
+            if len(exact or begins) != 1:
                 raise ProblemError(f'"{printable(text)}" is not an answer; {suggestion(text, self.choices)}')
-            return found[0]
+            return (exact or begins)[0]
         if self.open and text.casefold() in (UNKNOWN, "?", "no", "n", "-"):
             return UNKNOWN
         if THOUSANDS.fullmatch(text):
@@ -97,23 +93,24 @@ class Interview:
         return None if answer == UNKNOWN else float(answer)
 
     def assume(self, key: str) -> None:
-        """Note a guess that no answer has put right, be it that nobody was asked or that nobody knew."""
+        """Note a guess that no answer replaces: nobody was asked, or nobody knew."""
         if key not in self.assumed:
             self.assumed.append(key)
 
     def mark(self, *keys: str) -> str:
-        """Return what of these answers is a guess, as the end of a comment."""
+        """Return what of these answers is a guess, as the end of a comment; what is left to the fit is none."""
         reasons = [
             question.why or question.text
             for question in self.questions
-            if question.key in keys and (question.key not in self.answers or question.key in self.assumed)
+            if question.key in keys
+            and (question.key in self.assumed or (question.key not in self.answers and question.guess != UNKNOWN))
         ]
         return f"guessed: {'; '.join(reasons)}" if reasons else ""
 
     def list_guessed(self) -> list[str]:
-        """Return what results rest on and nobody knew: parameters, and other entries such as "unit of F1".
+        """Return the guesses that results rest on: parameters, and other entries such as "unit of F1".
 
-        What nobody knows and a fit finds is none of it, nor is the bandwidth that is asked for.
+        Unknown values that are fitted are not among them, nor is the bandwidth, which is a requirement.
         """
         open_keys = [
             question.key
