@@ -27,17 +27,22 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max
 PlantOrResponse = Annotated[str, StringConstraints(pattern=r"^(frf:)?[A-Za-z][A-Za-z0-9_-]*$", max_length=68)]
 
 
-class ParameterTable(StrictTable):
-    """A value with its unit, and what a fit may do with it."""
+class UnknownTable(StrictTable):
+    """A value that may be fitted."""
 
-    value: Number = key("In `unit`, else in the parameter's own.")
-    unit: str | None = key('Such as "N/mm", "kg m^2", "mN m".', default=None)
+    value: Number = key("The value, or the start of the fit.")
     free: Flag | None = key("Whether it is fitted; also where prior_std is given.", default=None)
-    min: Number | None = key("Least value of a fit.", default=None)
-    max: Number | None = key("Largest value of a fit.", default=None)
+    min: Number | None = key("Least value of the fit.", default=None)
+    max: Number | None = key("Largest value of the fit.", default=None)
     prior_std: Number | None = key(
         "Known within this standard deviation: a prior of the fit, and drawn by the certificate.", default=None
     )
+
+
+class ParameterTable(UnknownTable):
+    """A value with its unit, and what a fit may do with it."""
+
+    unit: str | None = key('Such as "N/mm", "kg m^2", "mN m"; the parameter\'s own if left out.', default=None)
 
 
 class PlantTable(BaseModel):
@@ -241,42 +246,27 @@ class ClockTable(StrictTable):
     """A time column."""
 
     column: Header = key("Header, or number from 1.")
-    unit: str | None = key('"s", "ms", "us"; left out: that in the header\'s brackets.', default=None)
-    file: str | None = key("Which of several logs has it.", default=None)
-    clock_offset_s: Number = key("Added to its times.", default=0.0)
+    unit: str | None = key("Unit of its numbers; that in the header's brackets if left out.", default=None)
+    file: str | None = key("The file that has it, of several logs.", default=None)
+    clock_offset_s: Number = key("Added to the times of its clock.", default=0.0)
     where: dict[str, Annotated[str, Strict()] | Number] | None = key("Rows that count: column and value.", default=None)
 
 
-class ColumnTable(StrictTable):
-    """A column of a log, the way from its numbers to its unit, and for an output its noise."""
+class ColumnTable(ClockTable):
+    """A column of a log, the conversion of its numbers to its unit, and for an output its noise."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False, populate_by_name=True)
 
-    column: Header = key("Header, or number from 1.")
-    unit: str | None = key("Left out: that in the header's brackets.", default=None)
-    scale: Number = key("Numbers are multiplied with it before their unit.", default=1.0)
+    scale: Number = key("Numbers are multiplied by it before their unit.", default=1.0)
     offset: Number = key("Added after the scale, in the unit.", default=0.0)
     wrap_bits: Whole | None = key("Numbers are two's complement of so many bits.", default=None, ge=2, le=53)
-    file: str | None = key("Which of several logs has it.", default=None)
     time: Header | ClockTable | None = key("Its own clock, where it has one.", default=None)
-    clock_offset_s: Number = key("Added to that clock's times.", default=0.0)
-    align: AlignTable | None = key("How it comes to the log's clock.", default=None)
-    where: dict[str, Annotated[str, Strict()] | Number] | None = key("Rows that count: column and value.", default=None)
+    align: AlignTable | None = key("How it is aligned to the log's clock.", default=None)
     source: Literal["header"] | None = key(
         '"header": a constant that the log\'s header states.', default=None, alias="from"
     )
-    shared: Flag = key("Whether another channel is this column, too.", default=False)
+    shared: Flag = key("Whether another channel uses this column, too.", default=False)
     sigma: Number | None = key("Standard deviation of the noise, SI; estimated where left out.", default=None)
-
-
-class UnknownTable(StrictTable):
-    """A value of an experiment that may be estimated."""
-
-    value: Number = key("Start of the fit, or the value.")
-    free: Flag | None = key("Whether it is fitted.", default=None)
-    min: Number | None = key("Least value.", default=None)
-    max: Number | None = key("Largest value.", default=None)
-    prior_std: Number | None = key("Known within this.", default=None)
 
 
 class ExcitationTable(StrictTable):

@@ -1,11 +1,14 @@
-"""What a problem file says about reading a log, as columns, alignment rules and paths."""
+"""How a problem file has a log read: columns, alignment rules and paths."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 from seaopt.errors import ProblemError
 from seaopt.logs import Column, Hold, Linear, Nearest
+from seaopt.logs.log.alignment import Rule
 from seaopt.problem.bench_tables import AlignTable, ClockTable, ColumnTable, ExperimentTable
 
 
@@ -42,39 +45,24 @@ def check_links(folder: Path, names: list[str]) -> None:
             raise ProblemError(f'log = "{name}" is a link out of the problem file\'s folder; put the log beside it')
 
 
-def make_column(table: str | int | ClockTable | ColumnTable, folder: Path) -> Column:
+def make_column(table: str | int | ClockTable, folder: Path) -> Column:
     """Return a column as the reader takes it."""
     if isinstance(table, str | int):
         return Column(column=table)
-    file = None if table.file is None else folder / table.file
-    if isinstance(table, ClockTable):
-        return Column(
-            column=table.column, unit=table.unit, file=file, clock_offset_s=table.clock_offset_s, where=table.where
-        )
-    time = table.time if table.time is None or isinstance(table.time, str | int) else make_column(table.time, folder)
-    return Column(
-        column=table.column,
-        unit=table.unit,
-        scale=table.scale,
-        offset=table.offset,
-        wrap_bits=table.wrap_bits,
-        file=file,
-        time=time,
-        clock_offset_s=table.clock_offset_s,
-        align=make_rule(table.align),
-        where=table.where,
-        from_header=table.source == "header",
-        shared=table.shared,
-    )
+    stated: dict[str, Any] = {name: getattr(table, name) for name in table.model_fields_set - {"source", "sigma"}}
+    if table.file is not None:
+        stated["file"] = folder / table.file
+    if isinstance(table, ColumnTable):
+        if isinstance(table.time, ClockTable):
+            stated["time"] = make_column(table.time, folder)
+        stated |= {"align": make_rule(table.align), "from_header": table.source == "header"}
+    return Column(**stated)
 
 
-def make_rule(table: AlignTable | None) -> Hold | Linear | Nearest | None:
+def make_rule(table: AlignTable | None) -> Rule | None:
     """Return an alignment rule."""
     if table is None:
         return None
-    if table.hold is not None:
-        return Hold(**table.hold.model_dump(exclude_none=True))
-    if table.linear is not None:
-        return Linear(**table.linear.model_dump(exclude_none=True))
-    assert table.nearest is not None
-    return Nearest(tolerance_s=table.nearest.tolerance_s)
+    kinds: dict[str, Callable[..., Rule]] = {"hold": Hold, "linear": Linear, "nearest": Nearest}
+    (name,) = (name for name in kinds if getattr(table, name) is not None)
+    return kinds[name](**getattr(table, name).model_dump(exclude_none=True))

@@ -15,6 +15,7 @@ from pydantic import (
     Discriminator,
     StringConstraints,
     Tag,
+    create_model,
     model_validator,
 )
 
@@ -200,6 +201,7 @@ def _check_ends(ends: tuple[float, float]) -> tuple[float, float]:
 
 
 Range = Annotated[tuple[Number, Number], AfterValidator(_check_ends)]
+OptionalRange = Range | None
 Bound = Range | Number  # a number is the end on the bad side of the figure: an Ms at most, a margin at least
 
 
@@ -219,35 +221,36 @@ class RangeTable(StrictTable):
         return self
 
 
-class FiguresTable(StrictTable):
-    """Figures of a loop: a number is the limit on the bad side, [low, high] a range."""
+FIGURES = {  # of a loop: what a number in [expect] is to each; a band is given by both ends
+    "bandwidth_hz": "at least", "tracking_band_hz": "", "crossover_hz": "at least",
+    "sensitivity_bandwidth_hz": "at least", "ms": "at most", "mt": "at most", "reference_peak": "at most",
+    "droop_db": "at most", "gain_margin_db": "at least", "phase_margin_deg": "at least", "delay_margin_s": "at least",
+    "disk_margin": "at least", "noise_gain": "at most",
+}  # fmt: skip
+WORST_FIGURES = {"worst_ms": "at most", "worst_mt": "at most"}  # at the worst case of a plant
 
-    bandwidth_hz: Bound | None = key("At least, where a number.", default=None)
-    tracking_band_hz: Range | None = key("The loop follows its reference from here to here.", default=None)
-    crossover_hz: Bound | None = key("At least, where a number.", default=None)
-    sensitivity_bandwidth_hz: Bound | None = key("At least, where a number.", default=None)
-    ms: Bound | None = key("Peak of the sensitivity; at most, where a number.", default=None)
-    mt: Bound | None = key("Peak of the complementary sensitivity; at most, where a number.", default=None)
-    reference_peak: Bound | None = key("At most, where a number.", default=None)
-    droop_db: Bound | None = key("At most, where a number.", default=None)
-    gain_margin_db: Bound | None = key("At least, where a number.", default=None)
-    phase_margin_deg: Bound | None = key("At least, where a number.", default=None)
-    delay_margin_s: Bound | None = key("At least, where a number.", default=None)
-    disk_margin: Bound | None = key("At least, where a number.", default=None)
-    noise_gain: Bound | None = key("At most, where a number.", default=None)
+
+def _make_figures(name: str, figures: Mapping[str, str]) -> Any:
+    """Return a table of figures: a number is the limit on the bad side, [low, high] a range."""
+    keys: dict[str, Any] = {}
+    for figure, end in figures.items():
+        text = f"{end.capitalize()}, where a number." if end else "The loop tracks its reference from here to here."
+        keys[figure] = (Bound | None if end else OptionalRange, key(text, default=None))
+    return create_model(name, __base__=StrictTable, __module__=__name__, **keys)
+
+
+class FiguresTable(_make_figures("LoopFiguresTable", FIGURES)):
+    """Figures of a loop: a number is the limit on the bad side, [low, high] a range."""
 
 
 class ExpectedControllerTable(FiguresTable):
-    """What the tuned controller is to be on its design plant."""
+    """Figures of the tuned controller on its design plant."""
 
     feasible: Flag = key("Every limit of [controller] is met.", default=True)
 
 
-class ExpectedPlantTable(FiguresTable):
-    """What a certified plant's loop is to be, at the nominal parameters and at the worst case; sliding and stuck."""
-
-    worst_ms: Bound | None = key("Ms at the worst case found; at most, where a number.", default=None)
-    worst_mt: Bound | None = key("Mt at the worst case found; at most, where a number.", default=None)
+class ExpectedPlantTable(FiguresTable, _make_figures("WorstFiguresTable", WORST_FIGURES)):
+    """Figures of a certified plant's loop, sliding and stuck, at the nominal parameters and at the worst case found."""
 
 
 class ExpectedCertificateTable(StrictTable):

@@ -1,4 +1,4 @@
-"""What a problem file's [expect] asks of its results, one expectation each, for `seaopt run` and the pytest plugin.
+"""The expectations of a problem file's [expect] table, one by one, for `seaopt run` and the pytest plugin.
 
 A number is the limit on the bad side of a figure (an Ms at most, a margin at least), a pair of numbers a range. What
 has a limit in [controller] is judged with that limit's tolerance, everything else to a millionth.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Literal
 
@@ -16,11 +16,10 @@ from seaopt.control import LoopFigures
 from seaopt.control.laws.limits import BY_NAME, LIMIT_ROUNDING
 from seaopt.formatting import format_band, format_figure, join_words
 from seaopt.problem import Problem, Stages
-from seaopt.problem.schema import FiguresTable, RangeTable
+from seaopt.problem.schema import FIGURES, WORST_FIGURES, FiguresTable, RangeTable
 from seaopt.records import record
 from seaopt.units import factor, unit_after
 
-AT_MOST = ("ms", "mt", "reference_peak", "droop_db", "noise_gain", "worst_ms", "worst_mt")
 UNITS = {"hz": "Hz", "db": "dB", "deg": "deg", "s": "s"}  # by how a figure's name ends
 LIMITS = {  # of [controller], by figure
     "bandwidth_hz": "bandwidth_hz", "sensitivity_bandwidth_hz": "min_sensitivity_bandwidth_hz", "ms": "max_sensitivity",
@@ -36,7 +35,7 @@ Ends = float | tuple[float, float]
 
 @record
 class Judgement:
-    """A figure against what was asked of it, in words, and what to do where it is not met."""
+    """A figure and the limit asked of it, in words, and what to do where it is not met."""
 
     met: bool
     found: str
@@ -96,153 +95,128 @@ def list_expectations(problem: Problem) -> list[Expectation]:
     []
 
     """
-    if problem.table.expect is None:
+    expect = problem.table.expect
+    if expect is None:
         return []
-    return [*_of_fit(problem), *_of_controller(problem), *_of_certificate(problem)]
+    expectations: list[Expectation] = []
 
+    def add(
+        stage: Literal["fit", "controller", "certificate"], name: str, judge: Callable[..., Judgement], *asked: Any
+    ) -> None:
+        expectations.append(Expectation(name=name, stage=stage, judge=partial(judge, *asked)))
 
-def _of_fit(problem: Problem) -> Iterator[Expectation]:
-    asked = problem.table.expect
-    assert asked is not None
     if problem.table.experiment:
-        yield Expectation(name="fit_met", stage="fit", judge=partial(_judge_fit, wanted=asked.fit_met))
-    for parameter, limits in asked.parameters.items():
-        judge = partial(_judge_parameter, parameter=parameter, limits=limits, source=problem.source)
-        yield Expectation(name=f"parameters.{parameter}", stage="fit", judge=judge)
-    for experiment, limits in asked.fit_percent.items():
+        add("fit", "fit_met", _judge_met, "fit", expect.fit_met)
+    for parameter, limits in expect.parameters.items():
+        add("fit", f"parameters.{parameter}", _judge_parameter, parameter, limits)
+    for experiment, limits in expect.fit_percent.items():
         for output, ends in (limits if isinstance(limits, dict) else {"": limits}).items():
             name = ".".join(filter(None, ("fit_percent", experiment, output)))
-            judge = partial(_judge_percent, experiment=experiment, output=output, ends=ends, source=problem.source)
-            yield Expectation(name=name, stage="fit", judge=judge)
+            add("fit", name, _judge_percent, experiment, output, ends)
+    if expect.controller is not None:
+        add("controller", "controller.feasible", _judge_met, "controller", expect.controller.feasible)
+        for figure, ends in _list_limits(expect.controller):
+            add("controller", f"controller.{figure}", _judge_design, figure, ends)
+    if expect.certificate is not None:
+        add("certificate", "certificate.passed", _judge_met, "certificate", expect.certificate.passed)
+        if expect.certificate.failure_probability is not None:
+            most = expect.certificate.failure_probability
+            add("certificate", "certificate.failure_probability", _judge_probability, most)
+        for plant, figures in expect.certificate.plants.items():
+            for figure, ends in _list_limits(figures):
+                add("certificate", f"certificate.plants.{plant}.{figure}", _judge_plant, plant, figure, ends)
+    return expectations
 
 
-def _of_controller(problem: Problem) -> Iterator[Expectation]:
-    asked = problem.table.expect.controller if problem.table.expect is not None else None
-    if asked is None:
-        return
-    judge = partial(_judge_feasible, wanted=asked.feasible)
-    yield Expectation(name="controller.feasible", stage="controller", judge=judge)
-    for figure, ends in _list_asked(asked):
-        judge = partial(_judge_design, figure=figure, ends=ends)
-        yield Expectation(name=f"controller.{figure}", stage="controller", judge=judge)
+def _list_limits(figures: FiguresTable) -> list[tuple[str, Ends]]:
+    """Return the figures that a table names, with their limits."""
+    limits = {name: getattr(figures, name) for name in type(figures).model_fields}
+    return [(name, ends) for name, ends in limits.items() if ends is not None and not isinstance(ends, bool)]
 
 
-def _of_certificate(problem: Problem) -> Iterator[Expectation]:
-    asked = problem.table.expect.certificate if problem.table.expect is not None else None
-    if asked is None:
-        return
-    judge = partial(_judge_passed, wanted=asked.passed)
-    yield Expectation(name="certificate.passed", stage="certificate", judge=judge)
-    if asked.failure_probability is not None:
-        judge = partial(_judge_probability, most=asked.failure_probability)
-        yield Expectation(name="certificate.failure_probability", stage="certificate", judge=judge)
-    for plant, figures in asked.plants.items():
-        for figure, ends in _list_asked(figures):
-            judge = partial(_judge_plant, plant=plant, figure=figure, ends=ends)
-            yield Expectation(name=f"certificate.plants.{plant}.{figure}", stage="certificate", judge=judge)
-
-
-def _list_asked(figures: FiguresTable) -> list[tuple[str, Ends]]:
-    """Return the figures that a table asks for, with their limits."""
-    asked = {name: getattr(figures, name) for name in type(figures).model_fields}
-    return [(name, ends) for name, ends in asked.items() if ends is not None and not isinstance(ends, bool)]
-
-
-def _judge_fit(results: Stages, wanted: bool) -> Judgement:
-    assert results.fit is not None
-    return _judge_flag(results.fit.met, wanted, results.fit.verdict)
-
-
-def _judge_feasible(results: Stages, wanted: bool) -> Judgement:
-    assert results.controller is not None
-    return _judge_flag(results.controller.feasible, wanted, results.controller.explanation)
-
-
-def _judge_passed(results: Stages, wanted: bool) -> Judgement:
-    assert results.certificate is not None
-    broken = [str(row) for row in results.certificate.requirements if not row.met]
-    more = [f"{len(broken) - SHOWN} more in robustness.json"] if len(broken) > SHOWN else []
-    return _judge_flag(results.certificate.passed, wanted, "; ".join([*broken[:SHOWN], *more]))
-
-
-def _judge_flag(found: bool, wanted: bool, remedy: str) -> Judgement:
+def _judge_met(stage: str, wanted: bool, results: Stages) -> Judgement:
+    """Judge whether a result is met, as it should be or should not."""
+    result = getattr(results, stage)
+    if stage == "certificate":
+        broken = [str(row) for row in result.requirements if not row.met]
+        more = [f"{len(broken) - SHOWN} more in robustness.json"] if len(broken) > SHOWN else []
+        remedy = "; ".join([*broken[:SHOWN], *more])
+    else:
+        remedy = result.verdict if stage == "fit" else result.explanation
     words = {True: "yes", False: "no"}
-    return Judgement(met=found is wanted, found=words[found], asked=words[wanted], remedy=remedy)
+    return Judgement(met=result.met is wanted, found=words[result.met], asked=words[wanted], remedy=remedy)
 
 
-def _judge_parameter(
-    results: Stages, parameter: str, limits: tuple[float, float] | RangeTable, source: str
-) -> Judgement:
+def _judge_parameter(parameter: str, limits: tuple[float, float] | RangeTable, results: Stages) -> Judgement:
     assert results.fit is not None
-    fit = results.fit
-    low, high, unit = _read_range(limits)
-    one = fit.parameters[parameter] if parameter in fit.parameters else fit.derived.get(parameter)
-    if one is None:
-        asked = _format_ends((low, high), unit or "")
-        return Judgement(met=False, found="nothing", asked=asked, remedy="no experiment that is fitted has it")
-    unit, scale = (one.unit, 1.0) if unit is None else (unit, factor(one.unit, unit))
-    value, std = one.value * scale, None if one.std is None else one.std * scale
+    if isinstance(limits, RangeTable):
+        low = -math.inf if limits.min is None else limits.min
+        ends, unit = (low, math.inf if limits.max is None else limits.max), limits.unit
+    else:
+        ends, unit = limits, None
+    estimate = {**results.fit.derived, **results.fit.parameters}.get(parameter)
+    if estimate is None:
+        remedy = "no experiment that is fitted has it"
+        return Judgement(met=False, found="nothing", asked=_format_ends(ends, unit or ""), remedy=remedy)
+    unit, scale = (estimate.unit, 1.0) if unit is None else (unit, factor(estimate.unit, unit))
+    value, std = estimate.value * scale, None if estimate.std is None else estimate.std * scale
     identified = std is None or math.isfinite(std)
-    again = f'"seaopt run {shlex.quote(source)}"'
-    remedy = f"{again} reports what the fit rests on; widen the range if the actuator is as it should be"
-    if not identified:
+    if identified:
+        remedy = (
+            f"{_spell_run(results)} reports what the fit rests on; widen the range if the actuator is as it should be"
+        )
+    else:
         remedy = f"the logs do not identify {parameter}; excite it, or give its value"
     return Judgement(
-        met=identified and _inside(value, (low, high)),
+        met=identified and _inside(value, ends),
         found=f"{value:.5g}" + ("" if std is None else f" ± {std:.2g}") + unit_after(unit),
-        asked=_format_ends((low, high), unit),
+        asked=_format_ends(ends, unit),
         remedy=remedy,
     )
 
 
-def _read_range(limits: tuple[float, float] | RangeTable) -> tuple[float, float, str | None]:
-    """Return the ends of a range, infinite where it has none, and the unit they are in, None for the figure's own."""
-    if not isinstance(limits, RangeTable):
-        return *limits, None
-    low = -math.inf if limits.min is None else limits.min
-    return low, math.inf if limits.max is None else limits.max, limits.unit
+def _spell_run(results: Stages) -> str:
+    return f'"seaopt run {shlex.quote(results.problem.source)}"'
 
 
-def _judge_percent(results: Stages, experiment: str, output: str, ends: Ends, source: str) -> Judgement:
+def _judge_percent(experiment: str, output: str, ends: Ends, results: Stages) -> Judgement:
     assert results.fit is not None
-    fitted = {name: row.fit_percent for name, row in results.fit.outputs.get(experiment, {}).items()}
-    scored = {} if fitted else {one.name: one.fit_percent for one in results.scores}
-    percents = fitted or scored.get(experiment, {})
+    percents = {name: row.fit_percent for name, row in results.fit.outputs.get(experiment, {}).items()}
+    if not percents:
+        percents = next((score.fit_percent for score in results.scores if score.name == experiment), {})
     values = {name: value for name, value in percents.items() if output in ("", name)}
-    remedy = (
-        f'"seaopt run {shlex.quote(source)}" shows the residuals of {experiment}, and what may be missing in the model'
-    )
+    remedy = f"{_spell_run(results)} shows the residuals of {experiment}, and what may be missing in the model"
     if not values:
         remedy = f"{experiment} measures {join_words(list(percents))}"
     return _judge_values(values, _span(ends, at_most=False), "%", remedy)
 
 
-def _judge_design(results: Stages, figure: str, ends: Ends) -> Judgement:
+def _judge_design(figure: str, ends: Ends, results: Stages) -> Judgement:
     assert results.controller is not None
     remedy = "a larger min_disk_margin or a lower bandwidth_hz in [controller] raises it"
     if figure in BANDS:
         remedy = FASTER
     elif figure in LIMITS:
-        asked = ends if not isinstance(ends, tuple) else ends[1] if figure in AT_MOST else ends[0]
-        remedy = f"ask the tuner for it: {LIMITS[figure]} = {asked:g} in [controller]"
+        limit = ends if not isinstance(ends, tuple) else ends[1] if FIGURES[figure] == "at most" else ends[0]
+        remedy = f"ask the tuner for it: {LIMITS[figure]} = {limit:g} in [controller]"
     return _judge_figure({"": _measure(results.controller.achieved, figure)}, figure, ends, remedy)
 
 
-def _judge_probability(results: Stages, most: float) -> Judgement:
+def _judge_probability(most: float, results: Stages) -> Judgement:
     assert results.certificate is not None
     draws = results.certificate.monte_carlo
-    few = "raise samples in [robustness]" if not draws.failures else f"{draws.failures} of {draws.samples} draws fail"
-    return _judge_values({"": draws.failure_probability_bound}, (-math.inf, most), "", few)
+    remedy = f"{draws.failures} of {draws.samples} draws fail" if draws.failures else "raise samples in [robustness]"
+    return _judge_values({"": draws.failure_probability_bound}, (-math.inf, most), "", remedy)
 
 
-def _judge_plant(results: Stages, plant: str, figure: str, ends: Ends) -> Judgement:
-    """Judge a figure of a plant, of one with friction both sliding and stuck."""
+def _judge_plant(plant: str, figure: str, ends: Ends, results: Stages) -> Judgement:
+    """Judge a figure of a plant, sliding and stuck where it has friction."""
     assert results.certificate is not None
     loops, worst = results.certificate.plants, results.certificate.worst
     states = [state for state in loops if state in (plant, f"{plant} sliding", f"{plant} stuck")]
     values = {
         state: getattr(worst[state], figure.removeprefix("worst_"))
-        if figure.startswith("worst_")
+        if figure in WORST_FIGURES
         else _measure(loops[state], figure)
         for state in states
     }
@@ -266,21 +240,15 @@ def _measure(figures: LoopFigures, figure: str) -> Any:
 
 
 def _judge_figure(values: Mapping[str, Any], figure: str, ends: Ends, remedy: str) -> Judgement:
-    if figure == "tracking_band_hz":
-        assert isinstance(ends, tuple)
-        return _judge_band(values, ends, remedy)
-    tolerance = BY_NAME[LIMITS[figure]].tolerance if figure in LIMITS else LIMIT_ROUNDING
-    unit = UNITS.get(figure.rpartition("_")[2], "")
-    return _judge_values(values, _span(ends, at_most=figure in AT_MOST), unit, remedy, tolerance)
-
-
-def _judge_band(values: Mapping[str, tuple[float, float] | None], asked: tuple[float, float], remedy: str) -> Judgement:
-    """Judge bands by place, each of which is to contain the one that is asked for."""
+    if figure != "tracking_band_hz":
+        tolerance = BY_NAME[LIMITS[figure]].tolerance if figure in LIMITS else LIMIT_ROUNDING
+        unit, at_most = UNITS.get(figure.rpartition("_")[2], ""), (FIGURES | WORST_FIGURES)[figure] == "at most"
+        return _judge_values(values, _span(ends, at_most=at_most), unit, remedy, tolerance)
+    assert isinstance(ends, tuple)  # every plant's band is to contain it
     return Judgement(
-        met=bool(values)
-        and all(band is not None and _inside(asked[0], band) and _inside(asked[1], band) for band in values.values()),
+        met=bool(values) and all(band and all(_inside(end, band) for end in ends) for band in values.values()),
         found=_format_places({place: format_band(band, "Hz") for place, band in values.items()}),
-        asked=f"one that contains {format_band(asked, 'Hz')}",
+        asked=f"one that contains {format_band(ends, 'Hz')}",
         remedy=remedy,
     )
 
@@ -288,7 +256,7 @@ def _judge_band(values: Mapping[str, tuple[float, float] | None], asked: tuple[f
 def _judge_values(
     values: Mapping[str, float], ends: tuple[float, float], unit: str, remedy: str, tolerance: float = LIMIT_ROUNDING
 ) -> Judgement:
-    """Judge figures by place, all of which are to be inside."""
+    """Judge figures by plant, all of which are to be inside."""
     return Judgement(
         met=bool(values) and all(_inside(value, ends, tolerance) for value in values.values()),
         found=_format_places({place: format_figure(value, unit, 5) for place, value in values.items()}),
