@@ -20,6 +20,7 @@ from seaopt.plants import Actuation, Friction, Mode, Plant, Port, Sensing, Serie
 from seaopt.plants.equations.expressions import MAX_LENGTH, RESERVED, list_names, parse
 from seaopt.plants.equations.stored_equations import StoredFunction, store_function
 from seaopt.problem.bench_tables import AnyPlant, EquationsTable, Formula, FrictionTable, PortTable
+from seaopt.problem.option_tables import StrictTable
 from seaopt.records import record
 from seaopt.units import factor, si_unit
 
@@ -84,7 +85,7 @@ def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) 
         energy=texts.of_states("energy", table.energy),
         optional_inputs=frozenset(table.optional_inputs),
         actuation=texts.actuate(),
-        sensing=_sense(table),
+        sensing=None if table.sensing is None else Sensing(**_list_fields(table.sensing)),
         spring=texts.spring(),
         ports=tuple(texts.port(f"ports.{number}", port, partners) for number, port in enumerate(table.ports, 1)),
         friction={key: texts.rub(f"friction.{key}", curve) for key, curve in table.friction.items()},
@@ -185,96 +186,74 @@ class _Texts:
         """Return a formula of states and parameters as a function; None where there is none."""
         return None if text is None else self.store(lambda read: read(place, text), self.states, self.parameters)
 
-    def of_parameters(self, place: str, text: Formula) -> StoredFunction:
-        """Return a formula of the parameters as a function."""
-        return self.store(lambda read: read(place, text), self.parameters)
+    def of_parameters(self, place: str, text: Formula | None) -> Any:
+        """Return a formula of the parameters as a function; None where there is none."""
+        return None if text is None else self.store(lambda read: read(place, text), self.parameters)
 
     def derive(self) -> StoredFunction | None:
         """Return the function of the derived figures."""
         figures = self.table.derived
-        return (
-            self.store(
-                lambda read: {
-                    key: (read(f"derived.{key}", figure.value), figure.unit) for key, figure in figures.items()
-                },
-                self.parameters,
-            )
-            if figures
-            else None
-        )
+
+        def write(read: Read) -> dict[str, Any]:
+            return {name: (read(f"derived.{name}", figure.value), figure.unit) for name, figure in figures.items()}
+
+        return self.store(write, self.parameters) if figures else None
 
     def actuate(self) -> Actuation | None:
         """Return what a controller commands."""
         role = self.table.actuation
-        return (
-            None
-            if role is None
-            else Actuation(
-                input=role.input,
-                effort=self.of_parameters("actuation.effort", role.effort),
-                unit=role.unit,
-                efficiency=role.efficiency,
-                speed=self.of_states("actuation.speed", role.speed),
-                largest=None if role.largest is None else self.of_parameters("actuation.largest", role.largest),
-            )
-        )
+        if role is None:
+            return None
+        functions: dict[str, Any] = {
+            "effort": self.of_parameters("actuation.effort", role.effort),
+            "speed": self.of_states("actuation.speed", role.speed),
+            "largest": self.of_parameters("actuation.largest", role.largest),
+        }
+        return Actuation(**_list_fields(role) | functions)
 
     def spring(self) -> SeriesSpring | None:
         """Return the elastic element."""
         role = self.table.spring
-        return (
-            None
-            if role is None
-            else SeriesSpring(
-                deflection=self.of_states("spring.deflection", role.deflection),
-                unit=role.unit,
-                stiffness=role.stiffness,
-                mass=role.mass,
-                damping=role.damping,
-            )
-        )
+        if role is None:
+            return None
+        return SeriesSpring(**_list_fields(role) | {"deflection": self.of_states("spring.deflection", role.deflection)})
 
     def port(self, place: str, role: PortTable, partners: Mapping[str, Plant]) -> Port:
         """Return a port; the plants that it names are made already."""
-        makers = {
-            what: None if name is None else lambda name=name: partners[name]
-            for what, name in (("held", role.held), ("probe", role.probe))
+        makers: dict[str, Any] = {
+            key: None if name is None else lambda name=name: partners[name]
+            for key, name in (("held", role.held), ("probe", role.probe))
         }
-        return Port(
-            motion=role.motion,
-            coordinate=role.coordinate,
-            rate=role.rate,
-            effort=role.effort,
-            payload=tuple(role.payload),
-            drive=role.drive,
-            ratio=self.of_parameters(f"{place}.ratio", role.ratio),
-            **makers,
-        )
+        return Port(**_list_fields(role) | makers | {"ratio": self.of_parameters(f"{place}.ratio", role.ratio)})
 
     def rub(self, place: str, role: FrictionTable) -> Friction:
         """Return a friction."""
         known = (*self.parameters, *role.loads)
 
-        def curve(what: str, text: Formula) -> StoredFunction:
-            return self.store(lambda read: read(f"{place}.{what}", text), VELOCITY, known)
+        def curve(key: str, text: Formula) -> StoredFunction:
+            return self.store(lambda read: read(f"{place}.{key}", text), VELOCITY, known)
 
-        def load(read: Read) -> dict[str, Any]:
+        def write_slopes(read: Read) -> tuple[Any, ...]:
+            return tuple(read(f"{place}.slopes", text) for text in role.slopes or ())
+
+        def write_loads(read: Read) -> dict[str, Any]:
             return {name: read(f"{place}.loads.{name}", text) for name, text in role.loads.items()}
 
-        slopes = role.slopes
-        return Friction(
-            velocity=self.of_states(f"{place}.velocity", role.velocity),
-            force=curve("force", role.force),
-            unit=role.unit,
-            effort=self.of_parameters(f"{place}.effort", role.effort),
-            slopes=None
-            if slopes is None
-            else self.store(lambda read: tuple(read(f"{place}.slopes", text) for text in slopes), known),
-            jump=None if role.jump is None else curve("jump", role.jump),
-            smoothing=role.smoothing,
-            loads=self.store(load, self.states, tuple(self.table.inputs), self.parameters) if role.loads else None,
-            rated=role.rated,
-        )
+        loaded_by = (self.states, tuple(self.table.inputs), self.parameters)
+        functions: dict[str, Any] = {
+            "velocity": self.of_states(f"{place}.velocity", role.velocity),
+            "force": curve("force", role.force),
+            "effort": self.of_parameters(f"{place}.effort", role.effort),
+            "slopes": None if role.slopes is None else self.store(write_slopes, known),
+            "jump": None if role.jump is None else curve("jump", role.jump),
+            "loads": self.store(write_loads, *loaded_by) if role.loads else None,
+        }
+        return Friction(**_list_fields(role) | functions)
+
+
+def _list_fields(table: StrictTable) -> dict[str, Any]:
+    """Return the keys of a role's table, which are the fields of the role."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in table}
 
 
 def _list_kinds(table: EquationsTable) -> dict[str, str]:
@@ -283,19 +262,6 @@ def _list_kinds(table: EquationsTable) -> dict[str, str]:
     for group, kind in KINDS.items():
         kinds |= dict.fromkeys(getattr(table, group), kind)
     return kinds
-
-
-def _sense(table: EquationsTable) -> Sensing | None:
-    if table.sensing is None:
-        return None
-    given = table.sensing
-    return Sensing(
-        regulated=tuple(given.regulated),
-        motor_position=given.motor_position,
-        motor_speed=given.motor_speed,
-        link_position=given.link_position,
-        from_encoders=tuple(given.from_encoders),
-    )
 
 
 def _declare(name: str, declared: Any) -> str | Parameter:

@@ -43,7 +43,7 @@ from seaopt.problem.columns import check_links, list_log_files, make_column, mak
 from seaopt.problem.equations import list_partners, list_unused, order_plants
 from seaopt.problem.option_tables import make_record
 from seaopt.problem.references import RESPONSE, guess_remarks, range_remarks
-from seaopt.problem.schema import ProblemTable, RobustnessTable, ScheduleTable
+from seaopt.problem.schema import ControllerTable, ProblemTable, RobustnessTable, ScheduleTable
 from seaopt.records import record
 from seaopt.robustness import place_value
 from seaopt.signals import Signal
@@ -101,21 +101,26 @@ class Problem:
             "holdout": table.holdout,
         }
 
-    def _ask_for_controller(self) -> str:
-        """Return what to say where the file has no controller: what is wrong in it, or the least table of one."""
-        if self.refused:
-            return self.refused
-        table = f'controller = {{ plant = "{next(iter(self.plants), "stand")}", bandwidth_hz = 30 }}'
-        return f"{self.source}: has no [controller]; add one to tune or certify: {table}"
+    @property
+    def asked(self) -> ControllerTable:
+        """The file's [controller].
+
+        Raises
+        ------
+        ProblemError
+            There is none; the message says what is wrong in it, or has the least table of one.
+
+        """
+        if self.table.controller is not None:
+            return self.table.controller
+        least = f'controller = {{ plant = "{next(iter(self.plants), "stand")}", bandwidth_hz = 30 }}'
+        raise ProblemError(self.refused or f"{self.source}: has no [controller]; add one to tune or certify: {least}")
 
     @property
     def design_plant(self) -> Plant:
         """The plant that the controller is designed on; of a measured response, what was on the bench."""
-        if self.table.controller is None:
-            raise ProblemError(self._ask_for_controller())
-        name: str = self.table.controller.plant
         on_bench = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in self.table.experiment}
-        return self.plants[on_bench.get(name, name)]
+        return self.plants[on_bench.get(self.asked.plant, self.asked.plant)]
 
     @property
     def schedule(self) -> ScheduleTable | None:
@@ -145,31 +150,24 @@ class Problem:
             A log cannot be read, or does not allow a frequency response.
 
         """
-        out: dict[str, MeasuredResponse] = {}
+        responses: dict[str, MeasuredResponse] = {}
         for name in self.response_names:
             table = next(experiment for experiment in self.table.experiment if f"{RESPONSE}{experiment.name}" == name)
             try:
-                out[name] = self._measure_response(self._make_experiment(table), source)
+                experiment = self._make_experiment(table)
+                responses[name] = measure_response(
+                    experiment.plant,
+                    experiment.log,
+                    list_names(self.asked.measured)[0],
+                    name=experiment.name,
+                    confidence=self.asked.frf_confidence,
+                    clock=Clock(
+                        period=experiment.log.period, hold=experiment.hold, delay_s=_find_delay(experiment, source)
+                    ),
+                )
             except SeaoptError as error:
                 raise type(error)(f"{self.source}: {name}: {error}") from error
-        return out
-
-    def _measure_response(self, experiment: Experiment, source: Fit | ParameterSet) -> MeasuredResponse:
-        controller, given = self.table.controller, experiment.delay_s
-        assert controller is not None
-        known = given.value if isinstance(given, Parameter) else given
-        if isinstance(given, Parameter) and given.free:
-            known = 0.0
-        if isinstance(source, Fit) and experiment.name in source.nuisance:
-            known = source.nuisance[experiment.name].delay_s
-        return measure_response(
-            experiment.plant,
-            experiment.log,
-            list_names(controller.measured)[0],
-            name=experiment.name,
-            confidence=controller.frf_confidence,
-            clock=Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known),
-        )
+        return responses
 
     @property
     def notes(self) -> list[str]:
@@ -211,10 +209,7 @@ class Problem:
 
     def certified_plants(self) -> dict[str, Plant]:
         """Return the design plant and those of [robustness], by name; none where all is measured."""
-        if self.table.controller is None:
-            raise ProblemError(self._ask_for_controller())
-        names = [self.table.controller.plant, *self.table.controller.robust_to]
-        names = [name for name in names if not name.startswith(RESPONSE)]
+        names = [name for name in (self.asked.plant, *self.asked.robust_to) if not name.startswith(RESPONSE)]
         names += [] if self.table.impedance is None else [self.table.impedance.plant]
         if not self.designs_on_response or self.table.robustness is not None:
             names += self.robustness.plants
@@ -244,31 +239,30 @@ class Problem:
 
         Each is behind the drive of its own experiments; the delays are as in `values`.
         """
-        out: dict[str, tuple[Plant, ParameterSet]] = {}
-        parameters, spec = self.values(source, spec), spec or self.spec or self.mpc
+        spec = spec or self.spec or self.mpc
         if spec is None:
-            return out
-        plants = take_own_delays(spec, self.design_plant, self.plants, source)
-        for name in self.table.controller.robust_to if self.table.controller else []:
+            return {}
+        pairs: dict[str, tuple[Plant, ParameterSet]] = {}
+        parameters, plants = self.values(source, spec), take_own_delays(spec, self.design_plant, self.plants, source)
+        for name in self.asked.robust_to:
             if name.startswith(RESPONSE):
                 continue
             plant = plants[name]
             values = plant.complete(parameters).drop_conditions()
-            out[name] = (plant, values)
+            pairs[name] = (plant, values)
             for parameter, ends in self.ranges.items():
                 for end in ends:
                     corner = place_value(plant, values, parameter, end, self.certified_plants())
                     if corner is not None:
-                        out[f"{name}, {parameter} = {end:g}"] = (plant, corner)
-        return out
+                        pairs[f"{name}, {parameter} = {end:g}"] = (plant, corner)
+        return pairs
 
     def draws(self, source: Fit | ParameterSet) -> list[dict[str, float]]:
         """Return the draws of parameters at which the controller must hold while it is tuned."""
-        count = self.table.controller.draws if self.table.controller else 0
-        if self.spec is None or not count:
+        if self.spec is None or not self.asked.draws:
             return []
         drive = find_drive(self.spec, self.design_plant, source)
-        return draw_values(source, count, self.robustness.seed, self.ranges, drive)
+        return draw_values(source, self.asked.draws, self.robustness.seed, self.ranges, drive)
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Read the logs, and make the virtual ones.
@@ -426,6 +420,16 @@ class Problem:
             seed=table.seed,
             sensors=make_record(Sensors, table),
         )
+
+
+def _find_delay(experiment: Experiment, source: Fit | ParameterSet) -> float:
+    """Return the delay that an experiment is known to have: fitted or given; none where it is still to be fitted."""
+    if isinstance(source, Fit) and experiment.name in source.nuisance:
+        return source.nuisance[experiment.name].delay_s
+    delay = experiment.delay_s
+    if isinstance(delay, Parameter):
+        return 0.0 if delay.free else delay.value
+    return delay
 
 
 def name_after(stem: str) -> str:

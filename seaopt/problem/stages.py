@@ -115,10 +115,10 @@ def simulate_experiment(problem: Problem, experiment: Experiment) -> Log:
         "initial_state": None if isinstance(start, str) else start,
         "hold": experiment.hold,
     }
-    log, plant = experiment.log, experiment.plant
+    log = experiment.log
     clock = log.time - log.time[0]
     stretches = [log.between(float(clock[p.start]), float(clock[p.stop - 1])) for p in log.segments]
-    pieces = [simulate(plant, problem.parameters, stretch, **options) for stretch in stretches]
+    pieces = [simulate(experiment.plant, problem.parameters, stretch, **options) for stretch in stretches]
     signals = {
         name: Signal(name=name, values=np.concatenate([piece[name] for piece in pieces]), unit=signal.unit)
         for name, signal in pieces[0].signals.items()
@@ -170,10 +170,10 @@ def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> 
 
 def tune_problem(
     problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore, executor: Executor | None = None
-) -> Controller | JointTuning:
-    """Tune the problem's controller, as `seaopt tune` does; with `retune`, until it is certified.
+) -> Controller | JointTuning | ScheduledController:
+    """Tune the problem's controller or schedule, as `seaopt tune` does; with `retune`, until it is certified.
 
-    Of predictive control it is the law while no limit is active; `design_mpc` returns all of it.
+    With predictive control it is the law while no limit is active; `design_mpc` returns all of it.
 
     Parameters
     ----------
@@ -184,18 +184,29 @@ def tune_problem(
     progress : callable, optional
         As in `seaopt.tune`.
     executor : concurrent.futures.Executor, optional
-        Of the certificates, with `retune`; as in `seaopt.certify`.
+        For the certificates, with `retune`; as in `seaopt.certify`.
 
     """
-    _refuse_schedule(problem, "tuned")
     if problem.mpc is not None:
         return linear_controller(design_mpc(problem, source))
     design, robust_to = list_plants(problem, source)
     assert problem.spec is not None
-    (spec, _), table = settle_delays(problem.spec, problem.design_plant, source), problem.robustness
-    draws = problem.draws(source)
+    spec, draws = settle_delays(problem.spec, problem.design_plant, source)[0], problem.draws(source)
+    values, schedule, table = problem.values(source), problem.schedule, problem.robustness
+    if schedule is not None:
+        return tune_schedule(
+            problem.design_plant,
+            values,
+            spec,
+            schedule.over,
+            schedule.points,
+            robust_to,
+            bandwidths_hz=schedule.bandwidth_hz,
+            draws=draws,
+            progress=progress,
+        )
     if not table.retune:
-        tuned = tune(design, problem.values(source), spec, robust_to, draws=draws, progress=progress)
+        tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
         return complete_controller(problem, tuned, source)
     if problem.response_names:
         raise ProblemError(
@@ -208,7 +219,7 @@ def tune_problem(
         spec,
         problem.certified_plants(),
         ranges=problem.ranges,
-        robust_to=problem.robust_to(source),
+        robust_to=robust_to,
         draws=draws,
         others=problem.parameters,
         samples=table.samples,
@@ -223,109 +234,35 @@ def tune_problem(
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
     """Return a controller with the problem's outer loop, its plausibility gate, and with what it compensates.
 
-    Raises SeaoptError: as `add_outer_loop` and `seaopt.control.add_compensation`.
+    Raises SeaoptError: as `seaopt.control.add_compensation`, or the stiffness has no critically damped impedance.
     """
-    controller = add_outer_loop(problem, controller, source)
+    outer, values = problem.table.impedance, problem.values(source)
+    if outer is not None:
+        plant, filter_s = problem.plants[outer.plant], outer.velocity_filter_s
+        if outer.damping == "critical":
+            impedance = critical_impedance(controller, plant, values, outer.stiffness, velocity_filter_s=filter_s)
+        else:
+            impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
+        controller = add_impedance(controller, plant, values, impedance, name=outer.plant)
     controller = replace(controller, gate=_make_gate(problem, controller))
-    assert problem.table.controller is not None
-    compensation = problem.table.controller.compensation
-    if compensation.friction is None and compensation.gravity is None and compensation.ripple is None:
+    tables = problem.asked.compensation
+    kinds = {"friction": CompensateFriction, "gravity": CompensateGravity, "ripple": CompensateRipple}
+    terms = {name: make_record(kind, table) for name, kind in kinds.items() if (table := getattr(tables, name))}
+    if not terms:
         return controller
-    link = None
-    if compensation.gravity is not None and compensation.gravity.plant is not None:
-        link = problem.plants[compensation.gravity.plant], problem.values(source)
-    return add_compensation(
-        controller,
-        friction=None if compensation.friction is None else make_record(CompensateFriction, compensation.friction),
-        gravity=None if compensation.gravity is None else make_record(CompensateGravity, compensation.gravity),
-        ripple=None if compensation.ripple is None else make_record(CompensateRipple, compensation.ripple),
-        link=link,
-    )
+    link = tables.gravity and tables.gravity.plant
+    return add_compensation(controller, **terms, link=(problem.plants[link], values) if link else None)
 
 
 def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> PlausibilityGate | None:
     """Return the gate that the file asks for; None where it asks for none."""
-    assert problem.table.controller is not None
-    table = problem.table.controller.gate
+    table = problem.asked.gate
     if table is None:
         return None
     try:
         return PlausibilityGate.of_controller(controller, **table.model_dump())
     except ControlError as error:
         raise ProblemError(f"{problem.source}: controller.gate: {error}") from error
-
-
-def _refuse_schedule(problem: Problem, done: str) -> None:
-    """Refuse to make one law of a problem that asks for a schedule."""
-    if problem.schedule is not None:
-        raise ProblemError(
-            f"{problem.source}: has a [controller.schedule], of which no one law is {done}; take it out for one law "
-            "for all"
-        )
-
-
-def tune_schedule_problem(
-    problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore
-) -> ScheduledController:
-    """Tune the problem's schedule, as `seaopt tune` does where there is a [controller.schedule]."""
-    assert problem.spec is not None and problem.schedule is not None
-    (spec, _), schedule = settle_delays(problem.spec, problem.design_plant, source), problem.schedule
-    values = problem.values(source)
-    return tune_schedule(
-        problem.design_plant,
-        values,
-        spec,
-        schedule.over,
-        schedule.points,
-        problem.robust_to(source),
-        bandwidths_hz=schedule.bandwidth_hz,
-        draws=problem.draws(source),
-        progress=progress,
-    )
-
-
-def certify_schedule_problem(
-    problem: Problem,
-    schedule: ScheduledController,
-    source: Fit | ParameterSet,
-    progress: Progress = ignore,
-    executor: Executor | None = None,
-) -> ScheduleCertificate:
-    """Certify a schedule on the problem's plants, simulations included, as `seaopt certify` does."""
-    table = problem.robustness
-    assert problem.schedule is not None
-    plants = problem.certified_plants()
-    return certify_schedule(
-        schedule,
-        plants,
-        source,
-        ranges=problem.ranges,
-        others=problem.parameters,
-        samples=table.samples,
-        seed=table.seed,
-        max_failure_probability=table.max_failure_probability,
-        min_rate=problem.schedule.min_rate,
-        current_step_A=table.step,
-        executor=executor,
-        sensors=problem.sensors.of(list_readings(schedule.controllers[0], plants)),
-        progress=progress,
-    )
-
-
-def add_outer_loop(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
-    """Return a controller with the outer loop of the problem's [impedance]; as it is where there is none.
-
-    Raises SeaoptError: the stiffness has no critically damped impedance.
-    """
-    table = problem.table.impedance
-    if table is None:
-        return controller
-    plant, values, filter_s = problem.plants[table.plant], problem.values(source), table.velocity_filter_s
-    if table.damping == "critical":
-        impedance = critical_impedance(controller, plant, values, table.stiffness, velocity_filter_s=filter_s)
-    else:
-        impedance = Impedance(stiffness=table.stiffness, damping=table.damping, velocity_filter_s=filter_s)
-    return add_impedance(controller, plant, values, impedance, name=table.plant)
 
 
 def list_plants(
@@ -335,13 +272,11 @@ def list_plants(
 
     `spec`: whose delays count in place of the problem's.
     """
-    measured = problem.measure_responses(source)
-    others: dict[str, Any] = problem.robust_to(source, spec)
-    assert problem.table.controller is not None
-    named = problem.table.controller.robust_to
-    others |= {name: response for name, response in measured.items() if name in named}
-    design = measured[problem.table.controller.plant] if problem.designs_on_response else problem.design_plant
-    return design, others
+    measured, plants = problem.measure_responses(source), problem.robust_to(source, spec)
+    asked = problem.asked
+    responses = {name: response for name, response in measured.items() if name in asked.robust_to}
+    design = measured[asked.plant] if problem.designs_on_response else problem.design_plant
+    return design, {**plants, **responses}
 
 
 def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet) -> Controller:
@@ -350,7 +285,11 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
     `given`: what `seaopt.control.read_law` returned; its rate and its delay are the loop's.
     Raises ProblemError: the problem has no [controller], or the law measures something else than it does.
     """
-    _refuse_schedule(problem, "measured")
+    if problem.schedule is not None:
+        raise ProblemError(
+            f"{problem.source}: has a [controller.schedule], and one law is measured against one [controller]; take it "
+            "out"
+        )
     if problem.spec is None:
         raise ProblemError(
             f"{problem.source}: has no [controller], whose limits a law is measured against; add one: bandwidth_hz = 30"
@@ -407,18 +346,18 @@ def _check_drive_delay(problem: Problem, given: GivenLaw, spec: DelayedSpec, sou
 
 def certify_problem(
     problem: Problem,
-    controller: Controller,
+    controller: Controller | ScheduledController,
     source: Fit | ParameterSet,
     progress: Progress = ignore,
     executor: Executor | None = None,
-) -> Certificate:
-    """Certify a controller on the problem's plants, simulations included, as `seaopt certify` does.
+) -> Certificate | ScheduleCertificate:
+    """Certify a controller or schedule on the problem's plants, simulations included, as `seaopt certify` does.
 
     Parameters
     ----------
     problem : Problem
         What `read_problem` returned.
-    controller : Controller
+    controller : Controller or ScheduledController
         The law, which knows its design plant.
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
@@ -426,29 +365,26 @@ def certify_problem(
         As in `seaopt.certify`.
 
     """
-    table, measured = problem.robustness, problem.measure_responses(source)
-    if problem.designs_on_response:
-        return certify(controller, problem.certified_plants(), source, seed=table.seed, measured=measured)
-    plants = problem.certified_plants()
-    read = list_readings(controller, plants)
-    sensors = problem.sensors.of(read)  # the file may name those of its other laws
+    table, plants, measured = problem.robustness, problem.certified_plants(), problem.measure_responses(source)
+    if isinstance(controller, Controller) and problem.designs_on_response:
+        return certify(controller, plants, source, seed=table.seed, measured=measured)
+    law = controller.controllers[0] if isinstance(controller, ScheduledController) else controller
+    read = list_readings(law, plants)
     options: dict[str, Any] = {
         "ranges": problem.ranges, "others": problem.parameters, "samples": table.samples, "seed": table.seed,
-        "bounds": Budget() if table.bounds else None, "max_failure_probability": table.max_failure_probability,
-        "min_friction_margin": table.min_friction_margin, "sensors": sensors, "current_step_A": table.step,
+        "max_failure_probability": table.max_failure_probability, "current_step_A": table.step,
+        "sensors": problem.sensors.of(read),  # the file may name those of its other laws
         "executor": executor, "progress": progress,
     }  # fmt: skip
+    if isinstance(controller, ScheduledController):
+        assert problem.schedule is not None
+        return certify_schedule(controller, plants, source, min_rate=problem.schedule.min_rate, **options)
+    options |= {"bounds": Budget() if table.bounds else None, "min_friction_margin": table.min_friction_margin}
     if problem.mpc is None:
         certificate = certify(controller, plants, source, measured=measured, **options)
     else:
-        certificate = certify_mpc(
-            design_mpc(problem, source),
-            plants,
-            source,
-            runs=table.constrained_runs,
-            bound_tolerance=table.bound_tolerance,
-            **options,
-        )
+        options |= {"runs": table.constrained_runs, "bound_tolerance": table.bound_tolerance}
+        certificate = certify_mpc(design_mpc(problem, source), plants, source, **options)
     unread = [name for name in problem.sensors.names if name not in read]
     if not unread:
         return certificate
@@ -482,9 +418,8 @@ class Stages:
     @property
     def fit(self) -> Fit | None:
         """The fit; None of a problem without experiments."""
-        return self._keep(
-            "fit", lambda: fit_problem(self.problem, self._experiments) if self.problem.table.experiment else None
-        )
+        fitted = self.problem.table.experiment
+        return self._keep("fit", lambda: fit_problem(self.problem, self._experiments) if fitted else None)
 
     @property
     def scores(self) -> list[ModelledOutputs]:
@@ -494,7 +429,7 @@ class Stages:
 
     @property
     def controller(self) -> Controller | None:
-        """The controller; None where the problem asks for none, or the fit allows none."""
+        """The controller; None where the problem asks for none, or for a schedule, or the fit allows none."""
         return self._keep("controller", self._tune)
 
     @property
@@ -512,19 +447,20 @@ class Stages:
         return self.problem.parameters if self.fit is None else self.fit
 
     def _tune(self) -> Controller | None:
-        if (
-            self.problem.spec is None
-            or self.problem.schedule is not None
-            or (self.fit is not None and not can_design(self.problem, self.fit))
-        ):
+        problem = self.problem
+        if problem.spec is None or problem.schedule or (self.fit is not None and not can_design(problem, self.fit)):
             return None
-        tuned = tune_problem(self.problem, self._source)
-        return tuned.controller if isinstance(tuned, JointTuning) else tuned
+        tuned = tune_problem(problem, self._source)
+        tuned = tuned.controller if isinstance(tuned, JointTuning) else tuned
+        assert isinstance(tuned, Controller)
+        return tuned
 
     def _certify(self) -> Certificate | None:
         if self.controller is None:
             return None
-        return certify_problem(self.problem, self.controller, self._source)
+        certificate = certify_problem(self.problem, self.controller, self._source)
+        assert isinstance(certificate, Certificate)
+        return certificate
 
     def _keep(self, name: str, make: Callable[[], Any]) -> Any:
         if name not in self._made:

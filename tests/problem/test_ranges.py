@@ -32,7 +32,7 @@ def test_guesses_of_which_nothing_is_drawn_are_named_with_ranges(stand, thor):
     known = thor.prior(J=1e-7)  # which is drawn
     (text,) = guess_remarks(["N_p", "unit of F1", "J", "k", "eta"], {"k": (6e5, 7e5)}, {"stand": stand}, known)
     n_p = thor["N_p"].value
-    assert "nothing is drawn of N_p and eta, which are guesses" in text
+    assert "the certificate does not vary N_p and eta, guesses" in text
     assert (
         f"parameters = {{ N_p = [{0.5 * n_p:.3g}, {2 * n_p:.3g}], eta = [0.5, {min(2.0, thor['eta'].max):.3g}] }}"
         in text
@@ -43,6 +43,6 @@ def test_guesses_of_which_nothing_is_drawn_are_named_with_ranges(stand, thor):
 def test_a_guess_of_nothing_is_named_without_a_range_and_one_below_zero_with_its_ends_in_order(stand, thor):
     plant = so.plants.moving_output()
     (text,) = guess_remarks(["b_r"], {}, {"stand": stand}, thor.update(b_r=0.0))
-    assert text.startswith("nothing is drawn of b_r, which is a guess") and "parameters" not in text
+    assert text.startswith("the certificate does not vary b_r, a guess") and "parameters" not in text
     (text,) = guess_remarks(["b_r", "g"], {}, {"swing": plant}, thor.update(b_r=0.0, g=-10.0))
-    assert "nothing is drawn of b_r and g" in text and text.endswith("parameters = { g = [-20, -5] }")
+    assert "the certificate does not vary b_r and g" in text and text.endswith("parameters = { g = [-20, -5] }")
