@@ -19,21 +19,9 @@ from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.mpc.export import SOURCES, set_gate, write_code
 from seaopt.control.mpc.stored import read_code
-from seaopt.errors import ProblemError
+from seaopt.errors import ControlError, ProblemError
 from seaopt.files import exists, read_json, to_json
-from seaopt.records import record
 from seaopt.reporting.sections.verdict import UNMET
-
-
-@record
-class GateOptions:
-    """What is typed of a plausibility gate, in the names of [controller.gate]; `leave_out` for none at all."""
-
-    range_N: str | None = None
-    max_step_N: float | None = None
-    max_held: int | None = None
-    ramp_s: float | None = None
-    leave_out: bool = False
 
 
 def export_controller(
@@ -42,18 +30,14 @@ def export_controller(
     json: bool,
     derate_margin_K: float | None = None,
     amount: Amount = "usual",
-    gate: GateOptions | None = None,
+    gate: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> bool:
     """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
 
     It may where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail.
-
-    Raises
-    ------
-    SeaoptError
-        There is no controller, it was edited, or made from another fit than the one beside it, or it cannot be written.
-
+    Raises SeaoptError: there is no controller, it was edited or made from another fit than the one beside it, or it
+    cannot be written.
     """
     path, schema, certificate = _find_law(results)
     of_problem = f"PROBLEM -o {shlex.quote(str(results))}"
@@ -66,82 +50,77 @@ def export_controller(
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
         options["derate"] = read_guard(content, derate_margin_K) or True
-    options["gate"] = choose_gate(content, gate or GateOptions(), options)
-    broken = _list_broken_requirements(path, certificate)
+    options["gate"] = choose_gate(content, gate or {}, options)
+    failed = _list_broken_requirements(path, certificate)
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
-    met = content.get("fit_met", True) is True
-    certified = broken is not None
-    if raised_from := _find_raised_limit(content, options):
-        what, says = ("certified", "certificate says") if certified else ("designed", "figures say")
+    feasible, fit_met = content["feasible"], content.get("fit_met", True) is True
+    met = feasible and fit_met and not failed
+    if limit := _find_raised_limit(content, options):
+        what, says = ("designed", "figures say") if failed is None else ("certified", "certificate says")
         Terminal(stderr=True).wrap(
-            f"warning: the limit asked for is above the one that the controller was {what} with, {raised_from}: its "
-            f"{says} nothing of more; raise the limit in the problem file, then tune and certify again"
+            f"warning: this limit is above the one that the controller was {what} with, {limit}: its {says} nothing "
+            "about larger commands; raise the limit in the problem file, then tune and certify again"
         )
     if json:
-        feasible, failed = content["feasible"], broken or []
         result = {
             "schema": "seaopt/export/1",
-            "met": feasible and met and not failed,
+            "met": met,
             "feasible": feasible,
-            "fit_met": met,
-            "certified": broken == [],
-            "certificate_failed": failed,
+            "fit_met": fit_met,
+            "certified": failed == [],
+            "certificate_failed": failed or [],
             "files": written,
         }
         sys.stdout.write(to_json(result))
-    else:
-        console = Terminal()
-        if not met:
-            console.wrap(f"not met: {UNMET}")
-        if not content["feasible"]:
-            missed = content["broken"] if is_schedule(content) else [join_labels(content["active_constraints"])]
-            console.wrap(f"not met: {'; '.join(missed)}")
-        if broken:
-            console.wrap(f"not met: the certificate of this controller FAILED: {', '.join(broken)}")
-        if not certified:
-            console.wrap(f"not certified: type seaopt certify {of_problem}")
-        if amount != "quiet" or (met and content["feasible"] and not broken):
-            console.list_files(written)
-        for note in content.get("notes") or () if amount == "verbose" else ():
-            console.wrap(f"note: {note}", indent=2)
-    return content["feasible"] and met and not broken
+        return met
+    console = Terminal()
+    missed = content["broken"] if is_schedule(content) else [join_labels(content["active_constraints"])]
+    for good, text in (
+        (fit_met, UNMET),
+        (feasible, "; ".join(missed)),
+        (not failed, f"the certificate of this controller FAILED: {', '.join(failed or ())}"),
+    ):
+        if not good:
+            console.wrap(f"not met: {text}")
+    if failed is None:
+        console.wrap(f"not certified: type seaopt certify {of_problem}")
+    if amount != "quiet" or met:
+        console.list_files(written)
+    for note in content.get("notes") or () if amount == "verbose" else ():
+        console.wrap(f"note: {note}", indent=2)
+    return met
 
 
 def choose_gate(
-    content: Mapping[str, Any], asked: GateOptions, options: Mapping[str, Any]
+    content: Mapping[str, Any], asked: Mapping[str, Any], options: Mapping[str, Any]
 ) -> PlausibilityGate | Literal[False] | None:
-    """Return the gate that is typed; False for none, None for that of the controller."""
-    typed = [
-        name
-        for name, value in (
-            ("gate-max-step", asked.max_step_N),
-            ("gate-max-held", asked.max_held),
-            ("gate-ramp", asked.ramp_s),
-        )
-        if value is not None
-    ]
-    if asked.range_N is None or asked.leave_out:
-        if typed or (asked.range_N is not None and asked.leave_out):
-            option = typed[0] if typed else "no-gate"
-            how = (
-                "is of a gate whose range is not typed; add --gate LOW:HIGH"
-                if typed
-                else "and --gate: type one of them"
-            )
-            raise ProblemError(f"--{option} {how}")
-        return False if asked.leave_out else None
+    """Return the gate that is typed; False for none, None for that of the controller.
+
+    `asked` has the keys of [controller.gate], None where nothing is typed, its range as LOW:HIGH, and `leave_out`.
+    """
+    typed = {name: value for name, value in asked.items() if value is not None and value is not False}
+    leave_out, ends = typed.pop("leave_out", False), typed.pop("range_N", None)
+    if leave_out and ends is not None:
+        raise ProblemError("--no-gate and --gate: type one of them")
+    if ends is None:
+        if typed:
+            option = {"max_step_N": "max-step", "max_held": "max-held", "ramp_s": "ramp"}[next(iter(typed))]
+            raise ProblemError(f"--gate-{option}: no gate is typed; add --gate LOW:HIGH")
+        return False if leave_out else None
     try:
-        low, high = (float(end) for end in asked.range_N.split(":"))
+        low, high = (float(end) for end in ends.split(":"))
     except ValueError:
-        raise ProblemError(
-            f"--gate {asked.range_N}: is not a range; type --gate LOW:HIGH, such as -4000:4000"
-        ) from None
+        raise ProblemError(f"--gate {ends}: is not a range; type --gate LOW:HIGH, such as -4000:4000") from None
     if is_schedule(content):
         raise ProblemError(
             "--gate: is not exported with a schedule; leave it out, and check the reading before the step"
         )
-    step = _find_own_step(content) if asked.max_step_N is None else asked.max_step_N
+    try:
+        spec = GateSpec(range_N=(low, high), **typed)
+    except ControlError as error:
+        raise ProblemError(f"--gate: {error}") from error
+    step = _find_own_step(content) if spec.max_step_N is None else spec.max_step_N
     limit = _find_limit(content, options)
     if step is None:
         raise ProblemError(
@@ -150,12 +129,9 @@ def choose_gate(
         )
     if limit is None:
         raise ProblemError("--gate: the command has no limit from which it goes to zero; type --current-limit")
-    usual = GateSpec(range_N=(low, high))
-    held = usual.max_held if asked.max_held is None else asked.max_held
-    ramp = usual.ramp_s if asked.ramp_s is None else asked.ramp_s
-    if not ramp > 0.0:
-        raise ProblemError(f"--gate-ramp {ramp:g}: is not a time; type seconds above zero, such as 0.1")
-    return PlausibilityGate(range_N=(low, high), max_step_N=step, max_held=held, ramp_A_per_s=limit / ramp)
+    return PlausibilityGate(
+        range_N=(low, high), max_step_N=step, max_held=spec.max_held, ramp_A_per_s=limit / spec.ramp_s
+    )
 
 
 def _find_own_step(content: Mapping[str, Any]) -> float | None:
@@ -194,8 +170,8 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
         missed = join_labels(content["active_constraints"])
         raise ProblemError(f"the controller misses {missed}; tune one that does not, or type --allow-infeasible")
     gate = options.pop("gate")
-    given = {name for name, value in options.items() if value not in (None, False)} - {"precision", "name"}
-    if given or options["name"] != "force_law":
+    typed = {name for name, value in options.items() if value not in (None, False) and name != "precision"}
+    if typed - {"name"} or options["name"] != "force_law":
         raise ProblemError(
             "the C code of predictive control has the limits and the names that it was designed with: force_mpc_...; "
             "leave out all options but --precision and those of --gate"
@@ -212,19 +188,15 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
 def _find_law(results: Path) -> tuple[Path, str, Path]:
     """Return the file of the law or of the schedule in a folder, its schema, and the file of its certificate.
 
-    Raises
-    ------
-    ProblemError
-        The folder has both.
-
+    Raises ProblemError: the folder has both.
     """
-    one, scheduled = results / FILES["tune"], results / SCHEDULE_FILES["tune"]
+    law, scheduled = results / FILES["tune"], results / SCHEDULE_FILES["tune"]
     if not exists(scheduled):
-        return one, SCHEMAS["tune"], results / FILES["certify"]
-    if one.is_file():
+        return law, SCHEMAS["tune"], results / FILES["certify"]
+    if law.is_file():
         raise ProblemError(
-            f"{results}: has {one.name} and {scheduled.name}, and one of them is of an earlier run; make the one that "
-            "is meant in a folder of its own: seaopt tune PROBLEM -o DIR"
+            f"{results}: has {law.name} and {scheduled.name}, one of them from an earlier run; tune again into a "
+            "folder of its own: seaopt tune PROBLEM -o DIR"
         )
     return scheduled, SCHEDULE_SCHEMAS["tune"], results / SCHEDULE_FILES["certify"]
 
@@ -232,11 +204,7 @@ def _find_law(results: Path) -> tuple[Path, str, Path]:
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
     """Return the requirements that the certificate of this controller says are not met; None without a certificate.
 
-    Raises
-    ------
-    SeaoptError
-        The certificate was edited or written by hand, or is of another controller.
-
+    Raises SeaoptError: the certificate was edited or written by hand, or is of another controller.
     """
     from seaopt.robustness.certificate.stored import list_requirements  # deferred: pydantic
 

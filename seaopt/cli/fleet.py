@@ -4,36 +4,26 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from seaopt.cli.progress import show_progress
-from seaopt.cli.show import SCREEN, show_sections, show_verdicts
-from seaopt.cli.terminal import Terminal
+from seaopt.cli.show import show_sections, show_verdicts
+from seaopt.cli.terminal import Amount, Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
-from seaopt.formatting import format_count, printable
-from seaopt.records import record
+from seaopt.formatting import format_count
 from seaopt.reporting.sections import judge
-from seaopt.reporting.sections.data import Commands
+from seaopt.reporting.sections.data import Commands, Reason, Verdict
+from seaopt.reporting.sections.text import LABEL
 
 if TYPE_CHECKING:
     from seaopt.fleet import Drift, Fleet, FleetLog, Population
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
 PAGE, ACTUATORS = "fleet.html", "actuators.parquet"
-
-
-@record
-class DriftOptions:
-    """What is asked of drift: columns of time and actuator, where it starts, and how often it may be wrong."""
-
-    time: Sequence[str] | None
-    actuator: Sequence[str] | None
-    since: str | None
-    false_alarms: float
 
 
 def run_fleet(
@@ -47,17 +37,19 @@ def run_fleet(
     workers: int | None,
     like: str | None,
     time_limit_s: float | None,
-    drift: DriftOptions,
+    drift: Mapping[str, Any],
     json: bool,
-    quiet: bool,
-    verbose: bool,
+    amount: Amount,
 ) -> bool:
-    """Fit the logs, write tables and page, and print verdict and spread; return whether every log is met."""
+    """Fit the logs, write tables and page, and print verdict and spread; return whether every log is met.
+
+    `drift` has the options of `seaopt.fleet.find_drift`.
+    """
     # Before workers start, who inherit it: threads of BLAS would fight over cores that all have a log.
     for name in THREADS:
         os.environ.setdefault(name, "1")
     from seaopt.executors import Processes, connect_dask
-    from seaopt.fleet import find_logs, fit_fleet, read_manifest
+    from seaopt.fleet import estimate_population, find_drift, find_logs, fit_fleet, read_manifest
     from seaopt.problem import read_problem
 
     if (manifest is None) == (not names):
@@ -81,24 +73,33 @@ def run_fleet(
                 )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"what was finished is in {folder}; the same command goes on from there") from None
-    found, population, missing = _summarise(fleet, drift)
-    content = _write(fleet, found, population, folder, problem)
+    result = find_drift(fleet, **drift)
+    population, missing = None, ""
+    try:
+        population = estimate_population(fleet, actuator=drift["actuator"], time=drift["time"])
+    except SeaoptError as error:
+        missing = str(error)
+    content = _write(fleet, result, population, folder, problem)
     if json:
         sys.stdout.write(to_json(content))
         return fleet.met
     console = Terminal()
-    _show(console, fleet, found, verbose=verbose)
-    if not quiet:
-        _show_tables(console, fleet, population, missing)
+    _show(console, fleet, result, verbose=amount == "verbose")
+    if amount != "quiet":
+        show_sections(console, fleet)
+        if population is None:
+            console.wrap(f"no population: {missing}", indent=2)
+        else:
+            show_sections(console, population)
         console.wrap(
-            f"wrote {folder / 'fleet'} (Parquet, a row a log), {folder / ACTUATORS} (a row an actuator), "
+            f"wrote {folder / 'fleet'} (Parquet, one row per log), {folder / ACTUATORS} (one row per actuator), "
             f"{folder / 'fleet.json'}, {folder / PAGE}"
         )
     return fleet.met
 
 
-def _check_options(logs: Sequence[FleetLog], drift: DriftOptions) -> None:
-    """Refuse before any log is fitted what drift could not be told with."""
+def _check_options(logs: Sequence[FleetLog], drift: Mapping[str, Any]) -> None:
+    """Refuse options of drift before any log is fitted."""
     import polars as pl
 
     from seaopt.fleet import Fleet, order_runs
@@ -108,23 +109,10 @@ def _check_options(logs: Sequence[FleetLog], drift: DriftOptions) -> None:
 
     names = tuple(logs[0].identity)
     rows = pl.DataFrame({"log": [log.path for log in logs], **{n: [log.identity[n] for log in logs] for n in names}})
-    history = order_runs(Fleet(rows=rows, units={}, identity=names), drift.actuator, drift.time)
-    choose_threshold(drift.false_alarms, PER_RUNS, 1)
-    if drift.since is not None:
-        parse_time(drift.since, history)
-
-
-def _summarise(fleet: Fleet, options: DriftOptions) -> tuple[Drift, Population | None, str]:
-    """Return drift and population of a fleet, and why there is no population, if there is none."""
-    from seaopt.fleet import estimate_population, find_drift
-
-    found = find_drift(
-        fleet, actuator=options.actuator, time=options.time, since=options.since, false_alarms=options.false_alarms
-    )
-    try:
-        return found, estimate_population(fleet, actuator=options.actuator, time=options.time), ""
-    except SeaoptError as error:
-        return found, None, str(error)
+    history = order_runs(Fleet(rows=rows, units={}, identity=names), drift["actuator"], drift["time"])
+    choose_threshold(drift["false_alarms"], PER_RUNS, 1)
+    if drift["since"] is not None:
+        parse_time(drift["since"], history)
 
 
 def _write(fleet: Fleet, drift: Drift, population: Population | None, folder: Path, problem: Path) -> dict[str, Any]:
@@ -157,30 +145,18 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
     show_verdicts(console, [] if verdict is None else [verdict], verbose=verbose)
     if fleet.short:
         count = format_count(len(fleet.short), "log")
-        console.wrap(printable(f"much shorter than the others: {count} ({fleet.short[0]})"), indent=9)
+        console.wrap(f"much shorter than the others: {count} ({fleet.short[0]})", indent=LABEL)
     if fleet.gaps:
         log, text = fleet.gaps[0]
-        console.wrap(printable(f"with gaps: {format_count(len(fleet.gaps), 'log')} ({log}: {text})"), indent=9)
+        console.wrap(f"with gaps: {format_count(len(fleet.gaps), 'log')} ({log}: {text})", indent=LABEL)
     if drift.left_out:
         total = format_count(len(fleet.rows), "log")
-        console.wrap(f"left out of drift, of {total}: {drift.describe_left_out()}", indent=9)
+        console.wrap(f"left out of drift, of {total}: {drift.describe_left_out()}", indent=LABEL)
     if drift.missing:
-        console.wrap(f"Drift: {drift.verdict}", indent=9)
+        console.wrap(f"Drift: {drift.verdict}", indent=LABEL)
         return
-    word, colour = ("alarm  ", "red") if drift.alarms else ("steady ", "green")
-    console.label(word, f"Drift: {drift.verdict}", style=colour, indent=9)
-    shown = drift.alarms if verbose else drift.alarms[: SCREEN.reasons]
-    for alarm in shown:
-        console.wrap(printable(f"{alarm.actuator}: {alarm.describe()}"), indent=9)
-    if len(drift.alarms) > len(shown):
-        console.wrap(f"and {len(drift.alarms) - len(shown)} more: --verbose prints them", indent=9)
+    alarms = tuple(Reason(what=f"{alarm.actuator}: {alarm.describe()}") for alarm in drift.alarms)
+    steady = Verdict(met=not alarms, text=f"Drift: {drift.verdict}", reasons=alarms, words=("steady", "alarm"))
+    show_verdicts(console, [steady], verbose=verbose)
     if drift.history.warning:
-        console.wrap(f"warning: {drift.history.warning}", indent=9)
-
-
-def _show_tables(console: Terminal, fleet: Fleet, population: Population | None, missing: str) -> None:
-    show_sections(console, fleet)
-    if population is None:
-        console.wrap(f"no population: {missing}", indent=2)
-    else:
-        show_sections(console, population)
+        console.wrap(f"warning: {drift.history.warning}", indent=LABEL)

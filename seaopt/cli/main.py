@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -16,6 +16,9 @@ from typer.core import TyperGroup
 from seaopt.cli.terminal import Amount, prepare_streams
 from seaopt.errors import ControlError, FileError, InternalError, LogError, SeaoptError, UnitError
 from seaopt.formatting import printable
+
+if TYPE_CHECKING:
+    from seaopt.cli.session import Session
 
 INTERRUPTED = 130  # exit codes, as a shell's
 PIPE_CLOSED = 141
@@ -66,16 +69,16 @@ Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Fol
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the verdict only, or the files written.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print all figures, notes and failures.")]
-
 Workers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers", metavar="N", min=1, help="Processes for certificates and sweeps; none but this, if left out."
-    ),
+    int | None, typer.Option(metavar="N", min=1, help="Processes for certificates and sweeps; one if left out.")
 ]
+Like = Annotated[
+    str | None, typer.Option(metavar="EXPERIMENT", help="Read the log as this experiment's; the first if left out.")
+]
+OUT = Path("out")
 
 
-def _version(wanted: bool) -> bool:
+def _print_version(wanted: bool) -> bool:
     if wanted:
         from seaopt import __version__
 
@@ -87,12 +90,12 @@ def _version(wanted: bool) -> bool:
 @app.callback()
 def _add_options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, metavar=" ", help="Print the version.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, metavar=" ", help="Print the version.")
     ] = False,
 ) -> None:
     """Series elastic actuators: from raw bench logs to a certified force controller.
 
-    Begin with `seaopt demo`, or on a log of your own with `seaopt new LOG`.
+    Start with `seaopt demo`, or with `seaopt new LOG` on a log of your own.
     """
 
 
@@ -100,15 +103,20 @@ def _choose_amount(quiet: bool, verbose: bool) -> Amount:
     return "quiet" if quiet else "verbose" if verbose else "usual"
 
 
-def _finish(session: Any, json: bool, stages: list[str], quiet: bool = False, verbose: bool = False) -> None:
-    """Print what was asked for on stdout and leave with the exit code of the verdict."""
-    session.show(json, stages, _choose_amount(quiet, verbose))
-    if not session.met(stages):
+def _exit_unless(met: bool) -> None:
+    if not met:
         raise typer.Exit(1)
 
 
+def _run_stage(session: Session, stage: str, json: bool, quiet: bool, verbose: bool) -> None:
+    """Run a stage, print its result, and leave with the exit code of its verdict."""
+    session.run(stage)
+    session.show(json, [stage], _choose_amount(quiet, verbose))
+    _exit_unless(session.met([stage]))
+
+
 @app.command()
-def demo(output: Folder = Path("out/demo"), json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
+def demo(output: Folder = OUT / "demo", json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Run the THOR problem on virtual logs: fit, tune, certify, report."""
     from seaopt.problem import demo_path
 
@@ -118,7 +126,7 @@ def demo(output: Folder = Path("out/demo"), json: Json = False, quiet: Quiet = F
 @app.command()
 def run(
     problem: ProblemFile,
-    output: Folder = Path("out"),
+    output: Folder = OUT,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -128,8 +136,7 @@ def run(
     from seaopt.cli.session import Session
 
     session = Session(problem, output, workers=workers)
-    stages = session.plan_stages()
-    done = list[str]()
+    stages, done, amount = session.plan_stages(), list[str](), _choose_amount(quiet, verbose)
     try:
         for stage in stages:
             if stage == "tune" and not session.can_design():
@@ -140,49 +147,29 @@ def run(
             done.append(stage)
     except Exception:  # minutes of work have a verdict, whatever becomes of the next stage
         if done and not json:
-            session.show(json, done, _choose_amount(quiet, verbose))
+            session.show(json, done, amount)
         raise
-    for what in session.explain_left_out(stages):
-        session.say(f"left out: {what}")
-    for what in session.name_leftovers(stages):
-        session.say(f"note: {what}")
-    _finish(session, json, stages, quiet, verbose)
-
-
-@app.command()
-def simulate(
-    problem: ProblemFile,
-    output: Folder = Path("out"),
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Simulate every experiment with the file's values; write one CSV each, and the logs of virtual ones."""
-    from seaopt.cli.session import Session
-
-    session = Session(problem, output, design=False)
-    session.run("simulate")
-    _finish(session, json, ["simulate"], quiet, verbose)
+    session.explain_stages(stages)
+    session.show(json, stages, amount)
+    _exit_unless(session.met(stages))
 
 
 @app.command()
 def frf(
     problem: ProblemFile,
-    output: Folder = Path("out"),
+    output: Folder = OUT,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     stretch: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", min=0.0, help="Length of a stretch, one over the resolution in Hz."),
+        typer.Option(metavar="SECONDS", min=0.0, help="Length of each averaged stretch, 1/(resolution in Hz)."),
     ] = None,
 ) -> None:
-    """Estimate frequency responses (H1, coherence, second-order fit); write frf.json and figure."""
+    """Estimate frequency responses (H1, coherence, second-order fit); write frf.json and its figure."""
     from seaopt.cli.session import Session
 
-    session = Session(problem, output, stretch_s=stretch, design=False)
-    session.run("frf")
-    _finish(session, json, ["frf"], quiet, verbose)
+    _run_stage(Session(problem, output, stretch_s=stretch, design=False), "frf", json, quiet, verbose)
 
 
 @app.command()
@@ -191,7 +178,7 @@ def inspect(
     time: Annotated[str | None, typer.Option(metavar="COLUMN", help="The clock's column.")] = None,
     channel: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=COLUMN", help="A channel; every column of numbers if left out. Repeatable."),
+        typer.Option(metavar="NAME=COLUMN", help="A channel; all numeric columns if left out. Repeatable."),
     ] = None,
     unit: Annotated[
         list[str] | None, typer.Option(metavar="NAME=UNIT", help="Unit of a channel, or of time. Repeatable.")
@@ -201,11 +188,12 @@ def inspect(
         typer.Option("--input", metavar="NAME", help="A channel that drives the others. Repeatable."),
     ] = None,
     align: Annotated[
-        str | None, typer.Option(metavar="RULE", help="How channels of other clocks come to this one: hold or linear.")
+        str | None,
+        typer.Option(metavar="RULE", help="How to bring channels with another clock to this one: hold or linear."),
     ] = None,
     counter: Annotated[
         str | None,
-        typer.Option(metavar="COLUMN=SAMPLES", help="A column that counts samples, and how many a count stands for."),
+        typer.Option(metavar="COLUMN=SAMPLES", help="A column that counts samples, and the samples per count."),
     ] = None,
     rate_hz: Annotated[
         float | None, typer.Option("--rate-hz", metavar="HZ", help="Sample rate of a log without a clock.")
@@ -218,7 +206,7 @@ def inspect(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Look for every fault in a log, and say what it excites."""
+    """Check a log for faults, and report which frequencies it excites."""
     from seaopt.cli.inspect import inspect_log
 
     if listed:
@@ -226,7 +214,7 @@ def inspect(
 
         typer.echo(printable(repr(contents(log))))
         return
-    if not inspect_log(
+    met = inspect_log(
         log,
         time=time,
         channels=channel or (),
@@ -238,8 +226,8 @@ def inspect(
         folder=output,
         json=json,
         amount=_choose_amount(quiet, verbose),
-    ):
-        raise typer.Exit(1)
+    )
+    _exit_unless(met)
 
 
 @app.command()
@@ -247,13 +235,15 @@ def new(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Raw logs, of any format.", show_default=False)],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="The problem file; beside the log, if left out."),
+        typer.Option("-o", "--output", metavar="FILE", help="The problem file; beside the log if left out."),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Ask nothing; take the best guesses and mark them.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Ask nothing; take the best guesses and mark them as guesses.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a problem file for logs: look at their columns, and ask what they do not say."""
+    """Create a problem file from logs: inspect their columns, and ask for what cannot be inferred."""
     from seaopt.cli.new import write_problem
 
     write_problem(logs, output, yes=yes, force=force, json=json)
@@ -262,85 +252,74 @@ def new(
 @app.command()
 def tune(
     problem: ProblemFile,
-    output: Folder = Path("out"),
+    output: Folder = OUT,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
     sweep: Annotated[
         str | None,
         typer.Option(
-            metavar="LOW:HIGH:STEP", help="Tune at each bandwidth (Hz) instead; write frontier.json and figure."
+            metavar="LOW:HIGH:STEP", help="Tune at each of these bandwidths (Hz) instead; write frontier.json."
         ),
     ] = None,
     free_law: Annotated[
-        bool, typer.Option("--free-law", help="With --sweep: also the best that any linear law could do.")
+        bool, typer.Option("--free-law", help="With --sweep: also find the best that any linear law could do.")
     ] = False,
     workers: Workers = None,
 ) -> None:
-    """Tune the controller with the fit in DIR; write controller.json."""
+    """Tune the controller on the fit in DIR; write controller.json."""
     from seaopt.cli.frontier import parse_bandwidths
     from seaopt.cli.session import Session
 
-    stage = "tune" if sweep is None else "sweep"
     if free_law and sweep is None:
-        raise ControlError("--free-law: is of a sweep; give --sweep LOW:HIGH:STEP too")
+        raise ControlError("--free-law: needs a sweep; give --sweep LOW:HIGH:STEP too")
     bandwidths = () if sweep is None else parse_bandwidths(sweep)
     session = Session(problem, output, bandwidths_hz=bandwidths, free_law=free_law, workers=workers)
-    session.run(stage)
-    _finish(session, json, [stage], quiet, verbose)
+    _run_stage(session, "tune" if sweep is None else "sweep", json, quiet, verbose)
 
 
 @app.command()
 def validate(
     problem: ProblemFile,
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A log that was not fitted.", show_default=False)],
-    output: Folder = Path("out"),
-    like: Annotated[
-        str | None,
-        typer.Option(metavar="EXPERIMENT", help="Whose columns and sensors it has; the first's, if left out."),
-    ] = None,
+    output: Folder = OUT,
+    like: Like = None,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Score the fit in DIR on another log, from its own initial state and offsets."""
+    """Score the fit in DIR on another log, with that log's own initial state and offsets."""
     from seaopt.cli.session import Session
 
     Session(problem, output, design=False).validate(log, like, json, _choose_amount(quiet, verbose))
 
 
-def _make_command(name: str, text: str) -> Callable[..., None]:
-    def command(
-        problem: ProblemFile,
-        output: Folder = Path("out"),
-        json: Json = False,
-        quiet: Quiet = False,
-        verbose: Verbose = False,
+def _add_stage(stage: str, text: str) -> None:
+    """Add the command of a stage that has no options of its own."""
+
+    @app.command(stage, help=text)
+    def _(
+        problem: ProblemFile, output: Folder = OUT, json: Json = False, quiet: Quiet = False, verbose: Verbose = False
     ) -> None:
         from seaopt.cli.session import Session
 
-        session = Session(problem, output, design=name != "fit")
-        session.run(name)
-        _finish(session, json, [name], quiet, verbose)
-
-    command.__doc__ = text
-    return command
+        _run_stage(Session(problem, output, design=stage == "report"), stage, json, quiet, verbose)
 
 
-for _stage_name, _help in (
-    ("fit", "Fit the parameters to the logs; write fit.json."),
-    ("report", "Write report.html and figures from the results in DIR."),
-):
-    app.command(_stage_name)(_make_command(_stage_name, _help))
+_add_stage("fit", "Fit the parameters to the logs; write fit.json.")
+_add_stage("report", "Write report.html and figures from the results in DIR.")
+_add_stage(
+    "simulate", "Simulate every experiment with the file's values; write a CSV file of each, and of each virtual log."
+)
 
 
 @app.command()
 def certify(
     problem: ProblemFile,
-    output: Folder = Path("out"),
+    output: Folder = OUT,
     controller: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A law of your own instead (JSON or TOML); it becomes controller.json."),
+        typer.Option(metavar="FILE", help="A law of your own (JSON or TOML) instead; it becomes controller.json."),
     ] = None,
     json: Json = False,
     quiet: Quiet = False,
@@ -353,44 +332,46 @@ def certify(
     session = Session(problem, output, workers=workers)
     if controller is not None:
         session.take_law(controller)
-    session.run("certify")
-    _finish(session, json, ["certify"], quiet, verbose)
+    _run_stage(session, "certify", json, quiet, verbose)
 
 
 @app.command()
 def export(
     results: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with controller.json.", show_default=False)],
     c: Annotated[Path, typer.Option("--c", "-o", metavar="OUT", help="Folder for the C code and the gains.")],
-    precision: Annotated[str, typer.Option(metavar="double|float", help="Of the C code.")] = "double",
-    name: Annotated[str, typer.Option(help="Begins every name in C.")] = "force_law",
+    precision: Annotated[str, typer.Option(metavar="double|float", help="Number type of the C code.")] = "double",
+    name: Annotated[str, typer.Option(help="Prefix of every name in the C code.")] = "force_law",
     current_limit: Annotated[
         float | None, typer.Option(metavar="AMPERES", help="In place of the specification's current_limit_A.")
     ] = None,
     command_limit: Annotated[
-        float | None, typer.Option(metavar="VALUE", help="The same of another command, in its unit: V, or a duty.")
+        float | None, typer.Option(metavar="VALUE", help="The same for another command, in its unit: V, or a duty.")
     ] = None,
     tracking_time: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Of the anti-windup, in place of the default.")
+        float | None, typer.Option(metavar="SECONDS", help="Time constant of the anti-windup.")
     ] = None,
     derate: Annotated[
-        bool, typer.Option("--derate", help='Lower the limit as the winding warms up, by the part "thermal".')
+        bool,
+        typer.Option("--derate", help='Lower the limit as the winding warms up; the plant needs the part "thermal".'),
     ] = False,
-    derate_margin: Annotated[float | None, typer.Option(metavar="KELVIN", help="The same, so far below T_max.")] = None,
+    derate_margin: Annotated[
+        float | None, typer.Option(metavar="KELVIN", help="Derate, and keep this far below T_max.")
+    ] = None,
     gate: Annotated[
-        str | None,
-        typer.Option(metavar="LOW:HIGH", help="Believe readings within this range, that move no further than:"),
+        str | None, typer.Option(metavar="LOW:HIGH", help="Reject readings outside this range, or that jump.")
     ] = None,
     gate_max_step: Annotated[
-        float | None, typer.Option(metavar="VALUE", help="So far in a sample; that of [controller.gate] if left out.")
+        float | None,
+        typer.Option(metavar="VALUE", help="Largest change per sample; that of [controller.gate] if left out."),
     ] = None,
     gate_max_held: Annotated[
-        int | None, typer.Option(metavar="N", help="Bridge so many others in a row, 5 if left out; then stop.")
+        int | None, typer.Option(metavar="N", help="Rejected readings in a row before a fault; 5 if left out.")
     ] = None,
     gate_ramp: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="In which the command goes to zero then; 0.1 if left out.")
+        float | None, typer.Option(metavar="SECONDS", help="Time from the limit to zero at a fault; 0.1 if left out.")
     ] = None,
     no_gate: Annotated[
-        bool, typer.Option("--no-gate", help="Leave out the gate of [controller.gate], and believe all readings.")
+        bool, typer.Option("--no-gate", help="Leave out the gate of [controller.gate]: accept all readings.")
     ] = False,
     allow_infeasible: Annotated[
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
@@ -399,27 +380,31 @@ def export(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Write the controller in DIR as C99, with its gains as a C header and a MATLAB script."""
-    from seaopt.cli.export import GateOptions, export_controller
+    """Write the controller in DIR as C99, and its gains as a C header and a MATLAB script."""
+    from seaopt.cli.export import export_controller
 
-    options = {
-        "current_limit_A": current_limit, "command_limit": command_limit, "tracking_time_s": tracking_time,
-        "derate": derate, "allow_infeasible": allow_infeasible,
-    }  # fmt: skip
-    if not export_controller(
+    met = export_controller(
         results,
         c,
         json,
         derate_margin,
         amount=_choose_amount(quiet, verbose),
-        gate=GateOptions(
-            range_N=gate, max_step_N=gate_max_step, max_held=gate_max_held, ramp_s=gate_ramp, leave_out=no_gate
-        ),
+        gate={
+            "range_N": gate,
+            "max_step_N": gate_max_step,
+            "max_held": gate_max_held,
+            "ramp_s": gate_ramp,
+            "leave_out": no_gate,
+        },
         precision=precision,
         name=name,
-        **options,
-    ):
-        raise typer.Exit(1)
+        current_limit_A=current_limit,
+        command_limit=command_limit,
+        tracking_time_s=tracking_time,
+        derate=derate,
+        allow_infeasible=allow_infeasible,
+    )
+    _exit_unless(met)
 
 
 @app.command()
@@ -429,38 +414,33 @@ def fleet(
         list[str] | None,
         typer.Argument(metavar="LOGS", help="Files, 'patterns/**/*.csv', addresses (s3://...).", show_default=False),
     ] = None,
-    output: Folder = Path("out"),
+    output: Folder = OUT,
     manifest: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A CSV file with the logs in its column log; the others say whose they are."),
+        typer.Option(metavar="FILE", help="A CSV file with the logs in its column log, and their identity in others."),
     ] = None,
     identity: Annotated[
         str | None,
-        typer.Option(metavar="PATTERN", help="How paths end: '{robot}/{actuator}_{run}.csv' makes three columns."),
+        typer.Option(metavar="PATTERN", help="End of the paths: '{robot}/{actuator}_{run}.csv' makes three columns."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster: tcp://HOST:PORT or tls://HOST:PORT.")
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask cluster: tcp://HOST:PORT or tls://HOST:PORT.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Processes here; as many as cores, if left out.")
+        int | None, typer.Option(metavar="N", min=1, help="Local processes; one per core if left out.")
     ] = None,
-    like: Annotated[
-        str | None,
-        typer.Option(metavar="EXPERIMENT", help="Which says how logs are read; the first with one, if left out."),
-    ] = None,
-    time_limit: Annotated[float, typer.Option(metavar="SECONDS", min=0.1, help="For one log.")] = 600.0,
+    like: Like = None,
+    time_limit: Annotated[float, typer.Option(metavar="SECONDS", min=0.1, help="Time limit per log.")] = 600.0,
     time: Annotated[
         str | None,
-        typer.Option(
-            metavar="COLUMNS", help="Of the identity, that say when; those called date, run, ... if left out."
-        ),
+        typer.Option(metavar="COLUMNS", help="Identity columns that give the time: date, run, ... if left out."),
     ] = None,
     actuator: Annotated[
         str | None,
-        typer.Option(metavar="COLUMNS", help="Of the identity, that name an actuator; the others, if left out."),
+        typer.Option(metavar="COLUMNS", help="Identity columns that name an actuator; the others if left out."),
     ] = None,
     since: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Earlier logs are left out of drift, as after a repair.")
+        str | None, typer.Option(metavar="TIME", help="Leave earlier logs out of drift, as after a repair.")
     ] = None,
     false_alarms: Annotated[
         float, typer.Option(metavar="P", help="Probability that a healthy actuator raises an alarm within 100 runs.")
@@ -469,16 +449,10 @@ def fleet(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Fit each of many logs by itself; write tables and a page in DIR, and go on there after a stop."""
-    from seaopt.cli.fleet import DriftOptions, run_fleet
+    """Fit many logs, each by itself; write tables and a page. The same command resumes after a stop."""
+    from seaopt.cli.fleet import run_fleet
 
-    options = DriftOptions(
-        time=None if time is None else time.split(","),
-        actuator=None if actuator is None else actuator.split(","),
-        since=since,
-        false_alarms=false_alarms,
-    )
-    if not run_fleet(
+    met = run_fleet(
         problem,
         logs or [],
         output,
@@ -488,22 +462,28 @@ def fleet(
         workers=workers,
         like=like,
         time_limit_s=time_limit,
-        drift=options,
+        drift={
+            "time": time and time.split(","),
+            "actuator": actuator and actuator.split(","),
+            "since": since,
+            "false_alarms": false_alarms,
+        },
         json=json,
-        quiet=quiet,
-        verbose=verbose,
-    ):
-        raise typer.Exit(1)
+        amount=_choose_amount(quiet, verbose),
+    )
+    _exit_unless(met)
 
 
 @app.command()
 def schema(
     document: Annotated[
         str,
-        typer.Argument(metavar="problem|fit|controller|schedule|robustness", help="Whose schema.", show_default=False),
+        typer.Argument(
+            metavar="problem|fit|controller|schedule|robustness", help="The kind of file.", show_default=False
+        ),
     ],
 ) -> None:
-    """Print the JSON Schema of a file that seaopt reads, for editors."""
+    """Print the JSON Schema of a kind of file, for editors."""
     from seaopt.cli.schemas import json_schema
     from seaopt.files import to_json
 

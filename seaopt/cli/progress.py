@@ -22,32 +22,12 @@ MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 REPORT_S = 30.0  # between lines of progress that go to a file
 
 
-def format_left(left_s: float) -> str:
-    """Return a time in words.
-
-    Examples
-    --------
-    >>> format_left(30.2), format_left(300.0)
-    ('30 s left', '5 min left')
-
-    """
-    return f"{left_s:.0f} s left" if left_s < 100.0 else f"{left_s / 60.0:.0f} min left"
-
-
 class TimeLeft:
     """How long a stage still takes, by the speed of all of it or of its last part, whichever is slower.
 
-    What goes wrong turns slow late: a fit that is done searching in a second looks for causes half a minute.
+    A stage may turn slow late: a fit that is done searching in a second looks for causes for half a minute. Nothing is
+    told before the share `told_from`: what comes before has no scale.
 
-    Parameters
-    ----------
-    clock : callable
-        Returns seconds.
-    told_from : float
-        The share from which it can be told: what comes before has no scale.
-
-    Examples
-    --------
     >>> now = iter([0.0, 10.0, 10.0])
     >>> left = TimeLeft(lambda: next(now))
     >>> left.move(0.25)
@@ -74,7 +54,8 @@ class TimeLeft:
             return ""
         slowness = max((last - started) / share, (last - since) / (share - before))
         silent = now - last  # what is silent for longer than was told takes longer
-        return format_left(max((1.0 - share) * slowness - silent, silent) if share < 1.0 else 0.0)
+        left_s = max((1.0 - share) * slowness - silent, silent) if share < 1.0 else 0.0
+        return f"{left_s:.0f} s left" if left_s < 100.0 else f"{left_s / 60.0:.0f} min left"
 
 
 class _Left(ProgressColumn):
@@ -82,11 +63,6 @@ class _Left(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         return Text(task.fields["left"].tell())
-
-
-def shorten_note(text: str) -> str:
-    """Return what fits beside the bar."""
-    return text if len(text) <= MOST_NOTE else text[: MOST_NOTE - 1] + "…"
 
 
 @contextmanager
@@ -115,7 +91,9 @@ def show_progress(
                 note(text)
                 return
             left.move(share)
-            bar.update(task, completed=share, note=shorten_note(printable(text)))
+            beside = printable(text)
+            beside = beside if len(beside) <= MOST_NOTE else f"{beside[: MOST_NOTE - 1]}…"
+            bar.update(task, completed=share, note=beside)
 
         timer = Timer(SHOWN_AFTER_S, lambda: bar.update(task, visible=True))
         timer.daemon = True
@@ -133,9 +111,6 @@ def _write_progress(
     """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
     latest, ended, started, left = "", Event(), time.monotonic(), TimeLeft(told_from=told_from)
 
-    def say(text: str) -> None:
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
-
     def tell(text: str, share: float | None = None, /) -> None:
         nonlocal latest
         if share is None:
@@ -148,7 +123,8 @@ def _write_progress(
         with suppress(OSError):  # a stderr that cannot be written is the stage's to find
             while not ended.wait(REPORT_S):
                 spent = time.monotonic() - started
-                say(f"{label}, {spent:.0f} s{f', {told}' if (told := left.tell()) else ''}: {latest or 'running'}")
+                parts = ", ".join(filter(None, [label, f"{spent:.0f} s", left.tell()]))
+                console.say(f"{parts}: {latest or 'running'}", soft_wrap=True)
 
     writer = Thread(target=write_lines, daemon=True)
     writer.start()
@@ -158,4 +134,4 @@ def _write_progress(
         ended.set()
         writer.join()
     if not brief or time.monotonic() - started > REPORT_S:
-        say(f"{label}: {latest or 'done'}")
+        console.say(f"{label}: {latest or 'done'}", soft_wrap=True)

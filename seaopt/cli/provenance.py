@@ -15,7 +15,6 @@ from typing import Any
 
 from seaopt.files import check_content, check_regular, digest_content, digest_plain
 from seaopt.problem import Problem
-from seaopt.problem.schema import ControllerTable
 from seaopt.robustness.uncertainty.draws import find_modes
 
 FILES = {
@@ -86,7 +85,7 @@ def _read_by_fit(problem: Problem) -> dict[str, Any]:
 
 def _read_by_design(problem: Problem) -> dict[str, Any]:
     """Return what a design reads besides [robustness]: [controller], its plants and values."""
-    asked = _controller(problem)
+    asked = problem.asked
     out = problem.table.model_dump(mode="json", include={"controller"})
     names = {name for name in (asked.plant, *asked.robust_to) if name in problem.plants}
     if problem.table.impedance is not None:
@@ -104,7 +103,7 @@ def _read_by_design(problem: Problem) -> dict[str, Any]:
 
 def _shape_by_robustness(problem: Problem, retune: int) -> dict[str, Any]:
     """Return what has a part in a design of [robustness], and of the uncertainty that it is asked about."""
-    asked, robustness, out = _controller(problem), problem.robustness, dict[str, Any]()
+    asked, robustness, out = problem.asked, problem.robustness, dict[str, Any]()
     if not (asked.robust_to or asked.draws or retune):
         return out
     out["ranges"] = robustness.model_dump(mode="json")["parameters"]
@@ -134,12 +133,7 @@ def _read_by_certify(problem: Problem) -> dict[str, Any]:
     robustness = problem.robustness.model_dump(mode="json", exclude={"retune"})
     read = {name: table["plant"][name] for name in problem.with_partners(plants)}
     sources = {"parameters": table["parameters"], "plant": read}
-    return sources | {"robustness": robustness, "design": _controller(problem).plant}
-
-
-def _controller(problem: Problem) -> ControllerTable:
-    assert problem.table.controller is not None  # whoever designs has asked for it before
-    return problem.table.controller
+    return sources | {"robustness": robustness, "design": problem.asked.plant}
 
 
 _READ_BY_STAGE: dict[str, tuple[Callable[[Problem], dict[str, Any]], tuple[str, ...]]] = {

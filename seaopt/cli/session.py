@@ -6,21 +6,16 @@ import json
 import platform
 import shlex
 import sys
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from seaopt import __version__
 from seaopt.cli.progress import LEAST_SHARE, show_progress
-from seaopt.cli.provenance import (
-    FILES,
-    ROBUSTNESS,
-    digest_sources,
-    name_file,
-)
+from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources, name_file
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
@@ -28,7 +23,7 @@ from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, 
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
-from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentified
+from seaopt.estimation import Experiment, Fit, warn_unidentified
 from seaopt.estimation.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.executors import Processes
@@ -42,7 +37,6 @@ from seaopt.problem.stages import (
     assess_problem,
     can_design,
     certify_problem,
-    certify_schedule_problem,
     check_mpc_file,
     design_mpc,
     fit_problem,
@@ -50,7 +44,6 @@ from seaopt.problem.stages import (
     score_problem,
     simulate_experiment,
     tune_problem,
-    tune_schedule_problem,
 )
 from seaopt.progress import Progress, count_off, divide
 from seaopt.reporting import write_frontier_figure, write_report
@@ -79,16 +72,12 @@ LABELS = {
     "report": "writing the report",
 }
 OWN_LAW = "; as a law of your own it is taken by seaopt certify PROBLEM --controller FILE -o DIR"
-READING = 0.1  # of the time of a fit
-# Of a specification: what a law of the user's own says itself, and nothing asks for.
-FILTERS = ("notch", "prefilter", "link_feedforward")
-OF_THE_LAW = ("structure", *FILTERS, "reference_weights", "sample_rate_hz", *DELAY_KEYS)
-IN_PARTS = ("tune", "sweep", "certify")  # stages that several processes can work on
-
-
-def _format_percents(score: ModelledOutputs) -> str:
-    """Return how well each output is predicted, on one line."""
-    return ", ".join(f"{name} {row['fit_percent']:.2f} %" for name, row in score.to_dict().items())
+READING = 0.1  # share of the time of a fit
+# What a law of the user's own states itself, so that the problem's specification does not ask for it.
+OF_THE_LAW = (
+    "structure", "notch", "prefilter", "link_feedforward", "reference_weights", "sample_rate_hz", *DELAY_KEYS,
+)  # fmt: skip
+PARALLEL = ("tune", "sweep", "certify")  # stages that several processes can share
 
 
 class Session:
@@ -120,11 +109,11 @@ class Session:
         self.results: dict[str, Any] = {}
         self.written: list[Path] = []
         self._experiments: tuple[Experiment, ...] | None = None
-        self._warned: set[str] = set()
+        self._said: set[str] = set()
         self._console = Terminal(stderr=True)
-        self._warn([f"{self.problem.refused}; a design refuses this"] if self.problem.refused else [])
-        for note in self.problem.notes:
-            self._note(note)
+        if self.problem.refused:
+            self._say_once("warning", [f"{self.problem.refused}; a design refuses this"])
+        self._say_once("note", self.problem.notes)
 
     def plan_stages(self) -> list[str]:
         """Return the stages that the problem has what it takes for."""
@@ -133,28 +122,32 @@ class Session:
             stages += ["tune", "certify"]
         if not stages:
             raise ProblemError(
-                f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them (a whole file is "
-                "written by seaopt new LOG)"
+                f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them, or write a whole "
+                "file from a log: seaopt new LOG"
             )
         return [*stages, "report"]
 
-    def explain_left_out(self, stages: list[str]) -> list[str]:
-        """Return what the file, or the fit, gives reason to expect of a whole run and does not get, and why."""
+    def explain_stages(self, stages: list[str]) -> None:
+        """Say on stderr what a whole run leaves out, and which results in the folder are of an earlier run."""
         source, table = self.problem.source, self.problem.table
         if table.robustness is not None and table.controller is None:
-            return [f"tuning and certifying: {source} has [robustness] but no [controller]; add one"]
-        if table.controller is not None and "tune" not in stages:
-            return ["tuning and certifying: they need a fit that has converged; mend it first"]
-        return []
-
-    def name_leftovers(self, stages: list[str]) -> list[str]:
-        """Return the results in the folder that an earlier run left and this one does not replace."""
-        paths = [self._path(stage) for stage in ("fit", "tune", "certify") if stage not in stages]
-        return [f"{path} is of an earlier run, and no part of this report" for path in paths if path.exists()]
+            self.say(f"left out: tuning and certifying: {source} has [robustness] but no [controller]; add one")
+        elif table.controller is not None and "tune" not in stages:
+            self.say("left out: tuning and certifying: they need a fit that has converged; mend it first")
+        for stage in ("fit", "tune", "certify"):
+            if stage not in stages and self._path(stage).exists():
+                self.say(f"note: {self._path(stage)} is of an earlier run, and no part of this report")
 
     def say(self, text: str) -> None:
         """Write one line on stderr."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self._console.say(text, soft_wrap=True)
+
+    def _say_once(self, kind: str, texts: Iterable[str]) -> None:
+        """Write each note or warning on stderr, unless it was written before."""
+        for text in texts:
+            if text not in self._said:
+                self.say(f"{kind}: {text}")
+            self._said.add(text)
 
     def can_design(self) -> bool:
         """Tell whether the fit of this run can be designed with: it converged, or there was none."""
@@ -166,28 +159,18 @@ class Session:
             "simulate": self._simulate, "fit": self._fit, "tune": self._tune, "certify": self._certify,
             "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
-        try:
-            with self._progress(stage) as tell, self._start_workers(stage):
-                stages[stage](tell)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
-
-    @contextmanager
-    def _start_workers(self, stage: str) -> Generator[None]:
-        """Have processes for a stage that has parts for them, where they are asked for."""
-        if self.workers is None or stage not in IN_PARTS:
-            yield
-            return
-        self.executor = Processes(self.workers)
-        try:
-            yield
-        finally:
-            self.executor.shutdown(cancel_futures=True)
-            self.executor = None
-
-    def _progress(self, stage: str) -> AbstractContextManager[Progress]:
-        told_from = READING + (1.0 - READING) * SCALED if stage == "fit" else 0.0
-        return show_progress(self._console, LABELS[stage], self._note, told_from=told_from + LEAST_SHARE)
+        told_from = LEAST_SHARE + (READING + (1.0 - READING) * SCALED if stage == "fit" else 0.0)
+        with ExitStack() as stack:
+            if self.workers is not None and stage in PARALLEL:
+                self.executor = Processes(self.workers)
+                stack.callback(self.executor.shutdown, cancel_futures=True)
+            try:
+                with show_progress(
+                    self._console, LABELS[stage], lambda note: self._say_once("note", [note]), told_from=told_from
+                ) as tell:
+                    stages[stage](tell)
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Return the problem's experiments, read or made once."""
@@ -208,39 +191,38 @@ class Session:
         """Return the parameter values to design with, the file's for what the fit does not have."""
         return self.problem.values(self.parameters())
 
-    def _design_values(self, *plants: Plant) -> ParameterSet:
-        """Return the values to design with; those that the fit cannot tell, of these plants, are named on stderr."""
-        values = self.values()
-        self._warn(warn_unidentified(values, {name for plant in plants for name in plant.parameters}))
-        return values
+    def _warn_of_design(self, plants: Iterable[Plant]) -> None:
+        """Name on stderr the parameters of plants that the fit cannot tell, and a delay that is too short."""
+        names = {name for plant in plants for name in plant.parameters}
+        self._say_once("warning", warn_unidentified(self.values(), names))
+        self._spec()
 
     def _spec(self) -> ControllerSpec:
-        """Return the specification with its delay; one that is shorter than the experiments' is warned of."""
-        assert self.problem.spec is not None  # whoever tunes has asked for the design plant before
+        """Return the specification with its delay; warn of one that is shorter than the experiments'."""
+        assert self.problem.spec is not None  # whoever designs has asked for the design plant before
         design, source = self.problem.design_plant, self.parameters()
-        self._warn(warn_delays(self.problem.spec, design, source))
+        self._say_once("warning", warn_delays(self.problem.spec, design, source))
         return settle_delays(self.problem.spec, design, source)[0]
 
-    def _warn(self, notes: Iterable[str]) -> None:
-        """Write each warning on stderr, once."""
-        for note in notes:
-            if note not in self._warned:
-                self.say(f"warning: {note}")
-            self._warned.add(note)
-
-    def _note(self, text: str) -> None:
-        """Write a note on stderr, unless it was a warning before."""
-        if text not in self._warned:
-            self.say(f"note: {text}")
-        self._warned.add(text)
-
-    def controller(self) -> Controller:
-        """Return the controller of this run or of the folder; one for other limits than the problem's is refused."""
+    def law(self) -> Controller | ScheduledController:
+        """Return the law or schedule of this run or of the folder; refuse one for other limits than the problem's."""
         if "tune" not in self.results:
-            design, _ = list_plants(self.problem, self.parameters())
-            controller = Controller.from_dict(self._read("tune"), design, self.values())
-            self._check_spec(controller.spec)
-            self.results["tune"] = controller
+            source, schedule = self.parameters(), self.problem.schedule
+            content = self._read("tune")
+            if schedule is None:
+                law = Controller.from_dict(content, list_plants(self.problem, source)[0], self.values())
+                self._check_spec(law.spec)
+            else:
+                law = ScheduledController.from_dict(
+                    content, self.problem.design_plant, self.values(), self.problem.robust_to(source)
+                )
+                if (law.over, list(law.points)) != (schedule.over, schedule.points):
+                    raise ProblemError(
+                        f"{self._path('tune')}: is over other points than [controller.schedule] of "
+                        f"{self.problem.source}; run {self._spell('tune')} again"
+                    )
+                self._check_spec(replace(law.spec, bandwidth_hz=self._spec().bandwidth_hz))
+            self.results["tune"] = law
         return self.results["tune"]
 
     def plan(self) -> ForceMPC:
@@ -261,13 +243,11 @@ class Session:
             return
         given = read_law(path)
         controller = assess_problem(self.problem, given, self.parameters())
-        target = self.folder / FILES["tune"]
-        known = (
-            read_json(target, SCHEMAS["tune"], remedy="give the law another folder: -o DIR") if target.exists() else {}
-        )
-        before = {"structure": CUSTOM} | known
-        if before.get("structure") != CUSTOM or "mpc" in before:
-            raise ProblemError(f"{target}: is a controller that was tuned; give the law another folder: -o DIR")
+        target, other = self.folder / FILES["tune"], "give the law another folder: -o DIR"
+        if target.exists():
+            earlier = read_json(target, SCHEMAS["tune"], remedy=other)
+            if earlier.get("structure") != CUSTOM or "mpc" in earlier:
+                raise ProblemError(f"{target}: is a controller that was tuned; {other}")
         self._keep(controller)
 
     def _keep(self, controller: Controller | ScheduledController) -> None:
@@ -276,26 +256,6 @@ class Session:
         self.results["tune"] = controller
         self._write("tune", controller.to_dict() | plan)
 
-    def schedule(self) -> ScheduledController:
-        """Return the schedule of this run or of the folder; one for other limits than the problem's is refused."""
-        if "tune" not in self.results:
-            schedule = ScheduledController.from_dict(
-                self._read("tune"), self.problem.design_plant, self.values(), self.problem.robust_to(self.parameters())
-            )
-            asked = self.problem.schedule
-            if asked is None or (schedule.over, list(schedule.points)) != (asked.over, asked.points):
-                raise ProblemError(
-                    f"{self._path('tune')}: is over other points than [controller.schedule] of {self.problem.source}; "
-                    f"run {self._spell('tune')} again"
-                )
-            self._check_spec(replace(schedule.spec, bandwidth_hz=self._spec().bandwidth_hz))
-            self.results["tune"] = schedule
-        return self.results["tune"]
-
-    def _designed(self) -> Controller | ScheduledController:
-        """Return what was tuned: one law, or a schedule."""
-        return self.controller() if self.problem.schedule is None else self.schedule()
-
     def _path(self, stage: str) -> Path:
         return self.folder / name_file(self.problem, stage)
 
@@ -303,12 +263,12 @@ class Session:
         return (SCHEDULE_SCHEMAS if self.problem.schedule is not None else SCHEMAS).get(stage, SCHEMAS[stage])
 
     def _check_spec(self, stored: ControllerSpec) -> None:
-        asked, path = self._spec().to_dict(), self._path("tune")
-        given = OF_THE_LAW if stored.structure == CUSTOM else ()
+        asked = self._spec().to_dict()
+        stated = OF_THE_LAW if stored.structure == CUSTOM else ()
         for name, value in stored.to_dict().items():
-            if name not in given and value != asked.get(name):
+            if name not in stated and value != asked.get(name):
                 raise ProblemError(
-                    f"{path}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
+                    f"{self._path('tune')}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
                     f"{asked.get(name)}; correct one of them, or run {self._spell('tune')} again"
                 )
 
@@ -340,7 +300,8 @@ class Session:
         if changed - {ROBUSTNESS}:
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         if changed:
-            self._note(f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one")
+            note = f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one"
+            self._say_once("note", [note])
         return content
 
     def _simulate(self, tell: Progress) -> None:
@@ -363,7 +324,7 @@ class Session:
         result = fit_problem(self.problem, self.experiments(), progress=fitting)
         self.results["fit"] = result
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
-        self._write("fit", result.to_dict() | {"validation": {one.name: one.to_dict() for one in scores}})
+        self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})
 
     def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> None:
         """Score the folder's fit on another log, and print that; all of what the log has to say, if `verbose`."""
@@ -372,18 +333,14 @@ class Session:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] that is fitted; {WRITE_ONE}")
         score = fitted.predict(self.problem.experiment_like(log, like))
         if as_json:
-            content = {
-                "schema": "seaopt/validation/1",
-                "log": str(log),
-                "fit_met": fitted.met,
-                "outputs": score.to_dict(),
-            }
-            sys.stdout.write(to_json(content))
+            content = {"schema": "seaopt/validation/1", "log": str(log), "fit_met": fitted.met}
+            sys.stdout.write(to_json(content | {"outputs": score.to_dict()}))
             return
         if not fitted.met:
             self.say(f"warning: scored {UNMET}: {fitted.verdict}")
         console = Terminal()
-        console.wrap(f"{log}: {_format_percents(score)}")
+        percents = ", ".join(f"{name} {percent:.2f} %" for name, percent in score.fit_percent.items())
+        console.wrap(f"{log}: {percents}")
         if amount != "quiet":
             console.say(repr(score))
         if amount == "verbose":
@@ -393,61 +350,49 @@ class Session:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; {WRITE_ONE}")
         experiments = self.experiments()
-        fitted = self._read_fit_if_any()
+        fitted = None
+        if (self.folder / FILES["fit"]).exists():
+            try:
+                fitted = Fit.from_dict(self._read("fit"))
+            except ProblemError as error:
+                self.say(f"left out: {error}")
         responses = estimate_responses(experiments, self.problem, fitted, self.stretch_s, tell)
         self.results["frf"] = responses
         self._write("frf", {"schema": SCHEMAS["frf"], **responses.to_dict()})
         self.written += responses.draw(self.folder / "frf")
 
-    def _read_fit_if_any(self) -> Fit | None:
-        """Return the folder's fit; None where there is none, or (noted on stderr) it was made from something else."""
-        if not (self.folder / FILES["fit"]).exists():
-            return None
-        try:
-            return Fit.from_dict(self._read("fit"))
-        except ProblemError as error:
-            self.say(f"left out: {error}")
-            return None
-
     def _tune(self, tell: Progress) -> None:
-        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.parameters())
-        self._design_values(design, *(plant for plant, _ in robust_to.values()))
-        self._spec()
-        if self.problem.schedule is not None:
-            result = tune_schedule_problem(self.problem, self.parameters(), tell)
-        else:
-            result = tune_problem(self.problem, self.parameters(), tell, self.executor)
+        source = self.parameters()
+        design = self.problem.design_plant
+        self._warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
+        result = tune_problem(self.problem, source, tell, self.executor)
         if isinstance(result, JointTuning):
             self.results["joint"], result = result, result.controller
         self._keep(result)
 
     def _sweep(self, tell: Progress) -> None:
+        source, file = self.parameters(), self.problem.source
         if self.problem.mpc is not None:
             raise ProblemError(
-                f'{self.problem.source}: a sweep tunes gains, and [controller] has structure = "mpc"; to sweep write '
-                'structure = "pid"'
+                f'{file}: a sweep tunes gains, and [controller] has structure = "mpc"; write structure = "pid" to sweep'
             )
         if self.problem.schedule is not None:
-            raise ProblemError(
-                f"{self.problem.source}: a sweep is of one law, and [controller.schedule] asks for one at every point; "
-                "take it out"
-            )
-        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.parameters())
-        values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
-        design, robust_to = list_plants(self.problem, self.parameters())
+            raise ProblemError(f"{file}: a sweep is of one law; take [controller.schedule] out")
+        design = self.problem.design_plant
+        self._warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
+        design, robust_to = list_plants(self.problem, source)
         if self.free_law and self.problem.designs_on_response:
             raise ProblemError(
-                f"{self.problem.source}: --free-law takes a model, and [controller] is designed on "
-                f"{self.problem.response_names[0]}; leave --free-law out, or name a plant there"
+                f"{file}: --free-law takes a model, and [controller] is designed on {self.problem.response_names[0]}; "
+                "leave --free-law out, or name a plant there"
             )
-        draws = self.problem.draws(self.parameters())
         result = sweep(
             design,
-            values,
+            self.values(),
             self._spec(),
             self.bandwidths_hz,
             robust_to,
-            draws=draws,
+            draws=self.problem.draws(source),
             free_law=self.free_law,
             executor=self.executor,
             progress=tell,
@@ -458,14 +403,10 @@ class Session:
 
     def _certify(self, tell: Progress) -> None:
         plants = self.problem.certified_plants()
-        law, source = self._designed(), self.parameters()
-        self._design_values(*plants.values())
-        if isinstance(law, ScheduledController):
-            result = certify_schedule_problem(self.problem, law, source, tell, self.executor)
-        else:
-            result = certify_problem(self.problem, law, source, tell, self.executor)
-        for remark in self.problem.remarks(self.values()):
-            self._note(remark)
+        law = self.law()
+        self._warn_of_design(plants.values())
+        result = certify_problem(self.problem, law, self.parameters(), tell, self.executor)
+        self._say_once("note", self.problem.remarks(self.values()))
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 
@@ -482,8 +423,8 @@ class Session:
                 results.append(fitted)
         tuned = "tune" in self.results or self._path("tune").exists()
         if self.problem.spec is not None and (tuned or not results):  # a report is of something
-            designed = self._designed()
-            results.append(designed if self.problem.mpc is None else self.plan())
+            law = self.law()
+            results.append(law if self.problem.mpc is None else self.plan())
             if "certify" not in self.results and self._path("certify").exists():
                 self._read_certificate()
             results += [self.results["certify"]] if "certify" in self.results else []
@@ -501,21 +442,16 @@ class Session:
 
     def _read_certificate(self) -> None:
         """Take the folder's certificate."""
-        content, source = self._read("certify"), self.parameters()
-        if self.problem.schedule is not None:
+        content, source, law = self._read("certify"), self.parameters(), self.law()
+        plants = self.problem.certified_plants()
+        if isinstance(law, ScheduledController):
             self.results["certify"] = ScheduleCertificate.from_dict(
-                content,
-                self.schedule(),
-                self.problem.certified_plants(),
-                source,
-                ranges=self.problem.ranges,
-                others=self.problem.parameters,
+                content, law, plants, source, ranges=self.problem.ranges, others=self.problem.parameters
             )
             return
-        asked, design = self.problem.spec or self.problem.mpc, self.problem.design_plant
-        assert asked is not None
-        plants = split_delayed(asked, design, self.problem.certified_plants(), source)
-        self.results["certify"] = Certificate.from_dict(content, self.controller(), plants, self.values())
+        assert self.problem.spec is not None
+        plants = split_delayed(self.problem.spec, self.problem.design_plant, plants, source)
+        self.results["certify"] = Certificate.from_dict(content, law, plants, self.values())
 
     def met(self, stages: list[str]) -> bool:
         """Tell whether everything that these stages require is met."""
@@ -530,53 +466,42 @@ class Session:
         expectations = list_expectations(self.problem)
         if expectations and isinstance(fit := self.results.get("fit"), Fit) and "scores" not in self.results:
             self.results["scores"] = score_problem(self.problem, fit, self.experiments())
+        one_law = self.problem.schedule is None
         results = Stages(
             self.problem,
             fit=self.results.get("fit"),
             scores=self.results.get("scores", []),
-            **({} if self.problem.schedule is not None else self._design_results()),
+            controller=self.results.get("tune") if one_law else None,
+            certificate=self.results.get("certify") if one_law else None,
         )
         return [expectation.check(results) for expectation in expectations]
-
-    def _design_results(self) -> dict[str, Any]:
-        return {"controller": self.results.get("tune"), "certificate": self.results.get("certify")}
 
     def _verdicts(self, stage: str) -> list[Verdict]:
         """Return what to say of a stage that has run; a design on a fit that is not met is not met either."""
         if stage == "expect":
             return judge_expectations(self._expected())
         result = self.results.get(stage)
-        if stage == "frf" and result is not None:
+        if result is None or stage == "simulate":
+            return []
+        if stage == "frf":
             return [Verdict(met=good, text=text) for good, text in result.verdict()]
-        if stage == "fit" and result is not None:
-            return self._name_guesses([self._judge(result)])
+        if stage == "sweep":
+            mend = f"mend the fit: {self._spell('fit')}"
+            return [] if self.fit_met() else [Verdict(met=False, text=UNMET, next=(mend,))]
         verdicts: list[Verdict] = []
-        if stage == "tune" and result is not None:
+        if stage == "tune":
             joint = self.results.get("joint")
             if joint is not None:
                 verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
-            verdicts.append(self._judge(result if self.problem.mpc is None else self.plan()))
-        if stage == "certify" and result is not None:
-            verdicts.append(self._judge(result))
-        if stage not in ("tune", "certify", "sweep") or self.fit_met():
-            return self._name_guesses(verdicts)
-        if stage == "sweep":
-            return [Verdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
-        return [doubt_design(one) for one in verdicts]
-
-    def _judge(
-        self, result: Fit | Controller | ScheduledController | ForceMPC | Certificate | ScheduleCertificate
-    ) -> Verdict:
-        """Return the verdict on a result, with what to type next."""
+            result = result if self.problem.mpc is None else self.plan()
         again = self._spell("run" if self.problem.table.experiment else "tune")
         verdict = judge(result, Commands(fit=self._spell("fit"), tune=self._spell("tune"), certify=again))
         assert verdict is not None
-        return verdict
-
-    def _name_guesses(self, verdicts: list[Verdict]) -> list[Verdict]:
-        """Return verdicts of which those that are met name the guesses that they rest on."""
+        verdicts.append(verdict)
+        if stage != "fit" and not self.fit_met():
+            return [doubt_design(verdict) for verdict in verdicts]
         guesses = state_guesses(self.problem.table.guessed)
-        return [name_guesses(one, guesses) for one in verdicts]
+        return [name_guesses(verdict, guesses) for verdict in verdicts]
 
     def _spell(self, command: str) -> str:
         """Return a command on this problem as it is typed."""
@@ -588,11 +513,10 @@ class Session:
             contents = {stage: self._json(stage) for stage in stages if stage != "report" or len(stages) == 1}
             if "expect" in self._judged(stages) and self.problem.table.expect is not None:
                 contents["expect"] = {"outcomes": [{"met": met, "text": text} for met, text in self._expected()]}
-            only = next(iter(contents.values())) if len(contents) == 1 else contents
-            sys.stdout.write(to_json(only))
+            sys.stdout.write(to_json(next(iter(contents.values())) if len(contents) == 1 else contents))
             return
         console = Terminal()
-        judged = [one for stage in self._judged(stages) for one in self._verdicts(stage)]
+        judged = [verdict for name in self._judged(stages) for verdict in self._verdicts(name)]
         show_verdicts(console, judged, verbose=amount == "verbose")
         if amount == "quiet" and judged:
             return

@@ -5,25 +5,19 @@ from __future__ import annotations
 import io
 import os
 import sys
-import textwrap
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console
-from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
-from seaopt.formatting import format_table, printable
-from seaopt.reporting.sections.text import Line
+from seaopt.formatting import printable
+from seaopt.reporting.sections.data import Table
+from seaopt.reporting.sections.text import Line, render_table, wrap
 
-Amount = Literal["quiet", "usual", "verbose"]  # of what is printed
-
-LEAST_WIDTH = 20  # of a wrapped text, in characters
-NARROW = 16  # characters of a cell that is never broken
+Amount = Literal["quiet", "usual", "verbose"]  # how much is printed
 
 
 class Terminal(Console):
@@ -31,22 +25,19 @@ class Terminal(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Print as Rich does."""
-        super().print(*(printable(one) if isinstance(one, str) else one for one in objects), **options)
+        super().print(*(printable(text) if isinstance(text, str) else text for text in objects), **options)
 
     def say(self, text: str, **options: Any) -> None:
         """Print a text as it is: no markup, no colours of Rich's own, lines broken at blanks."""
         self.print(text, highlight=False, markup=False, **options)
 
-    def wrap(self, text: str, *, indent: int = 0, **options: Any) -> None:
+    def wrap(self, text: str, *, indent: int = 0) -> None:
         """Print a text with its lines broken at blanks, all of them indented; commands in it stay whole words."""
-        for line in self.break_lines(text, indent=indent):
-            self.say(" " * indent + line, soft_wrap=True, **options)
+        self.write(wrap(text, self.width, indent=indent))
 
-    def label(self, word: str, text: str, *, style: str, indent: int) -> None:
-        """Print a word in a colour and a text beside it, whose further lines begin below the first one."""
-        first, *rest = self.break_lines(text, indent=indent)
-        self.say(word, style=style, end=" " * (indent - len(word)))
-        self.say("\n".join([first, *(" " * indent + line for line in rest)]), soft_wrap=True)
+    def tabulate(self, rows: Iterable[Sequence[str]], head: Sequence[str], align: str = "") -> None:
+        """Print rows in aligned columns, "<" or ">" for each."""
+        self.write(render_table(make_table(rows, head, align), self.width))
 
     def write(self, lines: Iterable[Line]) -> None:
         """Print lines of sections as they are, in their colours."""
@@ -65,32 +56,10 @@ class Terminal(Console):
                 lines.append(word)
         self.say("\n".join(lines), soft_wrap=True)
 
-    def break_lines(self, text: str, *, indent: int = 0) -> list[str]:
-        """Return a text as the lines that fit the terminal behind an indent; at least one."""
-        width = max(self.width - indent, LEAST_WIDTH)
-        return textwrap.wrap(printable(text), width, break_long_words=False, break_on_hyphens=False) or [""]
 
-    def tabulate(
-        self, rows: Iterable[Sequence[str]], head: Sequence[str] = (), align: str = "", *, indent: int = 2, gap: int = 2
-    ) -> None:
-        """Print rows in aligned columns: "<" or ">" for each; what is too wide is broken in its cell."""
-        cells = [[printable(cell) for cell in row] for row in rows]
-        lines = [*([list(head)] if head else []), *cells]
-        widths = [max(map(len, column)) for column in zip_longest(*lines, fillvalue="")]
-        whole = [align[at : at + 1] == ">" or width <= NARROW for at, width in enumerate(widths)]
-        least = sum(width if kept else NARROW for width, kept in zip(widths, whole, strict=True))
-        if least + gap * (len(widths) - 1) + indent > self.width:  # nothing is cut: the terminal breaks the lines
-            for line in format_table(cells, head or None, align):
-                self.say(" " * indent + line, soft_wrap=True)
-            return
-        table = Table(box=None, show_header=bool(head), pad_edge=False, padding=(0, gap, 0, 0), header_style="dim")
-        for at, kept in enumerate(whole):
-            # Figures stay whole; words are broken.
-            side = "right" if align[at : at + 1] == ">" else "left"
-            table.add_column(Text(head[at]) if head else "", justify=side, no_wrap=kept, overflow="fold")
-        for row in cells:
-            table.add_row(*map(Text, row))
-        self.print(Padding(table, (0, 0, 0, indent)))
+def make_table(rows: Iterable[Sequence[str]], head: Sequence[str], align: str = "") -> Table:
+    """Return rows of texts as a table of sections."""
+    return Table(head=tuple(head), rows=tuple(tuple(row) for row in rows), align=align)
 
 
 def prepare_streams() -> None:

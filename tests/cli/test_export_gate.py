@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.cli.export import GateOptions, choose_gate
+from seaopt.cli.export import choose_gate
 from seaopt.control import MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.control.laws.stored import read_controller
 from seaopt.control.mpc.export import collect_code
@@ -120,10 +120,10 @@ def test_a_range_that_is_typed_takes_the_step_of_the_problem_file(tuned, folder,
         (("--gate", "-4000:4000"), "write [controller.gate] with range_N = [-4000, 4000] in the problem file"),
         (("--gate", "4000"), "type --gate LOW:HIGH, such as -4000:4000"),
         (("--gate", "5:1", "--gate-max-step", "3"), "range_N = (5, 1) is not a range"),
-        (("--gate", "-9:9", "--gate-max-step", "-3"), "max_step_N = -3 is not between"),
-        (("--gate", "-9:9", "--gate-max-step", "0"), "max_step_N = 0 is not between"),
+        (("--gate", "-9:9", "--gate-max-step", "-3"), "max_step_N = -3 is not above 0"),
+        (("--gate", "-9:9", "--gate-max-step", "0"), "max_step_N = 0 is not above 0"),
         (("--gate", "-9:9", "--gate-max-step", "3", "--gate-max-held", "-1"), "max_held = -1"),
-        (("--gate", "-9:9", "--gate-max-step", "3", "--gate-ramp", "0"), "--gate-ramp 0"),
+        (("--gate", "-9:9", "--gate-max-step", "3", "--gate-ramp", "0"), "ramp_s = 0 is not above 0"),
         (("--gate", "-9:9", "--gate-max-step", "3", "--current-limit", "inf"), "type --current-limit"),
         (("--gate", "-9:9", "--no-gate"), "type one of them"),
         (("--gate-max-held", "3"), "add --gate LOW:HIGH"),
@@ -165,10 +165,10 @@ def test_a_plans_own_step_is_that_of_its_code(stand, thor):
     gate = PlausibilityGate(range_N=(-3000.0, 3500.0), max_step_N=300.0, max_held=8, ramp_A_per_s=45.0)
     plans = [force_mpc(stand, thor, MPCSpec(current_limit_A=9.0), gate=one) for one in (gate, None)]
     gated, bare = ({"mpc": {"code": collect_code(plan).to_dict()}, "guards": {"gate": None}} for plan in plans)
-    chosen = choose_gate(gated, GateOptions(range_N="-100:200", ramp_s=0.2), {})
+    chosen = choose_gate(gated, {"range_N": "-100:200", "ramp_s": 0.2}, {})
     assert chosen == PlausibilityGate(range_N=(-100.0, 200.0), max_step_N=300.0, max_held=5, ramp_A_per_s=45.0)
     with pytest.raises(ProblemError, match=r"type --gate-max-step, or write \[controller.gate\]"):
-        choose_gate(bare, GateOptions(range_N="-100:200"), {})
+        choose_gate(bare, {"range_N": "-100:200"}, {})
 
 
 @pytest.mark.slow

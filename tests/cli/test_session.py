@@ -206,7 +206,7 @@ def test_an_edited_controller_is_refused(write, tuned, tmp_path, changes):
     text, folder = tuned
     edit(folder, changes, sealed=False)
     with pytest.raises(so.SeaoptError, match=r"was edited.*run seaopt tune"):
-        Session(write(text), folder).controller()
+        Session(write(text), folder).law()
     with pytest.raises(so.SeaoptError, match=r"was edited.*run seaopt tune"):
         export_controller(folder, tmp_path / "c", json=False)
 
@@ -214,10 +214,10 @@ def test_an_edited_controller_is_refused(write, tuned, tmp_path, changes):
 def test_a_controller_is_judged_by_the_problems_limits(write, tuned):
     text, folder = tuned
     held = edit(folder, {}, sealed=True)
-    assert Session(write(text), folder).controller().gains == held["gains"]
+    assert Session(write(text), folder).law().gains == held["gains"]
     edit(folder, {"spec": {"max_sensitivity": 99.0}}, sealed=True)
     with pytest.raises(so.SeaoptError, match=r"spec.max_sensitivity is 99.0, and .*asks for 1.6"):
-        Session(write(text), folder).controller()
+        Session(write(text), folder).law()
 
 
 def test_feasible_is_found_out_again(write, tuned):
@@ -241,7 +241,7 @@ def test_a_fit_made_again_from_the_same_file_keeps_its_controller(write, tmp_pat
     after = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
     assert after["provenance"] != before["provenance"] and after["provenance"]["python"] == "4.0"
     assert after["made_from"] == before["made_from"] and "wall_s" not in after
-    Session(path, tmp_path).controller()  # is not refused
+    Session(path, tmp_path).law()  # is not refused
 
 
 def test_logs_that_are_not_fitted_are_scored(write, tmp_path, capsys):

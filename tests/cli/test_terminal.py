@@ -15,7 +15,9 @@ import seaopt as so
 from seaopt.cli.main import app
 from seaopt.cli.progress import TimeLeft
 from seaopt.cli.terminal import Terminal
+from seaopt.reporting.sections.data import Verdict
 from seaopt.reporting.sections.kinds.certificate import explain_failure
+from seaopt.reporting.sections.text import render_verdict
 from seaopt.robustness.certificate.requirement import Requirement, group_failures
 
 
@@ -63,7 +65,7 @@ def test_nothing_of_a_table_or_of_a_path_is_lost_however_narrow(width, capsys):
     console = Terminal(width=width)
     rows = [("natural_frequency_hz", "10.665", "± 15", "Hz"), ("J", "1.6348e-06", "± 4.5e-06", "kg m^2")]
     console.tabulate(rows, ("parameter", "value", "std", "unit"), "<>><")
-    console.label("not met", "Controller: every limit met, on a fit", style="red", indent=9)
+    console.write(render_verdict(Verdict(met=False, text="Controller: every limit met, on a fit"), width))
     console.list_files(["a b/c.json", "out with blanks/report.html"])
     text = capsys.readouterr().out
     lines = text.splitlines()
