@@ -119,7 +119,7 @@ def choose_threshold(probability: float, runs: int, charts: int, allowance: floa
 
 @record(eq=False)
 class Charts:
-    """Charts of one parameter, a row an actuator, a column a run."""
+    """Charts of one parameter: a row per actuator, a column per run."""
 
     # innovations over their stds; nan at the first run and where there is none
     ratios: Float[np.ndarray, "actuators runs"]

@@ -191,7 +191,7 @@ class Drift(Worded):
 
 @record(eq=False)
 class _Runs:
-    """Runs of one parameter, a row an actuator, a column a run, nan where there is none."""
+    """Runs of one parameter: a row per actuator, a column per run, nan where there is none."""
 
     actuators: list[str]
     places: Int[np.ndarray, "actuators runs"]  # rows of the history; -1 for none

@@ -68,7 +68,7 @@ class Population(Worded):
     between, within : array
         Covariances T, between actuators, and R, between runs of one; R is zero where no actuator has several logs.
     table : polars.DataFrame
-        A row an actuator: logs, and for each parameter NAME the posterior value, NAME_std, NAME_low and NAME_high
+        One row per actuator: logs, and for each parameter NAME the posterior value, NAME_std, NAME_low and NAME_high
         (95 %), and NAME_own with NAME_own_std from its own logs alone.
     left_out : mapping of reason to int
         Logs that are not used.

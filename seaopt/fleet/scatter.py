@@ -117,7 +117,7 @@ class Between:
 def estimate_between_runs(runs: Sequence[tuple[Runs, Runs]]) -> Between | None:
     """Return how much values differ from run to run beyond the variances of their fits; None of too few runs.
 
-    `runs`: a row an actuator in the order of time, nan where there is no run.
+    `runs`: a row per actuator in the order of time, nan where there is no run.
 
     Examples
     --------

@@ -96,7 +96,7 @@ def _describe_fit(plan: Plan, log: FleetLog, known: str | None) -> Row:
             return {"status": UNCHANGED}
         row: Row = {"log_sha256": digest}
         try:
-            experiment = problem.repeat_experiment(path)
+            experiment = problem.experiment_like(path, keep_slice=True)
             fitted = fit_problem(problem, [experiment])
         except SeaoptError as error:
             return row | {"status": FAILED, "reason": str(error)}

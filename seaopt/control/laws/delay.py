@@ -277,7 +277,7 @@ def warn_delays(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> 
         warnings.append(
             f"delay_samples = {spec.delay_samples} is an older key, the whole loop in samples with the drive's delay "
             "in it; give compute_delay_samples (from a reading to the command being put out), and drive_delay_s where "
-            "no log tells it"
+            "no log shows it"
         )
     stated = [f"{name} = {getattr(spec, name):g}" for name in ("delay_samples", "drive_delay_s") if getattr(spec, name)]
     parts = list_dead_times(plant) if stated else ()

@@ -99,8 +99,8 @@ class ControllerSpec:
         default=None,
     )
     drive_delay_s: float | None = option(
-        "From the command to its effect, exact in fractions of a sample, where no log tells it; that of the fit where "
-        "left out.",
+        "From the command to its effect, exact in fractions of a sample, for a delay that no log shows; that of the "
+        "fit where left out.",
         default=None,
         unit="s",
     )

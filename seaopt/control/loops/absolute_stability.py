@@ -101,11 +101,11 @@ class FrictionMargin:
         """Return up to how steep a friction stability is shown, and how, or why it is not."""
         if not self.factor:
             return f"stability between sliding and stuck is not shown ({self.multiplier})"
-        steep = "however steep" if np.isinf(self.factor) else f"up to {self.factor:.3g} times as steep as its own"
-        missing = "" if self.shown else "; for its own it is not"
+        steep = "however steep" if np.isinf(self.factor) else f"up to {self.factor:.3g} times as steep as the model's"
+        missing = "" if self.shown else "; not for the model's own"
         where = f"by a test at {self.angles} angles, between the samples too"
         where += ", linearised at rest" if self.linearised else ""
-        return f"stability is shown for every curve {steep}, {where}{missing}"
+        return f"stable for any friction curve {steep}, {where}{missing}"
 
     def __str__(self) -> str:
         return f"friction: {self.describe()}"

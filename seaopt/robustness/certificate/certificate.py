@@ -56,8 +56,8 @@ from seaopt.robustness.verification.verification import Verification, verify
 ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 NO_NOISE = (
-    "the simulations' sensor has no noise, which can free a joint that sticks, so that what is regulated wanders; give "
-    "certify(sensors=...), or sensors = { noise_std = ... } in [robustness]"
+    "simulated without sensor noise, which may dither a joint out of stiction; give certify(sensors=...), or sensors = "
+    "{ noise_std = ... } in [robustness]"
 )
 NO_MODEL = "nothing drawn or simulated: measured points alone, without a model"
 DESIGN_NAMES = ("design", DESIGN_PLANT)  # of the design plant where the caller does not list it
