@@ -108,6 +108,7 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     if first["type"] == "missing":
         return f"key {place} is missing; {remedy or f'add it: {key} = ...'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    words = words.replace("List should", "should").replace(" after validation", "")
     words = "should be a table" if first["type"] == "model_type" else words
     if not first["loc"]:  # of the whole file
         return f"{words}; {remedy or 'correct the file'}"
@@ -122,6 +123,8 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
         first["input"], str
     ):  # with its unit, as a rule: a number may be another
         correct = "give the number alone, without quotes, in the key's own unit"
+    elif kind == "literal":
+        correct = f"correct it: {own} = {_suggest_choice(first)}"
     else:
         correct = f"correct it: {key} = {EXAMPLES.get(kind, '...')}"
     return f"{place} = {shorten(first['input'])}: {words}; {remedy or correct}"
@@ -137,6 +140,13 @@ def _suggest_number(model: type[BaseModel], mistake: Mapping[str, Any]) -> str:
     return f"{default:g}" if isinstance(default, int | float) else "..."
 
 
+def _suggest_choice(mistake: Mapping[str, Any]) -> str:
+    """Return the text that was likely meant of those that may be given; "..." where they are no texts."""
+    choices = re.findall(r"'([^']*)'", mistake["ctx"]["expected"])
+    nearest = get_close_matches(str(mistake["input"]), choices, n=1, cutoff=0.0)
+    return f'"{nearest[0]}"' if nearest else "..."
+
+
 def _spell(value: Any) -> str:
     """Return a value as TOML has it, where it is short."""
     return json.dumps(value, ensure_ascii=False) if isinstance(value, str | int | float) else "..."
@@ -144,9 +154,9 @@ def _spell(value: Any) -> str:
 
 def _is_range(mistake: Mapping[str, Any]) -> bool:
     """Tell whether a mistake is that of two numbers that are not two; every tuple of the models is a range."""
-    return mistake["type"] in ("tuple_type", "too_long", "too_short") or (
-        mistake["type"] == "missing" and isinstance(mistake["loc"][-1], int)
-    )
+    if mistake["type"] in ("too_long", "too_short"):  # which a list may be, too
+        return mistake["ctx"]["field_type"] == "Tuple"
+    return mistake["type"] == "tuple_type" or (mistake["type"] == "missing" and isinstance(mistake["loc"][-1], int))
 
 
 def shorten(value: Any) -> str:

@@ -362,7 +362,7 @@ def export(
     ] = None,
     gate_max_step: Annotated[
         float | None,
-        typer.Option(metavar="VALUE", help="Largest change per sample; that of [controller.gate] if left out."),
+        typer.Option(metavar="VALUE", help="Largest change per sample; that of the problem file if left out."),
     ] = None,
     gate_max_held: Annotated[
         int | None, typer.Option(metavar="N", help="Rejected readings in a row before a fault; 5 if left out.")
@@ -371,7 +371,7 @@ def export(
         float | None, typer.Option(metavar="SECONDS", help="Time from the limit to zero at a fault; 0.1 if left out.")
     ] = None,
     no_gate: Annotated[
-        bool, typer.Option("--no-gate", help="Leave out the gate of [controller.gate]: accept all readings.")
+        bool, typer.Option("--no-gate", help="Leave out the problem file's gate: accept all readings.")
     ] = False,
     allow_infeasible: Annotated[
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")

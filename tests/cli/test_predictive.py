@@ -87,9 +87,9 @@ def test_what_blocks_a_plan_is_said_of_the_bandwidth_that_is_asked(planned, seao
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('structure = "mpc"', 'structure = "pid"', '[controller] asks for no plan; write structure = "mpc"'),
-        ("bandwidth_hz = 20", 'bandwidth_hz = 20\nrobust_to = ["stand"]', "controller.robust_to is of gains"),
-        ("samples = 20", "retune = 2", "robustness.retune is of gains"),
+        ('structure = "mpc"', 'structure = "pid"', '[controller] is not predictive; write structure = "mpc"'),
+        ("bandwidth_hz = 20", 'bandwidth_hz = 20\nrobust_to = ["stand"]', "controller.robust_to shapes gains"),
+        ("samples = 20", "retune = 2", "robustness.retune tunes gains"),
         ("qd =", "qqd =", 'bounds of "qqd": not an output or state'),
         ('plant = "stand"', 'plant = "stand"\nmeasured = ["F1", "qd"]', 'write measured = "F1"'),
     ],

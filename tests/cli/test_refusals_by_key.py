@@ -31,6 +31,12 @@ controller = { plant = "stand", bandwidth_hz = 30 }
         ("3.31e-6 }", '3.31e-6, min = "low" }', r"parameters.J.min = 'low'"),
         ("= 30", "= -30", r"bandwidth_hz = -30 is not positive.*bandwidth_hz = 30$"),
         ("= 30", "= 0", r"bandwidth_hz = 0 is not positive.*bandwidth_hz = 30$"),
+        ("= 30", '= 30, structure = "pdi"', r"structure = 'pdi': should be 'pd', .* or 'mpc'; .*structure = \"pd\"$"),
+        (
+            "= 30",
+            '= 30, schedule = { over = "k", points = [1] }',
+            r"points = \[1\]: should have at least 2 items, not 1",
+        ),
     ],
 )
 def test_a_wrong_value_is_refused_by_its_key(tmp_path, before, after, words):

@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 import pytest
+from typer.main import get_command
 
 import seaopt as so
 from seaopt.cli.main import app
@@ -147,6 +148,13 @@ def test_help_is_what_the_bare_command_prints(seaopt):
     out = seaopt()
     assert out.returncode == 0
     assert {"demo", "new", "run", "--install-completion"} <= set(out.stdout.replace("│", " ").split())
+
+
+def test_no_help_has_brackets_which_rich_would_take_for_markup():
+    """Such as [controller.gate], which was left out of the text."""
+    commands = get_command(app).commands
+    texts = {f"{name} {option.name}": option.help or "" for name, one in commands.items() for option in one.params}
+    assert len(texts) > 80 and [name for name, text in texts.items() if "[" in text] == []
 
 
 def test_shells_complete_commands(tmp_path):
