@@ -1,4 +1,4 @@
-"""Predictive control of a problem file: `structure = "mpc"` in [controller], and what only it has in [mpc]."""
+"""Predictive control of a problem file: `structure = "mpc"` in [controller], and its own keys in [mpc]."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from seaopt.options import list_options
 from seaopt.problem.option_tables import make_record
 from seaopt.problem.schema import MPC, ControllerTable, MPCTable, ProblemTable
 
-PLANNED = {one.name for one in list_options(MPCSpec)}
+PLANNED = {field.name for field in list_options(MPCSpec)}
 SHARED = PLANNED & ControllerTable.model_fields.keys() - {"measured"}  # keys of [controller] that a plan has too
 
 
@@ -21,7 +21,7 @@ def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
     controller = table.controller
     if controller is None or controller.structure != MPC:
         if table.mpc is not None:
-            raise ProblemError('[mpc] is there, and [controller] asks for no plan; write structure = "mpc" there')
+            raise ProblemError('[mpc] is given, but [controller] is not predictive; write structure = "mpc" there')
         return None
     _check_keys(table, controller)
     assert isinstance(controller.measured, str)
@@ -30,15 +30,15 @@ def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
 
 
 def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
-    given = sorted(controller.model_fields_set - {"plant", "measured", "structure", "gate", *SHARED})
-    if given:
-        raise ProblemError(f'controller.{given[0]} is of gains, and structure = "mpc" plans; take it out')
+    stated = sorted(controller.model_fields_set - {"plant", "measured", "structure", "gate", *SHARED})
+    if stated:
+        raise ProblemError(f'controller.{stated[0]} shapes gains, and structure = "mpc" has none; take it out')
     if not isinstance(controller.measured, str):
         raise ProblemError(
             f'controller.measured = {list(controller.measured)}: structure = "mpc" reads one output; write measured = '
             f'"{controller.measured[0]}"'
         )
     if table.impedance is not None:
-        raise ProblemError('[impedance] closes its loop around gains, and structure = "mpc" plans; take it out')
+        raise ProblemError('[impedance] closes its loop around gains, and structure = "mpc" has none; take it out')
     if table.robustness is not None and table.robustness.retune:
-        raise ProblemError('robustness.retune is of gains, and structure = "mpc" plans; take it out')
+        raise ProblemError('robustness.retune tunes gains, and structure = "mpc" has none; take it out')

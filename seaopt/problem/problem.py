@@ -105,11 +105,7 @@ class Problem:
     def asked(self) -> ControllerTable:
         """The file's [controller].
 
-        Raises
-        ------
-        ProblemError
-            There is none; the message says what is wrong in it, or has the least table of one.
-
+        Raises ProblemError: there is none; the message says what is wrong in it, or how to add one.
         """
         if self.table.controller is not None:
             return self.table.controller
@@ -143,12 +139,7 @@ class Problem:
         """Return the measured responses that the controller is tuned on, by name.
 
         The delay that an experiment is known to have, given or fitted, is in its response already.
-
-        Raises
-        ------
-        SeaoptError
-            A log cannot be read, or does not allow a frequency response.
-
+        Raises SeaoptError: a log cannot be read, or does not allow a frequency response.
         """
         responses: dict[str, MeasuredResponse] = {}
         for name in self.response_names:
@@ -267,11 +258,7 @@ class Problem:
     def experiments(self) -> tuple[Experiment, ...]:
         """Read the logs, and make the virtual ones.
 
-        Raises
-        ------
-        SeaoptError
-            A log cannot be read, or does not fit its plant.
-
+        Raises SeaoptError: a log cannot be read, or does not fit its plant.
         """
         experiments: list[Experiment] = []
         for table in self.table.experiment:
@@ -288,26 +275,14 @@ class Problem:
         scored = {table.name for table in self.table.experiment if table.use == "validate"}
         return tuple(experiment for experiment in experiments if experiment.name not in scored)
 
-    def experiment_like(self, log: Path, like: str | None = None) -> Experiment:
-        """Return another log as the experiment of a name would read it; as the first, if no name is given.
+    def experiment_like(self, log: Path, like: str | None = None, *, keep_slice: bool = False) -> Experiment:
+        """Return another log as an experiment that is named after its file, and read as the one of a name.
 
-        Raises
-        ------
-        SeaoptError
-            There is no such experiment, or the log cannot be read as it would read it.
-
+        `like` is the first experiment if left out; with `keep_slice`, of the same test, its slice_s holds too.
+        Raises SeaoptError: there is no such experiment, or the log cannot be read as it would read it.
         """
-        own = {"name": name_after(log.stem), "log": str(log.resolve()), "slice_s": None}
-        table = self.choose_template(like).model_copy(update=own)
-        return self._make_experiment(table, anywhere=True)
-
-    def repeat_experiment(self, log: Path, like: str | None = None) -> Experiment:
-        """Return another log of the same test as an experiment, which is named after its file and keeps the slice.
-
-        Raises SeaoptError: as `experiment_like`.
-        """
-        table = self.choose_template(like).model_copy(update={"name": name_after(log.stem), "log": str(log.resolve())})
-        return self._make_experiment(table, anywhere=True)
+        own = {"name": name_after(log.stem), "log": str(log.resolve())} | ({} if keep_slice else {"slice_s": None})
+        return self._make_experiment(self.choose_template(like).model_copy(update=own), anywhere=True)
 
     def choose_template(self, like: str | None = None) -> ExperimentTable:
         """Return the experiment of a name that has a log; the first, if no name is given.
@@ -316,32 +291,27 @@ class Problem:
         """
         tables = {table.name: table for table in self.table.experiment if table.virtual is None}
         if not tables or (like is not None and like not in tables):
-            what = f'no experiment "{like}" with a log' if like else "no [[experiment]] with a log"
-            raise ProblemError(f"{self.source}: has {what} that says how to read one; add one")
-        return tables[like] if like is not None else next(iter(tables.values()))
+            missing = f'experiment "{like}"' if like else "[[experiment]]"
+            raise ProblemError(f"{self.source}: has no {missing} with a log to read this one by; add one")
+        return tables[like or next(iter(tables))]
 
     def _make_experiment(self, table: ExperimentTable, *, anywhere: bool = False) -> Experiment:
         plant = self.plants[table.plant]
         if table.virtual:
-            own = {name: given for name, given in table.parameters.items() if isinstance(given, float | int)}
+            own = {name: value for name, value in table.parameters.items() if isinstance(value, float | int)}
             log = _compute_speeds(self._simulate_bench(plant, table.virtual, own), table)
         else:
             log = self._read_log(table, anywhere=anywhere)
         if table.slice_s is not None:
             log = log.between(*table.slice_s)
         log = _resample(log, table).decimate(table.decimate)
-        sigma = dict(table.sigma)
-        for name, column in table.outputs.items():
-            if isinstance(column, ColumnTable) and column.sigma is not None:
-                sigma[name] = column.sigma
-        measured = tuple(table.outputs) if not table.virtual else _virtual_outputs(plant, table.virtual)
-        own = {name: self._make_own(plant, table, name, log) for name in table.parameters}
-        differences = {name: make_record(Difference, difference) for name, difference in table.differences.items()}
+        columns = {name: column for name, column in table.outputs.items() if isinstance(column, ColumnTable)}
+        sigma = table.sigma | {name: column.sigma for name, column in columns.items() if column.sigma is not None}
         return Experiment(
             plant=plant,
             log=log,
             name=table.name,
-            outputs=measured,
+            outputs=_virtual_outputs(plant, table.virtual) if table.virtual else tuple(table.outputs),
             sigma=sigma,
             initial_state=table.initial_state,
             offset=table.offset,
@@ -353,46 +323,41 @@ class Problem:
             shots=table.shots,
             saturation=table.saturation,
             mask=table.mask,
-            parameters=own,
-            differences=differences,
+            parameters={name: self._make_own(plant, table, name, log) for name in table.parameters},
+            differences={name: make_record(Difference, difference) for name, difference in table.differences.items()},
         )
 
     def _make_own(self, plant: Plant, table: ExperimentTable, name: str, log: Log) -> float | Parameter:
         """Return a parameter of one log alone: a value, a free one, or the constant of a column or the header."""
-        given = table.parameters[name]
-        if isinstance(given, UnknownTable):
-            default = plant.defaults.get(name)
-            made = _make_unknown(name, plant.parameter_unit(name), given)
+        stated, unit = table.parameters[name], plant.parameter_unit(name)
+        if isinstance(stated, UnknownTable):
+            default, made = plant.defaults.get(name), _make_unknown(name, unit, stated)
             if default is None or not isinstance(made, Parameter):
                 return made
-            low = made.min if given.min is not None else min(default.min, made.value)
-            return replace(made, min=low, max=made.max if given.max is not None else max(default.max, made.value))
-        if not isinstance(given, ColumnTable):
-            return given
-        read, unit = log.signal(OWN + name).unit, plant.parameter_unit(name)
-        if read and read != unit and not same_dimension(read, unit):
+            low = made.min if stated.min is not None else min(default.min, made.value)
+            return replace(made, min=low, max=made.max if stated.max is not None else max(default.max, made.value))
+        if not isinstance(stated, ColumnTable):
+            return stated
+        signal, place = log.signal(OWN + name), f"experiment {table.name}: parameters: {name}"
+        if signal.unit and signal.unit != unit and not same_dimension(signal.unit, unit):
             raise ProblemError(
-                f'experiment {table.name}: parameters: {name} is in {unit or "no unit"}, and column "{given.column}" '
-                f"in {read}; correct the column's unit"
+                f'{place} is in {unit or "no unit"}, and column "{stated.column}" in {signal.unit}; correct the '
+                "column's unit"
             )
-        values = log[OWN + name]
-        value = float(np.median(values))
-        if not np.all(np.abs(values - value) <= ROUNDED * abs(value)):
-            raise ProblemError(
-                f'experiment {table.name}: parameters: {name} is not one value throughout column "{given.column}"; '
-                "make it an input"
-            )
+        value = float(np.median(signal.values))
+        if not np.all(np.abs(signal.values - value) <= ROUNDED * abs(value)):
+            raise ProblemError(f'{place} is not one value throughout column "{stated.column}"; make it an input')
         return value
 
     def _read_log(self, table: ExperimentTable, *, anywhere: bool) -> Log:
         """Read an experiment's log; `anywhere`: one that the user named, not the file, may lie outside its folder."""
         check_links(self.folder, [name for name in list_log_files(table) if not (anywhere and name == table.log)])
-        read = {OWN + name: given for name, given in table.parameters.items() if isinstance(given, ColumnTable)}
-        channels = {**table.inputs, **table.outputs, **read}
+        own = {OWN + name: column for name, column in table.parameters.items() if isinstance(column, ColumnTable)}
+        channels = {**table.inputs, **table.outputs, **own}
         return read_log(
             [self.folder / name for name in list_log_files(table)],
             time=None if table.time is None else make_column(table.time, self.folder),
-            channels={name: make_column(item, self.folder) for name, item in channels.items()},
+            channels={name: make_column(column, self.folder) for name, column in channels.items()},
             align=make_rule(table.align),
             window_s=table.window_s,
             counter=None if table.counter is None else make_record(Counter, table.counter),
@@ -402,18 +367,19 @@ class Problem:
 
     def _simulate_bench(self, plant: Plant, table: VirtualTable, own: Mapping[str, float]) -> Log:
         kinds = {"chirp": Chirp, "noise": Noise, "multisine": Multisine}
-        given = {name: getattr(table.excitation, name) for name in kinds}
         excitation: Excitation = tuple(
-            make_record(kinds[name], part) for name, part in given.items() if part is not None
+            make_record(kind, part)
+            for name, kind in kinds.items()
+            if (part := getattr(table.excitation, name)) is not None
         )
-        truth = {**plant.complete(self.parameters)}
-        for name, value in {**own, **table.truth}.items():
-            if name not in truth:
-                raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, truth)}')
-            truth[name] = replace(truth[name], value=value)
+        values, changed = plant.complete(self.parameters), {**own, **table.truth}
+        for name in changed:
+            if name not in values:
+                raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, values)}')
+        truth = [replace(parameter, value=changed.get(name, parameter.value)) for name, parameter in values.items()]
         return virtual_log(
             plant,
-            ParameterSet(truth.values()),
+            ParameterSet(truth),
             excitation,
             duration_s=table.duration_s,
             rate_hz=table.rate_hz,

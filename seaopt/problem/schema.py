@@ -190,7 +190,7 @@ class RobustnessTable(StrictTable):
     @model_validator(mode="after")
     def _check_step(self) -> RobustnessTable:
         if self.current_step_A and self.command_step:
-            raise ValueError("should have current_step_A or command_step, which is the same of another command")
+            raise ValueError("give current_step_A, or command_step for a command that is not a current, not both")
         return self
 
 
@@ -230,13 +230,13 @@ FIGURES = {  # of a loop: what a number in [expect] is to each; a band is given 
 WORST_FIGURES = {"worst_ms": "at most", "worst_mt": "at most"}  # at the worst case of a plant
 
 
-def _make_figures(name: str, figures: Mapping[str, str]) -> Any:
+def _make_figures(name: str, figures: Mapping[str, str], base: type[StrictTable] = StrictTable) -> Any:
     """Return a table of figures: a number is the limit on the bad side, [low, high] a range."""
     keys: dict[str, Any] = {}
     for figure, end in figures.items():
         text = f"{end.capitalize()}, where a number." if end else "The loop tracks its reference from here to here."
         keys[figure] = (Bound | None if end else OptionalRange, key(text, default=None))
-    return create_model(name, __base__=StrictTable, __module__=__name__, **keys)
+    return create_model(name, __base__=base, __module__=__name__, **keys)
 
 
 class FiguresTable(_make_figures("LoopFiguresTable", FIGURES)):
@@ -249,7 +249,7 @@ class ExpectedControllerTable(FiguresTable):
     feasible: Flag = key("Every limit of [controller] is met.", default=True)
 
 
-class ExpectedPlantTable(FiguresTable, _make_figures("WorstFiguresTable", WORST_FIGURES)):
+class ExpectedPlantTable(_make_figures("WorstFiguresTable", WORST_FIGURES, FiguresTable)):
     """Figures of a certified plant's loop, sliding and stuck, at the nominal parameters and at the worst case found."""
 
 
@@ -289,8 +289,8 @@ class ProblemTable(StrictTable):
     version: Annotated[Literal[1], BeforeValidator(_require_whole)] = key("Version of this format: 1.", alias="schema")
     title: str = key("Heading of the report.", default="untitled")
     guessed: list[Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]] = key(
-        "What of this file nobody knew: names of parameters, or words for other entries. Every "
-        "verdict names them; take a name out once its value is known.",
+        "Unverified values: names of parameters, or words for other entries. Each verdict lists them; remove an entry "
+        "once you have measured it.",
         default=[],
     )
     parameters: dict[str, Number | ParameterTable] = key(

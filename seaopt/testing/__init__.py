@@ -16,24 +16,18 @@ if TYPE_CHECKING:
     from seaopt.testing.expectations import list_expectations as list_expectations
     from seaopt.testing.virtual import virtual_experiment as virtual_experiment
 
-_HOME = {
-    "assert_recovered": "seaopt.testing.assertions",
-    "assert_predicts": "seaopt.testing.assertions",
-    "assert_certified": "seaopt.testing.assertions",
-    "virtual_experiment": "seaopt.testing.virtual",
-    "Expectation": "seaopt.testing.expectations",
-    "list_expectations": "seaopt.testing.expectations",
-}
 __all__ = [  # noqa: RUF022  (in the order of use)
     "assert_recovered", "assert_predicts", "assert_certified", "virtual_experiment", "Expectation",
     "list_expectations",
 ]  # fmt: skip
+_HOME = {"virtual_experiment": "virtual", "Expectation": "expectations", "list_expectations": "expectations"}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in __all__:
         raise AttributeError(f"module 'seaopt.testing' has no attribute {name!r}")
-    globals()[name] = value = getattr(import_module(_HOME[name]), name)
+    module = import_module(f"seaopt.testing.{_HOME.get(name, 'assertions')}")
+    globals()[name] = value = getattr(module, name)
     return value
 
 

@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from seaopt.errors import SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Experiment, Fit
 from seaopt.parameters import Parameter, ParameterSet
@@ -59,14 +57,12 @@ def assert_recovered(
     for name in fit.covariance.names:
         if name not in truth:
             raise SeaoptError(f'truth has no "{name}", which the fit estimated; {suggestion(name, truth)}')
-        expected = truth[name]
+        expected, fitted = truth[name], fit.parameters[name]
         true = expected.value if isinstance(expected, Parameter) else require_number(expected, f'truth["{name}"]')
-        fitted = fit.parameters[name]
-        std = fitted.std if fitted.std is not None else np.nan
-        error = fitted.value - true
-        distance = abs(error) / std if std > 0.0 else np.inf
-        relative = abs(error) / abs(true) if true else np.inf
-        good = distance <= sigmas and np.isfinite(std) and (within is None or relative <= within)
+        std, error = math.nan if fitted.std is None else fitted.std, abs(fitted.value - true)
+        distance = error / std if std > 0.0 else math.inf
+        relative = error / abs(true) if true else math.inf
+        good = distance <= sigmas and math.isfinite(std) and (within is None or relative <= within)
         failed |= not good
         rows.append(
             f"  {name:<12} fitted {fitted.value:.6g} ± {std:.2g}{unit_after(fitted.unit)}, true {true:.6g}: "
@@ -113,8 +109,8 @@ def assert_predicts(fit: Fit, experiment: Experiment, fit_percent: float | Mappi
     )
     if not limits:
         raise SeaoptError("fit_percent names no output, so that there is nothing to compare; give 95, or {'F1': 95}")
-    asked = {name: _require_finite(least, f'fit_percent["{name}"]') for name, least in limits.items()}
-    for name in asked:
+    for name, least in limits.items():
+        _require_finite(least, f'fit_percent["{name}"]')
         if name not in percents:
             raise SeaoptError(
                 f'fit_percent names "{name}", which {experiment.name} does not measure; {suggestion(name, percents)}'
@@ -122,9 +118,9 @@ def assert_predicts(fit: Fit, experiment: Experiment, fit_percent: float | Mappi
     rows = [
         f"  {name}: fit {percents[name]:.2f} %, asked for {least:g} %, rms residual {score.rms_residual[name]:.3g}"
         f"{unit_after(score.units[name])}{'' if percents[name] >= least else '   <-- TOO LOW'}"
-        for name, least in asked.items()
+        for name, least in limits.items()
     ]
-    if not all(percents[name] >= least for name, least in asked.items()):
+    if not all(percents[name] >= least for name, least in limits.items()):
         remark = "" if fit.met else f"; the fit is not met: {fit.verdict}"
         raise AssertionError("\n".join([f"{experiment.name} is not predicted{remark}:", *rows]))
 

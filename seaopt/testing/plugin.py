@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
+    from seaopt.bench import Excitation
     from seaopt.estimation import Experiment
+    from seaopt.plants import Plant
     from seaopt.problem import Stages
     from seaopt.testing.expectations import Expectation
 
@@ -95,19 +97,23 @@ def virtual_experiment() -> Callable[..., Experiment]:
 def stand_experiment() -> Experiment:
     """Return 20 s of the paper's first experiment: THOR's actuator on the stand, F1 and F2 with 2 N of noise."""
     from seaopt.bench import PAPER_STAND
-    from seaopt.plants import high_impedance, thor
-    from seaopt.testing import virtual_experiment
+    from seaopt.plants import high_impedance
 
-    noise = {"F1": 2.0, "F2": 2.0}
-    return virtual_experiment(high_impedance(), thor(), excitation=PAPER_STAND, noise_std=noise, name="stand")
+    return _make_thor(high_impedance(), PAPER_STAND, "stand")
 
 
 @pytest.fixture(scope="session")
 def swing_experiment() -> Experiment:
     """Return 20 s of its second: the output swings a pendulum of 4 kg, F1 and F2 with 2 N of noise."""
     from seaopt.bench import PAPER_SWING
-    from seaopt.plants import moving_output, thor
+    from seaopt.plants import moving_output
+
+    return _make_thor(moving_output(), PAPER_SWING, "swing")
+
+
+def _make_thor(plant: Plant, excitation: Excitation, name: str) -> Experiment:
+    from seaopt.plants import thor
     from seaopt.testing import virtual_experiment
 
     noise = {"F1": 2.0, "F2": 2.0}
-    return virtual_experiment(moving_output(), thor(), excitation=PAPER_SWING, noise_std=noise, name="swing")
+    return virtual_experiment(plant, thor(), excitation=excitation, noise_std=noise, name=name)

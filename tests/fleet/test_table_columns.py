@@ -18,7 +18,7 @@ def test_correlations_of_errors_are_those_of_the_fit_alone_and_guesses_are_named
     with ThreadPoolExecutor(1) as executor:
         fleet = so.fit_fleet(file, [stand / "logs/r1_j2.csv"], executor=executor)
     problem = so.read_problem(file)
-    alone = so.fit([problem.repeat_experiment(stand / "logs/r1_j2.csv")], problem.parameters)
+    alone = so.fit([problem.experiment_like(stand / "logs/r1_j2.csv", keep_slice=True)], problem.parameters)
     matrix = alone.covariance.matrix
     correlation = matrix[0, 1] / (matrix[0, 0] * matrix[1, 1]) ** 0.5
     assert fleet.rows["J:b_r_corr"][0] == pytest.approx(correlation, abs=1e-6) and abs(correlation) > 1e-4

@@ -1,4 +1,4 @@
-"""A log with what was made of its columns: roles, units, clock and plant, as a problem file will describe it."""
+"""A log with the roles and units of its columns, its clock and its plant, as a problem file will describe it."""
 
 from __future__ import annotations
 
@@ -44,13 +44,14 @@ class DescribedLog:
         """What is fitted; a link that is held has no angle."""
         return tuple(role for role in self.roles.outputs if not (role == "theta_l" and self.plant == "held"))
 
+    def si_scale(self, role: str) -> float:
+        """Return what a role's numbers are multiplied by to be in SI; 1 of a role that the log does not have."""
+        return factor(self.units[role], SI_UNITS[role]) * self.scales.get(role, 1.0) if role in self.units else 1.0
+
     @property
     def signals(self) -> dict[str, Float[np.ndarray, " n"]]:
         """Samples of each role in SI."""
-        return {
-            role: one.values * factor(self.units[role], SI_UNITS[role]) * self.scales.get(role, 1.0)
-            for role, one in self.roles.columns.items()
-        }
+        return {role: column.values * self.si_scale(role) for role, column in self.roles.columns.items()}
 
 
 def make_table(log: DescribedLog, outputs: Sequence[str]) -> Table | None:

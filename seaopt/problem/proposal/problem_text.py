@@ -228,9 +228,7 @@ def _describe_controller(
 def _find_noise(logs: Sequence[DescribedLog], output: str) -> float:
     """Return the standard deviation of an output's noise from sample to sample, in SI; 0 where no log has it."""
     levels = [
-        log.roles.columns[output].noise * factor(log.units[output], SI_UNITS[output])
-        for log in logs
-        if output in log.roles.columns
+        log.roles.columns[output].noise * abs(log.si_scale(output)) for log in logs if output in log.roles.columns
     ]
     return max(levels, default=0.0)
 

@@ -47,13 +47,17 @@ from seaopt.problem.proposal.roles import (
     is_rotary,
 )
 from seaopt.problem.proposal.survey import Survey, SurveyedColumn, regress, slow_sign, survey_log
-from seaopt.problem.proposal.traits import OUTLIERS, Traits, find_traits
+from seaopt.problem.proposal.traits import OUTLIERS, find_traits
 from seaopt.problem.proposal.vocabulary import COUNTS, is_m_open, read_header
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.units import factor
 
-READING, LOOKING = 1.0, 1.0  # of the time
+READING, LOOKING = 1.0, 1.0  # shares of the time
+UNITS = {  # that a column of a role may be in; the others are angles
+    "I": ("A", "mA"), "torque": ("N m", "mN m"), "V": ("V", "mV"), "duty": ("-", "percent"), "F1": ("N", "kN"),
+    "F2": ("N", "kN"), "q": ("m", "mm", "um"), "tau_s": ("N m", "mN m"),
+}  # fmt: skip
 FULL_DUTIES = (1, 100, 255, 885, 1000, 1023, 4095, 32767)  # of registers, for a full duty
 POSITIONS = {"q", "screw", "phi", "theta_m", "theta_l"}
 LINK_END = re.compile(r"[\s_.\-/]l$")  # of a name, beside one that ends in m: the link, and the motor
@@ -107,14 +111,8 @@ def propose(
     surveys = [_survey(path, interview) for path in count_off(logs, "reading log", reading)]
     turns, doubt = is_rotary([column for survey in surveys for column in survey.columns])
     if doubt:
-        kind = interview.ask(
-            "actuator",
-            "Is the actuator rotary (a gear) or linear (a screw)?",
-            "rotary" if turns else "linear",
-            doubt,
-            ("rotary", "linear"),
-        )
-        turns = kind == "rotary"
+        text, guess = "Is the actuator rotary (a gear) or linear (a screw)?", "rotary" if turns else "linear"
+        turns = interview.ask("actuator", text, guess, doubt, ("rotary", "linear")) == "rotary"
     assignments = [_assign(survey, interview, turns) for survey in surveys]
     pairs = list(zip(surveys, assignments, strict=True))
     described = [
@@ -238,16 +236,12 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
     )
     log = replace(log, scales=scales | _find_signs(log))
     log = replace(log, plant=_ask_link(log, interview))
-    return replace(log, traits=_look_at(log))
-
-
-def _look_at(log: DescribedLog) -> Traits:
     table = make_table(log, log.outputs)
     if table is None:
-        return Traits()
-    source, positions = log.roles.input, [name for name in log.outputs if name in POSITIONS]
-    held = not log.roles.columns[source].header.measured
-    return find_traits(table, source, log.outputs, positions, held=held)
+        return log
+    positions = [name for name in log.outputs if name in POSITIONS]
+    held = not roles.columns[roles.input].header.measured
+    return replace(log, traits=find_traits(table, roles.input, log.outputs, positions, held=held))
 
 
 def _list_notes(log: DescribedLog) -> Iterator[str]:
@@ -291,7 +285,7 @@ def _ask_units(roles: Assignment, interview: Interview) -> tuple[dict[str, str],
         unit, why = guess_unit(role, column)
         if why:
             text = f'Unit of "{column.name}" ({DESCRIPTIONS[role]})?'
-            unit = interview.ask(f"unit:{column.name}", text, unit, why, _choices_of(role))
+            unit = interview.ask(f"unit:{column.name}", text, unit, why, UNITS.get(role, ("rad", "deg", COUNTS)))
         if unit == COUNTS:
             turn = interview.number(
                 f"counts:{column.name}", f'Steps of "{column.name}" for a whole turn', 4096.0, "a common encoder's"
@@ -309,33 +303,20 @@ def _ask_units(roles: Assignment, interview: Interview) -> tuple[dict[str, str],
     return units, scales
 
 
-def _choices_of(role: str) -> tuple[str, ...]:
-    angle = ("rad", "deg", COUNTS)
-    return {
-        "I": ("A", "mA"),
-        "torque": ("N m", "mN m"),
-        "V": ("V", "mV"),
-        "duty": ("-", "percent"),
-        "F1": ("N", "kN"),
-        "F2": ("N", "kN"),
-        "q": ("m", "mm", "um"),
-        "tau_s": ("N m", "mN m"),
-    }.get(role, angle)
-
-
 def _find_signs(log: DescribedLog) -> dict[str, float]:
     """Return scales that turn a sensor round which falls as the effort rises; the first effort counts as right."""
     signals = log.signals
     effort = next((role for role in ("tau_s", "F1", "F2") if role in signals), None)
-    turned: dict[str, float] = {}
     if effort is None or log.survey.clock is None:
-        return turned
-    for role in ("F2", "theta_m", "screw", "q"):
-        # The motor's place follows the effort only where the link is held; elsewhere no sign is sure.
-        follows = role in signals and role != effort and regress(signals[role], signals[effort])[1] > FOLLOWS
-        if follows and slow_sign(signals[effort], signals[role], log.rate_hz) < 0:
-            turned[role] = -log.scales.get(role, 1.0)
-    return turned
+        return {}
+    # The motor's place follows the effort only where the link is held; elsewhere no sign is sure.
+    following = [
+        role
+        for role in ("F2", "theta_m", "screw", "q")
+        if role in signals and role != effort and regress(signals[role], signals[effort])[1] > FOLLOWS
+    ]
+    falling = [role for role in following if slow_sign(signals[effort], signals[role], log.rate_hz) < 0]
+    return {role: -log.scales.get(role, 1.0) for role in falling}
 
 
 def _ask_link(log: DescribedLog, interview: Interview) -> str:
@@ -343,12 +324,7 @@ def _ask_link(log: DescribedLog, interview: Interview) -> str:
     roles, key = log.roles, f"link:{log.survey.name}"
     if not roles.rotary:
         return "swing" if "phi" in roles.columns else "held"
-    units = {
-        role: factor(log.units[role], "rad") * log.scales.get(role, 1.0)
-        for role in ("theta_m", "theta_l")
-        if role in log.units
-    }
-    held, why = is_held(roles, units.get("theta_l", 1.0), units.get("theta_m", 1.0))
+    held, why = is_held(roles, log.si_scale("theta_l"), log.si_scale("theta_m"))
     return interview.ask(
         key,
         f"In {log.survey.name}, is the link held, free, or hanging (gravity pulls it back)?",
@@ -372,31 +348,18 @@ def _find_ratio(logs: Sequence[DescribedLog]) -> float | None:
 
 
 def _list_columns(log: DescribedLog) -> list[ProposedColumn]:
-    survey = log.survey
-    rows: list[ProposedColumn] = []
+    survey, rows = log.survey, list[ProposedColumn]()
+
+    def add(column: str, role: str, unit: str, description: str, doubt: str = "") -> None:
+        row = ProposedColumn(log=survey.name, column=column, role=role, unit=unit, description=description, doubt=doubt)
+        rows.append(row)
+
     if survey.clock is not None:
-        rows.append(
-            ProposedColumn(
-                log=survey.name,
-                column=survey.clock.name,
-                role="time",
-                unit=log.time_unit,
-                description="time",
-                doubt=doubt_clock(survey),
-            )
-        )
+        add(survey.clock.name, "time", log.time_unit, "time", doubt_clock(survey))
     for role, column in log.roles.columns.items():
-        rows.append(
-            ProposedColumn(
-                log=survey.name,
-                column=column.name,
-                role="input" if role == log.roles.input else role,
-                unit=column.header.unit or log.units[role],
-                description=DESCRIPTIONS[role],
-                doubt=log.roles.doubts.get(column.name, ""),
-            )
-        )
+        what = "input" if role == log.roles.input else role
+        unit, doubt = column.header.unit or log.units[role], log.roles.doubts.get(column.name, "")
+        add(column.name, what, unit, DESCRIPTIONS[role], doubt)
     for name, why in {**log.roles.unused, **survey.left_out}.items():
-        text = f"not used: {why}"
-        rows.append(ProposedColumn(log=survey.name, column=name, role="", unit="", description=text, doubt=""))
+        add(name, "", "", f"not used: {why}")
     return rows
