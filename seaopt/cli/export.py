@@ -93,13 +93,13 @@ def export_controller(
 
 
 def choose_gate(
-    content: Mapping[str, Any], asked: Mapping[str, Any], options: Mapping[str, Any]
+    content: Mapping[str, Any], gate: Mapping[str, Any], options: Mapping[str, Any]
 ) -> PlausibilityGate | Literal[False] | None:
     """Return the gate that is typed; False for none, None for that of the controller.
 
-    `asked` has the keys of [controller.gate], None where nothing is typed, its range as LOW:HIGH, and `leave_out`.
+    `gate` has the keys of [controller.gate], None where nothing is typed, its range as LOW:HIGH, and `leave_out`.
     """
-    typed = {name: value for name, value in asked.items() if value is not None and value is not False}
+    typed = {name: value for name, value in gate.items() if value is not None and value is not False}
     leave_out, ends = typed.pop("leave_out", False), typed.pop("range_N", None)
     if leave_out and ends is not None:
         raise ProblemError("--no-gate and --gate: type one of them")
@@ -148,20 +148,20 @@ def _find_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> float
     from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
     stored = read_controller(content)
-    asked = options["command_limit"] if options["current_limit_A"] is None else options["current_limit_A"]
-    limit = choose_limit(stored["command"], stored["spec"], asked)
+    limit = options["command_limit"] if options["current_limit_A"] is None else options["current_limit_A"]
+    limit = choose_limit(stored["command"], stored["spec"], limit)
     return None if limit is None or not math.isfinite(limit) else limit
 
 
 def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> str:
     """Return the limit that the controller was designed with, where an option asks for a higher one; else ""."""
-    asked = [options[name] for name in ("current_limit_A", "command_limit") if options.get(name) is not None]
-    if not asked:
+    limits = [options[name] for name in ("current_limit_A", "command_limit") if options.get(name) is not None]
+    if not limits:
         return ""
     from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
     stored = read_controller(content["controllers"][0] if is_schedule(content) else content)
-    return find_raised_limit(stored["command"], stored["spec"], asked[0])
+    return find_raised_limit(stored["command"], stored["spec"], limits[0])
 
 
 def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tuple[Path, ...]:

@@ -85,32 +85,32 @@ def _read_by_fit(problem: Problem) -> dict[str, Any]:
 
 def _read_by_design(problem: Problem) -> dict[str, Any]:
     """Return what a design reads besides [robustness]: [controller], its plants and values."""
-    asked = problem.asked
+    controller = problem.controller_table
     out = problem.table.model_dump(mode="json", include={"controller"})
-    names = {name for name in (asked.plant, *asked.robust_to) if name in problem.plants}
+    names = {name for name in (controller.plant, *controller.robust_to) if name in problem.plants}
     if problem.table.impedance is not None:
         out["impedance"] = problem.table.impedance.model_dump(mode="json")
         names.add(problem.table.impedance.plant)
     if problem.table.mpc is not None:
         out["mpc"] = problem.table.mpc.model_dump(mode="json")
     responses = {
-        f"frf:{one.name}": one.model_dump(mode="json")
-        for one in problem.table.experiment
-        if f"frf:{one.name}" in problem.response_names
+        f"frf:{table.name}": table.model_dump(mode="json")
+        for table in problem.table.experiment
+        if f"frf:{table.name}" in problem.response_names
     }
     return out | _describe_plants(problem, names) | ({"responses": responses} if responses else {})
 
 
 def _shape_by_robustness(problem: Problem, retune: int) -> dict[str, Any]:
     """Return what has a part in a design of [robustness], and of the uncertainty that it is asked about."""
-    asked, robustness, out = problem.asked, problem.robustness, dict[str, Any]()
-    if not (asked.robust_to or asked.draws or retune):
+    controller, robustness, out = problem.controller_table, problem.robustness, dict[str, Any]()
+    if not (controller.robust_to or controller.draws or retune):
         return out
     out["ranges"] = robustness.model_dump(mode="json")["parameters"]
     modes = find_modes(problem.certified_plants())
     if retune or not modes.keys().isdisjoint(problem.ranges):  # a mode's first plant says what puts it there
         out |= _describe_plants(problem, set(problem.certified_plants()))
-    if asked.draws or retune:
+    if controller.draws or retune:
         out["parameters"], out["seed"] = problem.table.model_dump(mode="json")["parameters"], robustness.seed
     if retune:
         out |= {"retune": retune, "samples": robustness.samples, "certified": list(problem.certified_plants())}
@@ -133,7 +133,7 @@ def _read_by_certify(problem: Problem) -> dict[str, Any]:
     robustness = problem.robustness.model_dump(mode="json", exclude={"retune"})
     read = {name: table["plant"][name] for name in problem.with_partners(plants)}
     sources = {"parameters": table["parameters"], "plant": read}
-    return sources | {"robustness": robustness, "design": problem.asked.plant}
+    return sources | {"robustness": robustness, "design": problem.controller_table.plant}
 
 
 _READ_BY_STAGE: dict[str, tuple[Callable[[Problem], dict[str, Any]], tuple[str, ...]]] = {

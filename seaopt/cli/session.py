@@ -263,13 +263,13 @@ class Session:
         return (SCHEDULE_SCHEMAS if self.problem.schedule is not None else SCHEMAS).get(stage, SCHEMAS[stage])
 
     def _check_spec(self, stored: ControllerSpec) -> None:
-        asked = self._spec().to_dict()
+        spec = self._spec().to_dict()
         stated = OF_THE_LAW if stored.structure == CUSTOM else ()
         for name, value in stored.to_dict().items():
-            if name not in stated and value != asked.get(name):
+            if name not in stated and value != spec.get(name):
                 raise ProblemError(
                     f"{self._path('tune')}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
-                    f"{asked.get(name)}; correct one of them, or run {self._spell('tune')} again"
+                    f"{spec.get(name)}; correct one of them, or run {self._spell('tune')} again"
                 )
 
     def fit_met(self) -> bool:

@@ -175,10 +175,10 @@ class EquationsTable(StrictTable):
 
 def _choose_plant(table: Any) -> str:
     """Return which table a plant is: one of equations where it has any, and no kind."""
-    own = (
+    stated = (
         isinstance(table, Mapping) and "kind" not in table and not table.keys().isdisjoint(EquationsTable.model_fields)
     )
-    return EquationsTable.__name__ if own or isinstance(table, EquationsTable) else PlantTable.__name__
+    return EquationsTable.__name__ if stated or isinstance(table, EquationsTable) else PlantTable.__name__
 
 
 AnyPlant = Annotated[

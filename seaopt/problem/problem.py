@@ -102,7 +102,7 @@ class Problem:
         }
 
     @property
-    def asked(self) -> ControllerTable:
+    def controller_table(self) -> ControllerTable:
         """The file's [controller].
 
         Raises ProblemError: there is none; the message says what is wrong in it, or how to add one.
@@ -116,7 +116,7 @@ class Problem:
     def design_plant(self) -> Plant:
         """The plant that the controller is designed on; of a measured response, what was on the bench."""
         on_bench = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in self.table.experiment}
-        return self.plants[on_bench.get(self.asked.plant, self.asked.plant)]
+        return self.plants[on_bench.get(self.controller_table.plant, self.controller_table.plant)]
 
     @property
     def schedule(self) -> ScheduleTable | None:
@@ -149,9 +149,9 @@ class Problem:
                 responses[name] = measure_response(
                     experiment.plant,
                     experiment.log,
-                    list_names(self.asked.measured)[0],
+                    list_names(self.controller_table.measured)[0],
                     name=experiment.name,
-                    confidence=self.asked.frf_confidence,
+                    confidence=self.controller_table.frf_confidence,
                     clock=Clock(
                         period=experiment.log.period, hold=experiment.hold, delay_s=_find_delay(experiment, source)
                     ),
@@ -200,7 +200,8 @@ class Problem:
 
     def certified_plants(self) -> dict[str, Plant]:
         """Return the design plant and those of [robustness], by name; none where all is measured."""
-        names = [name for name in (self.asked.plant, *self.asked.robust_to) if not name.startswith(RESPONSE)]
+        controller = self.controller_table
+        names = [name for name in (controller.plant, *controller.robust_to) if not name.startswith(RESPONSE)]
         names += [] if self.table.impedance is None else [self.table.impedance.plant]
         if not self.designs_on_response or self.table.robustness is not None:
             names += self.robustness.plants
@@ -235,7 +236,7 @@ class Problem:
             return {}
         pairs: dict[str, tuple[Plant, ParameterSet]] = {}
         parameters, plants = self.values(source, spec), take_own_delays(spec, self.design_plant, self.plants, source)
-        for name in self.asked.robust_to:
+        for name in self.controller_table.robust_to:
             if name.startswith(RESPONSE):
                 continue
             plant = plants[name]
@@ -250,10 +251,10 @@ class Problem:
 
     def draws(self, source: Fit | ParameterSet) -> list[dict[str, float]]:
         """Return the draws of parameters at which the controller must hold while it is tuned."""
-        if self.spec is None or not self.asked.draws:
+        if self.spec is None or not self.controller_table.draws:
             return []
         drive = find_drive(self.spec, self.design_plant, source)
-        return draw_values(source, self.asked.draws, self.robustness.seed, self.ranges, drive)
+        return draw_values(source, self.controller_table.draws, self.robustness.seed, self.ranges, drive)
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Read the logs, and make the virtual ones.
@@ -281,8 +282,8 @@ class Problem:
         `like` is the first experiment if left out; with `keep_slice`, of the same test, its slice_s holds too.
         Raises SeaoptError: there is no such experiment, or the log cannot be read as it would read it.
         """
-        own = {"name": name_after(log.stem), "log": str(log.resolve())} | ({} if keep_slice else {"slice_s": None})
-        return self._make_experiment(self.choose_template(like).model_copy(update=own), anywhere=True)
+        renamed = {"name": name_after(log.stem), "log": str(log.resolve())} | ({} if keep_slice else {"slice_s": None})
+        return self._make_experiment(self.choose_template(like).model_copy(update=renamed), anywhere=True)
 
     def choose_template(self, like: str | None = None) -> ExperimentTable:
         """Return the experiment of a name that has a log; the first, if no name is given.
@@ -298,8 +299,8 @@ class Problem:
     def _make_experiment(self, table: ExperimentTable, *, anywhere: bool = False) -> Experiment:
         plant = self.plants[table.plant]
         if table.virtual:
-            own = {name: value for name, value in table.parameters.items() if isinstance(value, float | int)}
-            log = _compute_speeds(self._simulate_bench(plant, table.virtual, own), table)
+            values = {name: value for name, value in table.parameters.items() if isinstance(value, float | int)}
+            log = _compute_speeds(self._simulate_bench(plant, table.virtual, values), table)
         else:
             log = self._read_log(table, anywhere=anywhere)
         if table.slice_s is not None:
@@ -352,8 +353,8 @@ class Problem:
     def _read_log(self, table: ExperimentTable, *, anywhere: bool) -> Log:
         """Read an experiment's log; `anywhere`: one that the user named, not the file, may lie outside its folder."""
         check_links(self.folder, [name for name in list_log_files(table) if not (anywhere and name == table.log)])
-        own = {OWN + name: column for name, column in table.parameters.items() if isinstance(column, ColumnTable)}
-        channels = {**table.inputs, **table.outputs, **own}
+        constants = {OWN + name: column for name, column in table.parameters.items() if isinstance(column, ColumnTable)}
+        channels = {**table.inputs, **table.outputs, **constants}
         return read_log(
             [self.folder / name for name in list_log_files(table)],
             time=None if table.time is None else make_column(table.time, self.folder),

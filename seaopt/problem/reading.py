@@ -1,4 +1,4 @@
-"""A problem file read and checked: from TOML to the objects that it stands for."""
+"""Read and check a problem file: from TOML to the objects that it stands for."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:
     for name in order_plants(tables):
         table = tables[name]
         try:
-            own = isinstance(table, EquationsTable)
-            plants[name] = make_plant(name, table, plants) if own else _make_plant_of_kind(table)
+            stated = isinstance(table, EquationsTable)
+            plants[name] = make_plant(name, table, plants) if stated else _make_plant_of_kind(table)
         except SeaoptError as error:
             text = str(error).removeprefix(f"plant {name}: ")
             raise type(error)(f"plant.{name}: {text}") from error
@@ -130,20 +130,20 @@ def _make_plant_of_kind(table: PlantTable) -> Plant:
 def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    asked: dict[str, Any] = {}
+    limits: dict[str, Any] = {}
     if table.robustness is not None and table.robustness.min_friction_margin is not None:
         designed, certified = table.controller.min_friction_margin, table.robustness.min_friction_margin
-        asked["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
-    return make_record(ControllerSpec, table.controller, **asked)
+        limits["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
+    return make_record(ControllerSpec, table.controller, **limits)
 
 
 def _read_toml(source: Path) -> dict[str, Any]:
     try:
         check_regular(source)
     except FileError as error:
-        found = shlex.quote(str(next(iter(sorted(source.glob("*.toml"))), "problem.toml")))
+        problem = shlex.quote(str(next(iter(sorted(source.glob("*.toml"))), "problem.toml")))
         folder = f" -o {shlex.quote(str(source))}" if any(source.glob("fit.json")) else ""
-        raise ProblemError(f"{error}, the problem's: seaopt run {found}{folder}") from error
+        raise ProblemError(f"{error}, the problem's: seaopt run {problem}{folder}") from error
     # What is there under another suffix is likely the log itself, which must not be offered as the file to write.
     is_log = source.suffix.lower() != ".toml"
     remedy = "write one from a log: " + shlex.join(

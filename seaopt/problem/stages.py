@@ -245,7 +245,7 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
             impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
         controller = add_impedance(controller, plant, values, impedance, name=outer.plant)
     controller = replace(controller, gate=_make_gate(problem, controller))
-    tables = problem.asked.compensation
+    tables = problem.controller_table.compensation
     kinds = {"friction": CompensateFriction, "gravity": CompensateGravity, "ripple": CompensateRipple}
     terms = {name: make_record(kind, table) for name, kind in kinds.items() if (table := getattr(tables, name))}
     if not terms:
@@ -256,7 +256,7 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
 
 def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> PlausibilityGate | None:
     """Return the gate that the file asks for; None where it asks for none."""
-    table = problem.asked.gate
+    table = problem.controller_table.gate
     if table is None:
         return None
     try:
@@ -273,9 +273,8 @@ def list_plants(
     `spec`: whose delays count in place of the problem's.
     """
     measured, plants = problem.measure_responses(source), problem.robust_to(source, spec)
-    asked = problem.asked
-    responses = {name: response for name, response in measured.items() if name in asked.robust_to}
-    design = measured[asked.plant] if problem.designs_on_response else problem.design_plant
+    responses = {name: response for name, response in measured.items() if name in problem.controller_table.robust_to}
+    design = measured[problem.controller_table.plant] if problem.designs_on_response else problem.design_plant
     return design, {**plants, **responses}
 
 

@@ -101,9 +101,9 @@ def list_expectations(problem: Problem) -> list[Expectation]:
     expectations: list[Expectation] = []
 
     def add(
-        stage: Literal["fit", "controller", "certificate"], name: str, judge: Callable[..., Judgement], *asked: Any
+        stage: Literal["fit", "controller", "certificate"], name: str, judge: Callable[..., Judgement], *limits: Any
     ) -> None:
-        expectations.append(Expectation(name=name, stage=stage, judge=partial(judge, *asked)))
+        expectations.append(Expectation(name=name, stage=stage, judge=partial(judge, *limits)))
 
     if problem.table.experiment:
         add("fit", "fit_met", _judge_met, "fit", expect.fit_met)

@@ -519,7 +519,7 @@ def test_outliers_ask_for_a_loss_that_bears_them(tmp_path):
     spoilt, clean = knee_log(tmp_path / "spoilt.csv", change=spoil), knee_log(tmp_path / "clean.csv")
     path = tmp_path / "spoilt.toml"
     path.write_text(spoilt.text, encoding="utf-8")
-    assert so.read_problem(path).table.fit.loss == "huber" and any("5 samples stand far off" in n for n in spoilt.notes)
+    assert so.read_problem(path).table.fit.loss == "huber" and any("5 samples are outliers" in n for n in spoilt.notes)
     assert '# loss = "huber"' in clean.text and not clean.notes
 
 
@@ -539,7 +539,7 @@ def test_a_motor_that_stands_still_time_and_again_is_offered_friction_that_stick
         return signals
 
     proposal = knee_log(tmp_path / "sticks.csv", change=stick)
-    assert any("theta_m stands still time and again: friction that sticks" in note for note in proposal.notes)
+    assert any("theta_m stands still again and again: friction sticks" in note for note in proposal.notes)
     path = tmp_path / "sticks.toml"
     taken = [line.removeprefix("# ") if "f_s =" in line or "parts =" in line or "sticks =" in line else line
              for line in proposal.text.splitlines()]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The text of a problem file from described logs and their actuator, with what is guessed in its comments."""
+"""The text of a problem file from described logs and their actuator, with guesses marked in its comments."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
             lines += [f"# parts = {_value([*parts, 'stribeck'])}", "# sticks = true  # friction jumps at rest"]
     names: set[str] = set()
     for log in logs:
-        name = next(one for one in _number_names(log.name) if one not in names)
+        name = next(name for name in _number_names(log.name) if name not in names)
         names.add(name)
         lines += ["", "[[experiment]]", *_align(_describe_experiment(log, name, interview))]
         lines.append(_describe_delay(log))
@@ -83,7 +83,7 @@ def _offer_stribeck(lines: Sequence[ParameterLine]) -> list[str]:
     sliding = next((line.value for line in lines if line.name == "f_c"), "")
     start = next(iter(re.findall(r"\d[\d.e+-]*", sliding)), "1.0")
     return [
-        "# A position stands still time and again. Where friction sticks, take these lines in, here and in the plants:",
+        "# A position stands still again and again. If friction sticks, uncomment these lines, here and in the plants:",
         f"# f_s = {{ value = {1.5 * float(start):.3g}, free = true }}  # breakaway friction, above f_c",
     ]
 
@@ -92,9 +92,9 @@ def _describe_delay(log: DescribedLog) -> str:
     """Return the line of a log's delay: fitted where the log shows one, else a remark that it may be."""
     delay = log.traits.delay_s
     if delay is None:
-        return "# delay_s = { value = 0.002, free = true, max = 0.02 }  # where the input takes effect late"
+        return "# delay_s = { value = 0.002, free = true, max = 0.02 }  # if the input takes effect late"
     text = f"delay_s = {{ value = {delay:.2g}, free = true, max = {max(4.0 * delay, 0.02):.2g} }}"
-    return _comment(text, "the outputs answer late, by their phase")
+    return _comment(text, "the outputs respond late, by their phase")
 
 
 def _describe_fit(logs: Sequence[DescribedLog]) -> list[str]:
@@ -104,9 +104,9 @@ def _describe_fit(logs: Sequence[DescribedLog]) -> list[str]:
     if lasts:
         rows.append(_comment("holdout = 0.2", "the last fifth of each log is kept back, to judge the fit by"))
     if far:
-        rows.append(_comment('loss = "huber"', f"{outliers} samples stand far off"))
+        rows.append(_comment('loss = "huber"', f"{outliers} samples are outliers"))
     elif lasts:
-        rows.append('# loss = "huber"  # where single samples are far off')
+        rows.append('# loss = "huber"  # if there are outliers')
     return ["", "[fit]", *rows] if rows else []
 
 
@@ -145,10 +145,10 @@ def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, intervie
     if role == "theta_m" and log.plant != "held" and reads_output(log):
         scale *= next(float(line.value) for line in actuator.lines if line.name == "N")
         interview.assume(f"gear:{column.name}")
-        guesses.append("guessed: it is given behind the gear, so times N")
+        guesses.append("guessed: measured behind the gear, so times N")
     if scale < 0.0:
         interview.assume(f"sign:{column.name}")
-        guesses.append("guessed: turned round, as it falls where the effort rises")
+        guesses.append("guessed: sign reversed, as it falls when the effort rises")
     return f"{name} = {_spell_column(column.name, unit, scale)}", "; ".join([*notes, *filter(None, guesses)])
 
 

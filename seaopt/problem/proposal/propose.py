@@ -1,4 +1,4 @@
-r"""A problem file for logs that nobody has described yet: what is seen in them, what is guessed, what has to be asked.
+r"""A problem file for logs that nobody has described yet, from what they show, guesses, and answers to questions.
 
 `propose` knows no terminal. It takes the answers that are there, guesses the others, and returns the file's text with
 the questions it had; whoever asks them calls it again with one answer more, until none is open:
@@ -65,7 +65,7 @@ LINK_END = re.compile(r"[\s_.\-/]l$")  # of a name, beside one that ends in m: t
 
 @record
 class ProposedColumn:
-    """A row of what was made of a log's columns; `doubt` says what of it is a guess."""
+    """A column of a log with its role; `doubt` says what of it is a guess."""
 
     log: str
     column: str
@@ -77,10 +77,10 @@ class ProposedColumn:
 
 @record
 class Proposal:
-    """A problem file's text, what was made of the columns, all questions, and those of them that nobody answered.
+    """A problem file's text, the roles of the columns, all questions, and the guesses for those without an answer.
 
-    `guessed` are the guesses that results rest on, as the file's key of that name has them; `notes` say what the logs
-    show that the file takes care of, or does not.
+    `guessed` are the guesses that results rest on, as the file's key of that name has them; `notes` are remarks on what
+    the logs show.
     """
 
     text: str
@@ -245,18 +245,18 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
 
 
 def _list_notes(log: DescribedLog) -> Iterator[str]:
-    """Yield what a log shows that the file takes care of, or that nothing in it can."""
+    """Yield remarks on what a log shows."""
     name, traits = log.survey.name, log.traits
     if traits.unexcited:
         yield f"{name}: {traits.unexcited}"
     if traits.delay_s is not None:
-        yield f"{name}: answers about {1e3 * traits.delay_s:.2g} ms late: delay_s is fitted"
+        yield f"{name}: the outputs respond about {1e3 * traits.delay_s:.2g} ms late: delay_s is fitted"
     if traits.outliers >= OUTLIERS:
-        yield f'{name}: {traits.outliers} samples stand far off: loss = "huber" bears them'
+        yield f'{name}: {traits.outliers} samples are outliers: loss = "huber" tolerates them'
     if traits.standing:
         yield (
-            f"{name}: {join_words(traits.standing)} stands still time and again: friction that sticks, as lines of "
-            "the file offer, or a sensor that stops (seaopt inspect)"
+            f"{name}: {join_words(traits.standing)} stands still again and again: friction sticks (the file has lines "
+            "for it), or a sensor stops (seaopt inspect)"
         )
 
 

@@ -30,8 +30,8 @@ class Question:
     @property
     def label(self) -> str:
         """The question in few words, for lists; of one log, with its name."""
-        first, *rest = re.split(r" \(|, |\?$", self.text)
-        return f"{rest[0]} in {first.removeprefix('In ')}" if first.startswith("In ") and rest else first
+        first, *more = re.split(r" \(|, |\?$", self.text)
+        return f"{more[0]} in {first.removeprefix('In ')}" if first.startswith("In ") and more else first
 
     @property
     def entry(self) -> str:

@@ -187,10 +187,10 @@ def _place_linear(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn
         if column.header.number is not None:
             roles.setdefault(f"F{column.header.number}", column)
     for column in forces:
-        rest = [role for role in ("F1", "F2") if role not in roles]
-        if column not in roles.values() and rest:
-            roles[rest[0]] = column
-            doubts[column.name] = f"the {DESCRIPTIONS[rest[0]]}, {rest[0]}, as its header has no number"
+        left = [role for role in ("F1", "F2") if role not in roles]
+        if column not in roles.values() and left:
+            roles[left[0]] = column
+            doubts[column.name] = f"the {DESCRIPTIONS[left[0]]}, {left[0]}, as its header has no number"
     for column in columns:
         link = column.header.side == "link"
         if column.header.quantity == "length":

@@ -1,4 +1,4 @@
-"""The columns of a raw log with what their headers and their samples say, before anybody has said what they are."""
+"""The columns of a raw log with their headers and samples, before they have roles."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class SurveyedColumn:
 
 @record(eq=False)
 class Survey:
-    """What is in one log."""
+    """The columns of one log."""
 
     path: Path
     clock: SurveyedColumn | None  # the column of times; None where the file has none
@@ -105,8 +105,8 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
         raise LogError(f"{path}: holds no column of numbers; list what it holds with {command}")
     headers = {field.name: read_header(field.name, field.unit) for field in numeric}
     times = [name for name, header in headers.items() if header.quantity == "time"]
-    own = [field.clock for field in numeric if field.clock]
-    chosen = clock or (own[0] if own else times[0] if times else None)
+    clocks = [field.clock for field in numeric if field.clock]
+    chosen = clock or (clocks[0] if clocks else times[0] if times else None)
     values = _read_raw(path, list(headers), chosen)
     if chosen is None:
         chosen = next((name for name, samples in values.items() if _runs_on(samples)), None)
@@ -125,7 +125,7 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     return Survey(
         path=path,
         clock=columns[chosen] if chosen is not None else None,
-        clocks=tuple(times or own),
+        clocks=tuple(times or clocks),
         columns=tuple(moving),
         left_out=words | still | copies,
     )

@@ -1,4 +1,4 @@
-r"""What the samples of a log ask of a fit: a delay, a loss that bears outliers, friction that sticks.
+r"""Traits of a log that a fit must allow for: a delay, outliers, friction that sticks.
 
 **Delay.** Well above the resonance of an actuator with m poles more than zeros the phase of its response is
 :math:`-m\pi/2 + c/f - 2\pi f \tau`: the poles' damping vanishes as c/f, and only what takes effect late goes on to
@@ -27,7 +27,7 @@ OUTLIERS = 3  # from which a log asks for a loss that bears them
 
 @record(eq=False)
 class Traits:
-    """What a log shows."""
+    """Traits of a log."""
 
     # by how much its outputs are late, beyond the plant's own lag; None where that is not seen
     delay_s: float | None = None
@@ -37,7 +37,7 @@ class Traits:
 
 
 def find_traits(table: Table, source: str, outputs: Sequence[str], positions: Sequence[str], *, held: bool) -> Traits:
-    """Return what a log shows.
+    """Return the traits of a log.
 
     `outputs`: what is fitted. `positions`: which of it are positions. `held`: whether the input holds each value until
     the next sample; a measured one does not.
@@ -57,8 +57,8 @@ def _find_delay(quality: Quality, source: str, outputs: Sequence[str], *, held: 
     spectra = quality.spectra
     if spectra is None or source not in spectra.channels:
         return None
-    found = [fit_delay(spectra, source, name, held=held) for name in outputs if name in spectra.channels]
-    sure = [(std, delay) for delay, std in filter(None, found)]
+    delays = [fit_delay(spectra, source, name, held=held) for name in outputs if name in spectra.channels]
+    sure = [(std, delay) for delay, std in filter(None, delays)]
     if not sure:
         return None
     std, delay = min(sure)

@@ -1,4 +1,4 @@
-"""What the header of a log's column says of it: which quantity, in which unit, of what, commanded or measured.
+"""Read the header of a log's column: which quantity, in which unit, of what, commanded or measured.
 
 Names are read word by word ("mot_pos", "motorPosition" and "Motorposition [Grad]" are the same), in English and German,
 as engineers and drives write them. What a header leaves open `seaopt.problem.proposal.roles` looks up in the data.
@@ -93,7 +93,7 @@ _QUANTITY_OF: dict[str, Quantity] = {
 
 @record
 class Header:
-    """What a column's name says."""
+    """A column's name, read."""
 
     name: str  # as the file has it
     quantity: Quantity  # "" where the name does not say
@@ -112,29 +112,29 @@ def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> H
 
     Examples
     --------
-    >>> one = read_header("mot_pos_deg")
-    >>> one.quantity, one.side, one.unit
+    >>> header = read_header("mot_pos_deg")
+    >>> header.quantity, header.side, header.unit
     ('angle', 'motor', 'deg')
     >>> read_header("Motorstrom [mA]").quantity, read_header("tau_s").unit
     ('current', '')
 
     """
     stated, bare = _clean_unit(unit), bare_name(name)
-    suffix, rest = ("", bare) if stated else _split_suffix(bare)
+    suffix, stem = ("", bare) if stated else _split_suffix(bare)
     if suffix == "m" and not metres:
-        suffix, rest = "", bare
-    words = split_words(rest)
+        suffix, stem = "", bare
+    words = split_words(stem)
     kinds = _list_quantities(words)
     place = bool(_matches(words, PLACE_WORDS | DEFLECTION_WORDS))
     if suffix and not _fits(suffix, kinds, words, place=place):
         suffix, words = "", split_words(bare)
         kinds = _list_quantities(words)
-    own = _quantity_of_unit(stated or suffix)
-    if "other" in kinds and own in ("", "voltage", "current"):  # of the supply, say
-        own = "other"
-    if "speed" in kinds and own in ("angle", "length"):  # a speed in rad, say, is none the less no angle
-        own = "speed"
-    quantity = "voltage" if bare == "V" else own or _decide(kinds, place=place, counts=COUNTS in (stated, suffix))
+    measures = _quantity_of_unit(stated or suffix)
+    if "other" in kinds and measures in ("", "voltage", "current"):  # of the supply, say
+        measures = "other"
+    if "speed" in kinds and measures in ("angle", "length"):  # a speed in rad, say, is none the less no angle
+        measures = "speed"
+    quantity = "voltage" if bare == "V" else measures or _decide(kinds, place=place, counts=COUNTS in (stated, suffix))
     return Header(
         name=name,
         quantity=quantity,
@@ -217,21 +217,21 @@ def _fits(unit: str, kinds: list[Quantity], words: list[str], *, place: bool) ->
 
 def _find_number(words: list[str]) -> int | None:
     """Return the number of F1 or F2, of "force 2" or "cell1"."""
-    found = re.search(r"(?:f|force|kraft|cell|loadcell)([12])$", "".join(words))
-    return int(found[1]) if found else None
+    match = re.search(r"(?:f|force|kraft|cell|loadcell)([12])$", "".join(words))
+    return int(match[1]) if match else None
 
 
 def _list_quantities(words: list[str]) -> list[Quantity]:
-    found: list[Quantity] = [quantity for quantity, known in QUANTITY_WORDS.items() if _matches(words, known)]
+    kinds: list[Quantity] = [quantity for quantity, known in QUANTITY_WORDS.items() if _matches(words, known)]
     # What is no signal is named in full, or else "states" would be a state.
-    return [kind for kind in found if kind != "other" or any(word in QUANTITY_WORDS["other"] for word in words)]
+    return [kind for kind in kinds if kind != "other" or any(word in QUANTITY_WORDS["other"] for word in words)]
 
 
 def _matches(words: Iterable[str], known: frozenset[str]) -> list[str]:
     """Return the words that are known, or hold a long known one."""
-    long = [one for one in known if len(one) >= LONG]
+    long = [word for word in known if len(word) >= LONG]
     bare = ((word, word.rstrip("0123456789")) for word in words)
-    return [word for word, stem in bare if word in known or stem in known or any(one in word for one in long)]
+    return [word for word, stem in bare if word in known or stem in known or any(part in word for part in long)]
 
 
 def _decide(kinds: list[Quantity], *, place: bool, counts: bool) -> Quantity:
