@@ -12,13 +12,8 @@ MAX_BANDWIDTHS = 200
 def parse_bandwidths(text: str) -> tuple[float, ...]:
     """Return the bandwidths of LOW:HIGH:STEP, both ends included.
 
-    Raises
-    ------
-    ControlError
-        It is not three numbers, or not an ascending range of a reasonable length.
+    Raises ControlError: it is not three numbers, or not an ascending range of a reasonable length.
 
-    Examples
-    --------
     >>> parse_bandwidths("15:25:5")
     (15.0, 20.0, 25.0)
 

@@ -1,4 +1,4 @@
-"""What `seaopt inspect` does: read a log as it is, print its quality report, write it where asked."""
+"""`seaopt inspect`: read a log as it is, print its quality report, write it where asked."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from seaopt.reporting.sections.text import Most, render_sections
 from seaopt.signals import Table
 from seaopt.units import is_unit, same_dimension
 
-READING, LOOKING, DRAWING = 1.0, 1.0, 1.0  # of the time, of a long log
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 MAX_DIGITS = 9  # of a count
 MOST_LINES = 200  # of channels, and of findings
@@ -46,12 +45,7 @@ def inspect_log(
     """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked.
 
     Returns whether it has no error, with which a fit refuses it or is wrong.
-
-    Raises
-    ------
-    SeaoptError
-        The log cannot be read, or an option is malformed.
-
+    Raises SeaoptError: the log cannot be read, or an option is malformed.
     """
     if folder is not None:
         check_folder(folder)
@@ -61,19 +55,21 @@ def inspect_log(
             unit = f"{name}={unit_of[name]}"
             command = _spell_command(path, shlex.join(["--channel", f"{name}=COLUMN", "--unit", unit]))
             raise SeaoptError(f"--unit {unit}: name its column too: {command}")
+    if align is not None and align not in RULES:
+        raise SeaoptError(f'--align "{align}" is not known; give {" or ".join(RULES)}')
     columns = {name: Column(column=header, unit=unit_of.get(name)) for name, header in headers.items()}
     read = partial(
         read_table,
         path,
         channels=columns or None,
-        align=_parse_rule(align),
+        align=None if align is None else RULES[align],
         counter=_parse_counter(counter),
         rate_hz=rate_hz,
     )
     written: list[Path] = []
     console = Terminal(stderr=True)
     with show_progress(console, "inspecting the log", console.say, brief=True) as tell:
-        reading, looking, drawing = divide(tell, READING, LOOKING, DRAWING * (folder is not None))
+        reading, looking, drawing = divide(tell, 1.0, 1.0, float(folder is not None))  # for a long log
         reading("reading", 0.0)
         table = _read_on_clock(path, read, time, unit_of.get("time"))
         quality = assess_quality(table, inputs=list(inputs) or None, progress=looking)
@@ -93,11 +89,7 @@ def inspect_log(
 def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:
     """Read a table; where its clock is not clear the error is the command to type, and seconds may be assumed.
 
-    Raises
-    ------
-    LogError
-        No column, or more than one, is named like a time, or it has another unit.
-
+    Raises LogError: no column, or more than one, is named like a time, or it has another unit.
     """
     if time is None and unit is not None:
         named = [field.name for field in contents(path).fields if field.numeric and is_time_name(field.name)]
@@ -108,10 +100,9 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
     try:
         return read(time=clock)
     except ClockError as error:
-        if error.column is None:
-            raise LogError(f"{error}; type {_spell_clock(path, *_choose_clock(path, error.candidates))}") from error
-        if not is_time_name(error.column):
-            raise LogError(f"{error}; type {_spell_clock(path, *_choose_clock(path, [error.column]))}") from error
+        if error.column is None or not is_time_name(error.column):
+            candidates = error.candidates if error.column is None else [error.column]
+            raise LogError(f"{error}; type {_spell_clock(path, *_choose_clock(path, candidates))}") from error
         table = read(time=Column(column=error.column, unit="s"))
         other = _spell_clock(path, error.column, "ms")
         note = f'column "{error.column}" has no unit: seconds were assumed; for milliseconds type {other}'
@@ -134,14 +125,6 @@ def _spell_clock(path: Path, column: str, unit: str) -> str:
 
 def _spell_command(path: Path, options: str) -> str:
     return f"seaopt inspect {shlex.quote(str(path))} {options}"
-
-
-def _parse_rule(align: str | None) -> Rule | None:
-    if align is None:
-        return None
-    if align not in RULES:
-        raise SeaoptError(f'--align "{align}" is not known; give {" or ".join(RULES)}')
-    return RULES[align]
 
 
 def _parse_counter(option: str | None) -> Counter | None:

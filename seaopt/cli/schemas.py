@@ -22,14 +22,7 @@ DOCUMENTS = {  # the module and model of each, its title, and the version that i
 
 
 def json_schema(document: str) -> dict[str, Any]:
-    """Return a document's JSON Schema.
-
-    Raises
-    ------
-    SeaoptError
-        There is no such document.
-
-    """
+    """Return a document's JSON Schema; raise a SeaoptError where there is no such document."""
     if document not in DOCUMENTS:
         raise SeaoptError(
             f'schema "{document}" is not known; {suggestion(document, DOCUMENTS)} (type seaopt schema problem)'
