@@ -124,7 +124,7 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     ):  # with its unit, as a rule: a number may be another
         correct = "give the number alone, without quotes, in the key's own unit"
     elif kind == "literal":
-        correct = f"correct it: {own} = {_suggest_choice(first)}"
+        correct = f"correct it: {key} = {_suggest_choice(first)}"
     else:
         correct = f"correct it: {key} = {EXAMPLES.get(kind, '...')}"
     return f"{place} = {shorten(first['input'])}: {words}; {remedy or correct}"
