@@ -19,7 +19,7 @@ GLOSSARY = {
     "bandwidth": "Lowest frequency at which the response to the reference is 3 dB below its value at 0 Hz.",
     "tracking band": "Frequencies at which the response to the reference is within 3 dB of 1.",
     "sensitivity bandwidth": "Frequency up to which |S| is below -3 dB: slower disturbances are reduced.",
-    "noise gain": "Largest gain over frequency from sensor noise to the motor's force or torque.",
+    "noise gain": "Largest gain over frequency from sensor noise to the motor's effort.",
     "droop": "How far the response to the reference falls below its static value up to a third of the bandwidth.",
     "reference peak": "Largest gain over frequency from the reference to the output, over its static value.",
     "std": "Standard deviation of the estimate, with coloured residuals allowed for.",
