@@ -41,13 +41,7 @@ from seaopt.control.loops.absolute_stability import FrictionMargin, friction_mar
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
-from seaopt.control.loops.sampled_plant import (
-    DELAYS,
-    DigitalPlant,
-    find_delay,
-    read_conditions,
-    sample,
-)
+from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, read_conditions, sample
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.force_plant import ForcePlant
@@ -328,15 +322,9 @@ class ForceMPC(LoopDelays, Result, Worded):
     ) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows.
 
-        Parameters
-        ----------
-        xi : array, shape (nx,)
-            The state's distance from its target.
-        u_s, last_A, drift : float
-            The command at rest, the last one, and the estimate of its disturbance.
-        targets : array, shape (p + 1,)
-            The force's targets from the first sample that a command reaches, as far as they are known.
-
+        `xi`: the state's distance from its target. `u_s`, `last_A`, `drift`: the command at rest, the last one, and the
+        estimate of its disturbance. `targets`: the force's, from the first sample that a command reaches on, as far as
+        they are known.
         """
         prediction, limit, ones = self.prediction, self.command_limit, np.ones(self.prediction.knots.size)
         slopes = np.zeros(len(prediction.M))
@@ -439,14 +427,8 @@ class ForceMPC(LoopDelays, Result, Worded):
         A plant with friction slides, as in `Controller.close`.
         """
         sliding = take_sliding(plant, params)
-        digital = sample(
-            sliding,
-            self.delay(params),
-            self.measured,
-            self.per_effort,
-            self.sample_time_s,
-            self.compute_delay_samples,
-        )
+        timing = self.sample_time_s, self.compute_delay_samples
+        digital = sample(sliding, self.delay(params), self.measured, self.per_effort, *timing)
         return Loop(plant=digital, law=self.law)
 
     @property
