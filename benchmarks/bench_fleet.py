@@ -33,7 +33,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.executors import Processes
 from seaopt.fleet.plan import list_columns, make_plan
-from seaopt.fleet.table import Table, make_schema
+from seaopt.fleet.table import FleetTable, make_schema
 
 PROBLEM = """
 schema = 1
@@ -158,7 +158,7 @@ def measure_table(count: int) -> None:
     """Print what a row costs along a table that grows, and one that is replaced, and what memory that takes."""
     with make_logs(1, 1.0, 200.0) as folder:
         plan = make_plan(so.read_problem(folder / "stand.toml"), None, None, "bench")
-        table = Table(folder / "out", make_schema(list_columns(plan.make_problem()), ()), plan)
+        table = FleetTable(folder / "out", make_schema(list_columns(plan.make_problem()), ()), plan)
         row = {"status": "met", "J": 1e-6, "J_std": 1e-9, "log_sha256": "0" * 64, "findings": []}
         for what in ("added", "replaced"):
             for tenth in range(TENTHS):
