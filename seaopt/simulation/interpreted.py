@@ -1,165 +1,326 @@
-"""The pass without a compiler: the state and its sensitivities, sample by sample in NumPy.
+"""The pass without a compiler: NumPy for linear plants, CasADi's virtual machine for the others.
 
-What changes from plant to plant is one function of a sample, (Z, k) -> (Z+, Y), where Z is the state with its
-derivatives behind it, one column per unknown, and Y the outputs with theirs: of a linear plant products of its exact
-matrices, of others CasADi's step with its derivatives.
+The log of a linear plant is cut into pieces of `ABREAST` samples, which start at rest and run side by side; what each
+inherits from the one before is added to it (superposition), so that Python's loops are over a piece and over pieces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
+import casadi as ca
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from seaopt.simulation.direct_call import DirectCall
-from seaopt.simulation.discretisation import transition
+from seaopt.plants.memo import memo
+from seaopt.records import record
+from seaopt.simulation.discretisation import Hold, transition
 from seaopt.simulation.integrator import output_function, step_function
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
 
-Columns = Float[np.ndarray, "_ nj"]
-Sample = Callable[[Columns, int], tuple[Columns, Columns]]
+ABREAST = 64  # few, as the power of an unstable plant's matrix up to this one is taken
+FOLDED_SAMPLES = 4096  # that CasADi's virtual machine chains in one call
+
+# Outputs, their derivatives, and states.
+Trajectory = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n nx"]]
 
 
 @np.errstate(all="ignore")  # a plant that overflows gives numbers that are not finite, as the compiled pass does
 def interpret_pass(
     model: Model, segment: Segment, point: Point, weights: Weights, stop: int, x0: Float[np.ndarray, " nx"]
 ) -> Pass:
-    """Run the samples before `stop`, and keep outputs, columns and states."""
-    layout, gains = layout_of(model.nx, model.ny, model.np, point), point.correction
-    sample = (_linear_sample if model.linear else _nonlinear_sample)(model, segment, point)
-    z = np.zeros((model.nx, layout.states))
-    z[:, 0] = x0
-    z[:, 1 + layout.shared : 1 + layout.shared + model.nx] = np.eye(model.nx)
-    y, states = np.empty((stop, model.ny, layout.states)), np.empty((stop, model.nx))
-    for k in range(stop):
-        states[k] = z[:, 0]
-        z, y[k] = sample(z, k)
-        if gains is not None:
-            (v,), _ = _compare(segment, point, layout, y[k : k + 1], slice(k, k + 1))
-            z -= gains[0] @ v
-            z[:, 1 : len(gains)] -= (gains[1:] @ v[:, 0]).T
-    ny, nc, columns = model.ny, layout.columns, None
+    """Run the samples before `stop` in NumPy and CasADi's virtual machine; keep outputs, columns and states."""
+    layout, forcing = layout_of(model.nx, model.ny, model.np, point), _inputs_in_force(segment, point)[:stop]
+    if model.linear and point.correction is None:
+        y, dy, x = _linear_trajectory(model, layout, point, forcing, x0)
+    else:
+        y, dy, x = _folded_trajectory(model, segment, point, forcing, x0)
+    ny, nc, v = model.ny, layout.columns, None
     gram, loss, count = np.zeros((ny, nc, nc)), np.zeros(ny), np.zeros(ny)
     if segment.y:
-        columns, counts = _compare(segment, point, layout, y, slice(0, stop))
-        if len(weights.sections):
-            from scipy.signal import sosfilt  # deferred: scipy is slow to load
-
-            columns = np.asarray(sosfilt(np.insert(weights.sections, 3, 1.0, axis=1), columns, axis=0))
-        counts[: weights.settle] = False
+        v, present = _columns(segment, point, weights, layout, y, dy)
         for o in range(ny):
-            v = columns[counts[:, o], o]
-            losses, weight = _loss_and_weight(v[:, 0], weights.loss, float(weights.knee[o]))
-            gram[o] = (v * weight[:, None]).T @ v
-            loss[o], count[o] = float(np.sum(losses)), float(len(v))
-    return Pass(gram=gram, loss=loss, count=count, outputs=y[:, :, 0].copy(), columns=columns, states=states)
-
-
-def _linear_sample(model: Model, segment: Segment, point: Point) -> Sample:
-    """Return the function of a sample of a linear plant."""
-    nx, blocks = model.nx, transition(model, point.theta, point.clock)
-    matrix, driving = blocks[0, :, :nx].copy(), blocks
-    driving[0, :, :nx] = 0.0  # the state itself goes through `matrix`
-    inputs = _inputs_in_force(segment, point).reshape(segment.n, -1)
-
-    def sample(z: Columns, k: int) -> tuple[Columns, Columns]:
-        both = matrix @ z
-        both[:, : len(driving)] += (driving @ np.concatenate((z[:, 0], inputs[k], (1.0,)))).T
-        return both[:nx], both[nx:]
-
-    return sample
-
-
-def _nonlinear_sample(model: Model, segment: Segment, point: Point) -> Sample:
-    """Return the function of a sample of another plant.
-
-    With a fraction of a delay an older input acts first: u_b held, or the line from u_c to u_a; then u_a held, or the
-    line from u_a to u_b.
-    """
-    step, output = DirectCall(step_function(model)), DirectCall(output_function(model))
-    clock, count, p = point.clock, model.np, model.parameters(point.theta)
-    inputs, fraction_s, joined = _inputs_in_force(segment, point), clock.fraction_s, clock.hold == "first"
-    level = np.zeros(model.nu)
-
-    def observe(z: Columns, t: float, held: Float[np.ndarray, "lags nu"]) -> Columns:
-        slope = (held[-1] - held[0]) / clock.period if joined and clock.split else level
-        u = held[1] if fraction_s > 0.0 and not joined else held[0] + fraction_s * slope
-        y, by_state, by_theta, by_input = output(t, z[:, 0], u, p)
-        both = by_state @ z
-        both[:, :1] = y
-        both[:, 1 : 1 + count] += by_theta
-        if clock.delay_free:
-            both[:, 1 + count] += by_input @ slope
-        return both
-
-    def advance(z: Columns, t: float, held: Float[np.ndarray, "lags nu"]) -> Columns:
-        older = (held[0] - held[-1] if joined else level) / clock.period
-        newer = (held[1] - held[0] if joined else level) / clock.period
-        parts = [(held[0], newer, range(point.substeps), clock.period - fraction_s, -1.0)]
-        if clock.split:  # the older line ends at u_a, where the newer one begins
-            parts.insert(0, (held[0 if joined else 1], older, range(-point.substeps, 0), fraction_s, 1.0))
-        for base, slope, steps, lasting_s, growth in parts:
-            h, dh = lasting_s / point.substeps, growth / point.substeps  # the delay makes h longer, by dh a second
-            for i in steps:
-                x, by_state, moved = step(t, z[:, 0], base + slope * h * i, base + slope * h * (i + 1), p, h)
-                z = by_state @ z
-                z[:, :1] = x
-                z[:, 1 : 1 + count] += moved[:, :count]
-                if clock.delay_free:
-                    z[:, 1 + count] += moved[:, count:] @ np.concatenate(((dh,), slope * dh * i, slope * dh * (i + 1)))
-                t += h
-        return z
-
-    def sample(z: Columns, k: int) -> tuple[Columns, Columns]:
-        t, sampling = segment.start_s + k * clock.period, model.plant.sampling
-        after = advance(z, t, inputs[k])
-        if sampling is not None:
-            rows, weights = sampling.matrix(tuple(model.plant.states))
-            after[rows] = weights @ z
-        return after, observe(z, t, inputs[k])
-
-    return sample
-
-
-def _inputs_in_force(segment: Segment, point: Point) -> Float[np.ndarray, "n lags nu"]:
-    """Return u_a, u_b, ... of every sample; before and after the log the first and the last input act."""
-    u = np.column_stack(segment.u)
-    rows = segment.lead + np.arange(segment.n)[:, None] - np.array(point.clock.lags)
-    return u[np.clip(rows, 0, len(u) - 1)]
-
-
-def _compare(
-    segment: Segment, point: Point, layout: Layout, y: Float[np.ndarray, "m ny nj"], rows: slice
-) -> tuple[Float[np.ndarray, "m ny nc"], Bool[np.ndarray, "m ny"]]:
-    """Return v of the samples in `rows`, zero where an output is missing, and which are there."""
-    measured = np.column_stack([channel[rows] for channel in segment.y])
-    present = np.isfinite(measured)
-    if segment.keep:
-        present &= np.column_stack([mask[rows] for mask in segment.keep]).astype(bool)
-    v = np.zeros((*measured.shape, layout.columns))
-    v[:, :, : layout.states] = point.gain[:, None] * y
-    v[:, :, 0] = point.read(y[:, :, 0].T, segment, rows).T - measured
-    basis = segment.drift_basis(rows, point.drift_terms)
-    for o in range(layout.ny):
-        first = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
-        v[:, o, first] += 1.0
-        v[:, o, first + 1 : first + 1 + point.drift_terms] += basis
-        v[:, o, first + layout.own - 1] += y[:, o, 0]
-    v[~present] = 0.0
-    return v, present
+            kept = v[present[:, o], o]
+            losses, weight = _loss_and_weight(kept[:, 0], weights.loss, float(weights.knee[o]))
+            gram[o] = (kept * weight[:, None]).T @ kept
+            loss[o], count[o] = float(np.sum(losses)), float(len(kept))
+    return Pass(gram=gram, loss=loss, count=count, outputs=y, columns=v, states=x)
 
 
 def _loss_and_weight(
     r: Float[np.ndarray, " n"], loss: str, knee: float
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the loss of each residual and the weight that makes its square's gradient the loss's."""
+    size = np.abs(r)
     if loss == "soft_l1":
         root = np.sqrt(1.0 + (r / knee) ** 2)
         return knee**2 * (root - 1.0), 1.0 / root
     if loss == "square" or not np.isfinite(knee):
         return 0.5 * r**2, np.ones_like(r)
-    size = np.maximum(np.abs(r), 1e-300)
     inside = size <= knee
-    return np.where(inside, 0.5 * r**2, knee * (size - 0.5 * knee)), np.where(inside, 1.0, knee / size)
+    return np.where(inside, 0.5 * r**2, knee * (size - 0.5 * knee)), np.where(
+        inside, 1.0, knee / np.maximum(size, 1e-300)
+    )
+
+
+def _inputs_in_force(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
+    """Return [u_a, u_b, ..., 1] of every sample."""
+    n, u = segment.n, np.column_stack(segment.u)
+    rows = segment.lead + np.arange(n)
+    inputs = (u[np.clip(rows - lag, 0, len(u) - 1)] for lag in point.clock.lags)
+    return np.hstack([*inputs, np.ones((n, 1))])
+
+
+def _linear_trajectory(
+    model: Model, layout: Layout, point: Point, forcing: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]
+) -> Trajectory:
+    """Return the trace of a linear plant: the state first, which with the inputs drives its derivatives."""
+    nx, count = model.nx, layout.states - 1
+    blocks = transition(model, point.theta, point.clock)
+    a, c = blocks[0, :nx, :nx], blocks[0, nx:, :nx]
+    x = _run_abreast(a, x0[:, None], (forcing @ blocks[0, :nx, nx:].T)[:, :, None])[:, :, 0]
+    driven = np.zeros((len(forcing), nx + model.ny, count))
+    driven[:, :, : len(blocks) - 1] = np.moveaxis(np.hstack([x, forcing]) @ blocks[1:].transpose(0, 2, 1), 0, 2)
+    start = np.zeros((nx, count))
+    start[:, layout.shared : layout.shared + nx] = np.eye(nx)
+    s = _run_abreast(a, start, driven[:, :nx])
+    return x @ c.T + forcing @ blocks[0, nx:, nx:].T, c @ s + driven[:, nx:], x
+
+
+def _run_abreast(
+    a: Float[np.ndarray, "nx nx"], start: Float[np.ndarray, "nx nc"], driven: Float[np.ndarray, "n nx nc"]
+) -> Float[np.ndarray, "n nx nc"]:
+    """Return z_0 to z_{n-1} of z_{k+1} = a z_k + driven_k."""
+    (n, nx, nc), count = driven.shape, -(-len(driven) // ABREAST)
+    padded = np.zeros((count * ABREAST, nx, nc))
+    padded[:n] = driven
+    forces = padded.reshape(count, ABREAST, nx, nc).transpose(1, 2, 0, 3).reshape(ABREAST, nx, count * nc)
+    z = np.zeros((ABREAST + 1, nx, count * nc))
+    for i in range(ABREAST):
+        z[i + 1] = a @ z[i] + forces[i]
+    power, ends = np.linalg.matrix_power(a, ABREAST), z[ABREAST].reshape(nx, count, nc)
+    inherited = np.empty((nx, count, nc))
+    for k in range(count):
+        inherited[:, k] = start
+        start = power @ start + ends[:, k]
+    late = inherited.reshape(nx, count * nc)
+    for i in range(ABREAST):
+        z[i] += late
+        late = a @ late
+    return z[:ABREAST].reshape(ABREAST, nx, count, nc).transpose(2, 0, 1, 3).reshape(-1, nx, nc)[:n]
+
+
+def _split(model: Model, scheme: _Scheme, w: Any) -> tuple[Any, list[Any]]:
+    """Return t and the inputs in force of a sample's data."""
+    nu = model.nu
+    return w[0], [w[1 + i * nu : 1 + (i + 1) * nu] for i in range(scheme.inputs)]
+
+
+def _blocks(model: Model, scheme: _Scheme, data: Any) -> list[Any]:
+    """Return the blocks of `transition` from its numbers."""
+    rows, width = model.nx + model.ny, model.nx + scheme.inputs * model.nu + 1
+    return [ca.reshape(part, width, rows).T for part in ca.vertsplit(data, rows * width)]
+
+
+@record
+class _Scheme:
+    """How samples are stepped: all of a `Point` that expressions depend on."""
+
+    hold: Hold
+    delay_free: bool
+    fractional: bool  # older inputs act for the first part of a period
+    inputs: int  # in force
+    substeps: int
+
+    @classmethod
+    def of(cls, point: Point) -> _Scheme:
+        clock = point.clock
+        return cls(
+            hold=clock.hold,
+            delay_free=clock.delay_free,
+            fractional=clock.fraction_s > 0.0,
+            inputs=len(clock.lags),
+            substeps=point.substeps,
+        )
+
+
+def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
+    """Return the state and its derivatives one sample on."""
+    steps, nx, nu = scheme.substeps, model.nx, model.nu
+    t, inputs = _split(model, scheme, w)
+    x, s = z[:, 0], z[:, 1:]
+    padding = ca.MX.zeros(nx, layout.states - 1 - model.np - scheme.delay_free)
+    if model.linear:
+        blocks, v = [block[:nx, :] for block in _blocks(model, scheme, data)], ca.vertcat(x, *inputs, 1.0)
+        forced = ca.horzcat(*(ca.mtimes(block, v) for block in blocks[1:]), padding)
+        return ca.horzcat(ca.mtimes(blocks[0], v), ca.mtimes(blocks[0][:, :nx], s) + forced)
+    step, p, period = step_function(model), data[:-2], data[-2] + data[-1]
+    joined = scheme.hold == "first"
+    for part in (0, 1) if scheme.delay_free or scheme.fractional else (1,):
+        h, dh = data[data.numel() - 2 + part] / steps, (-1.0 if part else 1.0) / steps
+        base = inputs[0] if joined or part else inputs[1]
+        slope = (inputs[1] - inputs[0] if part else inputs[0] - inputs[-1]) / period if joined else ca.MX.zeros(nu)
+        for i in range(steps) if part else range(-steps, 0):  # the older line ends at u_a, the newer begins there
+            x, a, b = step(t, x, base + slope * h * i, base + slope * h * (i + 1), p, h)
+            forced = [b[:, : model.np]]
+            if scheme.delay_free:
+                along = ca.vertcat(dh, slope * dh * i, slope * dh * (i + 1))
+                forced.append(ca.mtimes(b[:, model.np :], along))
+            s = ca.mtimes(a, s) + ca.horzcat(*forced, padding)
+            t = t + h
+    after, sampling = ca.horzcat(x, s), model.plant.sampling
+    if sampling is not None:
+        rows, weights = sampling.matrix(tuple(model.plant.states))
+        after[rows, :] = ca.mtimes(ca.DM(weights), z)
+    return after
+
+
+def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
+    """Return the outputs and their derivatives."""
+    t, inputs = _split(model, scheme, w)
+    x, s = z[:, 0], z[:, 1:]
+    if model.linear:
+        blocks, v = [block[model.nx :, :] for block in _blocks(model, scheme, data)], ca.vertcat(x, *inputs, 1.0)
+        y, c = ca.mtimes(blocks[0], v), blocks[0][:, : model.nx]
+        direct = [ca.mtimes(block, v) for block in blocks[1:]]
+    else:
+        u, du = inputs[1] if scheme.fractional else inputs[0], ca.MX.zeros(model.nu)
+        if scheme.hold == "first":
+            du = (inputs[-1] - inputs[0]) / (data[-2] + data[-1]) if scheme.inputs == 3 else du
+            u = inputs[0] + data[-2] * du
+        y, c, d, by_input = output_function(model)(t, x, u, data[:-2])
+        direct = [d, ca.mtimes(by_input, du)] if scheme.delay_free else [d]
+    count = sum(block.shape[1] for block in direct)
+    return ca.horzcat(y, ca.mtimes(c, s) + ca.horzcat(*direct, ca.MX.zeros(model.ny, layout.states - 1 - count)))
+
+
+def _correct(layout: Layout, z: Any, y: Any, w: Any, sensors: Any) -> Any:
+    """Return what the prediction errors take off the next state and its derivatives.
+
+    w ends in [measured, present, drift basis]; known is [offset, gain, drift, correction and its derivatives].
+    """
+    nx, ny, nd = layout.nx, layout.ny, layout.drift_terms
+    measured, present, basis = ca.vertsplit(w, [0, ny, 2 * ny, 2 * ny + nd])
+    offset, gain, drift, correction = ca.vertsplit(sensors, [0, ny, 2 * ny, (2 + nd) * ny, sensors.numel()])
+    coefficients = ca.reshape(drift, nd, ny).T
+    gains = [ca.reshape(part, ny, nx).T for part in ca.vertsplit(correction, nx * ny)]
+    rows = []
+    for o in range(ny):
+        value = gain[o] * y[o, 0] + offset[o] + ca.mtimes(coefficients[o, :], basis) - measured[o]
+        sensor_columns = ca.vertcat(1.0, basis, y[o, 0])
+        before = ca.MX.zeros(layout.shared + nx + o * layout.own)
+        after = ca.MX.zeros((ny - 1 - o) * layout.own)
+        derivative = gain[o] * y[o, 1:] + ca.vertcat(before, sensor_columns, after).T
+        rows.append(present[o] * ca.horzcat(value, derivative))
+    v = ca.vertcat(*rows)
+    moved = ca.horzcat(*(ca.mtimes(g, v[:, 0]) for g in gains[1:]), ca.MX.zeros(nx, layout.states - len(gains)))
+    return ca.mtimes(gains[0], v) + ca.horzcat(ca.MX.zeros(nx, 1), moved)
+
+
+@memo
+def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, int, int]) -> tuple[Any, Any]:
+    """Return CasADi's (Z, w, data) -> Z+, over FOLDED_SAMPLES, and (Z, w, data) -> [y, derivatives], of one sample.
+
+    The sizes are those of w, of the plant's part of the data, and of all data.
+    """
+    z, w = ca.MX.sym("z", model.nx, layout.states), ca.MX.sym("w", sizes[0])
+    data = ca.MX.sym("data", sizes[2])
+    plant = data[: sizes[1]]
+    y = _observe(model, scheme, layout, z, w, plant)
+    after = _advance(model, scheme, layout, z, w, plant)
+    if layout.corrected:
+        after = after - _correct(layout, z, y, w[1 + scheme.inputs * model.nu :], data[sizes[1] :])
+    sample, output = ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
+    return sample.mapaccum(FOLDED_SAMPLES), output
+
+
+@memo
+def _output_map(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, int, int], n: int) -> Any:
+    """Return the outputs' function of `_program` for n samples at once."""
+    return _program(model, layout, scheme, sizes)[1].map(n)
+
+
+def _fold(
+    function: Any, z: Float[np.ndarray, "nx nj"], w: Float[np.ndarray, "n w"], data: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "n1 nx nj"]:
+    """Fold a function of FOLDED_SAMPLES over all; the last chunk is filled up with repeats, which are dropped."""
+    n, (nx, nj) = len(w), z.shape
+    path = np.empty((n + 1, nx, nj))
+    path[0] = z
+    for start in range(0, n, FOLDED_SAMPLES):
+        part, count = w[start : start + FOLDED_SAMPLES], min(FOLDED_SAMPLES, n - start)
+        if count < FOLDED_SAMPLES:
+            part = np.vstack([part, np.repeat(part[-1:], FOLDED_SAMPLES - count, axis=0)])
+        block = np.array(function(path[start], part.T, data)).reshape(nx, FOLDED_SAMPLES, nj)
+        path[start + 1 : start + 1 + count] = block.transpose(1, 0, 2)[:count]
+    return path
+
+
+def _folded_trajectory(
+    model: Model,
+    segment: Segment,
+    point: Point,
+    forcing: Float[np.ndarray, "n w"],
+    x0: Float[np.ndarray, " nx"],
+) -> Trajectory:
+    """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
+    layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(point)
+    clock, time = point.clock, segment.start_s + point.clock.period * np.arange(len(forcing))
+    if model.linear:
+        data = transition(model, point.theta, clock).ravel()
+    else:
+        data = np.append(model.parameters(point.theta), (clock.fraction_s, clock.period - clock.fraction_s))
+    w, plant_size = np.column_stack([time, forcing[:, :-1]]), data.size
+    if point.correction is not None:
+        measured, present = _read_measured(segment, len(forcing))
+        w = np.hstack([w, measured, present, segment.drift_basis(slice(0, len(forcing)), layout.drift_terms)])
+        sensors = (point.offset, point.gain, point.drift, point.correction)
+        data = np.concatenate([data, *(np.asarray(values).ravel() for values in sensors)])
+    sizes, n = (w.shape[1], plant_size, data.size), len(w)
+    start = np.zeros((model.nx, layout.states))
+    start[:, 0] = x0
+    start[:, 1 + layout.shared : 1 + layout.shared + model.nx] = np.eye(model.nx)
+    path = _fold(_program(model, layout, scheme, sizes)[0], start, w, data)
+    flat = path[:-1].transpose(1, 0, 2).reshape(model.nx, n * layout.states)
+    outputs = _output_map(model, layout, scheme, sizes, n)(flat, w.T, np.repeat(data[:, None], n, 1))
+    y = np.array(outputs).reshape(model.ny, n, layout.states).transpose(1, 0, 2)
+    return y[:, :, 0], y[:, :, 1:], path[:-1, :, 0]
+
+
+def _read_measured(segment: Segment, stop: int) -> tuple[Float[np.ndarray, "n ny"], Any]:
+    """Return the measured outputs, zero where missing, and which are present."""
+    measured = np.column_stack([channel[:stop] for channel in segment.y])
+    present = np.isfinite(measured)
+    if segment.keep:
+        present &= np.column_stack([mask[:stop] for mask in segment.keep]).astype(bool)
+    return np.where(present, measured, 0.0), present
+
+
+def _columns(
+    segment: Segment,
+    point: Point,
+    weights: Weights,
+    layout: Layout,
+    y: Float[np.ndarray, "n ny"],
+    dy: Float[np.ndarray, "n ny nt"],
+) -> tuple[Float[np.ndarray, "n ny nc"], Any]:
+    """Return v of every sample, and which samples count."""
+    measured, present = _read_measured(segment, len(y))
+    basis = segment.drift_basis(slice(0, len(y)), point.drift_terms)
+    v = np.zeros((len(y), layout.ny, layout.columns))
+    v[:, :, 0] = point.read(y.T, segment, slice(0, len(y))).T - measured
+    v[:, :, 1 : 1 + dy.shape[2]] = point.gain[:, None] * dy
+    for o in range(layout.ny):
+        first = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
+        v[:, o, first] += 1.0
+        v[:, o, first + 1 : first + 1 + point.drift_terms] += basis
+        v[:, o, first + layout.own - 1] += y[:, o]
+    v[~present] = 0.0
+    if len(weights.sections):
+        from scipy.signal import sosfilt
+
+        sos = np.insert(weights.sections, 3, 1.0, axis=1)
+        v = np.asarray(sosfilt(sos, v, axis=0))
+    present[: weights.settle] = False
+    return v, present
