@@ -71,6 +71,7 @@ BEST_SHARE = 0.15  # of the population: what members are drawn to
 NEUTRAL_SHARE = 0.3  # of the population: begin without the optional parts
 KEPT = 0.99  # worst usage at which the search ends
 HOPELESS = 1.05  # worst usage beyond which one law is handed on, for what it misses least
+COLLAPSED = 1.0001  # ratio of usages within a population that has come together at one place: it leads nowhere else
 ENCIRCLES = 1e3  # factor of the usage of a loop whose turns say that it is unstable
 NO_ROOT = 1e9  # usage where no k_p makes the bandwidth
 HIGHEST_RATE = 3.0  # of the bandwidth's rad/s: rho
@@ -210,7 +211,8 @@ class Evolution:
         usage, laws = self.judge(population)
         best = max(2, int(BEST_SHARE * members))
         for _ in range(generations):
-            if np.min(usage) <= KEPT:
+            least = np.min(usage)
+            if least <= KEPT or (least > HOPELESS and np.max(usage) < COLLAPSED * least):
                 break
             order = np.argsort(usage)
             towards = population[order[rng.integers(best, size=members)]]
