@@ -11,6 +11,8 @@ F_m + G_{12} v` and :math:`F_e = G_{21} F_m + G_{22} v` of the port, a motor for
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -70,14 +72,16 @@ class Link:
         )
 
 
-def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Link:
-    """Return the link of a plant under a controller.
+def find_link(controller: Controller, plant: Plant, params: ParameterSet, link_damping: float | None = None) -> Link:
+    """Return the link of a plant under a controller, linearised at rest, sliding where it has friction.
 
-    `controller`: its law is closed around the port. `plant`, `params`: a plant whose link moves, linearised at rest,
-    sliding where it has friction.
+    `link_damping`: the damper at the link, in place of its own.
 
-    Raises ControlError: the link is held, the plant has no port, or the link is not a mass on a spring and a damper.
+    Raises ControlError: the link is held, the plant has no port, the link is not a mass on a spring and a damper, or
+    the damper is negative.
     """
+    if link_damping is not None and not 0.0 <= link_damping < np.inf:
+        raise ControlError(f"link_damping = {link_damping:g} is not a damper; give zero or more")
     if plant.port is None or plant.port.motion is None:
         raise ControlError(
             f"plant {plant.name} holds its link, so that no impedance can be rendered there; give a plant whose link "
@@ -95,9 +99,10 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
             f"{measured} of plant {plant.name} does not tell the effort on the link at rest; measure an output that "
             "does"
         )
+    load = _read_load(port, linear, plant.name)
     return Link(
         port=port,
-        load=_read_load(port, linear, plant.name),
+        load=load if link_damping is None else replace(load, damping=float(link_damping)),
         law=controller.law,
         delay_samples=controller.compute_delay_samples,
         direction=-1.0 / ratio.real,
@@ -118,17 +123,17 @@ def _read_load(port: PortModel, linear: tuple[Float[np.ndarray, "..."], ...], na
         @ c[0]
     )
     whole = -drive / (s * moved)
-    load = whole - response.motion_to_port
-    terms = np.column_stack([s, np.ones_like(s), 1.0 / s]) / np.abs(whole)[:, None]
-    seen = load / np.abs(whole)
-    rows, wanted = np.vstack([terms.real, terms.imag]), np.concatenate([seen.real, seen.imag])
+    size = np.abs(whole)
+    terms = np.column_stack([s, np.ones_like(s), 1.0 / s]) / size[:, None]
+    load = (whole - response.motion_to_port) / size
+    rows, wanted = np.vstack([terms.real, terms.imag]), np.concatenate([load.real, load.imag])
     scale = np.linalg.norm(rows, axis=0)
-    found = np.linalg.lstsq(rows / scale, wanted, rcond=None)[0] / scale
-    if np.max(np.abs(rows @ found - wanted)) > LOAD_ROUNDING:
+    coefficients = np.linalg.lstsq(rows / scale, wanted, rcond=None)[0] / scale
+    if np.max(np.abs(rows @ coefficients - wanted)) > LOAD_ROUNDING:
         raise ControlError(
             f"the link of plant {name} is no mass on a spring and a damper (a second elasticity behind the port); "
             "an impedance is rendered at a rigid link"
         )
     small = LOAD_ROUNDING * np.max(np.abs(wanted)) / scale
-    mass, damping, stiffness = np.where(np.abs(found) > small, found, 0.0)
-    return Load(inertia=float(mass), damping=float(damping), stiffness=float(stiffness))
+    inertia, damping, stiffness = map(float, np.where(np.abs(coefficients) > small, coefficients, 0.0))
+    return Load(inertia=inertia, damping=damping, stiffness=stiffness)

@@ -17,18 +17,19 @@ from seaopt.control.loops.outer_loop import Impedance
 from seaopt.control.loops.sampled_plant import hold
 from seaopt.records import record
 
-Matrix = Float[np.ndarray, "n n"]
+Matrix = Float[np.ndarray, "_ _"]
+Vector = Float[np.ndarray, " _"]
 
 
 @record(eq=False)
 class MovingLoop:
     """x+ = (m_0 + K_v m_stiffness + D_v m_damping) x + b x_0 K_v, link position = c x."""
 
-    fixed: Matrix  # fixed, by_stiffness, by_damping: shape (n, n)
+    fixed: Matrix
     by_stiffness: Matrix
     by_damping: Matrix
-    reference: Float[np.ndarray, " n"]  # the effect of the force law's reference
-    position: Float[np.ndarray, " n"]  # the link's position
+    reference: Vector  # the effect of the force law's reference
+    position: Vector  # the link's position
     direction: float
     sample_time_s: float
 
@@ -62,7 +63,7 @@ def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -
     `load`: what is on the port, the link's own inertia included; the link alone if left out.
     """
     load = link.load if load is None else load
-    port, law, period = link.port, link.law, link.sample_time_s
+    port, period = link.port, link.sample_time_s
     n = port.motor.size
     # F_e = -(m - m_0) v' - d v - k x, m_0 being the probe's inertia, and v' = a x + b u + force F_e.
     share = 1.0 / (1.0 + (load.inertia - port.mass) * port.force[port.speed])
@@ -77,49 +78,39 @@ def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -
     position = np.zeros(n)
     position[port.place] = 1.0
     rows, direct = np.vstack([c, position]), np.append(d, 0.0)
-    sampled = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
-    return _assemble(link, velocity_filter_s, tuple(part[0] for part in sampled), law.c.size)
+    held = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
+    plant = tuple(part[0] for part in held)
+    for _ in range(link.delay_samples):
+        plant = _wait(*plant)
+    return _assemble(link, velocity_filter_s, *plant)
 
 
-def _assemble(link: Link, velocity_filter_s: float, plant: Any, order: int) -> MovingLoop:
-    """Return the loop of a sampled plant (a, b, rows of what is read and of the position, their feedthrough)."""
-    big, late, rows, direct = plant
-    law, wait = link.law, link.delay_samples
+def _wait(a: Matrix, b: Vector, c: Matrix, d: Vector) -> tuple[Matrix, Vector, Matrix, Vector]:
+    """Return a sampled plant whose input acts one sample later."""
+    a = np.block([[a, b[:, None]], [np.zeros((1, b.size + 1))]])
+    return a, np.append(np.zeros(b.size), 1.0), np.column_stack([c, d]), np.zeros_like(d)
+
+
+def _assemble(link: Link, velocity_filter_s: float, a: Matrix, b: Vector, rows: Matrix, direct: Vector) -> MovingLoop:
+    """Return the loop of a sampled plant, whose rows are what the law reads and the position."""
+    law, n, through = link.law, b.size, direct[:-1]
     outer = link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s))
-    n, through = late.size, direct[:-1]
-    size = n + wait + order + 1
-    inner, speed = slice(n + wait, n + wait + order), size - 1
-    # Over the states (plant, commands under way, law, filter): the command that acts now, what is read, effort, place.
-    acts, read, position = np.zeros(size), np.zeros((through.size, size)), np.zeros(size)
-    read[:, :n], position[:n] = rows[:-1], rows[-1]
-    effort = np.zeros(size)
-    effort[inner] = law.c
-    if wait:
-        acts[n + wait - 1] = 1.0
-        read = read + np.outer(through, acts)
-        gain = 1.0
-    else:
-        gain = 1.0 / (1.0 - law.d[1:] @ through)
+    size = n + law.c.size + 1
+    inner, speed = slice(n, size - 1), size - 1
+    # Over the states (plant, law, filter of the speed): effort, readings, position.
+    effort, read, position = np.zeros(size), np.zeros((through.size, size)), np.zeros(size)
+    effort[inner], read[:, :n], position[:n] = law.c, rows[:-1], rows[-1]
+    gain = 1.0 / (1.0 - law.d[1:] @ through)
     effort = gain * (effort + law.d[1:] @ read)
+    read = read + np.outer(through, effort)
     per_reference = gain * law.d[0]  # of the effort
-    if not wait:
-        acts = effort
-        read = read + np.outer(through, effort)
     matrix, drive = np.zeros((size, size)), np.zeros(size)
-    matrix[:n, :n] = big
-    matrix[:n] += np.outer(late, acts)
-    if wait:
-        matrix[n] = effort
-        drive[n] = per_reference
-        for i in range(1, wait):
-            matrix[n + i, n + i - 1] = 1.0
-        read_per_reference = 0.0 * through
-    else:
-        drive[:n] = late * per_reference
-        read_per_reference = through * per_reference
+    matrix[:n, :n] = a
+    matrix[:n] += np.outer(b, effort)
+    drive[:n] = b * per_reference
     matrix[inner, inner] = law.a
     matrix[inner] += law.b[:, 1:] @ read
-    drive[inner] = law.b[:, 0] + law.b[:, 1:] @ read_per_reference
+    drive[inner] = law.b[:, 0] + law.b[:, 1:] @ (through * per_reference)
     filtered = outer.rate * position
     filtered[speed] += 1.0
     matrix[speed] = outer.pole * filtered - outer.rate * position

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float
 from seaopt.control.impedance.critical_damping import CriticalImpedances, scan_critical
 from seaopt.control.impedance.link import Link, find_link
 from seaopt.control.impedance.moving_loop import close_link
-from seaopt.control.impedance.sampled_port import PortResponses, PortTerms, SampledPort
+from seaopt.control.impedance.sampled_port import Angles, PortResponses, PortTerms, SampledPort
 from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.outer_loop import Impedance
@@ -177,36 +176,29 @@ def passive_region(
     ((20, 20), True)
 
     """
-    link = find_link(controller, plant, parameters)
-    if link_damping is not None:
-        if not 0.0 <= link_damping < np.inf:
-            raise ControlError(f"link_damping = {link_damping:g} is not a damper; give zero or more")
-        link = replace(link, load=replace(link.load, damping=float(link_damping)))
+    link = find_link(controller, plant, parameters, link_damping)
     if isinstance(points, bool) or not 2 <= points <= MOST_POINTS:
         raise ControlError(f"points = {points!r} is not a size of the grid; give 2 to {MOST_POINTS}")
     filter_s = Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s).filter_for(link.sample_time_s)
     port = SampledPort(link=link, velocity_filter_s=filter_s)
     held_stable = port.held_stable()
     terms = port.terms(port.angles(), link.load.damping)
-    spring = _find_spring(plant, parameters)
+    spring = None
+    if plant.spring is not None and plant.spring.stiffness is not None:
+        spring = plant.complete(parameters)[plant.spring.stiffness].value
     scales = _find_scales(link, spring)
-    box = _find_box(terms, scales) if terms is not None and held_stable else None
-    stiffest = None if box is None or terms is None else _find_stiffest(port, terms, box)
-    ranges = [
-        _choose_range(name, given, None if box is None else box[i], scales[i])
-        for i, (name, given) in enumerate((("stiffness", stiffness), ("damping", damping)))
-    ]
-    k, d = (np.linspace(*ends, points) for ends in ranges)
+    box = _find_box(terms, scales) if held_stable else None
+    about = box or (None, None)
+    k = np.linspace(*_choose_range("stiffness", stiffness, about[0], scales[0]), points)
+    d = np.linspace(*_choose_range("damping", damping, about[1], scales[1]), points)
     k_all, d_all = (part.ravel() for part in np.meshgrid(k, d, indexing="ij"))
-    margin = np.full(k_all.size, -np.inf) if terms is None else terms.least(k_all, d_all)
-    loop = close_link(link, filter_s)
     return ImpedanceRegion(
         stiffness=k,
         damping=d,
-        margin=margin.reshape(points, points),
-        free_radius=loop.radius(k_all, d_all).reshape(points, points),
+        margin=terms.least(k_all, d_all).reshape(points, points),
+        free_radius=close_link(link, filter_s).radius(k_all, d_all).reshape(points, points),
         held_stable=held_stable,
-        stiffest=stiffest,
+        stiffest=None if box is None else _find_stiffest(port, terms.theta, box),
         spring=spring,
         link_damping=link.load.damping,
         velocity_filter_s=filter_s,
@@ -233,11 +225,9 @@ def needed_damper(port: SampledPort, impedance: Impedance) -> float:
 
 def _bisect_damper(at: PortResponses, impedance: Impedance, low: float, high: float) -> float:
     """Return the least damper between two with which an impedance is passive at some angles; infinite beyond them."""
-    k, d = np.array([impedance.stiffness]), np.array([impedance.damping])
 
     def holds(damper: float) -> bool:
-        terms = at.weigh(damper)
-        return terms is not None and float(terms.least(k, d)[0]) > 0.0
+        return bool(np.min(at.weigh(damper).margin_of(impedance)) > 0.0)
 
     if not holds(high):
         return np.inf
@@ -247,12 +237,6 @@ def _bisect_damper(at: PortResponses, impedance: Impedance, low: float, high: fl
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if holds(middle) else (middle, high)
     return high
-
-
-def _find_spring(plant: Plant, parameters: ParameterSet) -> float | None:
-    """Return the stiffness of the plant's spring, where it names one."""
-    name = None if plant.spring is None else plant.spring.stiffness
-    return None if name is None else plant.complete(parameters)[name].value
 
 
 def _find_scales(link: Link, spring: float | None) -> tuple[float, float]:
@@ -279,18 +263,16 @@ def _find_box(terms: PortTerms, scales: tuple[float, float]) -> tuple[Grid, Grid
     return ends[0], ends[1]
 
 
-def _find_stiffest(port: SampledPort, terms: PortTerms, box: tuple[Grid, Grid]) -> Impedance | None:
+def _find_stiffest(port: SampledPort, theta: Angles, box: tuple[Grid, Grid]) -> Impedance | None:
     """Return the passive impedance of the largest stiffness, by bisection, looked at between the angles too."""
     d = np.linspace(*box[1], EDGE_POINTS)
-    theta = terms.theta
     about: Impedance | None = None
     for _ in range(2):
         low, high, about = 0.0, box[0][1] * (1.0 + ROOM), None
-        at = port.terms(theta, port.link.load.damping)
-        assert at is not None
+        terms = port.terms(theta, port.link.load.damping)
         for _ in range(EDGE_STEPS):
             middle = 0.5 * (low + high)
-            margin = at.least(np.full(d.size, middle), d)
+            margin = terms.least(np.full(d.size, middle), d)
             best = int(np.argmax(margin))
             if margin[best] > 0.0:
                 low = middle

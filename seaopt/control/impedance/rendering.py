@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.impedance.link import Link, Load, find_link
+from seaopt.control.impedance.link import Link, find_link
 from seaopt.control.impedance.moving_loop import MovingLoop, close_link
 from seaopt.control.impedance.region import needed_damper
 from seaopt.control.impedance.sampled_port import SampledPort
@@ -47,12 +47,11 @@ class BreakingEnvironment:
 
     def describe(self, called: Mechanics) -> str:
         """Return what it is and what it does, with units."""
-        what = (
-            f"a spring of {self.stiffness:.4g} {called.stiffness}"
-            if self.stiffness
-            else f"{self.inertia:.4g} {called.inertia} more"
+        spring, mass = (
+            f"a spring of {self.stiffness:.4g} {called.stiffness}",
+            f"{self.inertia:.4g} {called.inertia} more",
         )
-        return f"{what} at the link makes it oscillate at {self.frequency_hz:.4g} Hz"
+        return f"{spring if self.stiffness else mass} at the link makes it oscillate at {self.frequency_hz:.4g} Hz"
 
 
 @record(eq=False)
@@ -186,28 +185,23 @@ def render(
 
     """
     require_type(impedance, Impedance, "impedance", "give an Impedance", ControlError)
-    link = find_link(controller, plant, parameters)
-    load = link.load
-    if link_damping is not None:
-        load = Load(inertia=load.inertia, damping=float(link_damping), stiffness=load.stiffness)
-        link = Link(port=link.port, load=load, law=link.law, delay_samples=link.delay_samples, direction=link.direction)
-    outer = link.outer(impedance)
+    link = find_link(controller, plant, parameters, link_damping)
+    outer, damper = link.outer(impedance), link.load.damping
     port = SampledPort(link=link, velocity_filter_s=outer.velocity_filter_s)
     loop = close_link(link, outer.velocity_filter_s)
-    margin, worst = port.worst(impedance, load.damping, port.angles())
+    margin, worst = port.worst(impedance, damper, port.angles())
     passive = bool(margin > 0.0) and port.held_stable()
-    worst_hz = worst / (2 * np.pi * link.sample_time_s)
     radius = float(loop.radius(impedance.stiffness, impedance.damping))
     return Rendering(
         impedance=impedance,
         outer=outer,
         passive=passive,
         needed_damper=needed_damper(port, impedance),
-        link_damping=load.damping,
+        link_damping=damper,
         stable=radius <= GROWING,
         spectral_radius=radius,
-        breaking=None if passive else find_breaking(link, outer, port.find_failing_hz(impedance, load.damping)),
-        worst_hz=worst_hz,
+        breaking=None if passive else find_breaking(link, outer, port.find_failing_hz(impedance, damper)),
+        worst_hz=worst / (2 * np.pi * link.sample_time_s),
         band_hz=_find_band(link, outer),
         overshoot=_find_overshoot(loop, impedance, radius),
         called=mechanics_of(link.port.place_unit),
@@ -274,7 +268,7 @@ def find_breaking(link: Link, outer: OuterLoop, frequencies_hz: Float[np.ndarray
         omega = 2 * np.pi * float(frequency)
         more = float(wanted) - (omega * load.inertia - load.stiffness / omega)
         inertia, stiffness = (more / omega, 0.0) if more > 0.0 else (0.0, -more * omega)
-        whole = Load(inertia=load.inertia + inertia, damping=load.damping, stiffness=load.stiffness + stiffness)
+        whole = replace(load, inertia=load.inertia + inertia, stiffness=load.stiffness + stiffness)
         poles = close_link(link, outer.velocity_filter_s, whole).eigenvalues(outer.stiffness, outer.damping)
         fastest = complex(poles[int(np.argmax(np.abs(poles)))])
         if best is None or abs(fastest) > best.spectral_radius:
@@ -298,9 +292,8 @@ def _find_band(link: Link, outer: OuterLoop) -> tuple[float, float] | None:
     if not np.any(near):
         return None
     first = int(np.argmax(near))
-    following = near[first:]
-    last = first + (following.size - 1 if np.all(following) else int(np.argmin(following)) - 1)
-    return float(f[first]), float(f[last])
+    end = first + int(np.argmin(np.append(near[first:], False)))
+    return float(f[first]), float(f[end - 1])
 
 
 def _find_overshoot(loop: MovingLoop, impedance: Impedance, radius: float) -> float:

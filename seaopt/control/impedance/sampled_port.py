@@ -48,6 +48,7 @@ from seaopt.records import record
 
 Angles = Float[np.ndarray, " m"]
 Points = Float[np.ndarray, " n"]
+Aliases = Complex[np.ndarray, "m k"]
 ALIASES = 24  # on either side; what is beyond is summed as falling like 1/omega^2
 NEAR = 2  # aliases on either side whose c_k are added exactly; of the others only the size counts
 LOWEST_HZ = 0.01
@@ -61,19 +62,21 @@ FAILING = 40  # frequencies at which an environment is looked for
 class PortTerms:
     """c_k = p_k + W q_k at m angles and k aliases, for one damper at the link."""
 
-    theta: Angles  # shape (m,); angles
-    # by_force, by_place: p_k and q_k, the aliases in the order -N to N and then what is beyond on either side, as one
-    # each
-    by_force: Complex[np.ndarray, "m k"]
-    by_place: Complex[np.ndarray, "m k"]
+    theta: Angles
+    # p_k and q_k, the aliases in the order -N to N, then all those beyond on either side as one each
+    by_force: Aliases
+    by_place: Aliases
     weights: Complex[np.ndarray, "2 m"]  # W per stiffness and per damping
+    dissipates: bool  # something takes energy between the samples; nothing is passive without that
 
     def margin(self, stiffness: Points, damping: Points) -> Float[np.ndarray, "n m"]:
         """Return (|2 + sum c_k|^2 - (sum |c_k|)^2)/4 at every angle for n pairs of gains, positive where it is passive.
 
         Of one alias it is 1 + Re c: 1 without control, 0 where nothing is left of the damping. Of the far aliases the
-        sizes of p_k and W q_k are added, which is more than that of their sum.
+        sizes of p_k and W q_k are added, which is more than that of their sum. Where nothing dissipates it is -inf.
         """
+        if not self.dissipates:
+            return np.full((stiffness.size, self.theta.size), -np.inf)
         near = slice(ALIASES - NEAR, ALIASES + NEAR + 1)
         far = np.ones(self.by_force.shape[1], dtype=bool)
         far[near] = False
@@ -85,13 +88,14 @@ class PortTerms:
             sizes += np.abs(p + w * q)
         return 0.25 * (whole - sizes) * (whole + sizes)
 
+    def margin_of(self, impedance: Impedance) -> Angles:
+        """Return the margin of one impedance at every angle; its filter is the port's."""
+        return self.margin(np.array([impedance.stiffness]), np.array([impedance.damping]))[0]
+
     def least(self, stiffness: Points, damping: Points) -> Points:
         """Return the least margin over the angles, for n pairs of gains."""
-        parts = [
-            np.min(self.margin(stiffness[i : i + BLOCK], damping[i : i + BLOCK]), axis=1)
-            for i in range(0, stiffness.size, BLOCK)
-        ]
-        return np.concatenate(parts)
+        blocks = (slice(i, i + BLOCK) for i in range(0, stiffness.size, BLOCK))
+        return np.concatenate([np.min(self.margin(stiffness[some], damping[some]), axis=1) for some in blocks])
 
 
 @record(eq=False)
@@ -99,21 +103,23 @@ class PortResponses:
     """a_k b_k = p_k + W q_k at m angles and k aliases, and the actuator's own Re G_22, without a damper at the link."""
 
     theta: Angles
-    by_force: Complex[np.ndarray, "m k"]
-    by_place: Complex[np.ndarray, "m k"]
+    by_force: Aliases
+    by_place: Aliases
     weights: Complex[np.ndarray, "2 m"]
     resistance: Float[np.ndarray, "m k"]
     least_resistance: float
 
-    def weigh(self, damper: float) -> PortTerms | None:
-        """Return the terms with a damper at the link; None where nothing takes energy between the samples."""
+    def weigh(self, damper: float) -> PortTerms:
+        """Return the terms with a damper at the link."""
         dissipated, floor = damper + self.resistance, damper + self.least_resistance
-        if not floor > 0.0:
-            return None
-        by_force, by_place = (
-            _add_beyond(part / dissipated, dissipated / floor, self.theta) for part in (self.by_force, self.by_place)
+        by_force, by_place = self.by_force, self.by_place
+        if floor > 0.0:
+            by_force, by_place = (
+                _add_beyond(part / dissipated, dissipated / floor, self.theta) for part in (by_force, by_place)
+            )
+        return PortTerms(
+            theta=self.theta, by_force=by_force, by_place=by_place, weights=self.weights, dissipates=floor > 0.0
         )
-        return PortTerms(theta=self.theta, by_force=by_force, by_place=by_place, weights=self.weights)
 
 
 @record(eq=False)
@@ -125,15 +131,17 @@ class SampledPort:
 
     def held_stable(self) -> bool:
         """Tell whether nothing grows with the link held, which the gains do not change."""
-        poles = Loop(plant=self.link.held(), law=self.link.law).eigenvalues()
-        return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
+        return bool(np.max(np.abs(self.held_poles()), initial=0.0) <= GROWING)
+
+    def held_poles(self) -> Complex[np.ndarray, " n"]:
+        """Return the eigenvalues of the force loop with the link held."""
+        return Loop(plant=self.link.held(), law=self.link.law).eigenvalues()
 
     def angles(self) -> Angles:
         """Return angles from nearly static to the Nyquist frequency, close about the modes of plant and loop."""
         period = self.link.sample_time_s
-        locked = self.link.held()
-        closed = Loop(plant=locked, law=self.link.law).eigenvalues()
-        closed = np.log(closed[np.abs(closed) > 1e-6]) / period
+        held = self.held_poles()
+        closed = np.log(held[np.abs(held) > 1e-6]) / period
         poles = self.link.port.find_poles()
         at, width = np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
         at = 2 * np.pi * np.concatenate([at, np.abs(closed.imag) / (2 * np.pi)])
@@ -152,7 +160,7 @@ class SampledPort:
         response = link.port.response(np.abs(omega).ravel() / (2 * np.pi))
         conjugated = omega < 0.0
 
-        def at(values: Complex[np.ndarray, " n"]) -> Complex[np.ndarray, "m k"]:
+        def at(values: Complex[np.ndarray, " n"]) -> Aliases:
             grid = values.reshape(omega.shape)
             return np.where(conjugated, np.conj(grid), grid)
 
@@ -173,45 +181,33 @@ class SampledPort:
             least_resistance=self._find_floor(),
         )
 
-    def terms(self, theta: Angles, damping: float) -> PortTerms | None:
-        """Return the terms at angles with a damper at the link; None where nothing takes energy between the samples."""
+    def terms(self, theta: Angles, damping: float) -> PortTerms:
+        """Return the terms at angles with a damper at the link."""
         return self.respond(theta).weigh(damping)
 
     def worst(self, impedance: Impedance, damper: float, theta: Angles) -> tuple[float, float]:
-        """Return the least margin of an impedance with a damper at the link, looked at between the angles, and where.
-
-        Its filter is the port's.
-        """
-        least, found, angles = np.inf, float(theta[0]), theta
+        """Return the least margin of an impedance with a damper at the link, also between the angles, and its angle."""
+        least, worst, angles = np.inf, float(theta[0]), theta
         for _ in range(REFINEMENTS):
-            terms = self.terms(angles, damper)
-            if terms is None:
-                return -np.inf, float(theta[0])
-            margin = terms.margin(np.array([impedance.stiffness]), np.array([impedance.damping]))[0]
+            margin = self.terms(angles, damper).margin_of(impedance)
             at = int(np.argmin(margin))
             if margin[at] < least:
-                least, found = float(margin[at]), float(angles[at])
+                least, worst = float(margin[at]), float(angles[at])
             angles = _about_dips(angles, margin)
-        return least, found
+        return least, worst
 
     def find_failing_hz(self, impedance: Impedance, damper: float) -> Float[np.ndarray, " m"]:
         """Return frequencies at which an impedance is not passive, at most `FAILING`, and where it is least so."""
         theta = self.angles()
-        terms, worst = self.terms(theta, damper), self.worst(impedance, damper, theta)[1]
-        failing = theta[:0]
-        if terms is not None:
-            margin = terms.margin(np.array([impedance.stiffness]), np.array([impedance.damping]))[0]
-            failing = theta[margin <= 0.0]
+        margin, worst = self.terms(theta, damper).margin_of(impedance), self.worst(impedance, damper, theta)[1]
+        failing = theta[(margin <= 0.0) & np.isfinite(margin)]
         if failing.size:
             failing = failing[np.unique(np.linspace(0, failing.size - 1, FAILING).astype(int))]
         return np.union1d(failing, [worst]) / (2 * np.pi * self.link.sample_time_s)
 
     def refine(self, impedance: Impedance, damper: float, theta: Angles) -> Float[np.ndarray, " new"]:
         """Return new angles about those at which an impedance is least passive."""
-        terms = self.terms(theta, damper)
-        if terms is None:
-            return theta[:0]
-        return _about_dips(theta, terms.margin(np.array([impedance.stiffness]), np.array([impedance.damping]))[0])
+        return _about_dips(theta, self.terms(theta, damper).margin_of(impedance))
 
     def _find_floor(self) -> float:
         """Return what the actuator's own port dissipates at the highest frequencies: its spring's damper."""
@@ -229,10 +225,8 @@ def _about_dips(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
     return np.unique(np.linspace(theta[low], theta[high], POINTS_PER_DIP))
 
 
-def _add_beyond(
-    terms: Complex[np.ndarray, "m k"], over_floor: Float[np.ndarray, "m k"], theta: Angles
-) -> Complex[np.ndarray, "m new"]:
-    """Return terms that fall at least like 1/omega^2 with what is beyond the last alias on either side.
+def _add_beyond(terms: Aliases, over_floor: Float[np.ndarray, "m k"], theta: Angles) -> Complex[np.ndarray, "m new"]:
+    """Return terms that fall at least like 1/omega^2 with the sum beyond the last alias on either side.
 
     It is summed as if they fell no faster from there, and as if the port dissipated its least.
     """

@@ -34,10 +34,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
 from seaopt.control.tuning.frequencies import choose_prominent
-from seaopt.control.tuning.grid import Grid, LawResponse, Path, use_disc
+from seaopt.control.tuning.grid import Curve, Grid, Indices, LawResponse, Path, Usage, Values, use_disc
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     FRICTION,
@@ -50,6 +50,11 @@ from seaopt.control.tuning.optimisation_problem import (
     Task,
 )
 from seaopt.records import record
+
+PerGain = Float[np.ndarray, " g"]
+ValueSlopes = Float[np.ndarray, "n g"]
+PointSlopes = Float[np.ndarray, "c g"]
+GainResponses = Complex[np.ndarray, "g m"]
 
 MOST_PROGRAMS = 8
 ROWS_PER_LIMIT = 10  # per kind of limit
@@ -64,10 +69,10 @@ USAGE_PRICE = 20.0  # of one unit of usage beyond the limit, in logarithms of th
 class _LinearLimits:
     """Rows value + slope dtheta - slack <= 1, gathered one kind at a time."""
 
-    value: list[Float[np.ndarray, " n"]] = field(default_factory=list)
-    slope: list[Float[np.ndarray, "n g"]] = field(default_factory=list)
+    value: list[Values] = field(default_factory=list)
+    slope: list[ValueSlopes] = field(default_factory=list)
 
-    def add(self, value: Float[np.ndarray, " n"], slope: Float[np.ndarray, "n g"]) -> None:
+    def add(self, value: Values, slope: ValueSlopes) -> None:
         self.value.append(value)
         self.slope.append(slope)
 
@@ -80,10 +85,10 @@ class _Affine:
     """
 
     law: LawResponse
-    by_y: Complex[np.ndarray, "g m"]
-    by_r: Complex[np.ndarray, "g m"]
-    by_v: Complex[np.ndarray, "g m"]
-    by_speed: Complex[np.ndarray, "g m"]
+    by_y: GainResponses
+    by_r: GainResponses
+    by_v: GainResponses
+    by_speed: GainResponses
 
 
 def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAMS) -> tuple[float, LawNumbers]:
@@ -126,7 +131,7 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
     return merit, x
 
 
-def _choose_least_gains(task: Task, grid: Grid) -> Float[np.ndarray, " g"]:
+def _choose_least_gains(task: Task, grid: Grid) -> PerGain:
     """Return gains that make a difference: a tenth of the inverse plant's at the bandwidth."""
     w_b = 2 * np.pi * task.spec.bandwidth_hz
     inverse, of_speed = (
@@ -137,7 +142,7 @@ def _choose_least_gains(task: Task, grid: Grid) -> Float[np.ndarray, " g"]:
     return least[task.gains_tuned]
 
 
-def _scale_gains(task: Task, x: LawNumbers, least: Float[np.ndarray, " g"]) -> Float[np.ndarray, " g"]:
+def _scale_gains(task: Task, x: LawNumbers, least: PerGain) -> PerGain:
     """Return the size that a change of each gain is compared with: a weight's is that of what it weights."""
     sizes = np.array([*np.abs(x[: K_D + 1]), task.k_ff + x[K_P], x[K_D], x[K_V]])
     return np.maximum(sizes[task.gains_tuned], least)
@@ -160,7 +165,7 @@ def linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     return _Affine(law=task.respond(grid, x), by_y=by_y, by_r=by_r, by_v=by_speed * sensing, by_speed=by_speed)
 
 
-def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "g n"]) -> Float[np.ndarray, "n g"]:
+def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "g n"]) -> ValueSlopes:
     """Return the derivative of abs(value): the part of `by` along it."""
     size = np.maximum(np.abs(value), 1e-300)
     return np.real(np.conj(value) / size * by).T
@@ -201,7 +206,7 @@ def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> _LinearLimits:
 
 
 def _change_path(
-    path: Path, law: _Affine, column: Int[np.ndarray, " c"]
+    path: Path, law: _Affine, column: Indices
 ) -> tuple[Complex[np.ndarray, "c ..."], Complex[np.ndarray, "g c ..."]]:
     """Return a path's sums at c points, of one row or one per signal, and their derivatives by the g gains."""
     c_y, c_v, by_y, by_v = law.law.c_y[column], law.law.c_v[column], law.by_y[:, column], law.by_v[:, column]
@@ -210,9 +215,7 @@ def _change_path(
     return path.add_up(c_y, c_v), path.change(by_y, by_v)
 
 
-def _differentiate_curve(
-    grid: Grid, law: _Affine, name: str, index: Int[np.ndarray, " c"]
-) -> tuple[Float[np.ndarray, "c g"], Float[np.ndarray, "c g"]]:
+def _differentiate_curve(grid: Grid, law: _Affine, name: str, index: Indices) -> tuple[PointSlopes, PointSlopes]:
     """Return the derivatives of ln abs(1 + L) and of ln abs(X) of a limit by the gains, at points of plants."""
     at, column, curve = law.law, index % grid.f.size, CURVES[name]
     p, speed = grid.p.ravel()[index], grid.speed.ravel()[index]
@@ -227,13 +230,13 @@ def _differentiate_curve(
     return near, _differentiate_size(value, change) / np.maximum(np.abs(value), 1e-300)[:, None]
 
 
-def choose_near(usage: Float[np.ndarray, "k m"]) -> Int[np.ndarray, " c"]:
+def choose_near(usage: Usage) -> Indices:
     """Return flat indices of the points of a limit that are given to the program."""
     index = choose_prominent(usage, ROWS_PER_LIMIT)
     return index[usage.ravel()[index] > NEAR]
 
 
-def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Int[np.ndarray, " c"]) -> Float[np.ndarray, "c g"]:
+def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) -> PointSlopes:
     """Return the derivative of a limit's usage by the gains at points in discs, by central differences."""
     curve, column = CURVES[name], index % grid.f.size
     p, discs, level = grid.p.ravel()[index], grid.discs.ravel()[index], grid.levels[name][column]
@@ -262,9 +265,7 @@ def _add_bandwidth(task: Task, grid: Grid, law: _Affine, rows: _LinearLimits) ->
     rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
 
 
-def _expand_objective(
-    task: Task, grid: Grid, law: _Affine
-) -> tuple[Float[np.ndarray, "g g"], Float[np.ndarray, " n"], Float[np.ndarray, "n g"]]:
+def _expand_objective(task: Task, grid: Grid, law: _Affine) -> tuple[Float[np.ndarray, "g g"], Values, ValueSlopes]:
     """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
     at, count = law.law, len(law.by_y)
     if task.spec.objective == "noise":
@@ -291,9 +292,7 @@ def _expand_objective(
     return curvature / size, values / size, slopes / size
 
 
-def _solve_step(
-    task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " g"]
-) -> Float[np.ndarray, " g"] | None:
+def _solve_step(task: Task, grid: Grid, x: LawNumbers, reach: PerGain) -> PerGain | None:
     """Return the change of the gains that the quadratic program takes; None if it has no answer."""
     law, gains, n = linearise_law(task, grid, x), task.gains_tuned, reach.size
     rows = _linearise_limits(task, grid, law)
@@ -323,11 +322,11 @@ def _solve_step(
 
 def solve_qp(
     quadratic: Float[np.ndarray, "n n"],
-    linear: Float[np.ndarray, " n"],
+    linear: Values,
     matrix: Float[np.ndarray, "m n"],
-    lower: Float[np.ndarray, " m"],
-    upper: Float[np.ndarray, " m"],
-) -> Float[np.ndarray, " n"] | None:
+    lower: Curve,
+    upper: Curve,
+) -> Values | None:
     """Minimise x'Qx/2 + c'x with lower <= A x <= upper by OSQP; None where it refuses, or its status is no solution."""
     import osqp
 

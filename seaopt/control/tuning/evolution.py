@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.laws.limits import INTEGRAL_RAD_S
-from seaopt.control.tuning.grid import Grid
+from seaopt.control.tuning.grid import Grid, Values
 from seaopt.control.tuning.optimisation_problem import (
     DAMPING,
     K_D,
@@ -164,7 +164,7 @@ class Evolution:
         x[:, K_P], x[:, K_I], x[:, W_R] = k_p, rho * (1.0 + k_p), sigma * (task.k_ff + k_p)
         return x
 
-    def judge(self, members: Population) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 14"]]:
+    def judge(self, members: Population) -> tuple[Values, Float[np.ndarray, "n 14"]]:
         """Return the worst usage of a limit of members, each with the better of its two laws, and the laws."""
         x = self.decode(members)
         valid = np.isfinite(x[:, K_P]) & (x[:, K_P] >= 0.0)
@@ -204,7 +204,7 @@ class Evolution:
 
     def run(
         self, known: Sequence[LawNumbers] = (), *, members: int = MEMBERS, generations: int = GENERATIONS, seed: int = 0
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 14"]]:
+    ) -> tuple[Values, Float[np.ndarray, "n 14"]]:
         """Return the worst usages of the last population and its laws, the best first."""
         rng = np.random.default_rng((SEED, seed))
         population = self.spread(rng, known, members)

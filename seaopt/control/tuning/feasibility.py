@@ -25,6 +25,7 @@ from jaxtyping import Float
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.tuning.grid import Curve, Values
 from seaopt.errors import ControlError
 
 LEAST_SHARE = 1e-4  # of the sample rate: what is below is called nothing
@@ -57,7 +58,7 @@ def sensitivity_possible(sensitivity_hz: float, ms: float, sample_time_s: float,
     return bool(np.linalg.norm(_toeplitz(_exponential(-constant, slopes)), 2) <= 1.0 + 1e-9)
 
 
-def _exponential(constant: float, slopes: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+def _exponential(constant: float, slopes: Values) -> Curve:
     """Return the first coefficients of exp(constant + sum of slopes q^n): n g_n = sum of k slopes_k g_(n-k)."""
     g = np.zeros(slopes.size + 1)
     g[0] = np.exp(constant)
@@ -67,7 +68,7 @@ def _exponential(constant: float, slopes: Float[np.ndarray, " n"]) -> Float[np.n
     return g
 
 
-def _toeplitz(g: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+def _toeplitz(g: Values) -> Float[np.ndarray, "n n"]:
     index = np.arange(g.size)[:, None] - np.arange(g.size)
     return np.where(index >= 0, g[index], 0.0)
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.tuning.grid import Curve, Indices, Usage
 from seaopt.control.tuning.optimisation_problem import CURVES, OBJECTIVE_HZ, Task
 
 FREQUENCIES = 300
@@ -40,7 +41,7 @@ def count_growing(plant: DigitalPlant | MeasuredPlant) -> int:
     )
 
 
-def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
+def place_frequencies(task: Task) -> Curve:
     """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with f_b and all bands' ends in it.
 
     About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
@@ -66,7 +67,7 @@ def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
     return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
 
 
-def choose_prominent(usage: Float[np.ndarray, "k m"], count: int) -> Int[np.ndarray, " c"]:
+def choose_prominent(usage: Usage, count: int) -> Indices:
     """Return flat indices of up to `count` points that matter most: local maxima first, then the largest of others.
 
     Of the others every third is looked at: neighbours say the same.

@@ -14,6 +14,15 @@ from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.records import record
 
+Frequencies = Float[np.ndarray, " m"]
+Curve = Float[np.ndarray, " m"]  # over frequency
+Usage = Float[np.ndarray, "k m"]  # of a limit, a row for each plant
+Response = Complex[np.ndarray, " m"]
+Responses = Complex[np.ndarray, "n m"]
+ComplexArray = Complex[np.ndarray, "..."]
+Values = Float[np.ndarray, " n"]
+Indices = Int[np.ndarray, " c"]
+
 LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 
 
@@ -21,15 +30,15 @@ LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have 
 class Path:
     """A sum over the signals that a law reads, affine in its feedback: fixed + y C_y + v C_v, C_v of a speed loop."""
 
-    fixed: Complex[np.ndarray, "..."]
-    y: Complex[np.ndarray, "..."]
-    v: Complex[np.ndarray, "..."]
+    fixed: ComplexArray
+    y: ComplexArray
+    v: ComplexArray
 
-    def add_up(self, c_y: Complex[np.ndarray, "..."], c_v: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
+    def add_up(self, c_y: ComplexArray, c_v: ComplexArray) -> ComplexArray:
         """Return the sum of a law."""
         return self.fixed + self.y * c_y + self.v * c_v
 
-    def change(self, by_y: Complex[np.ndarray, "..."], by_v: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
+    def change(self, by_y: ComplexArray, by_v: ComplexArray) -> ComplexArray:
         """Return the change of the sum with those of C_y and C_v."""
         return self.y * by_y + self.v * by_v
 
@@ -68,21 +77,21 @@ class Grid:
 
     """
 
-    f: Float[np.ndarray, " m"]
-    q: Complex[np.ndarray, " m"]
-    p: Complex[np.ndarray, "n m"]
+    f: Frequencies
+    q: Response
+    p: Responses
     discs: Float[np.ndarray, "n m"]
-    fixed: Complex[np.ndarray, "n m"]
-    speed: Complex[np.ndarray, "n m"]
+    fixed: Responses
+    speed: Responses
     rows: tuple[int, ...]
-    kept: Complex[np.ndarray, " m"]
-    inverse: Complex[np.ndarray, " m"]
+    kept: Response
+    inverse: Response
     port: Path
     force: Path
-    unit: Complex[np.ndarray, " m"]
+    unit: Response
     friction: Path
     friction_size: Path
-    levels: Mapping[str, Float[np.ndarray, " m"]]
+    levels: Mapping[str, Curve]
 
     @property
     def reads_more(self) -> bool:
@@ -126,17 +135,17 @@ class LawResponse:
 def use_disc(
     curve: LimitCurve,
     level: Float[np.ndarray, "..."],
-    p: Complex[np.ndarray, "..."],
+    p: ComplexArray,
     discs: Float[np.ndarray, "..."],
-    c_y: Complex[np.ndarray, "..."],
-    c_r: Complex[np.ndarray, "..."],
-    rest: Complex[np.ndarray, "..."],
+    c_y: ComplexArray,
+    c_r: ComplexArray,
+    rest: ComplexArray,
 ) -> Float[np.ndarray, "..."]:
     """Return the usage of a limit by the worst of the responses in discs."""
     least, most = bound_disc(curve.of, p, discs, c_y, c_r, rest)
     return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level
 
 
-def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Frequencies) -> Curve:
     """Return the radii of the discs around a plant's responses; zeros of a model."""
     return plant.discs(f) if isinstance(plant, MeasuredPlant) else np.zeros(f.size)

@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
 from seaopt.control.loops.measured.loop import leave_positive
 from seaopt.control.tuning.frequencies import choose_prominent
-from seaopt.control.tuning.grid import Grid, LawResponse, Path
+from seaopt.control.tuning.grid import Grid, LawResponse, Path, Values
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     DAMPING,
@@ -453,12 +453,12 @@ def _solve(
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 
 
-def _stack(paths: Sequence[Path]) -> list[Float[np.ndarray, " n"]]:
+def _stack(paths: Sequence[Path]) -> list[Values]:
     """Return real and imaginary parts of the paths' fixed parts, then those of y, and of v."""
     whole = [np.concatenate([np.zeros(0), *(getattr(path, name) for path in paths)]) for name in ("fixed", "y", "v")]
     return [part for values in whole for part in (np.real(values), np.imag(values))]
 
 
-def _integrate_sensitivity(task: Task, grid: Grid, law: LawResponse) -> Float[np.ndarray, " n"]:
+def _integrate_sensitivity(task: Task, grid: Grid, law: LawResponse) -> Values:
     """Return the integral of abs(S) of every plant."""
     return (1.0 / np.abs(law.rest + grid.p * law.c_y)) @ task.weights(grid.f)

@@ -83,7 +83,17 @@ from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.control.tuning.grid import Grid, LawResponse, Path, measured_discs, use_disc
+from seaopt.control.tuning.grid import (
+    Curve,
+    Frequencies,
+    Grid,
+    LawResponse,
+    Path,
+    Response,
+    Usage,
+    measured_discs,
+    use_disc,
+)
 from seaopt.plants import Plant
 from seaopt.plants.roles import Friction
 from seaopt.records import record
@@ -251,7 +261,7 @@ class Task:
         """
         return STEADY * (max(self.k_ff, 0.0) + k_p + k_i * self.steady_s)
 
-    def level(self, name: str, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    def level(self, name: str, f: Frequencies) -> Curve:
         """Return a curve's level, with the reserve taken off; one that is never reached where none is imposed."""
         curve, limit, keep = CURVES[name], BY_NAME[name], 1.0 - self.spec.reserve
         allowed, floor = self.spec.allowed(limit), NO_FLOOR if self.spec.reference_filter is None else NO_FLOOR_FILTERED
@@ -351,7 +361,7 @@ class Task:
         law = self._make_law(replace(self.gains(x), prefilter=None))  # which is no part of the loop
         return all(close_plant(plant, law).is_stable() for plant in self.plants)
 
-    def grid(self, f: Float[np.ndarray, " m"], rows: Sequence[int] | None = None) -> Grid:
+    def grid(self, f: Frequencies, rows: Sequence[int] | None = None) -> Grid:
         """Return the responses of the plants, or of some of them, at frequencies."""
         q = np.exp(-2j * np.pi * f * self.spec.sample_time_s)
         kept = inverse = np.zeros(f.size, dtype=complex)
@@ -392,7 +402,7 @@ class Task:
             levels={name: self.level(name, f) for name in self.curve_names},
         )
 
-    def _feed(self, signals: Complex[np.ndarray, "... y m"], start: float, f: Float[np.ndarray, " m"]) -> Path:
+    def _feed(self, signals: Complex[np.ndarray, "... y m"], start: float, f: Frequencies) -> Path:
         """Return a number and a weighted sum over the signals fed back, of one row per signal."""
         y, none = signals[..., 0, :], np.zeros_like(signals[..., 0, :])
         fixed, v = none + start, none
@@ -403,9 +413,7 @@ class Task:
                 fixed = fixed + signals[..., row, :] * one.response(f, self.spec.sample_time_s)
         return Path(fixed=fixed, y=y, v=v)
 
-    def _respond(
-        self, row: int, f: Float[np.ndarray, " m"], q: Complex[np.ndarray, " m"]
-    ) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
+    def _respond(self, row: int, f: Frequencies, q: Response) -> tuple[Response, Response, Response]:
         """Return P, B without a speed loop, and the speed per command as the law has it, of one plant."""
         plant, fixed, speed = self.plants[row], np.ones(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
         if not self.further or isinstance(plant, MeasuredPlant):  # whose link is held: what is read besides is zero
@@ -419,7 +427,7 @@ class Task:
         return p, fixed, speed
 
     def _limit_feedback(
-        self, aimed: PlantWithFriction, f: Float[np.ndarray, " m"]
+        self, aimed: PlantWithFriction, f: Frequencies
     ) -> tuple[Complex[np.ndarray, "y m"], Complex[np.ndarray, "y y m"]]:
         """Return plants and weights of what a multiplier asks; nothing is asked below the test's lowest angle."""
         slope, own = self.spec.level(FRICTION), aimed.loop.slopes
@@ -464,9 +472,9 @@ class Task:
         rest = grid.fixed[plants] + through * grid.speed[plants]
         return through * self.speed_loop.sense(grid.q, self.spec.sample_time_s), rest
 
-    def usage(self, grid: Grid, law: LawResponse) -> dict[str, Float[np.ndarray, "k m"]]:
+    def usage(self, grid: Grid, law: LawResponse) -> dict[str, Usage]:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
-        rows: dict[str, list[Float[np.ndarray, " m"]]] = {}
+        rows: dict[str, list[Curve]] = {}
         for position in (position for position, row in enumerate(grid.rows) if row < self.design_states):
             for name, curve in self.design_usage(grid, position, law).items():
                 rows.setdefault(name, []).append(curve)
@@ -575,7 +583,7 @@ class Task:
         loop = close_plant(self.plants[row], law)
         return loop.figures(self.spec.bandwidth_hz) if isinstance(loop, DiscLoop) else loop.figures()
 
-    def weights(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    def weights(self, f: Frequencies) -> Curve:
         """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are frequencies."""
         first, last = np.searchsorted(f, [OBJECTIVE_HZ * (1 - 1e-9), self.spec.bandwidth_hz * (1 + 1e-9)])
         out, step = np.zeros(f.size), 0.5 * np.diff(np.log(f[first:last]))

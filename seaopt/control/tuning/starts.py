@@ -36,7 +36,7 @@ from seaopt.control.laws.limits import INTEGRAL_RAD_S
 from seaopt.control.laws.spec import HIGHEST_CORNER
 from seaopt.control.laws.structures import CASCADE, LawTerms
 from seaopt.control.tuning.frequencies import count_growing, find_light_modes
-from seaopt.control.tuning.grid import Grid, LawResponse
+from seaopt.control.tuning.grid import Grid, LawResponse, Response, Responses, Values
 from seaopt.control.tuning.optimisation_problem import (
     K_D,
     K_I,
@@ -58,6 +58,8 @@ from seaopt.control.tuning.optimisation_problem import (
     Task,
 )
 from seaopt.records import record
+
+GainRows = Float[np.ndarray, "n 5"]
 
 DERIVATIVE_GAINS = 24  # values of k_d where k_p follows from it
 LOOP_GAINS = 12  # values of k_p and of k_d where the reference's weight follows from them
@@ -225,11 +227,11 @@ class _Scan:
     grid: Grid
     shape: Shape
     terms: LawTerms
-    c_v: Complex[np.ndarray, " m"]
+    c_v: Response
     rest: Complex[np.ndarray, "k m"]
     at: int
 
-    def respond(self, c_y: Complex[np.ndarray, "n m"], c_r: Complex[np.ndarray, "n m"]) -> LawResponse:
+    def respond(self, c_y: Responses, c_r: Responses) -> LawResponse:
         """Return laws of this shape."""
         return LawResponse(c_y=c_y, c_r=c_r, c_v=self.c_v, rest=self.rest)
 
@@ -253,23 +255,23 @@ class _Scan:
         """What k_p, k_i and k_d are multiplied with."""
         return np.array([np.ones_like(self.grid.q), self.terms.integral, self.terms.rate])
 
-    def measurement(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
+    def measurement(self, gains: GainRows) -> Responses:
         """Return C_y of laws, without the series part."""
         return gains[:, :W_R] @ self.gained + self.terms.observer
 
-    def reference(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
+    def reference(self, gains: GainRows) -> Responses:
         """Return C_r of laws, without the series part and the prefilter."""
         ahead = self.task.k_ff * self.terms.ahead / self.terms.series
         behind = gains[:, :W_R].copy()
         behind[:, [K_P, K_D]] -= gains[:, [W_R, W_C]]
         return behind @ self.gained + ahead
 
-    def behind_prefilter(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
+    def behind_prefilter(self, gains: GainRows) -> Responses:
         """Return C_r of laws."""
         return self.terms.series * self.terms.prefilter * self.reference(gains)
 
 
-def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Values, GainRows]:
     """Return merits (less is better) and gains of the laws of one shape."""
     x = np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape])
     terms, (c_v, rest) = task.terms(grid, x), task.feed_speed(grid, x)
@@ -283,7 +285,7 @@ def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray,
     return merit, gains
 
 
-def _scan_fixed_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+def _scan_fixed_weight(scan: _Scan) -> tuple[Values, GainRows]:
     """Return merits and gains of laws with w_r = 0: k_p makes the bandwidth."""
     k_d = np.concatenate([[0.0], np.geomspace(0.02, 20.0, DERIVATIVE_GAINS)]) * scan.derivatives
     grids = np.meshgrid(k_d, _list_integrals(scan), _list_weights(scan.task), indexing="ij")
@@ -299,7 +301,7 @@ def _scan_fixed_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.n
     return _judge_loops(scan, c_y) + _judge_tracking(scan, c_y, c_r) + _price_missing_integral(scan, gains), gains
 
 
-def _scan_free_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
     """Return merits and gains of laws of which w_r makes the bandwidth, of the loops that promise most."""
     k_p = np.geomspace(0.03, 10.0, LOOP_GAINS) * max(scan.inverse, 1.0)
     k_d = np.concatenate([[0.0], np.geomspace(0.03, 10.0, LOOP_GAINS)]) * scan.derivatives
@@ -325,7 +327,7 @@ def _scan_free_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.nd
     return merit + _judge_tracking(scan, c_y, scan.behind_prefilter(gains)), gains
 
 
-def _choose_loops(merit: Float[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+def _choose_loops(merit: Values) -> Int[np.ndarray, " k"]:
     """Return the loops that are given weights: half of them the best, half spread over what keeps its limits."""
     order = np.argsort(merit)
     best, rest = np.split(order, [LOOPS_WEIGHTED // 2])
@@ -338,7 +340,7 @@ def _list_weights(task: Task) -> tuple[float, ...]:
     return {"tuned": WEIGHTS, "error": (0.0,), "measurement": (1.0,)}[task.spec.reference_weights]
 
 
-def _list_integrals(scan: _Scan) -> Float[np.ndarray, " n"]:
+def _list_integrals(scan: _Scan) -> Values:
     """Return values of k_i to try where k_p is not known yet."""
     if scan.task.spec.structure == "pd":
         return np.zeros(1)
@@ -347,7 +349,7 @@ def _list_integrals(scan: _Scan) -> Float[np.ndarray, " n"]:
     return np.append(slowest, fast) if scan.task.nominal is None else np.array([0.0, fast])
 
 
-def _price_missing_integral(scan: _Scan, gains: Float[np.ndarray, "n 5"]) -> Float[np.ndarray, " n"]:
+def _price_missing_integral(scan: _Scan, gains: GainRows) -> Values:
     """Return what a k_i counts that is below the least; beside an observer it will be none."""
     if scan.task.spec.structure not in ("pid", CASCADE):
         return np.zeros(gains.shape[0])
@@ -369,15 +371,13 @@ def solve_bandwidth(
     return np.concatenate([(-half + root) / lead, (-half - root) / lead])
 
 
-def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
+def _judge_loops(scan: _Scan, c_y: Responses) -> Values:
     """Return the logarithm of the objective, and what is worse than any where a limit on the loop is broken."""
     value, worst, encircles = judge_loops(scan.task, scan.grid, scan.respond(c_y, c_y))
     return np.log(np.maximum(value, NEXT_TO_NO_NOISE)) + _price(worst) + np.where(encircles, 50.0, 0.0)
 
 
-def judge_loops(
-    task: Task, grid: Grid, laws: LawResponse
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def judge_loops(task: Task, grid: Grid, laws: LawResponse) -> tuple[Values, Values, Bool[np.ndarray, " n"]]:
     """Return the objective of n laws, their worst usage of a limit on the loop, and whether 1 + L encircles zero."""
     count = laws.c_y.shape[0]
     weights, worst, value, turned = task.weights(grid.f), np.zeros(count), np.zeros(count), np.zeros(count)
@@ -400,14 +400,12 @@ def judge_loops(
     return value, worst, turned < LEAST_TURN
 
 
-def _judge_tracking(
-    scan: _Scan, c_y: Complex[np.ndarray, "n m"], c_r: Complex[np.ndarray, "n m"]
-) -> Float[np.ndarray, " n"]:
+def _judge_tracking(scan: _Scan, c_y: Responses, c_r: Responses) -> Values:
     """Return what limits on the reference's path count that are broken."""
     return _price(use_tracking(scan.task, scan.grid, scan.respond(c_y, c_r)))
 
 
-def use_tracking(task: Task, grid: Grid, laws: LawResponse) -> Float[np.ndarray, " n"]:
+def use_tracking(task: Task, grid: Grid, laws: LawResponse) -> Values:
     """Return the worst usage of a limit on the reference's path, of n laws."""
     worst = np.zeros(laws.c_y.shape[0])
     for row, plant in enumerate(grid.rows):
@@ -417,5 +415,5 @@ def use_tracking(task: Task, grid: Grid, laws: LawResponse) -> Float[np.ndarray,
     return worst
 
 
-def _price(worst: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _price(worst: Values) -> Values:
     return 20.0 * np.log(np.maximum(worst, 1.0))

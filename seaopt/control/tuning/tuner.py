@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Complex
 
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
@@ -62,6 +61,7 @@ from seaopt.control.tuning.easing import ROOM, ease_limits
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.frequencies import count_growing
+from seaopt.control.tuning.grid import Response
 from seaopt.control.tuning.optimisation_problem import (
     FRICTION,
     OBJECTIVE_HZ,
@@ -604,5 +604,5 @@ def _explain_rest(task: Task, text: str) -> str:
 def disturbance(loop: Loop | DiscLoop, bandwidth_hz: float) -> float:
     """Return the integral over ln f of abs(S) from 0.1 Hz to the bandwidth."""
     f = np.geomspace(OBJECTIVE_HZ, bandwidth_hz, 2000)
-    s: Complex[np.ndarray, " m"] = loop.sensitivity(f)
+    s: Response = loop.sensitivity(f)
     return float(np.trapezoid(np.abs(s), np.log(f)))
