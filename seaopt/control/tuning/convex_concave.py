@@ -91,26 +91,16 @@ class _Affine:
     by_speed: GainResponses
 
 
-def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAMS) -> tuple[float, LawNumbers]:
-    """Return the merit and the numbers after successive quadratic programs in the gains, filters as they are.
+def improve(task: Task, grid: Grid, start: LawNumbers) -> tuple[float, LawNumbers]:
+    """Return the merit and the numbers after successive quadratic programs in the gains from a stable law.
 
-    Parameters
-    ----------
-    task : Task
-        What is to be tuned.
-    grid : Grid
-        Frequencies that the limits are looked at on.
-    start : array, shape (14,)
-        Stable.
-    steps : int
-        Programs solved at most.
-
+    Its filters stay as they are.
     """
     x, radius = start, FIRST_GAIN_RADIUS
     least = _choose_least_gains(task, grid)
     scale = _scale_gains(task, start, least)
     merit = _measure_merit(task, grid, x)
-    for _ in range(steps):
+    for _ in range(MOST_PROGRAMS):
         step = _solve_step(task, grid, x, radius * scale)
         if step is None:
             break

@@ -22,20 +22,7 @@ ROOM = 1.02  # beyond what is used of an eased limit
 
 
 def ease_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop], progress: Progress = ignore) -> Solution:
-    """Return the law that misses the limits least, one that keeps what can be kept beside those missed most.
-
-    Parameters
-    ----------
-    task : Task
-        What no law was found for.
-    x : array, shape (14,)
-        The numbers whose worst limit is missed least.
-    loops : list of MeasuredLoop
-        Their loops.
-    progress : callable, optional
-        Called before each solution.
-
-    """
+    """Return the law that keeps what can be kept beside the limits missed most, from the one whose worst is least."""
     best, factors = (x, loops), dict(task.eased)
     for number in range(ROUNDS):
         missed = measure_missed(task, best[1])

@@ -15,7 +15,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.sampled_plant import sample_linear
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.frequencies import count_growing, place_frequencies
@@ -33,31 +32,33 @@ def find_largest_fall(task: Task) -> tuple[PlantWithFriction, float, LawNumbers]
     It is one of the plants that grow as they slide; None where no friction falls, or the limits are not kept without a
     fall either. That a law keeps them is measured, as it is of the answer itself.
     """
-    falling = [one for one in task.frictions if count_growing(task.plants[one.plant]) and np.min(one.flattest) < 0.0]
+    falling = [
+        sliding
+        for sliding in task.frictions
+        if count_growing(task.plants[sliding.plant]) and sliding.find_fall()[1] > 0.0
+    ]
     if not falling:
         return None
 
     def ease(share: float) -> Task:
-        eased = {one.plant: _ease(one, share) for one in falling}
+        eased = {sliding.plant: _ease(sliding, share) for sliding in falling}
         plants = tuple(eased[k].loop.plant if k in eased else plant for k, plant in enumerate(task.plants))
-        return replace(task, plants=plants, frictions=tuple(eased.get(one.plant, one) for one in task.frictions))
+        frictions = tuple(eased.get(sliding.plant, sliding) for sliding in task.frictions)
+        return replace(task, plants=plants, frictions=frictions)
 
-    def keeps(eased: Task, x: LawNumbers) -> bool:
-        return not list_broken_limits(eased.spec, eased.measure(x), eased.design_states)
-
-    x, _ = solve(ease(0.0))
-    if not keeps(ease(0.0), x):
+    x, loops = solve(ease(0.0))
+    if task.list_broken(loops):
         return None
     low, high, f = 0.0, 1.0, place_frequencies(task)
     while high > max(RESOLUTION * low, SMALLEST_SHARE):
         middle = float(np.sqrt(low * high)) if low else 0.25 * high
         eased = ease(middle)
         trial = refine(eased, eased.grid(f), improve(eased, eased.grid(f), x)[1]) if eased.is_stable(x) else x
-        if eased.is_stable(trial) and keeps(eased, trial):
+        if eased.is_stable(trial) and not eased.list_broken(eased.measure(trial)):
             x, low = trial, middle
         else:
             high = middle
-    return max(falling, key=lambda one: one.find_fall()[1]), low, x
+    return max(falling, key=lambda sliding: sliding.find_fall()[1]), low, x
 
 
 def _ease(sliding: PlantWithFriction, share: float) -> PlantWithFriction:

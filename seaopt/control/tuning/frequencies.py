@@ -11,7 +11,7 @@ from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.tuning.grid import Curve, Indices, Usage
+from seaopt.control.tuning.grid import Curve, Grid, Indices, Usage
 from seaopt.control.tuning.optimisation_problem import CURVES, OBJECTIVE_HZ, Task
 
 FREQUENCIES = 300
@@ -36,9 +36,9 @@ def find_light_modes(plant: DigitalPlant | MeasuredPlant) -> list[tuple[float, f
 @lru_cache(maxsize=256)
 def count_growing(plant: DigitalPlant | MeasuredPlant) -> int:
     """Return how many of a plant's poles grow without control; none of a measured one, whose log is bounded."""
-    return (
-        0 if isinstance(plant, MeasuredPlant) else int(np.count_nonzero(np.abs(np.linalg.eigvals(plant.a)) > GROWING))
-    )
+    if isinstance(plant, MeasuredPlant):
+        return 0
+    return int(np.count_nonzero(np.abs(np.linalg.eigvals(plant.a)) > GROWING))
 
 
 def place_frequencies(task: Task) -> Curve:
@@ -49,22 +49,22 @@ def place_frequencies(task: Task) -> Curve:
     """
     spec, nyquist = task.spec, 0.5 / task.spec.sample_time_s
     near: list[Float[np.ndarray, " _"]] = []
-    for f, zeta in {mode for plant in task.plants for mode in find_light_modes(plant)}:
-        reach = max(4 * zeta, 0.02) * f
-        near.append(np.linspace(f - reach, f + reach, int(min(2 * reach / max(zeta * f / 4, 1e-4), 80))))
-    extra = np.sort(np.concatenate([np.zeros(0), *near]))
-    extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
-    for plant in task.plants:
-        if isinstance(plant, MeasuredPlant):
-            extra = np.concatenate([extra, plant.f[:: 1 + plant.f.size // MORE_FREQUENCIES]])
-    slow, base = (
-        np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW_FREQUENCIES),
-        np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES),
-    )
+    for mode, zeta in {mode for plant in task.plants for mode in find_light_modes(plant)}:
+        reach = max(4 * zeta, 0.02) * mode
+        near.append(np.linspace(mode - reach, mode + reach, int(min(2 * reach / max(zeta * mode / 4, 1e-4), 80))))
+    own = [plant.f for plant in task.plants if isinstance(plant, MeasuredPlant)]
+    extra = [f[:: 1 + f.size // MORE_FREQUENCIES] for f in (np.sort(np.concatenate([np.zeros(0), *near])), *own)]
+    slow = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW_FREQUENCIES)[:-1]
+    base = np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES)
     ends = [spec.bandwidth_hz, *(spec.passive_band_hz or ())]
     ends += [end for name in CURVES for end in task.band_hz(name)]
-    grid = np.unique(np.concatenate([slow[:-1], base, extra, ends]))
-    return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
+    f = np.unique(np.concatenate([slow, base, *extra, ends]))
+    return f[(f >= LOWEST_HZ) & (f < nyquist)]
+
+
+def make_grid(task: Task) -> Grid:
+    """Return the responses of a task's plants at the frequencies that the tuner looks at."""
+    return task.grid(place_frequencies(task))
 
 
 def choose_prominent(usage: Usage, count: int) -> Indices:
@@ -72,13 +72,9 @@ def choose_prominent(usage: Usage, count: int) -> Indices:
 
     Of the others every third is looked at: neighbours say the same.
     """
-    rows, m = usage.shape
-    wide = np.full((rows, m + 2), -np.inf)
-    wide[:, 1:-1] = usage
+    wide = np.pad(usage, ((0, 0), (1, 1)), constant_values=-np.inf)
     top = (usage >= wide[:, :-2]) & (usage >= wide[:, 2:])
-    rank = np.where(
-        top, usage + 10.0 * (usage > 0.5), -np.inf
-    )  # a maximum outranks what is none, if it is near its limit
+    rank = np.where(top, usage + 10.0 * (usage > 0.5), -np.inf)  # a maximum near its limit outranks the others
     rank[:, ::3] = np.maximum(rank[:, ::3], usage[:, ::3])
     flat = rank.ravel()
     count = min(count, int(np.count_nonzero(np.isfinite(flat))))

@@ -120,21 +120,10 @@ class _Complex:
 
 
 def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5, *, keeping: bool = False) -> LawNumbers:
-    """Return the numbers at a local optimum, or the start if no better ones are found.
+    """Return the numbers at a local optimum near a stable start, or the start if no better ones are found.
 
-    Parameters
-    ----------
-    task : Task
-        What is to be tuned.
-    grid : Grid
-        Frequencies that the limits are looked at on.
-    start : array, shape (14,)
-        Stable.
-    rounds : int
-        Solutions at most; each adds the points where the one before broke a limit.
-    keeping : bool
-        Whether the first numbers that keep all limits are enough, whatever their objective.
-
+    `rounds`: solutions at most; each adds the points where the one before broke a limit. `keeping`: whether the first
+    numbers that keep all limits are enough, whatever their objective.
     """
     x, chosen, factor = start, _choose_points(task, grid, start), LARGEST_FACTOR
     rank, stalled = task.rank(grid, start), 0
@@ -433,9 +422,9 @@ def _solve(
         "" if spec.reference_filter is None else spec.reference_filter.order,
         grid.friction_size.y.shape[1],
     )
-    used = max(float(np.max(curve)) for curve in task.usage(grid, law).values())
     value = task.objective(grid, law)
-    x0 = np.concatenate([start / scale, [np.log(value) if noise else value, max(0.0, np.log(used)) + 0.01]])
+    slack = max(0.0, np.log(task.worst(grid, law))) + 0.01
+    x0 = np.concatenate([start / scale, [np.log(value) if noise else value, slack]])
     count = int(solver.size_out("g")[0])
     lower, upper = np.full(count, -np.inf), np.zeros(count)
     lower[0] = 0.0

@@ -67,6 +67,7 @@ from seaopt.control.laws.structures import (
     SpeedLoop,
     evaluate_terms,
 )
+from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.absolute_stability import (
     LOWEST_ANGLE,
     SIMPLEST,
@@ -126,28 +127,13 @@ K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_
 
 @record(eq=False)
 class PlantWithFriction:
-    """A plant with friction of which a margin is asked, or that grows as it slides.
+    """A plant with friction of which a margin is asked, or that grows as it slides."""
 
-    Parameters
-    ----------
-    plant : int
-        Which of the task's plants slides as it does.
-    model : Plant
-        The plant with its friction.
-    loop : FrictionLoop
-        The loop with its friction taken out; its own law does not matter.
-    flattest : array, shape (p,)
-        The flattest slope of each friction, N s/m (N m s/rad), which the loop has in it.
-    multiplier : str
-        That of the margin aimed at; empty where none is chosen yet, and nothing asked while the law is looked for.
-
-    """
-
-    plant: int
-    model: Plant
-    loop: FrictionLoop
-    flattest: Float[np.ndarray, " p"]
-    multiplier: str = ""
+    plant: int  # which of the task's plants slides as it does
+    model: Plant  # with its friction
+    loop: FrictionLoop  # with its friction taken out; its own law does not matter
+    flattest: Float[np.ndarray, " p"]  # slope of each friction, N s/m (N m s/rad), which the loop has in it
+    multiplier: str = ""  # of the margin aimed at; empty while none is chosen, and then nothing is asked
 
     def find_fall(self) -> tuple[Friction, float]:
         """Return the friction that falls most with speed, and how steeply."""
@@ -186,7 +172,7 @@ class Task:
     @property
     def speed_loop(self) -> SpeedLoop | None:
         """The speed loop that is tuned; None without one."""
-        return next((one for one in self.further if isinstance(one, SpeedLoop)), None)
+        return next((path for path in self.further if isinstance(path, SpeedLoop)), None)
 
     @property
     def gains_tuned(self) -> slice:
@@ -199,10 +185,10 @@ class Task:
 
         That on a speed loop's own noise gain is one only where there is such a loop.
         """
-        asked = [name for name in CURVES if self.spec.level(name) is not None]
-        if self.spec.objective == "noise" and NOISE not in asked:
-            asked.append(NOISE)
-        return tuple(name for name in asked if CURVES[name].of != "C_v" or self.speed_loop is not None)
+        imposed = [name for name in CURVES if self.spec.level(name) is not None]
+        if self.spec.objective == "noise" and NOISE not in imposed:
+            imposed.append(NOISE)
+        return tuple(name for name in imposed if CURVES[name].of != "C_v" or self.speed_loop is not None)
 
     @property
     def asks_margin(self) -> bool:
@@ -285,28 +271,28 @@ class Task:
         Without an integral k_r is fixed, for a static gain of 1.
         """
         spec, ts, integrates = self.spec, self.spec.sample_time_s, self.integrates(x)
-        fixed, free = (0.0, 0.0), (0.0, np.inf)
-        notch = ((0.1, 0.1), (0.5, 0.5), (1.0, 1.0))
+        fixed, free, one = (0.0, 0.0), (0.0, np.inf), (1.0, 1.0)
+
+        def warp(corner_hz: float | None, lowest: float) -> tuple[float, float]:
+            low, high = _range(corner_hz, lowest * spec.bandwidth_hz, HIGHEST_CORNER / ts)
+            return warp_frequency(low, ts), warp_frequency(high, ts)
+
+        notch, prefilter = ((0.1, 0.1), (0.5, 0.5), one), (one, one)
         fastest = (spec.level("min_filter_samples") or 0.0) * ts
         if spec.notch is not None:
-            centre = _range(spec.notch.frequency_hz, LOWEST_NOTCH * spec.bandwidth_hz, HIGHEST_CORNER / ts)
-            notch = (
-                (float(np.tan(np.pi * centre[0] * ts)), float(np.tan(np.pi * centre[1] * ts))),
-                _range(spec.notch.width, 0.02, 1.0),
-                _range(spec.notch.depth, 0.01, 1.0),
-            )
-        low_pass, prefilter = spec.reference_filter, ((1.0, 1.0), (1.0, 1.0))
+            width, depth = _range(spec.notch.width, 0.02, 1.0), _range(spec.notch.depth, 0.01, 1.0)
+            notch = (warp(spec.notch.frequency_hz, LOWEST_NOTCH), width, depth)
+        low_pass = spec.reference_filter
         if low_pass is not None:
-            corner = _range(low_pass.corner_hz, LOWEST_PREFILTER * spec.bandwidth_hz, HIGHEST_CORNER / ts)
-            damping = _range(low_pass.damping, *PREFILTER_DAMPING) if low_pass.is_second_order else (1.0, 1.0)
-            prefilter = ((float(np.tan(np.pi * corner[0] * ts)), float(np.tan(np.pi * corner[1] * ts))), damping)
+            damping = _range(low_pass.damping, *PREFILTER_DAMPING) if low_pass.is_second_order else one
+            prefilter = (warp(low_pass.corner_hz, LOWEST_PREFILTER), damping)
         ranges = [
             free, free if integrates else fixed, free,
             free if integrates and spec.reference_weights != "error" else fixed,
             free if spec.reference_weights != "error" else fixed,
             free if self.speed_loop is not None else fixed,
             (fastest, max(fastest, 4.0 / (2 * np.pi * spec.bandwidth_hz))),
-            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0),
+            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else one,
             (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed,
             *notch, *prefilter,
         ]  # fmt: skip
@@ -348,8 +334,8 @@ class Task:
 
     def _make_law(self, gains: Gains) -> Law:
         law = gains.law(self.spec.structure, self.spec.sample_time_s)
-        for one in self.further:
-            law = law if isinstance(one, SpeedLoop) else law.reading(one)
+        for path in self.further:
+            law = law if isinstance(path, SpeedLoop) else law.reading(path)
         return law
 
     def loop(self, x: LawNumbers, plant: int = 0) -> Loop | DiscLoop:
@@ -377,13 +363,13 @@ class Task:
         if self.port is not None and self.spec.passive_band_hz is not None:
             low, high = self.spec.passive_band_hz
             inside = np.flatnonzero((f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9)))
-            asked = weigh_passivity(self.port, self.spec.sample_time_s, self.spec.loop_delay_samples, f[inside])
-            unit[inside], loops[:, inside], forces[:, inside] = asked.unit, asked.loops, asked.forces
-        aimed = [one for one in self.frictions if one.multiplier and one.plant in rows]
+            passive = weigh_passivity(self.port, self.spec.sample_time_s, self.spec.loop_delay_samples, f[inside])
+            unit[inside], loops[:, inside], forces[:, inside] = passive.unit, passive.loops, passive.forces
+        aimed = [sliding for sliding in self.frictions if sliding.multiplier and sliding.plant in rows]
         plants = np.zeros((len(aimed), count, f.size), dtype=complex)
         weights = np.zeros((len(aimed), count, count, f.size), dtype=complex)
-        for k, one in enumerate(aimed):
-            plants[k], weights[k] = self._limit_feedback(one, f)
+        for k, sliding in enumerate(aimed):
+            plants[k], weights[k] = self._limit_feedback(sliding, f)
         return Grid(
             f=f,
             q=q,
@@ -404,40 +390,37 @@ class Task:
 
     def _feed(self, signals: Complex[np.ndarray, "... y m"], start: float, f: Frequencies) -> Path:
         """Return a number and a weighted sum over the signals fed back, of one row per signal."""
-        y, none = signals[..., 0, :], np.zeros_like(signals[..., 0, :])
-        fixed, v = none + start, none
-        for row, one in enumerate(self.further, start=1):
-            if isinstance(one, SpeedLoop):
+        y = signals[..., 0, :]
+        v = np.zeros_like(y)
+        fixed = v + start
+        for row, path in enumerate(self.further, start=1):
+            if isinstance(path, SpeedLoop):
                 v = signals[..., row, :]
             else:
-                fixed = fixed + signals[..., row, :] * one.response(f, self.spec.sample_time_s)
+                fixed = fixed + signals[..., row, :] * path.response(f, self.spec.sample_time_s)
         return Path(fixed=fixed, y=y, v=v)
 
     def _respond(self, row: int, f: Frequencies, q: Response) -> tuple[Response, Response, Response]:
         """Return P, B without a speed loop, and the speed per command as the law has it, of one plant."""
-        plant, fixed, speed = self.plants[row], np.ones(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
+        plant = self.plants[row]
         if not self.further or isinstance(plant, MeasuredPlant):  # whose link is held: what is read besides is zero
-            return plant.response(f), fixed, speed
-        p, *others = plant.responses(f)
-        for one, response in zip(self.further, others, strict=True):
-            if isinstance(one, SpeedLoop):
-                speed = response * one.sense(q, self.spec.sample_time_s)
-            else:
-                fixed = fixed + response * one.response(f, self.spec.sample_time_s)
-        return p, fixed, speed
+            return plant.response(f), np.ones(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
+        path = self._feed(plant.responses(f), 1.0, f)
+        speed = path.v if self.speed_loop is None else path.v * self.speed_loop.sense(q, self.spec.sample_time_s)
+        return path.y, path.fixed, speed
 
     def _limit_feedback(
         self, aimed: PlantWithFriction, f: Frequencies
     ) -> tuple[Complex[np.ndarray, "y m"], Complex[np.ndarray, "y y m"]]:
         """Return plants and weights of what a multiplier asks; nothing is asked below the test's lowest angle."""
-        slope, own = self.spec.level(FRICTION), aimed.loop.slopes
+        slope, slopes = self.spec.level(FRICTION), aimed.loop.slopes
         assert slope is not None, "it belongs to a specification with a friction margin"
-        factor = slope * (1.0 + self.spec.reserve + MARGIN_RESERVE) / float(np.min(own[own > 0.0]))
+        factor = slope * (1.0 + self.spec.reserve + MARGIN_RESERVE) / float(np.min(slopes[slopes > 0.0]))
         theta, count = 2 * np.pi * f * self.spec.sample_time_s, 1 + len(self.further)
-        asked = theta >= LOWEST_ANGLE
-        limit = limit_feedback(aimed.loop, theta[asked], aimed.multiplier, factor)
+        tested = theta >= LOWEST_ANGLE
+        limit = limit_feedback(aimed.loop, theta[tested], aimed.multiplier, factor)
         plants, weights = np.zeros((count, f.size), dtype=complex), np.zeros((count, count, f.size), dtype=complex)
-        plants[:, asked], weights[:, :, asked] = limit.plants, limit.weights
+        plants[:, tested], weights[:, :, tested] = limit.plants, limit.weights
         return plants, weights
 
     def terms(self, grid: Grid, x: LawsNumbers) -> LawTerms:
@@ -475,11 +458,13 @@ class Task:
     def usage(self, grid: Grid, law: LawResponse) -> dict[str, Usage]:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
         rows: dict[str, list[Curve]] = {}
-        for position in (position for position, row in enumerate(grid.rows) if row < self.design_states):
-            for name, curve in self.design_usage(grid, position, law).items():
+        for position, row in enumerate(grid.rows):
+            curves = self.curves(self.design_limits(row), grid, position, law)
+            curves |= self.port_usage(grid, law) if row == 0 else {}
+            for name, curve in curves.items():
                 rows.setdefault(name, []).append(curve)
         everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | self.friction_usage(grid, law)
-        return everywhere | {name: np.array(curves) for name, curves in rows.items()}
+        return everywhere | {name: np.array(usage) for name, usage in rows.items()}
 
     def curves(self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse) -> dict[str, np.ndarray]:
         """Return the usage of the imposed ones of some limits on a grid's plants, in discs around them the worst."""
@@ -500,17 +485,11 @@ class Task:
     def band_hz(self, name: str) -> tuple[float, float]:
         """Return from where to where a curve is looked at; finite ends are among the frequencies."""
         curve, allowed = CURVES[name], self.spec.allowed(BY_NAME[name])
-        low, high = (
+        ends = [
             None if end is None or allowed is None else end(allowed, self.spec.bandwidth_hz)
             for end in (curve.from_hz, curve.until_hz)
-        )
-        return 0.0 if low is None else low, np.inf if high is None else high
-
-    def design_usage(self, grid: Grid, position: int, law: LawResponse) -> dict[str, np.ndarray]:
-        """Return the usage of the limits that one of the grid's plants keeps as the design plant, sliding or stuck."""
-        row = grid.rows[position]
-        out = self.curves(self.design_limits(row), grid, position, law)
-        return out | (self.port_usage(grid, law) if row == 0 else {})
+        ]
+        return 0.0 if ends[0] is None else ends[0], np.inf if ends[1] is None else ends[1]
 
     def design_limits(self, row: int) -> tuple[str, ...]:
         """Return the limits that a plant keeps as the design plant, sliding or stuck; none if it is another."""
@@ -538,17 +517,19 @@ class Task:
         """Return the task with one multiplier per plant with friction: that named, or the one that shows most of x."""
         if not self.asks_margin:
             return self
-        names = (
-            [multiplier] * len(self.frictions)
-            if multiplier
-            else [margin.multiplier if margin.factor else SIMPLEST for margin in self.find_margins(self.law_of(x))]
-        )
-        aimed = (replace(one, multiplier=name) for one, name in zip(self.frictions, names, strict=True))
+        names = [multiplier] * len(self.frictions)
+        if not multiplier:
+            names = [margin.multiplier if margin.factor else SIMPLEST for margin in self.find_margins(self.law_of(x))]
+        aimed = (replace(sliding, multiplier=name) for sliding, name in zip(self.frictions, names, strict=True))
         return replace(self, frictions=tuple(aimed))
+
+    def list_broken(self, loops: Sequence[MeasuredLoop]) -> set[str]:
+        """Return the limits that a law with these loops misses."""
+        return list_broken_limits(self.spec, loops, self.design_states)
 
     def find_margins(self, law: Law) -> list[FrictionMargin]:
         """Return the margin of every plant with friction."""
-        return [friction_margin(replace(one.loop, law=law)) for one in self.frictions]
+        return [friction_margin(replace(sliding.loop, law=law)) for sliding in self.frictions]
 
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
         """Return the loop of every plant as limits are judged on it, the design plant's first."""
@@ -566,7 +547,7 @@ class Task:
         slopes: dict[int, float] = {}
         if self.asks_margin:
             margins = zip(self.frictions, self.find_margins(law), strict=True)
-            slopes = {one.plant: margin.least_slope for one, margin in margins}
+            slopes = {sliding.plant: margin.least_slope for sliding, margin in margins}
         return [
             MeasuredLoop(
                 name=name,
@@ -612,8 +593,11 @@ class Task:
     def judge(self, grid: Grid, x: LawNumbers, bandwidth_price: float) -> tuple[float, float]:
         """Return the worst usage on a grid, with the price of a bandwidth that is missed, and the objective."""
         law = self.respond(grid, x)
-        worst = max(float(np.max(curve)) for curve in self.usage(grid, law).values())
-        return max(worst, 1.0 + bandwidth_price * abs(self.miss(grid, law))), self.objective(grid, law)
+        return max(self.worst(grid, law), 1.0 + bandwidth_price * abs(self.miss(grid, law))), self.objective(grid, law)
+
+    def worst(self, grid: Grid, law: LawResponse) -> float:
+        """Return the largest usage of a limit on a grid."""
+        return max(float(np.max(curve)) for curve in self.usage(grid, law).values())
 
     def objective(self, grid: Grid, law: LawResponse) -> float:
         """Return the objective on a grid."""
@@ -630,6 +614,11 @@ def least_integral_rate(x: LawNumbers) -> float:
     at least the least rate of one for every T_v allowed.
     """
     return INTEGRAL_RAD_S / (1.0 - INTEGRAL_RAD_S / SLOWEST_SPEED_RATE) if x[SPEED_RATE] > 0.0 else INTEGRAL_RAD_S
+
+
+def warp_frequency(f: float, ts: float) -> float:
+    """Return a corner as the bilinear transform has it, tan(pi f T_s)."""
+    return float(np.tan(np.pi * f * ts))
 
 
 def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:

@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control.laws.limits import MeasuredLoop
-from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_limits
+from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.tuning.evolution import ENCIRCLES, Evolution
-from seaopt.control.tuning.frequencies import place_frequencies
+from seaopt.control.tuning.frequencies import make_grid
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task
 from seaopt.control.tuning.solution import recheck, tighten_limits
@@ -41,17 +40,9 @@ HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more 
 def find_possible_bandwidths(
     task: Task, x: LawNumbers, progress: Progress = ignore
 ) -> tuple[PossibleBandwidths, list[LawNumbers]]:
-    """Return the bandwidths nearby that keep the limits, and the numbers of the laws at those next to the one asked.
+    """Return the bandwidths nearby that keep the limits, and the numbers of the laws at those next to the task's own.
 
-    Parameters
-    ----------
-    task : Task
-        Of a bandwidth that does not keep them.
-    x : array, shape (14,)
-        The numbers that miss them least there.
-    progress : callable, optional
-        Called before each bandwidth that is tried.
-
+    `x`: the numbers that miss them least at the task's bandwidth.
     """
     return _Probes(task, x, progress).find()
 
@@ -119,15 +110,11 @@ class _Probes:
         """
         task = self._aim(bandwidth_hz)
         plain = replace(task, spec=replace(task.spec, min_friction_margin=None))
-
-        def keeps(loops: list[MeasuredLoop]) -> bool:
-            return not list_broken_limits(plain.spec, loops, plain.design_states)
-
-        if keeps(plain.measure(x)):
+        if not plain.list_broken(plain.measure(x)):
             return 0.0, x
-        x = recheck(task, task.grid(place_frequencies(task)), x, REFINEMENTS)
+        x = recheck(task, make_grid(task), x, REFINEMENTS)
         x, loops = tighten_limits(plain, x, plain.measure(x))
-        return (0.0 if keeps(loops) else NEARLY_KEPT), x
+        return (NEARLY_KEPT if plain.list_broken(loops) else 0.0), x
 
     def _aim(self, bandwidth_hz: float) -> Task:
         low, high = self.task.spec.bandwidth_range_hz  # what may be asked, not what may be looked at
@@ -142,7 +129,7 @@ class _Probes:
         not looked for anywhere else. From further away a refinement leads nowhere.
         """
         task = self._aim(bandwidth_hz)
-        grid = task.grid(place_frequencies(task))
+        grid = make_grid(task)
         apart, kept, start = min(
             (abs(np.log(f / bandwidth_hz)) + FAR * (usage > 0.0), usage == 0.0, f)
             for f, (usage, _) in self.tried.items()
@@ -155,12 +142,12 @@ class _Probes:
                 return usage, x
         search = Evolution.of(task, grid, [x])
         usages, laws = search.run([x], members=MEMBERS, generations=GENERATIONS)
-        starts = [one for one in map(task.tidy, laws[usages < ENCIRCLES][:STARTS_TRIED]) if task.is_stable(one)]
+        starts = list(filter(task.is_stable, map(task.tidy, laws[usages < ENCIRCLES][:STARTS_TRIED])))
         if not starts:
             return np.inf, x
-        known, x = x, min(starts, key=lambda one: task.rank(grid, one))
+        near, x = x, min(starts, key=lambda start: task.rank(grid, start))
         usage, _ = task.rank(grid, x)
-        if usage > PROMISING_USAGE or (refined and np.allclose(x, known, rtol=1e-3)):
+        if usage > PROMISING_USAGE or (refined and np.allclose(x, near, rtol=1e-3)):
             return usage, x
         x = refine(task, grid, x, REFINEMENTS)
         return task.rank(grid, x)[0], x

@@ -23,12 +23,12 @@ import numpy as np
 
 from seaopt.control.laws.limits import BY_NAME, MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ
-from seaopt.control.laws.verdict import judge_all, list_broken_limits
+from seaopt.control.laws.verdict import judge_all
 from seaopt.control.loops.absolute_stability import SIMPLEST
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import Evolution
-from seaopt.control.tuning.frequencies import place_frequencies
+from seaopt.control.tuning.frequencies import make_grid, place_frequencies
 from seaopt.control.tuning.grid import Grid
 from seaopt.control.tuning.interior_point import CLEARLY, HOPELESS, refine
 from seaopt.control.tuning.optimisation_problem import FRICTION, K_I, W_R, LawNumbers, Task
@@ -59,17 +59,8 @@ def solve(
 ) -> Solution:
     """Find the best numbers, and return them with every plant's loop.
 
-    Parameters
-    ----------
-    task : Task
-        What is to be tuned.
-    warm : sequence of arrays, shape (14,)
-        Numbers to start from besides those of the scan, which then tries one less.
-    progress : callable, optional
-        Called as starts are refined.
-    far_off : float
-        Worst usage of the best of two refined starts beyond which no other is refined.
-
+    `warm`: numbers to start from besides those of the scan, which then tries one less. `far_off`: worst usage of the
+    best of two refined starts beyond which no other is refined.
     """
     once, raising = divide(progress, ONCE, (3.0 * ONCE + RAISING) * task.asks_margin)
     x, loops = _solve_once(task, warm, once, far_off)
@@ -82,7 +73,7 @@ def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], 
     The multiplier that shows most of a law is made a limit, and the best law with that looked for, as another may then
     show more. Where none has the margin, it is the law with the largest that keeps all other limits.
     """
-    broken, best = list_broken_limits(task.spec, loops, task.design_states), (x, loops)
+    broken, best = task.list_broken(loops), (x, loops)
     if not broken:
         return best
     *parts, raising = divide(progress, ONCE, ONCE, ONCE, RAISING)
@@ -91,10 +82,10 @@ def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], 
     other = x
     for multiplier, part in zip(("", "", SIMPLEST), parts, strict=True):
         tried = _solve_once(task.aim_multipliers(best[0], multiplier), (best[0],), part)
-        missed, other = list_broken_limits(task.spec, tried[1], task.design_states), tried[0]
-        if not missed:
+        broken, other = task.list_broken(tried[1]), tried[0]
+        if not broken:
             return tried
-        if missed == {FRICTION} and _least_slope(tried[1]) > _least_slope(best[1]):
+        if broken == {FRICTION} and _least_slope(tried[1]) > _least_slope(best[1]):
             best = tried
     return _raise_friction_margin(task, *best, other, raising)
 
@@ -110,10 +101,10 @@ def _raise_friction_margin(
     high = task.spec.level(FRICTION)
     assert high is not None
     low, f = _least_slope(loops) or LEAST_MARGIN * high, place_frequencies(task)
-    least, asked = low, high
+    least, most = low, high
     while high / low > MARGIN_RESOLUTION:
-        left = _count_halvings(low, high) / _count_halvings(least, asked)
-        progress(f"friction margin {low:.3g} of {asked:.3g}", 1.0 - left)
+        left = _count_halvings(low, high) / _count_halvings(least, most)
+        progress(f"friction margin {low:.3g} of {most:.3g}", 1.0 - left)
         middle = float(np.sqrt(low * high))
         easier = replace(task, spec=replace(task.spec, min_friction_margin=middle))
         for start, multiplier in ((x, ""), (other, SIMPLEST)):
@@ -121,7 +112,7 @@ def _raise_friction_margin(
             grid = aimed.grid(f)
             tried = refine(aimed, grid, improve(aimed, grid, start)[1])
             measured = aimed.measure(tried)
-            if not list_broken_limits(aimed.spec, measured, aimed.design_states):
+            if not aimed.list_broken(measured):
                 x, loops, low = tried, measured, _least_slope(measured)
                 break
         else:
@@ -141,37 +132,31 @@ def _least_slope(loops: Sequence[MeasuredLoop]) -> float:
 def _solve_once(task: Task, warm: Sequence[LawNumbers], progress: Progress, far_off: float = FAR_OFF) -> Solution:
     """Find the best numbers with the multipliers that are aimed at, if any."""
     finding, checking = divide(progress, SCAN + IMPROVEMENT + REFINEMENT, RECHECK)
-    grid = task.grid(place_frequencies(task))
+    grid = make_grid(task)
     x = find_best(replace(task, settles=False), grid, warm, finding, far_off)
     return _finish(task, grid, x, checking)
 
 
 def _solve_from(task: Task, x: LawNumbers, progress: Progress = ignore, *, keeping: bool = False) -> Solution:
-    """Find the best numbers near given ones; `keeping` is of `refine`."""
-    grid = task.grid(place_frequencies(task))
-    x = refine(task, grid, improve(task, grid, x)[1], _count_rounds(task), keeping=keeping)
-    return _finish(task, grid, x, progress)
+    """Find the best numbers near others; `keeping` is of `refine`."""
+    grid = make_grid(task)
+    return _finish(task, grid, _descend(task, grid, x, keeping=keeping), progress)
+
+
+def _descend(task: Task, grid: Grid, x: LawNumbers, *, keeping: bool = False) -> LawNumbers:
+    """Return the numbers after quadratic programs and interior point."""
+    return refine(task, grid, improve(task, grid, x)[1], _count_rounds(task), keeping=keeping)
 
 
 def search(task: Task, x: LawNumbers, loops: list[MeasuredLoop], *, again: bool = True) -> Solution:
-    """Return a law that misses limits, or a better one that an evolution finds; what misses none is returned as it is.
+    """Return a law that keeps the limits as it is; of one that misses them a better one, if an evolution finds it.
 
-    Parameters
-    ----------
-    task : Task
-        What is to be tuned.
-    x : array, shape (14,)
-        The law that keeps the limits, or misses them least so far.
-    loops : list of MeasuredLoop
-        Its loops.
-    again : bool
-        Whether a second population is tried where the first has no law that keeps them.
-
+    `again`: whether a second population is tried where the first has no law that keeps them.
     """
-    if not list_broken_limits(task.spec, loops, task.design_states) - {FRICTION}:
+    if not task.list_broken(loops) - {FRICTION}:
         return x, loops
-    grid = task.grid(place_frequencies(task))
-    return retry(task, x, loops, Evolution.of(task, grid, [x]).find([x], again=again), keeping=not again)
+    evolution = Evolution.of(task, make_grid(task), [x])
+    return retry(task, x, loops, evolution.find([x], again=again), keeping=not again)
 
 
 def retry(
@@ -181,15 +166,15 @@ def retry(
 
     `keeping` is of `refine`: the first numbers that keep the limits may be enough.
     """
-    grid = task.grid(place_frequencies(task))
+    grid = make_grid(task)
     best, rank = (x, loops), task.rank(grid, x)
     for start in map(task.tidy, starts):
         if not task.is_stable(start):
             continue
         tried = _solve_from(task, start, keeping=keeping)
-        missed = list_broken_limits(task.spec, tried[1], task.design_states)
-        if not missed - {FRICTION}:
-            return _meet_friction_margin(task, *tried, ignore) if missed else tried
+        broken = task.list_broken(tried[1])
+        if not broken - {FRICTION}:
+            return _meet_friction_margin(task, *tried, ignore) if broken else tried
         if task.rank(grid, tried[0]) < rank:
             best, rank = tried, task.rank(grid, tried[0])
     return best
@@ -199,7 +184,7 @@ def _finish(task: Task, grid: Grid, x: LawNumbers, checking: Progress) -> Soluti
     """Return numbers that leave as much to their integral as is allowed, rechecked, with their loops."""
     settling = task.tidy(x)
     if settling[W_R] < x[W_R]:
-        x = refine(task, grid, improve(task, grid, settling)[1], _count_rounds(task))
+        x = _descend(task, grid, settling)
     checking("checking between the frequencies", 0.0)
     x = recheck(task, grid, x)
     loops = task.measure(x)
@@ -219,9 +204,9 @@ def tighten_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solu
             break
         factors |= {name: factors.get(name, 1.0) / used**2 for name, used in missed.items()}
         tight = replace(task, eased=factors)
-        trial = refine(tight, tight.grid(place_frequencies(tight)), best[0])
+        trial = refine(tight, make_grid(tight), best[0])
         best = (trial, task.measure(trial))
-        if not list_broken_limits(task.spec, best[1], task.design_states):
+        if not task.list_broken(best[1]):
             return best
     return x, loops
 
@@ -262,12 +247,12 @@ def find_best(
     """Find the best numbers on a grid; `far_off` is of `solve`."""
     scanning, improving, refining = divide(progress, SCAN, IMPROVEMENT, REFINEMENT)
     scanning("scanning gains", 0.0)
-    parts = (task.nominal, task.spec.notch, task.spec.reference_filter, task.speed_loop)
-    more = any(part is not None for part in parts)
+    spec = task.spec
+    more = any(part is not None for part in (task.nominal, spec.notch, spec.reference_filter, task.speed_loop))
     warm = [task.tidy(x) for x in warm]
     first = [x for x in warm if task.is_stable(x)] + find_starts(task, grid, STARTS_TRIED + 2 * more - bool(warm))
     ranked = sorted((improve(task, grid, x) for x in count_off(first, "start", improving)), key=lambda pair: pair[0])
-    count = len(ranked) if task.spec.notch is not None else STARTS_REFINED + more
+    count = len(ranked) if spec.notch is not None else STARTS_REFINED + more
     chosen: list[LawNumbers] = []
     for _, x in ranked:
         if len(chosen) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
@@ -300,7 +285,7 @@ def _quicken_integral(task: Task, grid: Grid, x: LawNumbers) -> LawNumbers:
     faster = task.tidy(faster)
     if not task.is_stable(faster):
         return x
-    return min(x, refine(task, grid, improve(task, grid, faster)[1], LONG_ROUNDS), key=lambda one: task.rank(grid, one))
+    return min(x, _descend(task, grid, faster), key=lambda numbers: task.rank(grid, numbers))
 
 
 def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
@@ -333,9 +318,9 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
     Where limits are missed clearly with all of it, little is looked for without any; and what lies between is solved
     only where a law near the better of these two comes close to keeping them.
     """
-    asked, link = task.spec.link_feedforward, task.link
-    broken = list_broken_limits(task.spec, loops, task.design_states)
-    if asked is None or asked.fraction is not None or link is None or not broken:
+    request, link = task.spec.link_feedforward, task.link
+    broken = task.list_broken(loops)
+    if request is None or request.fraction is not None or link is None or not broken:
         return task, x, loops
     shares = (*(0.8 ** (power + 1) for power in range(LOWER_FRACTIONS)), 0.0)
     *lower, none = (feed_link(task, replace(link, fraction=round(share * link.fraction, 3))) for share in shares)
@@ -345,21 +330,21 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
         without = solve(none, (x,), far_off=CLEARLY)
         least, start = min((miss, x), (_measure_miss(none, without[0]), without[0]), key=lambda pair: pair[0])
         close = float(np.clip(1.0 + CLOSER * (least - 1.0), CLEARLY, HOPELESS))
-        lower = [] if least > FAR_OFF else [one for one in lower if _follow(one, start) <= close]
-    found = (task, x, loops)
-    for one in (*lower, none):
-        found = (one, *(without if one is none and without else solve(one)))
-        broken = list_broken_limits(one.spec, found[2], one.design_states)
+        lower = [] if least > FAR_OFF else [fed for fed in lower if _follow(fed, start) <= close]
+    answer = (task, x, loops)
+    for fed in (*lower, none):
+        answer = (fed, *(without if fed is none and without else solve(fed)))
+        broken = fed.list_broken(answer[2])
         if not broken:
-            return found
+            return answer
         if broken == {FRICTION}:
-            missing.append(found)
-    return max(missing, key=lambda one: min(loop.friction_slope for loop in one[2])) if missing else found
+            missing.append(answer)
+    return max(missing, key=lambda solution: _least_slope(solution[2])) if missing else answer
 
 
 def _measure_miss(task: Task, x: LawNumbers) -> float:
     """Return the worst usage of a limit."""
-    return task.rank(task.grid(place_frequencies(task)), x)[0]
+    return task.rank(make_grid(task), x)[0]
 
 
 def _follow(task: Task, x: LawNumbers) -> float:
@@ -367,5 +352,5 @@ def _follow(task: Task, x: LawNumbers) -> float:
     x = task.tidy(x)
     if not task.is_stable(x):
         return math.inf
-    grid = task.grid(place_frequencies(task))
+    grid = make_grid(task)
     return task.rank(grid, refine(task, grid, x, 2))[0]

@@ -56,6 +56,7 @@ from seaopt.control.tuning.optimisation_problem import (
     W_R,
     LawNumbers,
     Task,
+    warp_frequency,
 )
 from seaopt.records import record
 
@@ -82,18 +83,7 @@ LEAST_TURN = -0.3 * np.pi  # of 1 + L from the lowest frequency to the highest: 
 
 
 def find_starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
-    """Return up to `count` distinct stable starts, best first; next to no feedback if the scan has none.
-
-    Parameters
-    ----------
-    task : Task
-        What is to be tuned.
-    grid : Grid
-        Frequencies that hold the bandwidth.
-    count : int
-        How many.
-
-    """
+    """Return up to `count` distinct stable starts, best first; next to no feedback if the scan has none."""
     coarse = thin_grid(task, grid)
     shapes = list(_list_shapes(task, coarse))
     merits, scanned = zip(*(_rank_shape(task, coarse, shape) for shape in shapes), strict=True)
@@ -201,7 +191,7 @@ def _list_prefilters(task: Task) -> list[tuple[float, float]]:
         return [(1.0, 1.0)]
     highest = HIGHEST_CORNER * task.spec.sample_rate_hz
     corners = np.minimum([*(task.spec.bandwidth_hz * np.array(PREFILTERS)), highest], highest)
-    return [(float(w), PREFILTER_START) for w in np.tan(np.pi * corners * task.spec.sample_time_s)]
+    return [(warp_frequency(corner, task.spec.sample_time_s), PREFILTER_START) for corner in corners]
 
 
 def _list_notches(task: Task) -> list[tuple[float, float, float]]:
@@ -210,13 +200,9 @@ def _list_notches(task: Task) -> list[tuple[float, float, float]]:
     modes = [f for plant in task.plants[:SCANNED_PLANTS] for f, _ in find_light_modes(plant) if f > f_b]
     centres = np.minimum(np.unique(np.round([*modes, 1.5 * f_b, 3.0 * f_b], 1)), HIGHEST_CORNER / ts)
     shapes = ((0.2, 0.1), (0.6, 0.1), (0.6, 0.4))
-    w = np.tan(np.pi * centres * ts)
-    least = float(np.tan(np.pi * min(LOWEST_NOTCH * f_b, HIGHEST_CORNER / ts) * ts))
-    return [
-        (float(w[-1]), 0.5, 1.0),
-        (least, 0.05, 0.05),
-        *((float(one), width, depth) for one in w for width, depth in shapes),
-    ]
+    w = [warp_frequency(centre, ts) for centre in centres]
+    least = warp_frequency(min(LOWEST_NOTCH * f_b, HIGHEST_CORNER / ts), ts)
+    return [(w[-1], 0.5, 1.0), (least, 0.05, 0.05), *((at, *shape) for at in w for shape in shapes)]
 
 
 @record(eq=False)

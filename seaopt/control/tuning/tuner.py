@@ -32,7 +32,6 @@ from seaopt.control.laws.verdict import (
     judge_all,
     list_active,
     list_broken,
-    list_broken_limits,
 )
 from seaopt.control.loops.compensation.link_feedforward import (
     LinkPath,
@@ -182,7 +181,7 @@ def _describe_request(
 ) -> str:
     """Return what it takes to repeat a call."""
     values = params.parameters if isinstance(params, Fit) else params
-    others = {name: one[0].name if isinstance(one, tuple) else one.name for name, one in robust_to.items()}
+    others = {name: (plant[0] if isinstance(plant, tuple) else plant).name for name, plant in robust_to.items()}
     numbers = {name: parameter.value for name, parameter in values.items()}
     return (
         f"plant: {plant.name}; parameters: {numbers}; specification: {spec.to_dict()}; "
@@ -225,7 +224,7 @@ def _tune(
     task, x, loops = lower_fraction(task, x, loops)
     if not task.eased:
         x, loops = search(task, x, loops)
-    possible, broken = None, list_broken_limits(spec, loops, task.design_states)
+    possible, broken = None, task.list_broken(loops)
     if broken - {FRICTION}:  # of a margin alone it is known what can be had
         near: list[LawNumbers] = []
         if not task.eased:
@@ -233,7 +232,7 @@ def _tune(
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
             x, loops = retry(task, x, loops, near)
-        if list_broken_limits(spec, loops, task.design_states):
+        if task.list_broken(loops):
             x, loops = ease_limits(task, x, loops, easing)
     controller = make_controller(task, x, loops, (plant, params), possible)
     progress(f"{spec.structure}, {spec.bandwidth_hz:g} Hz", 1.0)
@@ -243,11 +242,7 @@ def _tune(
 def name_design(plant: Plant | MeasuredResponse) -> Plant:
     """Return the plant that says what a design plant, a model or a measured one, is commanded by.
 
-    Raises
-    ------
-    ControlError
-        It is neither.
-
+    Raises ControlError: it is neither.
     """
     model = plant.plant if isinstance(plant, MeasuredResponse) else plant
     require_plant(model, "plant", ControlError)
@@ -269,12 +264,9 @@ def _find_possible(
         return possible, near
     steepest, largest, law = eased
     friction, fall = steepest.find_fall()
+    parameters = list_fall_parameters(steepest.model, friction)
     possible = replace(
-        possible,
-        fall=fall,
-        largest_fall=largest * fall,
-        fall_unit=friction.slope_unit,
-        fall_parameters=list_fall_parameters(steepest.model, friction),
+        possible, fall=fall, largest_fall=largest * fall, fall_unit=friction.slope_unit, fall_parameters=parameters
     )
     return possible, [*near, law]
 
@@ -286,13 +278,9 @@ def make_task(
     robust_to: RobustTo,
     draws: Sequence[Mapping[str, float]] = (),
 ) -> Task:
-    """Return what is to be tuned.
+    """Return the task of a request.
 
-    Raises
-    ------
-    ControlError
-        As `tune`.
-
+    Raises ControlError: as `tune`.
     """
     design = name_design(plant)
     values = design.complete(params)
@@ -303,14 +291,7 @@ def make_task(
     require_type(draws, Sequence, "draws", "give a sequence of mappings of parameter to value", ControlError)
     for draw in draws:
         require_type(draw, Mapping, "one of draws", "give a mapping of parameter to value", ControlError)
-    measured = {str(name): one for name, one in robust_to.items() if isinstance(one, MeasuredResponse)}
-    models_given = {name: one for name, one in robust_to.items() if not isinstance(one, MeasuredResponse)}
-    for name, other in models_given.items():
-        count = len(other) if isinstance(other, tuple) else 2
-        if count != 2:
-            raise ControlError(f"robust_to: {name} is a tuple of {count}; give a plant, or (plant, parameters)")
-        require_plant(other[0] if isinstance(other, tuple) else other, f"robust_to: {name}", ControlError)
-    seen = {name: spec.see_response(one, command) for name, one in measured.items()}
+    seen: dict[str, MeasuredPlant] = {}
     first: dict[str, MeasuredPlant] = {}
     named: dict[str, tuple[Plant, ParameterSet]] = {}
     if isinstance(plant, MeasuredResponse):
@@ -319,33 +300,32 @@ def make_task(
     else:
         named["design plant"] = (plant, values)
     late = read_conditions(design, values).get(DRIVE_DELAY, 0.0)
-    named |= {
-        str(name): (p[0], place_drive_delay(spec, p[1], late)) if isinstance(p, tuple) else (p, values)
-        for name, p in models_given.items()
-    }
+    for name, other in robust_to.items():
+        if isinstance(other, MeasuredResponse):
+            seen[str(name)] = spec.see_response(other, command)
+            continue
+        pair = other if isinstance(other, tuple) else (other, values)
+        if len(pair) != 2:
+            raise ControlError(f"robust_to: {name} is a tuple of {len(pair)}; give a plant, or (plant, parameters)")
+        require_plant(pair[0], f"robust_to: {name}", ControlError)
+        named[str(name)] = (pair[0], place_drive_delay(spec, pair[1], late)) if pair is other else pair
     link = _find_link(spec, named, bool(first), gain)
     if link is not None:
-        named = {name: (link.see(model), given) for name, (model, given) in named.items()}
+        named = {name: (link.see(model), params) for name, (model, params) in named.items()}
         design, signals = link.see(design), (*signals, link.measured)
     varied = {parameter for draw in draws for parameter in draw}
     models: dict[str, tuple[Plant, CompletedParameters]] = {}
     design_states = 1 if first else len(split_friction({"": design}, values, varied))
     whole: dict[Plant, Plant] = {}  # the plant with its friction, of one that slides
-    for name, (model, given) in named.items():
-        completed = model.complete(given)
+    for name, (model, params) in named.items():
+        completed = model.complete(params)
         variants = split_friction({name: model}, completed, varied)
-        models |= {one: (variant, variant.complete(completed)) for one, variant in variants.items()}
+        models |= {state: (variant, variant.complete(completed)) for state, variant in variants.items()}
         if model not in variants.values():  # it has friction, and is there twice or more
             whole[friction_states(model)[SLIDING]] = model
     pairs = [*models.items(), *_draw_plants(models, draws)]
-    plants = (
-        *first.values(),
-        *(
-            sample(model, values, signals, gain, spec.sample_time_s, spec.loop_delay_samples)
-            for _, (model, values) in pairs
-        ),
-        *seen.values(),
-    )
+    sampled = (sample(*pair, signals, gain, spec.sample_time_s, spec.loop_delay_samples) for _, pair in pairs)
+    plants = (*first.values(), *sampled, *seen.values())
     static = plants[0].static_gain
     if not np.isfinite(static) or abs(static) < 1e-6:
         raise ControlError(
@@ -362,9 +342,6 @@ def make_task(
     if link is not None:
         link = _limit_fraction(link, spec, plants)
         further = (*further, link.feedback(spec.sample_time_s))
-    frictions = _find_friction(
-        spec, signals, [pair for _, pair in pairs], plants[len(first) :], whole, gain, len(first)
-    )
     return Task(
         spec=spec,
         plants=plants,
@@ -374,21 +351,14 @@ def make_task(
         port=port,
         design_states=design_states,
         signals=signals,
-        frictions=frictions,
+        frictions=_find_friction(spec, signals, [pair for _, pair in pairs], plants, whole, gain, len(first)),
         further=further,
         link=link,
     )
 
 
 def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
-    """Refuse a cascade whose second signal is not the motor's speed.
-
-    Raises
-    ------
-    ControlError
-        As said.
-
-    """
+    """Refuse a cascade whose second signal is not the motor's speed."""
     first, name = list_names(spec.measured)
     speed = None if design.sensing is None else design.sensing.motor_speed
     if speed is not None and name != speed:
@@ -401,16 +371,12 @@ def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
 def _find_link(
     spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], on_response: bool, per_effort: float
 ) -> LinkPath | None:
-    """Return the path from the link's motion, of the first plant whose link moves; None where none is asked.
+    """Return the path from the link's motion, of the first plant whose link moves; None where none is requested.
 
-    Raises
-    ------
-    ControlError
-        No plant has such a signal, or the design plant is a measured response.
-
+    Raises ControlError: no plant has such a signal, or the design plant is a measured response.
     """
-    asked = spec.link_feedforward
-    if asked is None:
+    feedforward = spec.link_feedforward
+    if feedforward is None:
         return None
     if on_response:
         raise ControlError(
@@ -418,9 +384,10 @@ def _find_link(
             "responses alone, whose links stand still; design on a model, and name the response in robust_to"
         )
     for model, values in named.values():
-        if name_link_signal(asked, model) is not None:
-            return model_link_path(asked, model, values, spec.regulated, per_effort, spec.bandwidth_hz)
-    missing = "link motion" if asked.measured is None else f'output "{asked.measured}" that is its link\'s motion'
+        if name_link_signal(feedforward, model) is not None:
+            return model_link_path(feedforward, model, values, spec.regulated, per_effort, spec.bandwidth_hz)
+    signal = feedforward.measured
+    missing = "link motion" if signal is None else f'output "{signal}" that is its link\'s motion'
     raise ControlError(
         f"link_feedforward: none of {', '.join(named)} has a {missing}; name a plant whose link moves in robust_to, "
         'as robust_to = ["swing"]'
@@ -428,7 +395,7 @@ def _find_link(
 
 
 def _limit_fraction(link: LinkPath, spec: ControllerSpec, plants: Sequence[DigitalPlant | MeasuredPlant]) -> LinkPath:
-    """Return the path with the largest fraction that may be, where none is asked."""
+    """Return the path with the largest fraction that may be, where none is stated."""
     if spec.link_feedforward is None or spec.link_feedforward.fraction is not None:
         return link
     models = [plant for plant in plants if isinstance(plant, DigitalPlant)]
@@ -443,10 +410,10 @@ def _limit_fraction(link: LinkPath, spec: ControllerSpec, plants: Sequence[Digit
 
 def aim_task(task: Task, spec: ControllerSpec) -> Task:
     """Return a task at another bandwidth, with the corners and the largest fraction of the link's path there."""
-    task, asked = replace(task, spec=spec), spec.link_feedforward
-    if asked is None or task.link is None:
+    task, feedforward = replace(task, spec=spec), spec.link_feedforward
+    if feedforward is None or task.link is None:
         return task
-    return feed_link(task, _limit_fraction(asked.place(task.link, spec.bandwidth_hz), spec, task.plants))
+    return feed_link(task, _limit_fraction(feedforward.place(task.link, spec.bandwidth_hz), spec, task.plants))
 
 
 def _check_measured_design(spec: ControllerSpec) -> None:
@@ -472,13 +439,13 @@ def _find_friction(
     gain: float,
     before: int,
 ) -> tuple[PlantWithFriction, ...]:
-    """Return the plants of which a friction margin is asked, and those that grow as they slide.
+    """Return the plants of which a friction margin is required, and those that grow as they slide.
 
-    Of those that slide, `whole` is the one with friction; in the task, `before` plants precede these.
+    `whole`: of a plant that slides the one with friction. `before`: how many of the task's `plants` precede the pairs.
     """
     slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s, len(signals))
-    found: list[PlantWithFriction] = []
-    for number, (model, values) in enumerate(pairs):
+    frictions: list[PlantWithFriction] = []
+    for number, (model, values) in enumerate(pairs, start=before):
         if model not in whole or (slope is None and not count_growing(plants[number])):
             continue
         plant = whole[model]
@@ -491,31 +458,31 @@ def _find_friction(
                 "change the plant or the measured output"
             )
         flattest, _ = friction_slopes(plant, values)
-        found.append(PlantWithFriction(plant=before + number, model=plant, loop=loop, flattest=flattest))
-    return tuple(found)
+        frictions.append(PlantWithFriction(plant=number, model=plant, loop=loop, flattest=flattest))
+    return tuple(frictions)
 
 
 def _draw_plants(
     models: Mapping[str, tuple[Plant, CompletedParameters]], draws: Sequence[Mapping[str, float]]
 ) -> list[tuple[str, tuple[Plant, CompletedParameters]]]:
     """Return every plant at every draw, under a name; a draw that changes nothing of a plant is left out."""
-    known = {name for model, _ in models.values() for name in (*model.parameters, *conditions((model,)))}
-    out: list[tuple[str, tuple[Plant, CompletedParameters]]] = []
+    names = {name for model, _ in models.values() for name in (*model.parameters, *conditions((model,)))}
+    pairs: list[tuple[str, tuple[Plant, CompletedParameters]]] = []
     for number, values in enumerate(draws, start=1):
-        for parameter in values:
-            if parameter not in known:
-                raise ControlError(f'draws name "{parameter}", which no plant has; {suggestion(parameter, known)}')
-        for name, (model, nominal) in models.items():
-            own = {**conditions((model,)), **nominal}
-            used = {
-                key: require_number(value, f"draws: {key}", ControlError) for key, value in values.items() if key in own
-            }
+        for name in values:
+            if name not in names:
+                raise ControlError(f'draws name "{name}", which no plant has; {suggestion(name, names)}')
+        drawn = {name: require_number(value, f"draws: {name}", ControlError) for name, value in values.items()}
+        for plant, (model, nominal) in models.items():
+            parameters = {**conditions((model,)), **nominal}
+            used = {name: value for name, value in drawn.items() if name in parameters}
             if not used:
                 continue
             label = format_values(used, missing="") if len(used) < 3 else f"draw {number}"
-            drawn = nominal.given.with_parameters(*(replace(own[key], value=value) for key, value in used.items()))
-            out.append((f"{name}, {label}", (model, model.complete(drawn))))
-    return out
+            changed = (replace(parameters[name], value=value) for name, value in used.items())
+            completed = model.complete(nominal.given.with_parameters(*changed))
+            pairs.append((f"{plant}, {label}", (model, completed)))
+    return pairs
 
 
 def make_controller(
@@ -554,6 +521,7 @@ def describe_law(
         plant = task.link.see(plant)
     verdicts = judge_all(spec, loops, task.design_states)
     broken = list_broken(verdicts)
+    explanations = explain_broken(spec, verdicts, loops[0], close_plant(task.plants[0], law))
     controller = Controller(
         structure=spec.structure,
         gains=gains,
@@ -569,10 +537,7 @@ def describe_law(
         robust_to=task.names[task.design_states :],
         design=None if isinstance(plant, MeasuredResponse) else (plant, params),
         observer=observer,
-        blocked_by=tuple(
-            _explain_rest(task, text)
-            for text in explain_broken(spec, verdicts, loops[0], close_plant(task.plants[0], law))
-        ),
+        blocked_by=tuple(_explain_rest(task, text) for text in explanations),
         possible=None if not broken else possible,
         measured=measure_all_discs(task.plants, law, spec.bandwidth_hz),
         link=task.link,
@@ -584,7 +549,7 @@ def describe_law(
 
 
 def _find_rest_gain(task: Task) -> float | None:
-    """Return the noise gain of the stuck plant that any integral has at rest; None where the limit allows it.
+    """Return the noise gain that any integral has on the stuck plant at rest; None where the limit allows it.
 
     An integral holds the reading at rest: it makes 1/P(0) there, which is far above 1 where bristles hold the motor.
     """
