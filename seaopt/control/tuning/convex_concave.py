@@ -79,16 +79,12 @@ class _LinearLimits:
 
 @record(eq=False)
 class _Affine:
-    """The law at the iterate, and the derivatives of C_y, C_r and C_v by the g gains.
-
-    `by_speed` is that of C_v per unit of what senses the speed: times the plant's speed, that of B.
-    """
+    """The law at the iterate, and the derivatives of C_y, C_r and C_v by the g gains."""
 
     law: LawResponse
     by_y: GainResponses
     by_r: GainResponses
     by_v: GainResponses
-    by_speed: GainResponses
 
 
 def improve(task: Task, grid: Grid, start: LawNumbers) -> tuple[float, LawNumbers]:
@@ -123,11 +119,8 @@ def improve(task: Task, grid: Grid, start: LawNumbers) -> tuple[float, LawNumber
 
 def _choose_least_gains(task: Task, grid: Grid) -> PerGain:
     """Return gains that make a difference: a tenth of the inverse plant's at the bandwidth."""
-    w_b = 2 * np.pi * task.spec.bandwidth_hz
-    inverse, of_speed = (
-        1.0 / (float(np.interp(task.spec.bandwidth_hz, grid.f, np.abs(row))) or 1.0)
-        for row in (grid.p[0], grid.speed[0])
-    )
+    w_b, at = 2 * np.pi * task.spec.bandwidth_hz, task.find_bandwidth(grid)
+    inverse, of_speed = (1.0 / (gain or 1.0) for gain in (float(np.abs(grid.plants.y[0, at])), task.speed_gain(grid)))
     least = 0.1 * np.array([inverse, 0.1 * w_b * inverse, inverse / w_b, inverse, inverse / w_b, of_speed])
     return least[task.gains_tuned]
 
@@ -150,9 +143,8 @@ def linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     one, none, gains = np.ones_like(grid.q), np.zeros_like(grid.q), task.gains_tuned
     by_y = series * np.array([one, integral, rate, none, none, none])[gains]
     by_r = series * prefilter * np.array([one, integral, rate, -one, -rate, none])[gains]
-    by_speed = series * np.array([none, none, none, none, none, one])[gains]
-    sensing = none if task.speed_loop is None else task.speed_loop.sense(grid.q, task.spec.sample_time_s)
-    return _Affine(law=task.respond(grid, x), by_y=by_y, by_r=by_r, by_v=by_speed * sensing, by_speed=by_speed)
+    by_v = series * np.array([none, none, none, none, none, task.sense(grid.q)])[gains]
+    return _Affine(law=task.respond(grid, x), by_y=by_y, by_r=by_r, by_v=by_v)
 
 
 def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "g n"]) -> ValueSlopes:
@@ -207,16 +199,15 @@ def _change_path(
 
 def _differentiate_curve(grid: Grid, law: _Affine, name: str, index: Indices) -> tuple[PointSlopes, PointSlopes]:
     """Return the derivatives of ln abs(1 + L) and of ln abs(X) of a limit by the gains, at points of plants."""
-    at, column, curve = law.law, index % grid.f.size, CURVES[name]
-    p, speed = grid.p.ravel()[index], grid.speed.ravel()[index]
-    one = at.rest.ravel()[index] + p * at.c_y[column]
+    at, curve, (row, column) = law.law, CURVES[name], np.divmod(index, grid.f.size)
+    path = grid.plants.at((row, column))
+    one, by_loop = _change_path(path, law, column)
     by_y, by_r, by_v = (by[:, column] for by in (law.by_y, law.by_r, law.by_v))
-    by_loop = p * by_y + speed * law.by_speed[:, column]
     near = _differentiate_size(one, by_loop) / np.abs(one)[:, None]
     if curve.of == "1":
         return near, 0.0 * near
-    value = curve.numerator(p, at.c_y[column], at.c_r[column], one - 1.0, at.c_v[column])
-    change = curve.change(p, by_y, by_r, by_loop, by_v)
+    value = curve.numerator(path.y, at.c_y[column], at.c_r[column], one - 1.0, at.c_v[column])
+    change = curve.change(path.y, by_y, by_r, by_loop, by_v)
     return near, _differentiate_size(value, change) / np.maximum(np.abs(value), 1e-300)[:, None]
 
 
@@ -228,9 +219,9 @@ def choose_near(usage: Usage) -> Indices:
 
 def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) -> PointSlopes:
     """Return the derivative of a limit's usage by the gains at points in discs, by central differences."""
-    curve, column = CURVES[name], index % grid.f.size
-    p, discs, level = grid.p.ravel()[index], grid.discs.ravel()[index], grid.levels[name][column]
-    rest = law.law.rest.ravel()[index]
+    curve, (row, column) = CURVES[name], np.divmod(index, grid.f.size)
+    path, discs, level = grid.plants.at((row, column)), grid.discs[row, column], grid.levels[name][column]
+    p, rest = path.y, path.add_rest(law.law.c_v[column])
     slope = np.zeros((index.size, len(law.by_y)))
     for k in range(len(law.by_y)):
         by_y, by_r = law.by_y[k, column], law.by_r[k, column]
@@ -245,11 +236,11 @@ def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) ->
 
 
 def _add_bandwidth(task: Task, grid: Grid, law: _Affine, rows: _LinearLimits) -> None:
-    at = task.find_bandwidth(grid)
-    p, speed = grid.p[0, at], grid.speed[0, at]
-    one, through = np.array([law.law.rest[0, at] + p * law.law.c_y[at]]), np.array([p * law.law.c_r[at]])
-    by_loop = p * law.by_y[:, [at]] + speed * law.by_speed[:, [at]]
-    slope = _differentiate_size(through, p * law.by_r[:, [at]]) / np.abs(through)
+    at = np.array([task.find_bandwidth(grid)])
+    path = grid.plants.at((0, at))
+    one, by_loop = _change_path(path, law, at)
+    through = path.y * law.law.c_r[at]
+    slope = _differentiate_size(through, path.y * law.by_r[:, at]) / np.abs(through)
     slope = slope - _differentiate_size(one, by_loop) / np.abs(one)
     miss = task.miss(grid, law.law)
     rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
@@ -259,24 +250,24 @@ def _expand_objective(task: Task, grid: Grid, law: _Affine) -> tuple[Float[np.nd
     """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
     at, count = law.law, len(law.by_y)
     if task.spec.objective == "noise":
-        used = np.abs(at.c_y / (at.rest[0] + grid.p[0] * at.c_y))[None]
-        index = choose_prominent(used / max(np.max(used), NEXT_TO_NO_NOISE), ROWS_PER_LIMIT)
-        one, used = at.rest[0, index] + grid.p[0, index] * at.c_y[index], used[0, index]
-        by_y = law.by_y[:, index]
-        by_loop = grid.p[0, index] * by_y + grid.speed[0, index] * law.by_speed[:, index]
-        slope = _differentiate_size(at.c_y[index], by_y) - used[:, None] * _differentiate_size(one, by_loop)
+        noise = np.abs(at.c_y / grid.plants.at(0).add_up(at.c_y, at.c_v))
+        index = choose_prominent(noise[None] / max(np.max(noise), NEXT_TO_NO_NOISE), ROWS_PER_LIMIT)
+        (one, by_loop), used = _change_path(grid.plants.at((0, index)), law, index), noise[index]
+        by_size = _differentiate_size(at.c_y[index], law.by_y[:, index])
+        slope = by_size - used[:, None] * _differentiate_size(one, by_loop)
         size = max(np.max(used), NEXT_TO_NO_NOISE)
         return np.zeros((count, count)), used / size, slope / np.abs(one)[:, None] / size
     w = task.weights(grid.f)
     inside = w > 0.0
-    one = at.rest[:, inside] + grid.p[:, inside] * at.c_y[inside]
+    plants = grid.plants.at((slice(None), inside))
+    one = plants.add_up(at.c_y[inside], at.c_v[inside])
     rho = np.abs(one)
     values = (1.0 / rho) @ w[inside]
     size, worst = np.max(values), int(np.argmax(values))
     unit = np.conj(one) / rho
-    along = np.real((unit * grid.p[:, inside])[:, None] * law.by_y[None, :, inside])
+    along = np.real((unit * plants.y)[:, None] * law.by_y[None, :, inside])
     if task.speed_loop is not None:
-        along += np.real((unit * grid.speed[:, inside])[:, None] * law.by_speed[None, :, inside])
+        along += np.real((unit * plants.v)[:, None] * law.by_v[None, :, inside])
     slopes = -np.einsum("nkm,nm,m->nk", along, rho**-2, w[inside])
     curvature = 2.0 * np.einsum("km,lm,m,m->kl", along[worst], along[worst], rho[worst] ** -3, w[inside])
     return curvature / size, values / size, slopes / size

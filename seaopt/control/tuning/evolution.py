@@ -115,9 +115,9 @@ class Evolution:
         if high[K_I] > 0.0:
             least = 1.01 * least_integral_rate(rest) if task.integrates(rest) else 1e-3 * INTEGRAL_RAD_S
             low[K_I], high[K_I] = least, HIGHEST_RATE * w_b
-        low[K_D], high[K_D] = np.array(GAINS) / max(float(np.abs(grid.p[0, at])), 1e-9) / w_b
+        low[K_D], high[K_D] = np.array(GAINS) / max(float(np.abs(grid.plants.y[0, at])), 1e-9) / w_b
         if high[K_V] > 0.0:
-            low[K_V], high[K_V] = np.array(GAINS) / max(float(np.abs(grid.speed[0, at])), 1e-12)
+            low[K_V], high[K_V] = np.array(GAINS) / max(task.speed_gain(grid), 1e-12)
         low[T_F] = max(low[T_F], 1e-2 * task.spec.sample_time_s)
         low[[W_R, W_C]], high[[W_R, W_C]] = 0.0, np.minimum(high[[W_R, W_C]], 1.0)
         if task.spec.reference_weights == "measurement":
@@ -153,8 +153,8 @@ class Evolution:
         wide = x.T[:, :, None]
         terms = task.terms(at, wide)
         series, integral, rate, more, ahead, prefilter = (np.ravel(np.broadcast_to(t, (len(x), 1))) for t in terms)
-        _, rest = task.feed_speed(at, wide)
-        through, back = at.p[0, 0] * series, np.broadcast_to(rest[0].ravel(), (len(x),))
+        plant = at.plants.at((0, 0))
+        through, back = plant.y * series, plant.add_rest(x[:, K_V] * series * task.sense(at.q))
         kappa = 1.0 + rho * integral
         slope = task.k_ff * (ahead / series - sigma) + rho * integral + (x[:, K_D] - x[:, W_C]) * rate
         one = back + through * (rho * integral + x[:, K_D] * rate + more)

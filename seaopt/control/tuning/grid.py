@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,9 +35,13 @@ class Path:
     y: ComplexArray
     v: ComplexArray
 
+    def add_rest(self, c_v: ComplexArray) -> ComplexArray:
+        """Return the sum without the regulated signal."""
+        return self.fixed + self.v * c_v
+
     def add_up(self, c_y: ComplexArray, c_v: ComplexArray) -> ComplexArray:
         """Return the sum of a law."""
-        return self.fixed + self.y * c_y + self.v * c_v
+        return self.add_rest(c_v) + self.y * c_y
 
     def change(self, by_y: ComplexArray, by_v: ComplexArray) -> ComplexArray:
         """Return the change of the sum with those of C_y and C_v."""
@@ -49,87 +54,49 @@ class Path:
 
 @record(eq=False)
 class Grid:
-    """Responses at frequencies.
-
-    Parameters
-    ----------
-    f, q
-        Frequencies in Hz, and exp(-j omega T_s).
-    p : array, shape (plants, m)
-        Plants with hold and delay; the first is the design plant.
-    discs : array, shape (plants, m)
-        Radii of the discs around them of those that are measured; zeros of models.
-    fixed, speed : arrays, shape (plants, m)
-        B of the module's docstring without a speed loop, and the speed per command as the law has it; ones and zeros
-        where the law reads nothing further.
-    rows : tuple of int
-        Which of the task's plants they are.
-    kept, inverse
-        The nominal plant's parts at q; zeros without an observer.
-    port, force : Path
-        The loop with link 2 held and the force on it, of a `PassivityCondition`, in the passive band; 1 elsewhere.
-    unit
-        G_22/abs(G_22) there; zero elsewhere.
-    friction, friction_size : Path, shapes (frictions, m) and (frictions, signals, m)
-        1 + plants C and weights C of a `FeedbackLimit` for each plant with friction of which a margin is aimed at.
-    levels : mapping of limit to array, shape (m,)
-        Of every limit that is looked at.
-
-    """
+    """The plants' responses, the parts of a law and the limits' levels at m frequencies."""
 
     f: Frequencies
-    q: Response
-    p: Responses
-    discs: Float[np.ndarray, "n m"]
-    fixed: Responses
-    speed: Responses
-    rows: tuple[int, ...]
-    kept: Response
+    q: Response  # exp(-j omega T_s)
+    # shape (plants, m): the command per effort asked, 1 + L, with P as y; the first is the design plant
+    plants: Path
+    discs: Float[np.ndarray, "n m"]  # radii around the plants that are measured; zeros of models
+    rows: tuple[int, ...]  # which of the task's plants they are
+    kept: Response  # kept, inverse: the nominal plant's parts; zeros without an observer
     inverse: Response
+    # the loop with link 2 held and the force on it, of a `PassivityCondition`, in the passive band; 1 elsewhere
     port: Path
     force: Path
-    unit: Response
+    unit: Response  # G_22/abs(G_22) there; zero elsewhere
+    # shapes (frictions, m) and (frictions, signals, m): 1 + plants C and weights C of a `FeedbackLimit` for each plant
+    # with friction of which a margin is aimed at
     friction: Path
     friction_size: Path
-    levels: Mapping[str, Curve]
+    levels: Mapping[str, Curve]  # of every limit that is looked at
 
     @property
     def reads_more(self) -> bool:
         """Whether the loop has a path besides that of the regulated signal."""
-        return bool(np.any(self.speed) or np.any(self.fixed != 1.0))
+        return bool(np.any(self.plants.v) or np.any(self.plants.fixed != 1.0))
 
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
-        return Grid(
-            f=self.f[index],
-            q=self.q[index],
-            p=self.p[:, index],
-            discs=self.discs[:, index],
-            fixed=self.fixed[:, index],
-            speed=self.speed[:, index],
-            rows=self.rows,
-            kept=self.kept[index],
-            inverse=self.inverse[index],
-            port=self.port.at(index),
-            force=self.force.at(index),
-            unit=self.unit[index],
-            friction=self.friction.at((..., index)),
-            friction_size=self.friction_size.at((..., index)),
+        paths = ("plants", "port", "force", "friction", "friction_size")
+        return replace(
+            self,
+            **{name: getattr(self, name)[..., index] for name in ("f", "q", "discs", "kept", "inverse", "unit")},
+            **{name: getattr(self, name).at((..., index)) for name in paths},
             levels={name: level[index] for name, level in self.levels.items()},
         )
 
 
 @record(eq=False)
 class LawResponse:
-    """Laws at a grid's frequencies: C_y and C_r of one or of n, C_v of a speed loop, and B on the grid's plants.
-
-    Of n laws C_v and B have a row each, or are the same of all.
-    """
+    """Laws at a grid's frequencies: C_y and C_r of one or of n, and C_v of a speed loop, of each or the same of all."""
 
     c_y: Complex[np.ndarray, "*n m"]
     c_r: Complex[np.ndarray, "*n m"]
     c_v: Complex[np.ndarray, "*v m"]
-    rest: Complex[np.ndarray, "k *v m"]
 
 
 def use_disc(

@@ -249,8 +249,8 @@ def _build_program(
         c_r = ((both - x[W_R] + rate * (x[K_D] - x[W_C])) * series + _Complex.of(ahead) * data["kff"]) * low_pass
         loop, c_v = at["p"] * c_y, _Complex.of(0.0)
         if paths:
-            through = _Complex.of(series) * x[K_V]
-            loop, c_v = loop + (at["fixed"] - 1.0) + through * at["speed"], through * at["sense"]
+            c_v = _Complex.of(series) * x[K_V] * at["sense"]
+            loop = loop + (at["fixed"] - 1.0) + c_v * at["speed"]
         return _Points(p=at["p"], c_y=c_y, c_r=c_r, c_v=c_v, loop=loop)
 
     names = [f"{name}_{part}" for name in complex_data for part in ("re", "im")]
@@ -343,49 +343,40 @@ def _solve(
     """Solve the program on the chosen points, numbers within a factor; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
     m, kinds, passive, friction = grid.f.size, tuple(grid.levels), task.port is not None, grid.friction.y.size > 0
-    flat = np.concatenate([chosen[kind] for kind in kinds])
-    radii = grid.discs.ravel()[flat]
-    columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
-    fixed, speed = grid.fixed.ravel()[flat], grid.speed.ravel()[flat]
+    row, column = np.divmod(np.concatenate([chosen[kind] for kind in kinds]), m)
+    columns, bottoms, tops = [column], [grid.plants.at((row, column))], list[Path]()
+    radii, unit = grid.discs[row, column], np.zeros(0, dtype=complex)
     levels = [grid.levels[kind][chosen[kind] % m] for kind in kinds]
-    bottoms: list[Path] = []  # of the limits whose plant is none of the task's
-    tops: list[Path] = []
     if passive:
         at_port = chosen[PASSIVE]
         levels.append(np.full(at_port.size, 1.0 - spec.reserve))
-        columns, unit = np.concatenate([columns, at_port]), grid.unit[at_port]
-        unit = np.where(unit == 0.0, 1.0, unit)  # outside the band nothing is asked
+        columns.append(at_port)
+        unit = np.where(grid.unit == 0.0, 1.0, grid.unit)[at_port]  # outside the band nothing is required
         bottoms.append(grid.port.at(at_port))
         tops.append(grid.force.at(at_port))
     if friction:
         row, column = np.divmod(chosen[FRICTION], m)
         levels.append(np.ones(column.size))
-        columns = np.concatenate([columns, column])
+        columns.append(column)
         bottoms.append(grid.friction.at((row, column)))
         tops += [grid.friction_size.at((row, k, column)) for k in range(grid.friction_size.y.shape[1])]
-    sense = np.zeros_like(grid.q) if task.speed_loop is None else task.speed_loop.sense(grid.q, spec.sample_time_s)
-    if bottoms:
-        own = sense[columns[p.size :]]
-        p = np.concatenate([p, *(path.y for path in bottoms)])
-        fixed = np.concatenate([fixed, *(path.fixed for path in bottoms)])
-        speed = np.concatenate([speed, own * np.concatenate([path.v for path in bottoms])])
-    radii = np.concatenate([radii, np.zeros(columns.size - radii.size)]) if np.any(grid.discs) else np.zeros(0)
+    size = sum(part.size for part in columns)
+    radii = np.concatenate([radii, np.zeros(size - radii.size)]) if np.any(grid.discs) else np.zeros(0)
     weights, law = np.zeros(0), task.respond(grid, start)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
         padded = np.resize(inside, QUADRATURE_CHUNK * (1 + (inside.size - 1) // QUADRATURE_CHUNK))
         weights = np.where(np.arange(padded.size) < inside.size, task.weights(grid.f)[padded], 0.0)
         worst = np.resize(np.argsort(-_integrate_sensitivity(task, grid, law))[:WORST_PLANTS], WORST_PLANTS)
-        columns = np.concatenate([columns, np.tile(padded, WORST_PLANTS)])
-        p, fixed, speed = (
-            np.concatenate([part, whole[worst][:, padded].ravel()])
-            for part, whole in ((p, grid.p), (fixed, grid.fixed), (speed, grid.speed))
-        )
+        columns += [padded] * WORST_PLANTS
+        bottoms += [grid.plants.at((plant, padded)) for plant in worst]
+    column = np.concatenate(columns)
+    p, fixed, speed = (np.concatenate([getattr(path, part) for path in bottoms]) for part in ("y", "fixed", "v"))
     at = task.find_bandwidth(grid)
     low, high = task.bounds(start)
     sizes = np.abs(start)
     sizes[[W_R, W_C]] = task.k_ff + start[K_P], start[K_D]
-    least_v = LEAST_SPEED_GAIN / (float(np.abs(grid.speed[0, at])) or 1.0)
+    least_v = LEAST_SPEED_GAIN / (task.speed_gain(grid) or 1.0)
     scale = np.maximum(
         sizes, [0.1, 0.1, 1e-4, 0.1, 1e-4, least_v, 0.1 * spec.sample_time_s, 1e-4, 1.0, 1e-3, 1e-2, 1e-2, 1e-3, 1e-2]
     )
@@ -396,16 +387,14 @@ def _solve(
         np.minimum(high, factor * np.maximum(start, 0.3 * scale)),
     )
     near[[W_R, W_C]], far[[W_R, W_C]] = low[[W_R, W_C]], high[[W_R, W_C]]
-    every = [p, grid.q[columns], grid.kept[columns], grid.inverse[columns]]
-    one = [z[at] for z in (grid.p[0], grid.q, grid.kept, grid.inverse)]
-    paths = grid.reads_more
+    design, paths = grid.plants.at(0), grid.reads_more
+    every = [(p, design.y)] + [(part[column], part) for part in (grid.q, grid.kept, grid.inverse)]
     if paths:
-        every += [fixed, speed, sense[columns]]
-        one += [grid.fixed[0, at], grid.speed[0, at], sense[at]]
-    parts = [part for z in every for part in (np.real(z), np.imag(z))]
+        sense = task.sense(grid.q)
+        every += [(fixed, design.fixed), (speed, design.v), (sense[column], sense)]
     data = [
-        *parts, weights, np.log(np.concatenate(levels)),
-        np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
+        *(part for z, _ in every for part in (np.real(z), np.imag(z))), weights, np.log(np.concatenate(levels)),
+        [part for _, z in every for part in (z[at].real, z[at].imag)], [spec.sample_time_s], [task.k_ff], scale,
         (linear * scale[gains] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit), radii,
         *_stack(tops),
     ]  # fmt: skip
@@ -450,4 +439,4 @@ def _stack(paths: Sequence[Path]) -> list[Values]:
 
 def _integrate_sensitivity(task: Task, grid: Grid, law: LawResponse) -> Values:
     """Return the integral of abs(S) of every plant."""
-    return (1.0 / np.abs(law.rest + grid.p * law.c_y)) @ task.weights(grid.f)
+    return (1.0 / np.abs(grid.plants.add_up(law.c_y, law.c_v))) @ task.weights(grid.f)

@@ -355,7 +355,7 @@ class Task:
             kept = np.polynomial.polynomial.polyval(q, self.nominal.kept)
             inverse = self.nominal.inverse_response(f, self.spec.sample_time_s)
         rows = tuple(range(len(self.plants)) if rows is None else rows)
-        p, fixed, speed = (np.array(part) for part in zip(*(self._respond(row, f, q) for row in rows), strict=True))
+        paths = [self._respond(row, f) for row in rows]
         discs = np.array([measured_discs(self.plants[row], f) for row in rows])
         unit = np.zeros(f.size, dtype=complex)
         count = 1 + len(self.further)
@@ -373,10 +373,8 @@ class Task:
         return Grid(
             f=f,
             q=q,
-            p=p,
+            plants=Path(**{part: np.array([getattr(path, part) for path in paths]) for part in ("fixed", "y", "v")}),
             discs=discs,
-            fixed=fixed,
-            speed=speed,
             rows=rows,
             kept=kept,
             inverse=inverse,
@@ -400,14 +398,12 @@ class Task:
                 fixed = fixed + signals[..., row, :] * path.response(f, self.spec.sample_time_s)
         return Path(fixed=fixed, y=y, v=v)
 
-    def _respond(self, row: int, f: Frequencies, q: Response) -> tuple[Response, Response, Response]:
-        """Return P, B without a speed loop, and the speed per command as the law has it, of one plant."""
+    def _respond(self, row: int, f: Frequencies) -> Path:
+        """Return 1 + L of one plant, the speed of a speed loop as it is read."""
         plant = self.plants[row]
         if not self.further or isinstance(plant, MeasuredPlant):  # whose link is held: what is read besides is zero
-            return plant.response(f), np.ones(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
-        path = self._feed(plant.responses(f), 1.0, f)
-        speed = path.v if self.speed_loop is None else path.v * self.speed_loop.sense(q, self.spec.sample_time_s)
-        return path.y, path.fixed, speed
+            return Path(fixed=np.ones(f.size, dtype=complex), y=plant.response(f), v=np.zeros(f.size, dtype=complex))
+        return self._feed(plant.responses(f), 1.0, f)
 
     def _limit_feedback(
         self, aimed: PlantWithFriction, f: Frequencies
@@ -431,29 +427,24 @@ class Task:
         prefilter = None if low_pass is None else (x[PREFILTER_W], x[DAMPING] if low_pass.is_second_order else None)
         return evaluate_terms(grid.q, self.spec.sample_time_s, x[T_F], observer, notch, x[SPEED_RATE], prefilter)
 
-    def law(self, grid: Grid, x: LawsNumbers) -> tuple[Complex[np.ndarray, "*w m"], Complex[np.ndarray, "*w m"]]:
-        """Return C_r and C_y on a grid."""
-        series, integral, rate, observer, ahead, prefilter = self.terms(grid, x)
-        both = x[K_P] + x[K_I] * integral
-        c_r = prefilter * (ahead * self.k_ff + series * (both - x[W_R] + (x[K_D] - x[W_C]) * rate))
-        return c_r, series * (both + x[K_D] * rate + observer)
-
     def respond(self, grid: Grid, x: LawsNumbers) -> LawResponse:
-        """Return the law on a grid, with what its further signals do on every plant of it."""
-        c_r, c_y = self.law(grid, x)
-        c_v, rest = self.feed_speed(grid, x)
-        return LawResponse(c_y=c_y, c_r=c_r, c_v=c_v, rest=rest)
+        """Return the law on a grid."""
+        series, integral, rate, observer, ahead, prefilter = self.terms(grid, x)
+        both, sense = x[K_P] + x[K_I] * integral, self.sense(grid.q)
+        return LawResponse(
+            c_y=series * (both + x[K_D] * rate + observer),
+            c_r=prefilter * (ahead * self.k_ff + series * (both - x[W_R] + (x[K_D] - x[W_C]) * rate)),
+            c_v=sense if self.speed_loop is None else x[K_V] * series * sense,
+        )
 
-    def feed_speed(
-        self, grid: Grid, x: LawsNumbers
-    ) -> tuple[Complex[np.ndarray, "*w m"], Complex[np.ndarray, "k *w m"]]:
-        """Return C_v, from what a speed loop reads to effort, and B on every plant of a grid."""
-        if self.speed_loop is None:
-            return np.zeros_like(grid.q), grid.fixed
-        through = x[K_V] * self.terms(grid, x).series
-        plants = (slice(None), *(None,) * (np.ndim(through) - 1))  # of many laws, a row each on every plant
-        rest = grid.fixed[plants] + through * grid.speed[plants]
-        return through * self.speed_loop.sense(grid.q, self.spec.sample_time_s), rest
+    def sense(self, q: Response) -> Response:
+        """Return from the speed's signal to the speed as the law has it; zeros without a speed loop."""
+        return np.zeros_like(q) if self.speed_loop is None else self.speed_loop.sense(q, self.spec.sample_time_s)
+
+    def speed_gain(self, grid: Grid) -> float:
+        """Return the design plant's speed per command as the law has it, at the bandwidth; 0 without a speed loop."""
+        at = self.find_bandwidth(grid)
+        return float(np.abs(grid.plants.v[0, at] * self.sense(grid.q)[at]))
 
     def usage(self, grid: Grid, law: LawResponse) -> dict[str, Usage]:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
@@ -468,7 +459,8 @@ class Task:
 
     def curves(self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse) -> dict[str, np.ndarray]:
         """Return the usage of the imposed ones of some limits on a grid's plants, in discs around them the worst."""
-        p, rest, discs = grid.p[plants], law.rest[plants], grid.discs[plants]
+        path, discs = grid.plants.at(plants), grid.discs[plants]
+        p, rest = path.y, path.add_rest(law.c_v)
         open_loop = rest - 1.0 + p * law.c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
@@ -579,8 +571,8 @@ class Task:
     def miss(self, grid: Grid, law: LawResponse) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
         at = self.find_bandwidth(grid)
-        p, c_y, c_r = grid.p[0, at], law.c_y[at], law.c_r[at]
-        return float(np.log(np.abs(np.sqrt(2.0) * p * c_r / (law.rest[0, at] + p * c_y))))
+        path = grid.plants.at((0, at))
+        return float(np.log(np.abs(np.sqrt(2.0) * path.y * law.c_r[at] / path.add_up(law.c_y[at], law.c_v[at]))))
 
     def rank(self, grid: Grid, x: LawNumbers) -> tuple[float, float]:
         """Return what to sort laws by: the worst usage if a limit is broken, then the objective.
@@ -601,7 +593,7 @@ class Task:
 
     def objective(self, grid: Grid, law: LawResponse) -> float:
         """Return the objective on a grid."""
-        distance = np.abs(law.rest + grid.p * law.c_y)
+        distance = np.abs(grid.plants.add_up(law.c_y, law.c_v))
         if self.spec.objective == "noise":
             return max(float(np.max(np.abs(law.c_y) / distance[: self.design_states])), NEXT_TO_NO_NOISE)
         return float(np.max((1.0 / distance) @ self.weights(grid.f)))

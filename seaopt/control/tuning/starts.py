@@ -138,10 +138,8 @@ def thin_grid(task: Task, grid: Grid, plants: Sequence[int] = range(SCANNED_PLAN
     coarse = grid.at(index)
     return replace(
         coarse,
-        p=coarse.p[some],
+        plants=coarse.plants.at(some),
         discs=coarse.discs[some],
-        fixed=coarse.fixed[some],
-        speed=coarse.speed[some],
         rows=tuple(coarse.rows[k] for k in some),
     )
 
@@ -178,8 +176,7 @@ def _list_speed_loops(task: Task, grid: Grid) -> list[tuple[float, float]]:
     """Return (k_v, 1/T_v) to try: none, and of a cascade some of each."""
     if task.speed_loop is None:
         return [(0.0, 0.0)]
-    at = task.find_bandwidth(grid)
-    gains = np.array(SPEED_GAINS) / max(float(np.abs(grid.speed[0, at])), 1e-12)
+    gains = np.array(SPEED_GAINS) / max(task.speed_gain(grid), 1e-12)
     shares = SPEED_RATES if task.spec.speed_loop == "PI" else SPEED_RATES[:1]
     rates = [share * 2 * np.pi * task.spec.bandwidth_hz for share in shares]
     return [(0.0, 0.0), *itertools.product(map(float, gains), rates)]
@@ -214,22 +211,31 @@ class _Scan:
     shape: Shape
     terms: LawTerms
     c_v: Response
-    rest: Complex[np.ndarray, "k m"]
     at: int
 
     def respond(self, c_y: Responses, c_r: Responses) -> LawResponse:
         """Return laws of this shape."""
-        return LawResponse(c_y=c_y, c_r=c_r, c_v=self.c_v, rest=self.rest)
+        return LawResponse(c_y=c_y, c_r=c_r, c_v=self.c_v)
+
+    @property
+    def plant(self) -> complex:
+        """The design plant at the bandwidth."""
+        return complex(self.grid.plants.y[0, self.at])
 
     @property
     def through(self) -> complex:
         """The design plant times the series part, at the bandwidth."""
-        return complex(self.grid.p[0, self.at] * self.terms.series[self.at])
+        return self.plant * complex(self.terms.series[self.at])
+
+    @property
+    def rest(self) -> complex:
+        """B of the design plant at the bandwidth."""
+        return complex(self.grid.plants.at((0, self.at)).add_rest(self.c_v[self.at]))
 
     @property
     def inverse(self) -> float:
         """The inverse of the plant at the bandwidth, in which gains are counted."""
-        return 1.0 / max(abs(self.grid.p[0, self.at]), 1e-6)
+        return 1.0 / max(abs(self.plant), 1e-6)
 
     @property
     def derivatives(self) -> float:
@@ -260,10 +266,9 @@ class _Scan:
 def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Values, GainRows]:
     """Return merits (less is better) and gains of the laws of one shape."""
     x = np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape])
-    terms, (c_v, rest) = task.terms(grid, x), task.feed_speed(grid, x)
-    terms = LawTerms(*(np.broadcast_to(term, grid.f.shape) for term in terms))
-    at = task.find_bandwidth(grid)
-    scan = _Scan(task=task, grid=grid, shape=shape, terms=terms, c_v=c_v, rest=rest, at=at)
+    terms = LawTerms(*(np.broadcast_to(term, grid.f.shape) for term in task.terms(grid, x)))
+    c_v = x[K_V] * terms.series * task.sense(grid.q)
+    scan = _Scan(task=task, grid=grid, shape=shape, terms=terms, c_v=c_v, at=task.find_bandwidth(grid))
     parts = [_scan_fixed_weight(scan)]
     if task.spec.structure != "pd" and task.spec.reference_weights != "error":
         parts.append(_scan_free_weight(scan))
@@ -277,7 +282,7 @@ def _scan_fixed_weight(scan: _Scan) -> tuple[Values, GainRows]:
     grids = np.meshgrid(k_d, _list_integrals(scan), _list_weights(scan.task), indexing="ij")
     k_d, k_i, weight = (values.ravel() for values in grids)
     gains = np.column_stack([0.0 * k_d, k_i, k_d, 0.0 * k_d, weight * k_d])[(k_d > 0.0) | (weight == weight[0])]
-    back = complex(scan.rest[0, scan.at]) + scan.through * scan.measurement(gains)[:, scan.at]
+    back = scan.rest + scan.through * scan.measurement(gains)[:, scan.at]
     ahead = scan.through * complex(scan.terms.prefilter[scan.at])
     k_p = solve_bandwidth(scan.through, ahead, ahead * scan.reference(gains)[:, scan.at], back)
     gains = np.tile(gains, (2, 1))
@@ -301,7 +306,7 @@ def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
     gains, c_y, merit = gains[chosen], c_y[chosen], merit[chosen]
     gains[:, W_C] = np.resize(weights, chosen.size) * gains[:, K_D]
     whole = scan.reference(gains)[:, scan.at]
-    one = scan.rest[0, scan.at] + scan.grid.p[0, scan.at] * c_y[:, scan.at]
+    one = scan.rest + scan.plant * c_y[:, scan.at]
     size = np.abs(one) / (np.sqrt(2.0) * abs(scan.through * scan.terms.prefilter[scan.at]))
     with np.errstate(invalid="ignore"):
         gains[:, W_R] = np.real(whole) + np.resize([-1.0, 1.0], chosen.size) * np.sqrt(size**2 - np.imag(whole) ** 2)
@@ -369,13 +374,13 @@ def judge_loops(task: Task, grid: Grid, laws: LawResponse) -> tuple[Values, Valu
     weights, worst, value, turned = task.weights(grid.f), np.zeros(count), np.zeros(count), np.zeros(count)
     for margins in task.friction_usage(grid, laws).values():
         worst = np.max(margins, axis=(1, 2))
-    for row, p in enumerate(grid.p):
+    for row in range(len(grid.rows)):
         own = tuple(name for name in task.design_limits(grid.rows[row]) if name not in TRACKING)
         usage = task.curves(SCOPES["every plant"] + own, grid, row, laws)
         usage |= task.port_usage(grid, laws) if grid.rows[row] == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=-1))
-        distance = laws.rest[row] + p * laws.c_y
+        distance = grid.plants.at(row).add_up(laws.c_y, laws.c_v)
         turn = np.sum(np.angle(distance[:, 1:] * np.conj(distance[:, :-1])), axis=1)
         # A stable loop turns by half a circle more for every pole of the plant that grows.
         turned = np.minimum(turned, turn - np.pi * count_growing(task.plants[grid.rows[row]]))

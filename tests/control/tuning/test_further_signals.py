@@ -46,14 +46,10 @@ def test_the_curves_are_those_of_the_loop(structure: str) -> None:
     for row, plant in enumerate(task.plants):
         assert isinstance(plant, DigitalPlant)
         loop = Loop(plant=plant, law=law)
-        np.testing.assert_allclose(
-            response.rest[row] + grid.p[row] * response.c_y - 1.0, loop.open_loop(grid.f), rtol=1e-8
-        )
-        np.testing.assert_allclose(
-            grid.p[row] * response.c_r / (response.rest[row] + grid.p[row] * response.c_y),
-            loop.tracking(grid.f),
-            rtol=1e-8,
-        )
+        path = grid.plants.at(row)
+        distance = path.add_up(response.c_y, response.c_v)
+        np.testing.assert_allclose(distance - 1.0, loop.open_loop(grid.f), rtol=1e-8)
+        np.testing.assert_allclose(path.y * response.c_r / distance, loop.tracking(grid.f), rtol=1e-8)
     if structure != "given":
         np.testing.assert_allclose(response.c_v, law.feedback_responses(grid.f)[1], rtol=1e-8)
 
@@ -69,8 +65,9 @@ def test_the_law_is_affine_in_its_gains(structure: str) -> None:
     at, before, after = linearise_law(task, grid, x), task.respond(grid, x), task.respond(grid, moved)
     for name, by in (("c_y", at.by_y), ("c_r", at.by_r), ("c_v", at.by_v)):
         np.testing.assert_allclose(getattr(after, name) - getattr(before, name), change @ by, rtol=1e-7, atol=1e-11)
-    moved_by = (change @ at.by_speed) * grid.speed
-    np.testing.assert_allclose(after.rest - before.rest, moved_by, rtol=1e-7, atol=1e-11)
+    distances = [grid.plants.add_up(law.c_y, law.c_v) for law in (before, after)]
+    moved_by = grid.plants.change(change @ at.by_y, change @ at.by_v)
+    np.testing.assert_allclose(distances[1] - distances[0], moved_by, rtol=1e-7, atol=1e-11)
 
 
 def test_some_of_the_frequencies_are_of_the_same_plants() -> None:
