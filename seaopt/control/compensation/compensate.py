@@ -137,11 +137,11 @@ def _find_margin(
     if loop is None:
         return refuse("the plant has no friction to compensate")
     try:
-        found = find_motor_friction(plant, params)
-        per_rate = find_reading(plant, params, term.reads, found)
+        friction = find_motor_friction(plant, params)
+        per_rate = find_reading(plant, params, term.reads, friction)
     except ControlError as error:
         return refuse(str(error))
     # What the law takes for the velocity, of this plant's own.
-    velocity = loop.velocity[found.index] * term.velocity_per_rate / per_rate
+    velocity = loop.velocity[friction.index] * term.velocity_per_rate / per_rate
     reading = SpeedReading(velocity=velocity, differenced=True)
     return compensation_margin(loop, reading, term.slope, first, enough)

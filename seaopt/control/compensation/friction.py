@@ -100,24 +100,27 @@ def make_friction_term(
     Raises ControlError: no friction is where the motor acts, no output is the motor's position, the reference asks for
     no velocity at rest, or stability is shown for no smoothing at all.
     """
-    found = find_motor_friction(plant, params)
-    effort = spec.fraction * found.level
+    friction = find_motor_friction(plant, params)
+    effort = spec.fraction * friction.level
     reads = ""
     if spec.source == "reference":
-        velocity, speed = find_velocity_per_rate(plant, params, regulated, found.name), spec.speed or found.smoothing
+        velocity, speed = (
+            find_velocity_per_rate(plant, params, regulated, friction.name),
+            spec.speed or friction.smoothing,
+        )
     else:
         reads = find_motor_position(plant, "friction", 'take from = "reference", or ')
-        velocity = find_reading(plant, params, reads, found)
-        speed = spec.speed or _choose_speed(found, effort, loop)
+        velocity = find_reading(plant, params, reads, friction)
+        speed = spec.speed or _choose_speed(friction, effort, loop)
     if speed is None:
         raise ControlError(
-            f"compensate.friction: the friction {found.name} of {plant.name} states no smoothing; give the speed at "
+            f"compensate.friction: the friction {friction.name} of {plant.name} states no smoothing; give the speed at "
             "which the compensation has its full size: compensate = { friction = { speed = 0.001 } }"
         )
     return FrictionTerm(
         effort=effort,
         speed=speed,
-        speed_unit=found.unit,
+        speed_unit=friction.unit,
         fraction=spec.fraction,
         source=spec.source,
         reads=reads,
@@ -125,12 +128,12 @@ def make_friction_term(
     )
 
 
-def _choose_speed(found: MotorFriction, effort: float, loop: FrictionLoop | None) -> float:
+def _choose_speed(friction: MotorFriction, effort: float, loop: FrictionLoop | None) -> float:
     """Return the plant's own smoothing, or twice what stability is shown for where that is more."""
-    smoothing = found.smoothing or 0.0
+    smoothing = friction.smoothing or 0.0
     if loop is None:
         return smoothing
-    reading = SpeedReading(velocity=loop.velocity[found.index], differenced=True)
+    reading = SpeedReading(velocity=loop.velocity[friction.index], differenced=True)
     margin = compensation_margin(loop, reading, effort / smoothing if smoothing else 1.0)
     if not margin.slope:
         raise ControlError(
@@ -156,19 +159,19 @@ def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
     return position
 
 
-def find_reading(plant: Plant, params: ParameterSet, output: str, found: MotorFriction) -> float:
+def find_reading(plant: Plant, params: ParameterSet, output: str, friction: MotorFriction) -> float:
     """Return the velocity at a friction per rate of an output that moves with it.
 
     Raises ControlError: the output moves otherwise than the friction does.
     """
     values = plant.complete(params)
     x, u = find_rest(plant, values)
-    velocity = np.array(friction_matrices(plant)(x, u, values.vector)[2])[found.index]
+    velocity = np.array(friction_matrices(plant)(x, u, values.vector)[2])[friction.index]
     a, _, c, _ = state_space(friction_states(plant)[SLIDING], values)
     rate = c[list(plant.outputs).index(output)] @ a
     if not _is_parallel(velocity, rate):
         raise ControlError(
-            f"compensate.friction: {output} of {plant.name} does not move as its friction {found.name} does; take "
+            f"compensate.friction: {output} of {plant.name} does not move as its friction {friction.name} does; take "
             'from = "reference"'
         )
     return float(velocity @ rate / (rate @ rate))

@@ -80,5 +80,5 @@ def _rest_at(
     observe, rows = output_function(plant), [list(plant.outputs).index(name) for name in names]
     values = plant.complete(params)
     x, u = find_rests(plant, values, {coordinate: angles}, angles.size)
-    found = [np.array(observe(0.0, *at, values.vector)).ravel()[rows] for at in zip(x.T, u.T, strict=True)]
-    return np.array(found).T
+    outputs = [np.array(observe(0.0, *at, values.vector)).ravel()[rows] for at in zip(x.T, u.T, strict=True)]
+    return np.array(outputs).T

@@ -324,15 +324,15 @@ def _sum_coloured(influence: Rows, left: Float[np.ndarray, " n"]) -> Float[np.nd
 
 def _select(fit: _Solution, first: int, cycles: Sequence[int], source: str) -> list[int]:
     """Return the harmonics that differ from chance, by Wald's test at 1 % over all of them."""
-    found: list[int] = []
+    chosen: list[int] = []
     for i, n in enumerate(cycles):
         pair = slice(first + 2 * i, first + 2 * i + 2)
         wald = fit.values[pair] @ np.linalg.solve(fit.covariance[pair, pair], fit.values[pair])
         if math.exp(-0.5 * wald) < CHANCE / len(cycles):
-            found.append(n)
-    if not found:
+            chosen.append(n)
+    if not chosen:
         raise ControlError(
             f"{source}: no harmonic up to {max(cycles)} cycles per revolution differs from chance; log longer, look "
             "further with highest, or leave ripple alone"
         )
-    return found
+    return chosen

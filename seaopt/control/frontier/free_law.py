@@ -47,6 +47,8 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError
 from seaopt.records import record
 
+Frequencies = Float[np.ndarray, " m"]
+Coefficients = Float[np.ndarray, " n"]
 FUNCTIONS = 40
 SLOW_POLES = 12  # exponentials, from the slowest to the bandwidth
 SLOWEST_HZ = 0.01
@@ -102,11 +104,11 @@ class FreeLaw:
 class _Terms:
     """What Q is a sum of, and the plant, at frequencies."""
 
-    f: Float[np.ndarray, " m"]
+    f: Frequencies
     p: Complex[np.ndarray, " m"]
     basis: Complex[np.ndarray, "m n"]
 
-    def s(self, x: Float[np.ndarray, " n"]) -> Complex[np.ndarray, " m"]:
+    def s(self, x: Coefficients) -> Complex[np.ndarray, " m"]:
         """Return S."""
         return 1.0 - self.p * (self.basis @ x)
 
@@ -169,7 +171,7 @@ def bound_free_law(
         raise ControlError(f"functions = {functions!r} is not a number of functions; give 1 or more")
     if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) > GROWING:
         return FreeLaw(status="unstable plant", objective=spec.objective)
-    stable = [law for law in laws if _is_stable(plant, law)]
+    stable = [law for law in laws if Loop(plant=plant, law=law).is_stable()]
     f = _place(spec)
     terms = _make_terms(plant, spec, stable, _add_rest(spec, f), functions)
     nodes, weights = _place_nodes(spec, f)
@@ -191,11 +193,7 @@ def bound_free_law(
     )
 
 
-def _is_stable(plant: DigitalPlant, law: Law) -> bool:
-    return Loop(plant=plant, law=law).is_stable()
-
-
-def _place(spec: ControllerSpec) -> Float[np.ndarray, " m"]:
+def _place(spec: ControllerSpec) -> Frequencies:
     """Return the frequencies of the program, with the ends of all bands."""
     nyquist = 0.5 * spec.sample_rate_hz
     ends = [OBJECTIVE_HZ, spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz or spec.bandwidth_hz]
@@ -203,14 +201,12 @@ def _place(spec: ControllerSpec) -> Float[np.ndarray, " m"]:
     return np.unique(np.concatenate([slow, base, np.linspace(spec.bandwidth_hz, nyquist, EVEN), ends]))
 
 
-def _add_rest(spec: ControllerSpec, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
+def _add_rest(spec: ControllerSpec, f: Frequencies) -> Coefficients:
     """Return frequencies with 0 Hz before them where the law integrates."""
     return f if spec.structure == "pd" else np.concatenate([[0.0], f])
 
 
-def _place_nodes(
-    spec: ControllerSpec, f: Float[np.ndarray, " m"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "i k"]]:
+def _place_nodes(spec: ControllerSpec, f: Frequencies) -> tuple[Coefficients, Float[np.ndarray, "i k"]]:
     """Return the nodes and weights of the integral over ln f from 0.1 Hz to the bandwidth, of each interval a row."""
     u = np.log(f[(f >= OBJECTIVE_HZ * (1 - 1e-9)) & (f <= spec.bandwidth_hz * (1 + 1e-9))])
     at, share = np.polynomial.legendre.leggauss(NODES)
@@ -219,7 +215,7 @@ def _place_nodes(
 
 
 def _make_terms(
-    plant: DigitalPlant, spec: ControllerSpec, laws: Sequence[Law], f: Float[np.ndarray, " m"], functions: int
+    plant: DigitalPlant, spec: ControllerSpec, laws: Sequence[Law], f: Frequencies, functions: int
 ) -> _Terms:
     """Return plant and functions at frequencies."""
     ts, z = plant.sample_time_s, np.exp(2j * np.pi * f * plant.sample_time_s)
@@ -260,13 +256,12 @@ class _Program:
         loop = -terms.p[:, None] * basis  # of S
         self.integrates = spec.structure != "pd"
         some = slice(1, None) if self.integrates else slice(None)
-        f, ones = terms.f[some], np.ones(m - self.integrates)
-        self.limits = [_Modulus(constant=ones + 0j, slope=loop[some], level=_s_level(spec, f))]
-        mt, disk, noise = (spec.level(name) for name in ("max_complementary", "min_disk_margin", "max_noise_gain"))
-        if mt is not None:
-            self.limits.append(_Modulus(constant=0j * ones, slope=-loop[some], level=mt * ones))
-        if disk is not None:
-            self.limits.append(_Modulus(constant=ones + 0j, slope=2.0 * loop[some], level=2.0 / disk * ones))
+        ones = np.ones(m - self.integrates) + 0j
+        self.limits = [
+            _Modulus(constant=(offset + factor) * ones, slope=factor * loop[some], level=level)
+            for offset, factor, level in _list_loop_limits(spec, terms.f[some])
+        ]
+        noise = spec.level("max_noise_gain")
         if noise is not None and not self.noise:
             self.limits.append(_Modulus(constant=np.zeros(m) + 0j, slope=basis, level=np.full(m, float(noise))))
         self.zero = loop[0].real if self.integrates else np.zeros(n)
@@ -281,7 +276,7 @@ class _Program:
         self.rows: list[Float[np.ndarray, "r v"]] = []
         self.ends: list[Float[np.ndarray, " r"]] = []
 
-    def solve(self) -> tuple[float, Float[np.ndarray, " n"]] | Literal["impossible", "no answer"]:
+    def solve(self) -> tuple[float, Coefficients] | Literal["impossible", "no answer"]:
         """Return the optimum and the coefficients; or why there are none."""
         for psi in 2 * np.pi * np.arange(FIRST_DIRECTIONS) / FIRST_DIRECTIONS:
             for limit in (*self.limits, self.aim):
@@ -320,7 +315,7 @@ class _Program:
                 return np.asarray(result.x)
         return "impossible" if result.status == INFEASIBLE else "no answer"
 
-    def _add_cuts(self, x: Float[np.ndarray, " n"], bound: Float[np.ndarray, " t"]) -> bool:
+    def _add_cuts(self, x: Coefficients, bound: Float[np.ndarray, " t"]) -> bool:
         """Add the directions in which the answer breaks a limit, or its own objective; tell whether there are any."""
         added = False
         for limit in self.limits:
@@ -355,27 +350,26 @@ class _Program:
         self.ends.append(ends)
 
 
-def _s_level(spec: ControllerSpec, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return what abs(S) may be."""
-    ms = spec.level("max_sensitivity") or np.inf
+def _list_loop_limits(spec: ControllerSpec, f: Frequencies) -> list[tuple[float, float, Frequencies]]:
+    """Return (offset, factor, level) of each limit on the loop: abs(offset + factor S) is at most the level."""
+    ms, mt, disk = (spec.level(name) for name in ("max_sensitivity", "max_complementary", "min_disk_margin"))
     slow = f <= spec.sensitivity_bandwidth_limit_hz * (1.0 + 1e-9)
-    return np.minimum(np.where(slow, HALF_POWER, ms), 1e3)
-
-
-def _look_again(
-    spec: ControllerSpec, terms: _Terms, integral: _Integral, x: Float[np.ndarray, " n"]
-) -> tuple[float, float]:
-    """Return the objective, and by which share a limit is missed at most on many frequencies."""
-    positive, every = terms.f > 0.0, terms.basis @ x
-    f, s, q = terms.f[positive], terms.s(x)[positive], every[positive]
-    usage = [np.abs(s) / _s_level(spec, f)]
-    for name, size in (("max_complementary", 1.0 - s), ("max_noise_gain", q)):
-        level = spec.level(name)
-        if level is not None and not (name == "max_noise_gain" and spec.objective == "noise"):
-            usage.append(np.abs(size) / level)
-    disk = spec.level("min_disk_margin")
+    limits = [(0.0, 1.0, np.minimum(np.where(slow, HALF_POWER, ms or np.inf), 1e3))]
+    if mt is not None:
+        limits.append((1.0, -1.0, np.full(f.size, float(mt))))
     if disk is not None:
-        usage.append(np.abs(2.0 * s - 1.0) * disk / 2.0)
-    noise = spec.objective == "noise"
-    value = np.max(np.abs(every)) if noise else np.sum(integral.weights.ravel() * np.abs(integral.terms.s(x)))
-    return float(value), max(0.0, max(float(np.max(curve)) for curve in usage) - 1.0)
+        limits.append((-1.0, 2.0, np.full(f.size, 2.0 / disk)))
+    return limits
+
+
+def _look_again(spec: ControllerSpec, terms: _Terms, integral: _Integral, x: Coefficients) -> tuple[float, float]:
+    """Return the objective, and by which share a limit is missed at most on many frequencies."""
+    positive, q = terms.f > 0.0, terms.basis @ x
+    s, noise = terms.s(x)[positive], spec.level("max_noise_gain")
+    limits = _list_loop_limits(spec, terms.f[positive])
+    usage = [float(np.max(np.abs(offset + factor * s) / level)) for offset, factor, level in limits]
+    value = np.max(np.abs(q))
+    if spec.objective != "noise":
+        usage += [] if noise is None else [float(np.max(np.abs(q[positive])) / noise)]
+        value = np.sum(integral.weights.ravel() * np.abs(integral.terms.s(x)))
+    return float(value), max(0.0, *(used - 1.0 for used in usage))

@@ -180,10 +180,8 @@ def sweep(
     controllers: list[Controller] = []
     for point, solved in zip(specs, _solve_chains(swept, specs, executor, progress), strict=True):
         task = feed_link(replace(swept.task, spec=point), solved.link)
-        controller = make_controller(task, solved.x, solved.loops, swept.design)
-        row = _row(task, solved.x, solved.loops, controller)
-        rows.append(replace(row, without_sticking=solved.without_sticking, free_law=solved.free_law))
-        controllers.append(controller)
+        controllers.append(make_controller(task, solved.x, solved.loops, swept.design))
+        rows.append(_make_row(task, solved, controllers[-1]))
     progress(f"{spec.structure}, {len(rows)} bandwidths", 1.0)
     return Frontier(rows=tuple(rows), controllers=tuple(controllers))
 
@@ -260,11 +258,11 @@ def _make_sliding_task(
 ) -> Task:
     """Return the task on the sliding plants alone; measured ones are what they are."""
     sliding: dict[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse] = {}
-    for name, given in robust_to.items():
-        if isinstance(given, MeasuredResponse):
-            sliding[name] = given
+    for name, other in robust_to.items():
+        if isinstance(other, MeasuredResponse):
+            sliding[name] = other
             continue
-        model, values = given if isinstance(given, tuple) else (given, params)
+        model, values = other if isinstance(other, tuple) else (other, params)
         sliding[name] = (take_sliding(model, model.complete(values)), values)
     design = plant if isinstance(plant, MeasuredResponse) else take_sliding(plant, plant.complete(params))
     return make_task(design, params, spec, sliding, draws)
@@ -283,19 +281,21 @@ def _worst_disturbance(task: Task, x: LawNumbers) -> float:
     return max(disturbance(task.loop(x, i), task.spec.bandwidth_hz) for i in range(len(task.plants)))
 
 
-def _row(task: Task, x: LawNumbers, loops: list[MeasuredLoop], controller: Controller) -> FrontierRow:
-    design, f_b = loops[0].figures, task.spec.bandwidth_hz
-    worst = max(loops, key=lambda loop: loop.figures.ms)
+def _make_row(task: Task, solved: _Solved, controller: Controller) -> FrontierRow:
+    design, f_b = solved.loops[0].figures, task.spec.bandwidth_hz
+    worst = max(solved.loops, key=lambda loop: loop.figures.ms)
     return FrontierRow(
         bandwidth_hz=f_b,
         met=controller.met,
         noise_gain=design.noise_gain,
         ms=worst.figures.ms,
         ms_plant=worst.name,
-        disturbance=_worst_disturbance(task, x),
+        disturbance=_worst_disturbance(task, solved.x),
         sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz,
         phase_margin_deg=design.phase_margin_deg,
         disk_margin=design.disk_margin,
         force_limit_N=controller.force_limit(f_b),
         blocked_by=controller.blocked_by,
+        without_sticking=solved.without_sticking,
+        free_law=solved.free_law,
     )

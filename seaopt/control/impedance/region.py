@@ -287,14 +287,14 @@ def _find_stiffest(port: SampledPort, theta: Angles, box: tuple[Grid, Grid]) -> 
     return about
 
 
-def _choose_range(name: str, given: Grid | None, found: Grid | None, scale: float) -> Grid:
+def _choose_range(name: str, stated: Grid | None, about: Grid | None, scale: float) -> Grid:
     """Return the ends of an axis of the map: as given, about the region, or by its scale."""
-    if given is not None:
-        low, high = (float(end) for end in given)
+    if stated is not None:
+        low, high = (float(end) for end in stated)
         if not (np.isfinite(low) and np.isfinite(high) and low < high and (name != "stiffness" or low >= 0.0)):
             raise ControlError(f"{name} = ({low:g}, {high:g}) is not a range; give low < high")
         return low, high
-    low, high = found if found is not None else (0.0, 0.2 * scale)
+    low, high = about if about is not None else (0.0, 0.2 * scale)
     room = ROOM * (high - low)
     return (0.0, high + room) if name == "stiffness" else (low - room, high + room)
 

@@ -170,7 +170,7 @@ def _score(controller: Controller, plant: Plant, parameters: ParameterSet) -> Sc
     figures = controller.close(plant, parameters).figures()
     parameters = controller.delay(parameters)
     port = port_of(take_sliding(plant, parameters), parameters, controller.signals, controller.command.per_effort)
-    found = passivity(controller, plant, parameters)
+    port_passivity = passivity(controller, plant, parameters)
     period = controller.sample_time_s
     top = min(figures.bandwidth_hz or 1.0 / period, 0.49 / period)
     f = np.union1d(np.geomspace(LOWEST_HZ, max(top, 2 * LOWEST_HZ), POINTS), [1.0])
@@ -185,8 +185,8 @@ def _score(controller: Controller, plant: Plant, parameters: ParameterSet) -> Sc
         impedance_1hz=float(size[np.searchsorted(f, 1.0)]),
         impedance_largest=float(np.max(size)),
         impedance_share=float(np.sqrt(np.mean(share**2))),
-        passive_to_hz=found.violated_hz,
-        needed_damping=max(-found.least_damping_N_s_per_m, 0.0) if found.held_stable else np.inf,
+        passive_to_hz=port_passivity.violated_hz,
+        needed_damping=max(-port_passivity.least_damping_N_s_per_m, 0.0) if port_passivity.held_stable else np.inf,
         noise_gain=figures.noise_gain,
         noise_rms=_find_noise_rms(controller, plant, parameters),
         unit=mechanics_of(port.place_unit).damping,

@@ -140,10 +140,10 @@ def _measure_merit(task: Task, grid: Grid, x: LawNumbers) -> float:
 def linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     """Return the law on a grid with its derivatives by the gains."""
     series, integral, rate, _, _, prefilter = task.terms(grid, x)
-    one, none, gains = np.ones_like(grid.q), np.zeros_like(grid.q), task.gains_tuned
-    by_y = series * np.array([one, integral, rate, none, none, none])[gains]
-    by_r = series * prefilter * np.array([one, integral, rate, -one, -rate, none])[gains]
-    by_v = series * np.array([none, none, none, none, none, task.sense(grid.q)])[gains]
+    ones, zeros, gains = np.ones_like(grid.q), np.zeros_like(grid.q), task.gains_tuned
+    by_y = series * np.array([ones, integral, rate, zeros, zeros, zeros])[gains]
+    by_r = series * prefilter * np.array([ones, integral, rate, -ones, -rate, zeros])[gains]
+    by_v = series * np.array([zeros, zeros, zeros, zeros, zeros, task.sense(grid.q)])[gains]
     return _Affine(law=task.respond(grid, x), by_y=by_y, by_r=by_r, by_v=by_v)
 
 
@@ -172,16 +172,18 @@ def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> _LinearLimits:
     if task.port is not None:
         index = choose_near(usage[PASSIVE])
         used, column = usage[PASSIVE].ravel()[index], index % grid.f.size
-        (one, by_one), (top, by_top) = (_change_path(path.at(column), law, column) for path in (grid.port, grid.force))
-        slope = np.real(grid.unit[column] * (by_top * np.conj(one) + top * np.conj(by_one))) / np.abs(top * one)
+        (loop, by_loop), (top, by_top) = (
+            _change_path(path.at(column), law, column) for path in (grid.port, grid.force)
+        )
+        slope = np.real(grid.unit[column] * (by_top * np.conj(loop) + top * np.conj(by_loop))) / np.abs(top * loop)
         rows.add(used, -slope.T / (1.0 - task.spec.reserve))
     if FRICTION in usage:
         index = choose_near(usage[FRICTION])
         used, (row, column) = usage[FRICTION].ravel()[index], np.divmod(index, grid.f.size)
-        one, by_one = _change_path(grid.friction.at((row, column)), law, column)
+        distance, by_distance = _change_path(grid.friction.at((row, column)), law, column)
         parts, by_parts = _change_path(grid.friction_size.at((row, slice(None), column)), law, column)
         relative = np.real(np.sum(np.conj(parts) * by_parts, axis=-1)) / np.sum(np.abs(parts) ** 2, axis=-1)
-        near = _differentiate_size(one, by_one) / np.abs(one)[:, None]
+        near = _differentiate_size(distance, by_distance) / np.abs(distance)[:, None]
         rows.add(used, used[:, None] * (relative.T - near))
     _add_bandwidth(task, grid, law, rows)
     return rows
@@ -201,12 +203,12 @@ def _differentiate_curve(grid: Grid, law: _Affine, name: str, index: Indices) ->
     """Return the derivatives of ln abs(1 + L) and of ln abs(X) of a limit by the gains, at points of plants."""
     at, curve, (row, column) = law.law, CURVES[name], np.divmod(index, grid.f.size)
     path = grid.plants.at((row, column))
-    one, by_loop = _change_path(path, law, column)
+    distance, by_loop = _change_path(path, law, column)
     by_y, by_r, by_v = (by[:, column] for by in (law.by_y, law.by_r, law.by_v))
-    near = _differentiate_size(one, by_loop) / np.abs(one)[:, None]
+    near = _differentiate_size(distance, by_loop) / np.abs(distance)[:, None]
     if curve.of == "1":
         return near, 0.0 * near
-    value = curve.numerator(path.y, at.c_y[column], at.c_r[column], one - 1.0, at.c_v[column])
+    value = curve.numerator(path.y, at.c_y[column], at.c_r[column], distance - 1.0, at.c_v[column])
     change = curve.change(path.y, by_y, by_r, by_loop, by_v)
     return near, _differentiate_size(value, change) / np.maximum(np.abs(value), 1e-300)[:, None]
 
@@ -238,10 +240,10 @@ def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) ->
 def _add_bandwidth(task: Task, grid: Grid, law: _Affine, rows: _LinearLimits) -> None:
     at = np.array([task.find_bandwidth(grid)])
     path = grid.plants.at((0, at))
-    one, by_loop = _change_path(path, law, at)
+    distance, by_loop = _change_path(path, law, at)
     through = path.y * law.law.c_r[at]
     slope = _differentiate_size(through, path.y * law.by_r[:, at]) / np.abs(through)
-    slope = slope - _differentiate_size(one, by_loop) / np.abs(one)
+    slope = slope - _differentiate_size(distance, by_loop) / np.abs(distance)
     miss = task.miss(grid, law.law)
     rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
 
@@ -252,19 +254,19 @@ def _expand_objective(task: Task, grid: Grid, law: _Affine) -> tuple[Float[np.nd
     if task.spec.objective == "noise":
         noise = np.abs(at.c_y / grid.plants.at(0).add_up(at.c_y, at.c_v))
         index = choose_prominent(noise[None] / max(np.max(noise), NEXT_TO_NO_NOISE), ROWS_PER_LIMIT)
-        (one, by_loop), used = _change_path(grid.plants.at((0, index)), law, index), noise[index]
+        (distance, by_loop), used = _change_path(grid.plants.at((0, index)), law, index), noise[index]
         by_size = _differentiate_size(at.c_y[index], law.by_y[:, index])
-        slope = by_size - used[:, None] * _differentiate_size(one, by_loop)
+        slope = by_size - used[:, None] * _differentiate_size(distance, by_loop)
         size = max(np.max(used), NEXT_TO_NO_NOISE)
-        return np.zeros((count, count)), used / size, slope / np.abs(one)[:, None] / size
+        return np.zeros((count, count)), used / size, slope / np.abs(distance)[:, None] / size
     w = task.weights(grid.f)
     inside = w > 0.0
     plants = grid.plants.at((slice(None), inside))
-    one = plants.add_up(at.c_y[inside], at.c_v[inside])
-    rho = np.abs(one)
+    distance = plants.add_up(at.c_y[inside], at.c_v[inside])
+    rho = np.abs(distance)
     values = (1.0 / rho) @ w[inside]
     size, worst = np.max(values), int(np.argmax(values))
-    unit = np.conj(one) / rho
+    unit = np.conj(distance) / rho
     along = np.real((unit * plants.y)[:, None] * law.by_y[None, :, inside])
     if task.speed_loop is not None:
         along += np.real((unit * plants.v)[:, None] * law.by_v[None, :, inside])

@@ -104,16 +104,16 @@ class Evolution:
     free: Int[np.ndarray, " d"]
 
     @classmethod
-    def of(cls, task: Task, grid: Grid, known: Sequence[LawNumbers] = ()) -> Evolution:
+    def of(cls, task: Task, grid: Grid, starts: Sequence[LawNumbers] = ()) -> Evolution:
         """Prepare the search on some frequencies of a grid, and on the plants that bear the first known law worst."""
-        grid = thin_grid(task, grid, _choose_plants(task, grid, known))
-        rest, at = make_rest_start(task), task.find_bandwidth(grid)
+        grid = thin_grid(task, grid, _choose_plants(task, grid, starts))
+        numbers, at = make_rest_start(task), task.find_bandwidth(grid)
         if task.speed_loop is not None and task.spec.speed_loop == "PI":
-            rest[SPEED_RATE] = SLOWEST_SPEED_RATE
-        low, high = task.bounds(rest)
+            numbers[SPEED_RATE] = SLOWEST_SPEED_RATE
+        low, high = task.bounds(numbers)
         w_b = 2 * np.pi * task.spec.bandwidth_hz
         if high[K_I] > 0.0:
-            least = 1.01 * least_integral_rate(rest) if task.integrates(rest) else 1e-3 * INTEGRAL_RAD_S
+            least = 1.01 * least_integral_rate(numbers) if task.integrates(numbers) else 1e-3 * INTEGRAL_RAD_S
             low[K_I], high[K_I] = least, HIGHEST_RATE * w_b
         low[K_D], high[K_D] = np.array(GAINS) / max(float(np.abs(grid.plants.y[0, at])), 1e-9) / w_b
         if high[K_V] > 0.0:
@@ -153,13 +153,13 @@ class Evolution:
         wide = x.T[:, :, None]
         terms = task.terms(at, wide)
         series, integral, rate, more, ahead, prefilter = (np.ravel(np.broadcast_to(t, (len(x), 1))) for t in terms)
-        plant = at.plants.at((0, 0))
+        plant = at.plants.at(0)
         through, back = plant.y * series, plant.add_rest(x[:, K_V] * series * task.sense(at.q))
         kappa = 1.0 + rho * integral
         slope = task.k_ff * (ahead / series - sigma) + rho * integral + (x[:, K_D] - x[:, W_C]) * rate
-        one = back + through * (rho * integral + x[:, K_D] * rate + more)
+        reached = back + through * (rho * integral + x[:, K_D] * rate + more)
         front = through * prefilter
-        k_p = solve_bandwidth(through * kappa, front * (kappa - sigma), front * slope, one)
+        k_p = solve_bandwidth(through * kappa, front * (kappa - sigma), front * slope, reached)
         x, rho, sigma = np.tile(x, (2, 1)), np.tile(rho, 2), np.tile(sigma, 2)
         x[:, K_P], x[:, K_I], x[:, W_R] = k_p, rho * (1.0 + k_p), sigma * (task.k_ff + k_p)
         return x
@@ -191,23 +191,28 @@ class Evolution:
             logarithms = np.log(np.maximum(x, safe) / safe) / np.log(high / safe)
         return np.clip(np.where(shares, (x - low) / (high - low), logarithms), 0.0, 1.0)
 
-    def spread(self, rng: np.random.Generator, known: Sequence[LawNumbers], count: int) -> Population:
+    def spread(self, rng: np.random.Generator, starts: Sequence[LawNumbers], count: int) -> Population:
         """Return a first population: a Latin hypercube, a share of it without the optional parts, and known laws."""
         d = self.free.size
         members = (rng.permuted(np.tile(np.arange(count), (d, 1)), axis=1).T + rng.random((count, d))) / count
         bare = slice(0, int(NEUTRAL_SHARE * count))
         for k, end in ((NOTCH_DEPTH, 1.0), (PREFILTER_W, 1.0), (DAMPING, 0.5), (K_V, 0.0)):
             members[bare, self.free == k] = end
-        for row, x in enumerate(known[:count]):
+        for row, x in enumerate(starts[:count]):
             members[count - 1 - row] = self.encode(x)
         return members
 
     def run(
-        self, known: Sequence[LawNumbers] = (), *, members: int = MEMBERS, generations: int = GENERATIONS, seed: int = 0
+        self,
+        starts: Sequence[LawNumbers] = (),
+        *,
+        members: int = MEMBERS,
+        generations: int = GENERATIONS,
+        seed: int = 0,
     ) -> tuple[Values, Float[np.ndarray, "n 14"]]:
         """Return the worst usages of the last population and its laws, the best first."""
         rng = np.random.default_rng((SEED, seed))
-        population = self.spread(rng, known, members)
+        population = self.spread(rng, starts, members)
         usage, laws = self.judge(population)
         best = max(2, int(BEST_SHARE * members))
         for _ in range(generations):
@@ -216,9 +221,9 @@ class Evolution:
                 break
             order = np.argsort(usage)
             towards = population[order[rng.integers(best, size=members)]]
-            one, other = (population[rng.integers(members, size=members)] for _ in range(2))
+            first, second = (population[rng.integers(members, size=members)] for _ in range(2))
             factor = rng.uniform(0.3, 0.9, size=(members, 1))
-            trial = population + factor * (towards - population) + factor * (one - other)
+            trial = population + factor * (towards - population) + factor * (first - second)
             crossed = rng.random(trial.shape) < rng.choice([0.5, 0.9], size=(members, 1))
             crossed[np.arange(members), rng.integers(trial.shape[1], size=members)] = True
             trial = np.where(crossed, trial, population)
@@ -230,32 +235,32 @@ class Evolution:
         order = np.argsort(usage, kind="stable")
         return usage[order], laws[order]
 
-    def find(self, known: Sequence[LawNumbers] = (), *, again: bool = True) -> list[LawNumbers]:
+    def find(self, starts: Sequence[LawNumbers] = (), *, again: bool = True) -> list[LawNumbers]:
         """Return the best stable law found; where limits are nearly kept, the two best.
 
         Where the first population keeps no limits another one may begin `again`, with its best, and with the best of
         one without the optional parts.
         """
-        usage, laws = self.run(known, generations=GENERATIONS if again else SHORT)
+        usage, laws = self.run(starts, generations=GENERATIONS if again else SHORT)
         if usage[0] > KEPT and again:
             handed, bare = list(laws[:HANDED_ON]), self.without_parts()
             if bare.free.size < self.free.size:
-                handed += [*bare.run(known, seed=1)[1][:HANDED_ON]]
-            usage, laws = self.run([*known, *handed], seed=2)
-        found: list[LawNumbers] = []
+                handed += [*bare.run(starts, seed=1)[1][:HANDED_ON]]
+            usage, laws = self.run([*starts, *handed], seed=2)
+        stable: list[LawNumbers] = []
         count = 1 if usage[0] > HOPELESS else 2
         for x in laws[usage < ENCIRCLES]:
             x = self.task.tidy(x)
-            if len(found) < count and not any(np.allclose(x, one, rtol=0.1, atol=1e-6) for one in found):
-                found += [x] if self.task.is_stable(x) else []
-        return found
+            if len(stable) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in stable):
+                stable += [x] if self.task.is_stable(x) else []
+        return stable
 
 
-def _choose_plants(task: Task, grid: Grid, known: Sequence[LawNumbers]) -> list[int]:
+def _choose_plants(task: Task, grid: Grid, starts: Sequence[LawNumbers]) -> list[int]:
     """Return some of the task's plants, the first of them those of the design."""
     others = list(range(task.design_states, len(grid.rows)))
-    if known:
-        law = task.respond(grid, known[0])
+    if starts:
+        law = task.respond(grid, starts[0])
         usage = [task.curves(SCOPES["every plant"], grid, k, law) for k in others]
         worst = [max((float(np.max(curve)) for curve in of.values()), default=0.0) for of in usage]
         others = [k for _, k in sorted(zip(worst, others, strict=True), key=lambda pair: -pair[0])]

@@ -90,9 +90,9 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
     while high / low > 1.01:
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if sensitivity_possible(middle, ms, spec.sample_time_s, late) else (low, middle)
-    asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with a delay of {late - 1} whole samples"
+    request = f"bandwidth_hz = {spec.bandwidth_hz:g} with a delay of {late - 1} whole samples"
     raise ControlError(
-        f"{asked} at {spec.sample_rate_hz:g} Hz: no controller keeps |S| below -3 dB up to {wanted:.4g} Hz with "
+        f"{request} at {spec.sample_rate_hz:g} Hz: no controller keeps |S| below -3 dB up to {wanted:.4g} Hz with "
         f"max_sensitivity = {ms:g}; the delay allows at most {low:.3g} Hz, so lower bandwidth_hz or "
         "min_sensitivity_bandwidth_hz, or the delay"
     )
@@ -132,9 +132,9 @@ def check_current(spec: ControllerSpec, k_ff: float, command: Command, friction:
             f"a {command.word} of up to {command.show(limit)} makes {limit / per_effort:.4g} {unit}, no more than the "
             f"friction {levels}: nothing moves; {_advise(spec, limit)}"
         )
-    held = limit / (per_effort * abs(k_ff))
-    if spec.step_N is not None and spec.step_N > held:
+    largest = limit / (per_effort * abs(k_ff))
+    if spec.step_N is not None and spec.step_N > largest:
         raise ControlError(
-            f"step_N = {spec.step_N:g} takes {command.show(limit * spec.step_N / held)} at rest, more than the limit "
-            f"of {command.show(limit)}: no controller makes it; ask for {held:.4g} {unit} at most"
+            f"step_N = {spec.step_N:g} takes {command.show(limit * spec.step_N / largest)} at rest, more than the "
+            f"limit of {command.show(limit)}: no controller makes it; ask for {largest:.4g} {unit} at most"
         )

@@ -35,11 +35,11 @@ class Path:
     y: ComplexArray
     v: ComplexArray
 
-    def add_rest(self, c_v: Any) -> Any:  # of arrays or, at one point, numbers
+    def add_rest(self, c_v: ComplexArray) -> ComplexArray:
         """Return the sum without the regulated signal."""
         return self.fixed + self.v * c_v
 
-    def add_up(self, c_y: Any, c_v: Any) -> Any:
+    def add_up(self, c_y: ComplexArray, c_v: ComplexArray) -> ComplexArray:
         """Return the sum of a law."""
         return self.add_rest(c_v) + self.y * c_y
 

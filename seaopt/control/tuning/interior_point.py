@@ -154,8 +154,8 @@ def _has_stalled(usage: float, trial: float) -> bool:
 
 def _reached_end(trial: LawNumbers, x: LawNumbers, factor: float) -> bool:
     """Tell whether a number changed by as much as it may in one solution; the weights may as they like."""
-    rest = np.delete(np.arange(x.size), [W_R, W_C])
-    return bool(np.any((trial > 0.99 * factor * x)[rest] | (trial < 1.01 / factor * x)[rest]))
+    bounded = np.delete(np.arange(x.size), [W_R, W_C])
+    return bool(np.any((trial > 0.99 * factor * x)[bounded] | (trial < 1.01 / factor * x)[bounded]))
 
 
 def _add_missed(task: Task, grid: Grid, x: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
@@ -207,8 +207,8 @@ def _build_program(
     inside: bool,
     prefilter: str,
     signals: int,
-) -> tuple[Any, list[str]]:
-    """Return the IPOPT solver and the names of its data, in order."""
+) -> Any:
+    """Return the IPOPT solver; its data are those of `_solve`, in the same order."""
     passive, tops = PASSIVE in kinds, POINTS_PER_LIMIT * ((PASSIVE in kinds) + signals * (FRICTION in kinds))
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
@@ -255,7 +255,7 @@ def _build_program(
 
     names = [f"{name}_{part}" for name in complex_data for part in ("re", "im")]
     p, c_y, c_r, c_v, open_loop = law({name: data[name][:n] for name in names})
-    distance = (open_loop + 1.0).square() + SMOOTHING
+    squared = (open_loop + 1.0).square() + SMOOTHING
     slices = {kind: slice(POINTS_PER_LIMIT * i, POINTS_PER_LIMIT * (i + 1)) for i, kind in enumerate(kinds)}
 
     def add_up(number: int, where: slice) -> _Complex:
@@ -266,28 +266,26 @@ def _build_program(
 
     usage: dict[str, Any] = {}
     for kind, where in slices.items():
+        level = data["ln_level"][where]
         if kind == PASSIVE:  # the plant is the port here
-            u, one = _Complex(data["unit"][:POINTS_PER_LIMIT], data["unit"][POINTS_PER_LIMIT:]), open_loop + 1.0
+            unit = _Complex(data["unit"][:POINTS_PER_LIMIT], data["unit"][POINTS_PER_LIMIT:])
             top = add_up(0, where)
-            turned = u * top * one.at(where).conjugate()
-            cosine = turned.re / ca.sqrt((top.square() + SMOOTHING) * distance[where])
-            usage[kind] = (1 - cosine) / ca.exp(data["ln_level"][where]) - 1
-            continue
-        if kind == FRICTION:  # a noise gain, weighted, on a plant of its own
+            turned = unit * top * (open_loop + 1.0).at(where).conjugate()
+            cosine = turned.re / ca.sqrt((top.square() + SMOOTHING) * squared[where])
+            usage[kind] = (1 - cosine) / ca.exp(level) - 1
+        elif kind == FRICTION:  # a noise gain, weighted, on a plant of its own
             size = sum(add_up(passive + k, where).square() for k in range(signals))
-            usage[kind] = 0.5 * ca.log((size + SMOOTHING) / distance[where]) - data["ln_level"][where]
-            continue
-        curve = CURVES[kind]
-        if discs:
-            size = _bound_disc(curve, p, open_loop, data["discs"], c_y, c_r)[where]
-            usage[kind] = data["ln_level"][where] - size if curve.floor else size - data["ln_level"][where]
-            continue
-        value = curve.numerator(p, c_y, c_r, open_loop, c_v)
-        top = value.square()[where] if isinstance(value, _Complex) else value
-        size = 0.5 * ca.log((top + SMOOTHING) / distance[where]) - data["ln_level"][where]
-        usage[kind] = -size if curve.floor else size
-    point = {name: data["at"][i] for i, name in enumerate(names)}
-    there = law(point)
+            usage[kind] = 0.5 * ca.log((size + SMOOTHING) / squared[where]) - level
+        else:
+            curve = CURVES[kind]
+            if discs:
+                size = _bound_disc(curve, p, open_loop, data["discs"], c_y, c_r)[where]
+            else:
+                value = curve.numerator(p, c_y, c_r, open_loop, c_v)
+                top = value.square()[where] if isinstance(value, _Complex) else value
+                size = 0.5 * ca.log((top + SMOOTHING) / squared[where])
+            usage[kind] = level - size if curve.floor else size - level
+    there = law({name: data["at"][i] for i, name in enumerate(names)})
     bandwidth = 0.5 * ca.log(2 * (there.p * there.c_r).square() / (there.loop + 1.0).square())
     if noise:
         where = slices[NOISE]
@@ -310,7 +308,7 @@ def _build_program(
                   # Scaled already and small: MUMPS's own scaling and ordering take longer than its solution.
                   "mumps_pivot_order": 0, "mumps_permuting_scaling": 0, "mumps_scaling": 0},
     }  # fmt: skip
-    return ca.nlpsol("polish", "ipopt", nlp, options), list(data)
+    return ca.nlpsol("polish", "ipopt", nlp, options)
 
 
 def _bound_disc(curve: LimitCurve, p: _Complex, open_loop: _Complex, r: Any, c_y: _Complex, c_r: _Complex) -> Any:
@@ -398,7 +396,7 @@ def _solve(
         (linear * scale[gains] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit), radii,
         *_stack(tops),
     ]  # fmt: skip
-    solver, _ = _build_program(
+    solver = _build_program(
         weights.size,
         (*kinds, *([PASSIVE] * passive), *([FRICTION] * friction)),
         task.nominal is not None,

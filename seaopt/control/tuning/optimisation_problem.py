@@ -570,9 +570,9 @@ class Task:
 
     def miss(self, grid: Grid, law: LawResponse) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
-        at = self.find_bandwidth(grid)
+        at = np.array([self.find_bandwidth(grid)])
         path = grid.plants.at((0, at))
-        return float(np.log(np.abs(np.sqrt(2.0) * path.y * law.c_r[at] / path.add_up(law.c_y[at], law.c_v[at]))))
+        return float(np.log(np.abs(np.sqrt(2.0) * path.y * law.c_r[at] / path.add_up(law.c_y[at], law.c_v[at])))[0])
 
     def rank(self, grid: Grid, x: LawNumbers) -> tuple[float, float]:
         """Return what to sort laws by: the worst usage if a limit is broken, then the objective.

@@ -230,7 +230,7 @@ class _Scan:
     @property
     def rest(self) -> complex:
         """B of the design plant at the bandwidth."""
-        return complex(self.grid.plants.at((0, self.at)).add_rest(self.c_v[self.at]))
+        return complex(self.grid.plants.at(0).add_rest(self.c_v)[self.at])
 
     @property
     def inverse(self) -> float:
@@ -306,8 +306,8 @@ def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
     gains, c_y, merit = gains[chosen], c_y[chosen], merit[chosen]
     gains[:, W_C] = np.resize(weights, chosen.size) * gains[:, K_D]
     whole = scan.reference(gains)[:, scan.at]
-    one = scan.rest + scan.plant * c_y[:, scan.at]
-    size = np.abs(one) / (np.sqrt(2.0) * abs(scan.through * scan.terms.prefilter[scan.at]))
+    distance = scan.rest + scan.plant * c_y[:, scan.at]
+    size = np.abs(distance) / (np.sqrt(2.0) * abs(scan.through * scan.terms.prefilter[scan.at]))
     with np.errstate(invalid="ignore"):
         gains[:, W_R] = np.real(whole) + np.resize([-1.0, 1.0], chosen.size) * np.sqrt(size**2 - np.imag(whole) ** 2)
     most = scan.task.k_ff + gains[:, K_P]
@@ -321,9 +321,9 @@ def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
 def _choose_loops(merit: Values) -> Int[np.ndarray, " k"]:
     """Return the loops that are given weights: half of them the best, half spread over what keeps its limits."""
     order = np.argsort(merit)
-    best, rest = np.split(order, [LOOPS_WEIGHTED // 2])
-    rest = rest[merit[rest] < merit[order[0]] + HOPELESS_MERIT]
-    return np.concatenate([best, rest[:: 1 + rest.size // (LOOPS_WEIGHTED // 2)]])
+    best, worse = np.split(order, [LOOPS_WEIGHTED // 2])
+    worse = worse[merit[worse] < merit[order[0]] + HOPELESS_MERIT]
+    return np.concatenate([best, worse[:: 1 + worse.size // (LOOPS_WEIGHTED // 2)]])
 
 
 def _list_weights(task: Task) -> tuple[float, ...]:
@@ -349,16 +349,16 @@ def _price_missing_integral(scan: _Scan, gains: GainRows) -> Values:
 
 
 def solve_bandwidth(
-    by_y: Any, by_r: Any, slope: Complex[np.ndarray, " n"], one: Complex[np.ndarray, " n"]
+    by_y: Any, by_r: Any, slope: Complex[np.ndarray, " n"], distance: Complex[np.ndarray, " n"]
 ) -> Float[np.ndarray, " two_n"]:
     """Return both roots k_p of 2 |by_r k_p + slope|^2 = |by_y k_p + one|^2; not a number where there is none."""
     size, passed = np.abs(by_y) ** 2, 2.0 * np.abs(by_r) ** 2
-    half = np.real(2.0 * slope * np.conj(by_r) - one * np.conj(by_y))
-    rest = 2.0 * np.abs(slope) ** 2 - np.abs(one) ** 2
+    half = np.real(2.0 * slope * np.conj(by_r) - distance * np.conj(by_y))
+    constant = 2.0 * np.abs(slope) ** 2 - np.abs(distance) ** 2
     lead = passed - size
     lead = np.where(np.abs(lead) > LEAST_LEAD * size, lead, LEAST_LEAD * size)  # at |F|^2 = 1/2 it is linear
     with np.errstate(invalid="ignore"):
-        root = np.sqrt(half**2 - lead * rest)
+        root = np.sqrt(half**2 - lead * constant)
     return np.concatenate([(-half + root) / lead, (-half - root) / lead])
 
 
@@ -375,8 +375,8 @@ def judge_loops(task: Task, grid: Grid, laws: LawResponse) -> tuple[Values, Valu
     for margins in task.friction_usage(grid, laws).values():
         worst = np.max(margins, axis=(1, 2))
     for row in range(len(grid.rows)):
-        own = tuple(name for name in task.design_limits(grid.rows[row]) if name not in TRACKING)
-        usage = task.curves(SCOPES["every plant"] + own, grid, row, laws)
+        names = tuple(name for name in task.design_limits(grid.rows[row]) if name not in TRACKING)
+        usage = task.curves(SCOPES["every plant"] + names, grid, row, laws)
         usage |= task.port_usage(grid, laws) if grid.rows[row] == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=-1))
