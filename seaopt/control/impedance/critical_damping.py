@@ -35,6 +35,7 @@ POLES = 800
 SAME_POLE = 1e-5  # to which the two poles of a double one are computed
 REAL = 1e-9  # imaginary part of a pole that does not oscillate
 NEWTON_STEPS, SMALL_STEP = 4, 1e-6
+Poles = Float[np.ndarray, " k"]
 
 
 @record(eq=False)
@@ -87,8 +88,7 @@ def critical_impedance(
     """
     require_number(stiffness, "stiffness", ControlError)
     link = find_link(controller, plant, parameters)
-    undamped = Impedance(stiffness=stiffness, damping=0.0, velocity_filter_s=velocity_filter_s)
-    return find_critical(link, undamped.filter_for(link.sample_time_s), stiffness)
+    return find_critical(link, link.speed_filter(velocity_filter_s).velocity_filter_s, stiffness)
 
 
 def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
@@ -98,7 +98,7 @@ def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
     """
     p = np.geomspace(SLOWEST_POLE, FASTEST_POLE, POLES)
     loop = close_link(link, velocity_filter_s)
-    k, d = _place(loop, link, velocity_filter_s, p)
+    k, d = _place(loop, p)
     good = np.isfinite(k) & np.isfinite(d) & (k > 0.0)
     poles = loop.eigenvalues(np.where(good, k, 0.0), np.where(good, d, 0.0))
     slower = np.abs(poles) > np.exp(-p)[:, None] * (1.0 + SAME_POLE)
@@ -130,23 +130,20 @@ def find_critical(link: Link, velocity_filter_s: float, stiffness: float) -> Imp
     loop = close_link(link, velocity_filter_s)
     p = float(np.interp(stiffness, stiffnesses, scan.rate)) * link.sample_time_s
     for _ in range(NEWTON_STEPS):  # the table is fine enough for Newton's method on K_v(p)
-        k, _ = _place(loop, link, velocity_filter_s, np.array([p, p * (1.0 + SMALL_STEP)]))
+        k, _ = _place(loop, np.array([p, p * (1.0 + SMALL_STEP)]))
         p += (stiffness - float(k[0])) * SMALL_STEP * p / float(k[1] - k[0])
-    damping = float(_place(loop, link, velocity_filter_s, np.array([p]))[1][0])
+    damping = float(_place(loop, np.array([p]))[1][0])
     return Impedance(stiffness=stiffness, damping=damping, velocity_filter_s=velocity_filter_s)
 
 
-def _place(
-    loop: MovingLoop, link: Link, velocity_filter_s: float, p: Float[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def _place(loop: MovingLoop, p: Poles) -> tuple[Poles, Poles]:
     """Return K_v and D_v of double poles at z = exp(-p)."""
-    outer = link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s))
-    z = np.exp(-p)
+    z, outer = np.exp(-p), loop.outer
     inner = z[:, None, None] * np.eye(loop.position.size) - loop.fixed
-    once = np.linalg.solve(inner, np.broadcast_to(loop.reference[:, None], (z.size, loop.position.size, 1)))
+    once = np.linalg.solve(inner, loop.reference[:, None])
     twice = np.linalg.solve(inner, once)[:, :, 0]
     x, slope = once[:, :, 0] @ loop.position, -(twice @ loop.position)
     with np.errstate(divide="ignore", invalid="ignore"):
-        n, n_slope = -1.0 / (loop.direction * x), slope / (loop.direction * x**2)
+        n, n_slope = -1.0 / (outer.direction * x), slope / (outer.direction * x**2)
         d = n_slope / outer.difference_slope(z)
         return n - d * np.real(outer.difference(z.astype(complex))), d

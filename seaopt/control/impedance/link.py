@@ -60,6 +60,10 @@ class Link:
         """Return the sampled plant from motor force to what is measured with the link held."""
         return self.port.hold_link(self.sample_time_s, self.delay_samples)
 
+    def speed_filter(self, velocity_filter_s: float | None) -> OuterLoop:
+        """Return an outer loop without gains, which only filters its speed; over one sample if left out."""
+        return self.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s))
+
     def outer(self, impedance: Impedance) -> OuterLoop:
         """Return the outer loop that renders an impedance here."""
         return OuterLoop(

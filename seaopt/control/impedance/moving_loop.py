@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.impedance.link import Link, Load
-from seaopt.control.loops.outer_loop import Impedance
+from seaopt.control.loops.outer_loop import Impedance, OuterLoop
 from seaopt.control.loops.sampled_plant import hold
 from seaopt.records import record
 
@@ -23,15 +23,14 @@ Vector = Float[np.ndarray, " _"]
 
 @record(eq=False)
 class MovingLoop:
-    """x+ = (m_0 + K_v m_stiffness + D_v m_damping) x + b x_0 K_v, link position = c x."""
+    """x+ = (fixed + K_v by_stiffness + D_v by_damping) x + reference K_v x_0, link position = position x."""
 
     fixed: Matrix
     by_stiffness: Matrix
     by_damping: Matrix
     reference: Vector  # the effect of the force law's reference
     position: Vector  # the link's position
-    direction: float
-    sample_time_s: float
+    outer: OuterLoop  # the filter of the speed
 
     def matrix(self, stiffness: Any, damping: Any) -> Float[np.ndarray, "... n n"]:
         """Return the closed loop's matrix, of arrays of gains as a stack."""
@@ -48,13 +47,21 @@ class MovingLoop:
 
     def step(self, impedance: Impedance, samples: int) -> Float[np.ndarray, " samples"]:
         """Return the link's position, sample by sample, after a unit step of x_0."""
-        a = self.matrix(impedance.stiffness, impedance.damping)
-        drive = self.reference * (self.direction * impedance.stiffness)
-        x, out = np.zeros(drive.size), np.empty(samples)
+        a, drive = self._driven(impedance)
+        x, path = np.zeros(drive.size), np.empty(samples)
         for k in range(samples):
-            out[k] = self.position @ x
+            path[k] = self.position @ x
             x = a @ x + drive
-        return out
+        return path
+
+    def end(self, impedance: Impedance) -> float:
+        """Return the link's position long after a unit step of x_0."""
+        a, drive = self._driven(impedance)
+        return float(self.position @ np.linalg.solve(np.eye(drive.size) - a, drive))
+
+    def _driven(self, impedance: Impedance) -> tuple[Matrix, Vector]:
+        drive = self.reference * (self.outer.direction * impedance.stiffness)
+        return self.matrix(impedance.stiffness, impedance.damping), drive
 
 
 def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -> MovingLoop:
@@ -94,7 +101,7 @@ def _wait(a: Matrix, b: Vector, c: Matrix, d: Vector) -> tuple[Matrix, Vector, M
 def _assemble(link: Link, velocity_filter_s: float, a: Matrix, b: Vector, rows: Matrix, direct: Vector) -> MovingLoop:
     """Return the loop of a sampled plant, whose rows are what the law reads and the position."""
     law, n, through = link.law, b.size, direct[:-1]
-    outer = link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s))
+    outer = link.speed_filter(velocity_filter_s)
     size = n + law.c.size + 1
     inner, speed = slice(n, size - 1), size - 1
     # Over the states (plant, law, filter of the speed): effort, readings, position.
@@ -120,6 +127,5 @@ def _assemble(link: Link, velocity_filter_s: float, a: Matrix, b: Vector, rows: 
         by_damping=-link.direction * np.outer(drive, filtered),
         reference=drive,
         position=position,
-        direction=link.direction,
-        sample_time_s=link.sample_time_s,
+        outer=outer,
     )

@@ -179,7 +179,7 @@ def passive_region(
     link = find_link(controller, plant, parameters, link_damping)
     if isinstance(points, bool) or not 2 <= points <= MOST_POINTS:
         raise ControlError(f"points = {points!r} is not a size of the grid; give 2 to {MOST_POINTS}")
-    filter_s = Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s).filter_for(link.sample_time_s)
+    filter_s = link.speed_filter(velocity_filter_s).velocity_filter_s
     port = SampledPort(link=link, velocity_filter_s=filter_s)
     held_stable = port.held_stable()
     terms = port.terms(port.angles(), link.load.damping)

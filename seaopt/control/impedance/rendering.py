@@ -300,9 +300,6 @@ def _find_overshoot(loop: MovingLoop, impedance: Impedance, radius: float) -> fl
     """Return by how much a step of x_0 overshoots, as a share of where the link ends."""
     if radius > GROWING or not impedance.stiffness > 0.0:
         return np.inf if radius > GROWING else 0.0
-    a = loop.matrix(impedance.stiffness, impedance.damping)
-    drive = loop.reference * (loop.direction * impedance.stiffness)
-    ends = float(loop.position @ np.linalg.solve(np.eye(drive.size) - a, drive))
     slow = -1.0 / math.log(min(max(radius, math.exp(-1.0)), 1.0 - 1e-5))  # samples of the slowest time constant
     path = loop.step(impedance, min(int(12.0 * slow) + 50, 200_000))
-    return max(float(np.max(path) / ends - 1.0), 0.0)
+    return max(float(np.max(path) / loop.end(impedance) - 1.0), 0.0)

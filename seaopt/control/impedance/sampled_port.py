@@ -170,7 +170,7 @@ class SampledPort:
         closed = z**-link.delay_samples / (1.0 + np.sum(link.held().responses(f) * feedback, axis=0))
         moved = sum(c[:, None] * at(g) for c, g in zip(feedback, response.motion_to_read, strict=True))
         drive = -at(response.motor_to_port) * (-np.expm1(-1j * theta) * closed)[:, None] / (s * period)
-        outer = self.link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=self.velocity_filter_s))
+        outer = link.speed_filter(self.velocity_filter_s)
         gain = link.direction * reference
         return PortResponses(
             theta=theta,

@@ -82,26 +82,13 @@ Population = Float[np.ndarray, "n d"]
 
 @record(eq=False)
 class Evolution:
-    """The search for one task.
-
-    Parameters
-    ----------
-    task : Task
-        What is to be tuned.
-    grid : Grid
-        Frequencies that the limits are looked at on, not many.
-    low, high : array, shape (14,)
-        Ends of the numbers' ranges; of k_i those of rho, of the weights those of their shares. k_p is no member's own.
-    free : array of int
-        The numbers of which a member has its own.
-
-    """
+    """The search for one task."""
 
     task: Task
-    grid: Grid
-    low: LawNumbers
+    grid: Grid  # not many frequencies
+    low: LawNumbers  # ends of the numbers' ranges; of k_i those of rho, of the weights those of their shares
     high: LawNumbers
-    free: Int[np.ndarray, " d"]
+    free: Int[np.ndarray, " d"]  # the numbers in which members differ; k_p is not among them
 
     @classmethod
     def of(cls, task: Task, grid: Grid, starts: Sequence[LawNumbers] = ()) -> Evolution:
@@ -181,9 +168,9 @@ class Evolution:
     def encode(self, x: LawNumbers) -> Float[np.ndarray, " d"]:
         """Return the member next to a law."""
         x = x.copy()
-        x[W_C] = x[W_C] / max(x[K_D], 1e-12)
-        x[W_R] = x[W_R] / max(self.task.k_ff + x[K_P], 1e-12)
-        x[K_I] = x[K_I] / (1.0 + x[K_P])
+        x[W_C] /= max(x[K_D], 1e-12)
+        x[W_R] /= max(self.task.k_ff + x[K_P], 1e-12)
+        x[K_I] /= 1.0 + x[K_P]
         low, high, x = self.low[self.free], self.high[self.free], x[self.free]
         shares = np.isin(self.free, [W_R, W_C])
         safe = np.where(shares, 1.0, np.maximum(low, 1e-300))
@@ -258,10 +245,13 @@ class Evolution:
 
 def _choose_plants(task: Task, grid: Grid, starts: Sequence[LawNumbers]) -> list[int]:
     """Return some of the task's plants, the first of them those of the design."""
-    others = list(range(task.design_states, len(grid.rows)))
+    plants = list(range(task.design_states, len(grid.rows)))
     if starts:
         law = task.respond(grid, starts[0])
-        usage = [task.curves(SCOPES["every plant"], grid, k, law) for k in others]
-        worst = [max((float(np.max(curve)) for curve in of.values()), default=0.0) for of in usage]
-        others = [k for _, k in sorted(zip(worst, others, strict=True), key=lambda pair: -pair[0])]
-    return [*range(task.design_states), *others][:SCANNED_PLANTS]
+
+        def find_worst(plant: int) -> float:
+            usage = task.curves(SCOPES["every plant"], grid, plant, law)
+            return max((float(np.max(curve)) for curve in usage.values()), default=0.0)
+
+        plants.sort(key=find_worst, reverse=True)
+    return [*range(task.design_states), *plants][:SCANNED_PLANTS]

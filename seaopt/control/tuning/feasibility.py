@@ -32,21 +32,10 @@ LEAST_SHARE = 1e-4  # of the sample rate: what is below is called nothing
 
 
 def sensitivity_possible(sensitivity_hz: float, ms: float, sample_time_s: float, late: int) -> bool:
-    """Tell whether a loop that answers `late` samples late can have abs(S) below -3 dB up to a frequency, and Ms.
+    """Tell whether a loop that answers `late` (1 or more) samples late can have abs(S) below -3 dB up to a frequency.
 
-    Parameters
-    ----------
-    sensitivity_hz : float
-        Where abs(S) may leave -3 dB.
-    ms : float
-        Largest abs(S) above.
-    sample_time_s : float
-        Seconds.
-    late : int
-        Samples, at least 1.
+    `ms`: the largest abs(S) above.
 
-    Examples
-    --------
     >>> [sensitivity_possible(12.0, 1.6, 1e-3, late) for late in (2, 40)]
     [True, False]
 
@@ -74,14 +63,7 @@ def _toeplitz(g: Values) -> Float[np.ndarray, "n n"]:
 
 
 def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
-    """Refuse a bandwidth that the delay rules out for every controller.
-
-    Raises
-    ------
-    ControlError
-        It does; the message says what the delay allows.
-
-    """
+    """Refuse a bandwidth that the delay rules out for every controller, with what the delay allows."""
     wanted, ms = spec.sensitivity_bandwidth_limit_hz, spec.level("max_sensitivity")
     late = _count_waiting(plant)
     if ms is None or wanted <= 0.0 or late < 1 or sensitivity_possible(wanted, ms, spec.sample_time_s, late):
@@ -115,14 +97,7 @@ def _advise(spec: ControllerSpec, limit: float) -> str:
 
 
 def check_current(spec: ControllerSpec, k_ff: float, command: Command, friction: Mapping[str, float]) -> None:
-    """Refuse a current limit that does not hold the step, or does not overcome dry friction.
-
-    Raises
-    ------
-    ControlError
-        As said.
-
-    """
+    """Refuse a current limit that does not hold the step, or does not overcome dry friction."""
     limit, per_effort, unit = command.limit(spec.limit_asked), command.per_effort, command.effort_unit
     if limit is None:
         return
