@@ -30,7 +30,6 @@ answer that is cut off after 500 iterations, as half of them are, is good enough
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -55,6 +54,7 @@ PerGain = Float[np.ndarray, " g"]
 ValueSlopes = Float[np.ndarray, "n g"]
 PointSlopes = Float[np.ndarray, "c g"]
 GainResponses = Complex[np.ndarray, "g m"]
+Rows = tuple[Values, ValueSlopes]
 
 MOST_PROGRAMS = 8
 ROWS_PER_LIMIT = 10  # per kind of limit
@@ -63,18 +63,6 @@ SMALLEST_GAIN_RADIUS = 0.01
 NEAR = 0.4  # of a limit: points that use less of it are left out
 STEP = 1e-5  # of C_y: of differences where responses lie in discs
 USAGE_PRICE = 20.0  # of one unit of usage beyond the limit, in logarithms of the objective
-
-
-@dataclass(slots=True)  # filled row by row
-class _LinearLimits:
-    """Rows value + slope dtheta - slack <= 1, gathered one kind at a time."""
-
-    value: list[Values] = field(default_factory=list)
-    slope: list[ValueSlopes] = field(default_factory=list)
-
-    def add(self, value: Values, slope: ValueSlopes) -> None:
-        self.value.append(value)
-        self.slope.append(slope)
 
 
 @record(eq=False)
@@ -153,22 +141,22 @@ def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray
     return np.real(np.conj(value) / size * by).T
 
 
-def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> _LinearLimits:
-    """Return the linearised limits at the frequencies and plants where they matter."""
-    rows, usage = _LinearLimits(), task.usage(grid, law.law)
+def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> list[Rows]:
+    """Return rows value + slope dtheta - slack <= 1 at the frequencies and plants where the limits matter."""
+    rows, usage = list[Rows](), task.usage(grid, law.law)
     measured = bool(np.any(grid.discs))
     for name in grid.levels:
         index = choose_near(usage[name])
         used, near_limit = usage[name].ravel()[index], CURVES[name].of == "1"  # the limit is on abs(1 + L) itself
         if measured:
             slope = _differentiate_usage(grid, law, name, index)
-            rows.add(2.0 - 1.0 / used if near_limit else used, slope / used[:, None] ** 2 if near_limit else slope)
+            rows.append((2.0 - 1.0 / used, slope / used[:, None] ** 2) if near_limit else (used, slope))
             continue
         near, relative = _differentiate_curve(grid, law, name, index)
         if near_limit:
-            rows.add(2.0 - 1.0 / used, -near / used[:, None])
+            rows.append((2.0 - 1.0 / used, -near / used[:, None]))
             continue
-        rows.add(used, used[:, None] * ((near - relative) if CURVES[name].floor else (relative - near)))
+        rows.append((used, used[:, None] * ((near - relative) if CURVES[name].floor else (relative - near))))
     if task.port is not None:
         index = choose_near(usage[PASSIVE])
         used, column = usage[PASSIVE].ravel()[index], index % grid.f.size
@@ -176,7 +164,7 @@ def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> _LinearLimits:
             _change_path(path.at(column), law, column) for path in (grid.port, grid.force)
         )
         slope = np.real(grid.unit[column] * (by_top * np.conj(loop) + top * np.conj(by_loop))) / np.abs(top * loop)
-        rows.add(used, -slope.T / (1.0 - task.spec.reserve))
+        rows.append((used, -slope.T / (1.0 - task.spec.reserve)))
     if FRICTION in usage:
         index = choose_near(usage[FRICTION])
         used, (row, column) = usage[FRICTION].ravel()[index], np.divmod(index, grid.f.size)
@@ -184,9 +172,8 @@ def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> _LinearLimits:
         parts, by_parts = _change_path(grid.friction_size.at((row, slice(None), column)), law, column)
         relative = np.real(np.sum(np.conj(parts) * by_parts, axis=-1)) / np.sum(np.abs(parts) ** 2, axis=-1)
         near = _differentiate_size(distance, by_distance) / np.abs(distance)[:, None]
-        rows.add(used, used[:, None] * (relative.T - near))
-    _add_bandwidth(task, grid, law, rows)
-    return rows
+        rows.append((used, used[:, None] * (relative.T - near)))
+    return [*rows, _linearise_bandwidth(task, grid, law)]
 
 
 def _change_path(
@@ -237,7 +224,7 @@ def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) ->
     return slope
 
 
-def _add_bandwidth(task: Task, grid: Grid, law: _Affine, rows: _LinearLimits) -> None:
+def _linearise_bandwidth(task: Task, grid: Grid, law: _Affine) -> Rows:
     at = np.array([task.find_bandwidth(grid)])
     path = grid.plants.at((0, at))
     distance, by_loop = _change_path(path, law, at)
@@ -245,7 +232,7 @@ def _add_bandwidth(task: Task, grid: Grid, law: _Affine, rows: _LinearLimits) ->
     slope = _differentiate_size(through, path.y * law.by_r[:, at]) / np.abs(through)
     slope = slope - _differentiate_size(distance, by_loop) / np.abs(distance)
     miss = task.miss(grid, law.law)
-    rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
+    return np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope])
 
 
 def _expand_objective(task: Task, grid: Grid, law: _Affine) -> tuple[Float[np.ndarray, "g g"], Values, ValueSlopes]:
@@ -283,9 +270,9 @@ def _solve_step(task: Task, grid: Grid, x: LawNumbers, reach: PerGain) -> PerGai
     low, high = (ends[gains] for ends in task.bounds(x))
     linear, least, largest = task.linear_limits(x)
     # Variables: the gains' changes in units of `reach`, the objective, the slack.
-    value, slope = np.concatenate(rows.value), np.concatenate(rows.slope) * reach
+    value, slope = (np.concatenate(part) for part in zip(*rows, strict=True))
     rows_of = [
-        np.column_stack([slope, np.zeros(value.size), -np.ones(value.size)]),
+        np.column_stack([slope * reach, np.zeros(value.size), -np.ones(value.size)]),
         np.column_stack([slopes * reach, -np.ones(values.size), np.zeros(values.size)]),
         np.column_stack([linear * reach, np.zeros((least.size, 2))]),
         np.column_stack([np.eye(n), np.zeros((n, 2))]),
