@@ -288,7 +288,7 @@ def test_without_a_static_gain_the_role_is_named():
 
 def test_an_effort_without_the_right_sign_is_refused():
     reverse = OWN.update(K=-12.5)
-    with pytest.raises(ControlError, match=r"negative, -12\.5; reverse the input"):
+    with pytest.raises(ControlError, match=r"is -12\.5; reverse the input"):
         command_of(mass_on_a_spring(), reverse, "F")
     stated = mass_on_a_spring(actuation=Actuation(input="U", effort=lambda p: p.K))
     with pytest.raises(ControlError, match=r"check K = -12\.5 N/V"):
