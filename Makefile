@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test slow check lint types contract notebooks docs floors golden bench bench-peers fuzz nocompiler clean setup
+.PHONY: demo test slow check lint types contract notebooks docs floors golden bench bench-peers truth fuzz nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
@@ -91,6 +91,10 @@ bench: $(READY)
 # Other estimators on one problem, each in an environment of its own; ARGS="--only jax,seaopt" for some of them.
 bench-peers: $(READY)
 	$(BIN)/python benchmarks/peers/run.py $(ARGS)
+
+# How often a met fit is right where the actuator has physics that the model lacks; ARGS="--fits 300 --seed 7" for more.
+truth: $(READY)
+	$(BIN)/python benchmarks/truth/run.py $(ARGS)
 
 # Random and mutated CSV, JSON and MAT files, and plants of problem files, so many seconds each; needs atheris (CPython on Linux).
 FUZZ_SECONDS := 60

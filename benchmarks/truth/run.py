@@ -1,0 +1,158 @@
+"""How often a met fit is right where the actuator is not the model: `make truth [ARGS="--fits 60 --seed 7"]`.
+
+Each case is an actuator of `actuators.py` with none, one or two effects that the fitted model lacks. It is fitted as
+its user would fit it: friction that sticks, a free delay, values off by up to a factor of two. A fit is *bad* where it
+is met and has a parameter both 3 % off and outside 4 of its standard deviations. Each fit runs in a process of its own
+with a bound on its processor time. The table is printed, and with --json FILE every case is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from actuators import EFFECTS, KINDS, RATE_HZ, Actuator
+
+FREE = {True: ("J", "b_r", "k", "f_c", "eta"), False: ("J_m", "b_r", "k_s", "f_c", "eta")}
+SILENT = {"efficiency", "stand"}  # what no such log can tell: only words can warn
+BAD_SHARE, BAD_STDS, QUANTILE = 0.03, 4.0, 1.96
+
+
+def draw_cases(count: int, rng: np.random.Generator) -> Iterator[Actuator]:
+    """Yield actuators of every kind in turn: a sixth as modelled, half with one effect, a third with two."""
+    kinds, effects = list(KINDS), list(EFFECTS)
+    for k in range(count):
+        kind = kinds[k % len(kinds)]
+        link = "pendulum" if kind != "screw" and rng.uniform() < 0.4 else "locked"
+        possible = [name for name in effects if not (name == "stand" and link == "pendulum")]
+        number = (0, 1, 1, 1, 2, 2)[k // len(kinds) % 6]
+        chosen = rng.choice(possible, size=number, replace=False)
+        sizes = {str(name): round(float(rng.uniform(0.6, 1.3)), 3) for name in chosen}
+        yield Actuator(kind=kind, link=link, effects=sizes, delay_s=round(float(rng.uniform(0.0003, 0.003)), 5))
+
+
+def fit_case(actuator: Actuator, seed: int, seconds: float, limit_s: float) -> dict[str, Any]:
+    """Return what a fit says of an actuator's log, and what is true."""
+    resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + limit_s), resource.RLIM_INFINITY))
+    import seaopt as so
+
+    rng, kind = np.random.default_rng(seed), KINDS[actuator.kind]
+    readings = actuator.record(seconds=seconds, amplitude=1.0, seed=seed)
+    log = so.Log.from_arrays(**readings).restamp(rate_hz=RATE_HZ)
+    base = so.plants.high_impedance() if kind.linear else so.plants.rotary(link=actuator.link)
+    plant = so.plants.let_stick(base)
+    known = {name: value for name, value in actuator.truth.items() if name in plant.parameters}
+    free = FREE[kind.linear]
+    guess = {name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free}
+    params = plant.defaults.update(**known | guess).free(*free)
+    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    outputs = tuple(name for name in readings if name not in ("time", "I"))
+    started = time.process_time()
+    fit = so.fit([so.Experiment(plant=plant, log=log, outputs=outputs, delay_s=delay)], params)
+    fitted = fit.to_dict()["parameters"]
+    return {
+        "met": fit.met,
+        "status": fit.status,
+        "cpu_s": round(time.process_time() - started, 2),
+        "parameters": {
+            name: {"true": known[name], "value": fitted[name]["value"], "std": fitted[name]["std"]}
+            for name in free
+            if fitted[name]["std"] is not None
+        },
+        "findings": [f"{finding.severity} {finding.kind} {finding.where}" for finding in fit.findings],
+    }
+
+
+def run_case(job: tuple[Actuator, int, float, float]) -> dict[str, Any]:
+    """Return a case's row; what its process did not live to say is a row, too."""
+    actuator, seed, _, limit_s = job
+    context = get_context("spawn")
+    row: dict[str, Any] = asdict(actuator) | {"seed": seed}
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(sender, *job))
+    process.start()
+    sender.close()
+    try:
+        return row | receiver.recv()
+    except EOFError:
+        return row | {"met": False, "status": f"not done in {limit_s:g} s", "cpu_s": limit_s, "parameters": {}}
+    finally:
+        process.join()
+
+
+def _send(sender: Any, *job: Any) -> None:
+    sender.send(fit_case(*job))
+
+
+def is_bad(row: dict[str, Any]) -> bool:
+    """Tell whether a parameter of a fit is 3 % off and outside 4 standard deviations."""
+    return any(
+        abs(p["value"] / p["true"] - 1) > BAD_SHARE and abs(p["value"] - p["true"]) > BAD_STDS * p["std"]
+        for p in row["parameters"].values()
+    )
+
+
+def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield a table of what became of the cases, by what the model lacks."""
+    groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        names = sorted(row["effects"])
+        groups["nothing missing" if not names else names[0] if len(names) == 1 else "two effects"].append(row)
+        silent = SILENT & set(names)
+        groups[
+            "= all that a log can show" if names and not silent else "= what no log shows" if silent else "="
+        ].append(row)
+    groups.pop("=", None)
+    yield f"{'missing':26s} fits  met  bad of met  in 95 %  not done  median s"
+    for name in sorted(groups, key=lambda name: (name.startswith("="), name)):
+        group = groups[name]
+        met = [row for row in group if row["met"]]
+        inside = [abs(p["value"] - p["true"]) <= QUANTILE * p["std"] for row in met for p in row["parameters"].values()]
+        share = f"{100 * np.mean(inside):.0f} %" if inside else "-"
+        late = sum(row["status"].startswith("not done") for row in group)
+        bad, median = sum(map(is_bad, met)), np.median([row["cpu_s"] for row in group])
+        yield f"{name:26s} {len(group):4d} {len(met):4d} {bad:11d} {share:>8s} {late:9d} {median:9.1f}"
+
+
+def main() -> None:
+    """Run the cases that the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fits", type=int, default=90)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=15.0, help="length of each log")
+    parser.add_argument("--limit", type=float, default=60.0, help="processor time of a fit, s")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    cases = list(draw_cases(options.fits, np.random.default_rng(options.seed)))
+    jobs = [(case, 1000 * options.seed + k, options.seconds, options.limit) for k, case in enumerate(cases)]
+    rows: list[dict[str, Any]] = []
+    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(run_case, jobs):
+            rows.append(row)
+            effects = ", ".join(row["effects"]) or "nothing missing"
+            verdict = "BAD" if row["met"] and is_bad(row) else "met" if row["met"] else row["status"]
+            print(
+                f"{len(rows):4d} {row['kind']:7s} {row['link']:9s} {effects:30s} {row['cpu_s']:6.1f} s  {verdict}",
+                flush=True,
+            )
+            if options.json:
+                options.json.write_text(json.dumps(rows, indent=1))
+    print("\n".join(summarise(rows)))
+
+
+if __name__ == "__main__":
+    main()
