@@ -72,7 +72,8 @@ def choose_prominent(usage: Usage, count: int) -> Indices:
 
     Of the others every third is looked at: neighbours say the same.
     """
-    wide = np.pad(usage, ((0, 0), (1, 1)), constant_values=-np.inf)
+    wide = np.full((usage.shape[0], usage.shape[1] + 2), -np.inf)  # `np.pad` would take longer than all the rest
+    wide[:, 1:-1] = usage
     top = (usage >= wide[:, :-2]) & (usage >= wide[:, 2:])
     rank = np.where(top, usage + 10.0 * (usage > 0.5), -np.inf)  # a maximum near its limit outranks the others
     rank[:, ::3] = np.maximum(rank[:, ::3], usage[:, ::3])

@@ -450,6 +450,8 @@ class Task:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
         rows: dict[str, list[Curve]] = {}
         for position, row in enumerate(grid.rows):
+            if row >= self.design_states:
+                continue
             curves = self.curves(self.design_limits(row), grid, position, law)
             curves |= self.port_usage(grid, law) if row == 0 else {}
             for name, curve in curves.items():
