@@ -24,7 +24,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import block_diag
 
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.minimal import build_chain
@@ -60,9 +59,12 @@ class Assembly:
         chain = np.zeros((max(len(self.chain), len(other.chain)), self.d.size))
         chain[: len(self.chain)] += self.chain
         chain[: len(other.chain)] += other.chain
+        n, more = self.c.size, other.c.size
+        a = np.zeros((n + more, n + more))  # `block_diag` would take longer than all the rest of a law
+        a[:n, :n], a[n:, n:] = self.a, other.a
         return Assembly(
             chain=chain,
-            a=np.asarray(block_diag(self.a, other.a)),
+            a=a,
             b=np.vstack([self.b, other.b]),
             c=np.concatenate([self.c, other.c]),
             d=self.d + other.d,
