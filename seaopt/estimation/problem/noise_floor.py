@@ -1,0 +1,94 @@
+r"""The noise that a residual has of its sensor, and how many times that the residual is.
+
+What a model lacks changes little from one sample to the next, a sensor's noise does. Of white noise the second
+difference has six times its variance, so that an output's noise is at least
+
+.. math:: s = \sqrt{\overline{(r_{t-1} - 2 r_t + r_{t+1})^2} / 6}
+
+(differences as of von Neumann, Ann. Math. Statist. 12, 1941), and at least what its quantisation makes, a step over
+the root of 12, which a slow signal shows in no difference. The noise that a user states counts where the sensor's is
+coloured, as behind a filter. The excess, the residual's rms over that noise, is 1 to 1.1 of right models.
+
+Both are of the residuals as they are fitted: in the band, and as the loss weighs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.problem.losses import Loss
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
+from seaopt.estimation.problem.shapes import PerOutput, Vector
+from seaopt.logs.quality.faults import find_quantisation
+from seaopt.records import record
+
+STATED = 5.0  # times the noise between neighbours that a stated one counts for: more is a weight, not a sensor's noise
+
+
+@record(eq=False)
+class NoiseFloor:
+    """The noise and the rms of an experiment's residuals, output by output, in sigma of the fit."""
+
+    noise: PerOutput
+    rms: PerOutput
+    count: PerOutput  # samples that count
+
+    @property
+    def excess(self) -> PerOutput:
+        """How many times its noise a residual is; 0 where no sample counts."""
+        return self.rms / np.maximum(self.noise, 1e-300)
+
+
+def measure_excess(problem: FitProblem, z: Vector) -> dict[str, float]:
+    """Return how many times its sensor's noise each output's residual is, by EXPERIMENT.OUTPUT, at unknowns `z`."""
+    residuals = compute_residuals(problem, z)
+    return list_excess(problem, {e.name: measure_floor(e, residuals[e.name]) for e in problem.experiments})
+
+
+def list_excess(problem: FitProblem, floors: Mapping[str, NoiseFloor]) -> dict[str, float]:
+    """Return the excess of each output, by EXPERIMENT.OUTPUT."""
+    return {output.label: float(floors[output.experiment.name].excess[output.index]) for output in problem.outputs}
+
+
+def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> NoiseFloor:
+    """Return the noise of an experiment's outputs, and their residuals' rms."""
+    loss, gain = experiment.loss, _measure_noise_gain(experiment)
+    settle = experiment.weights.settle
+    noise, rms, count = (np.zeros(len(experiment.sigma)) for _ in range(3))
+    for output in experiment.outputs:
+        o, name, sigma = output.index, output.name, output.sigma
+        used = [segment.mark_counted(settle)[:, o] for segment in experiment.segments]
+        count[o] = sum(int(np.count_nonzero(part)) for part in used)
+        power = sum(float(np.sum(loss.slope(part) ** 2)) for part in residuals.weighted_of(name))
+        rms[o] = np.sqrt(power / max(count[o], 1.0))
+        seconds = [np.diff(loss.slope(part * (gain / sigma)), 2) for part in residuals.raw_of(name)]
+        seconds = [part[np.isfinite(part)] for part in seconds]
+        neighbours = float(np.sqrt(np.mean(np.concatenate(seconds) ** 2) / 6.0)) if any(map(len, seconds)) else 0.0
+        step = find_quantisation(np.concatenate(output.measured)) / np.sqrt(12.0) * gain / sigma
+        stated = _weigh_gaussian(loss) if name in experiment.data.sigma else 0.0
+        noise[o] = max(neighbours, step, min(stated, STATED * neighbours))
+    return NoiseFloor(noise=noise, rms=rms, count=count)
+
+
+def _weigh_gaussian(loss: Loss) -> float:
+    """Return the rms of what a loss makes of Gaussian residuals of 1 sigma."""
+    r = np.linspace(-6.0, 6.0, 601)
+    density = np.exp(-0.5 * r**2)
+    return float(np.sqrt(np.sum(loss.slope(r) ** 2 * density) / np.sum(density)))
+
+
+def _measure_noise_gain(experiment: FitExperiment) -> float:
+    """Return how many times its rms white noise is behind the filter of the fit's band."""
+    sections, settle = experiment.weights.sections, experiment.weights.settle
+    if not len(sections):
+        return 1.0
+    from scipy.signal import sosfilt  # deferred: scipy is slow to load
+
+    impulse = np.zeros(max(settle, 16))
+    impulse[0] = 1.0
+    filters = np.insert(sections, 3, 1.0, axis=1)  # a0 = 1 is left out of sections
+    return float(np.linalg.norm(np.asarray(sosfilt(filters, impulse))))

@@ -1,0 +1,92 @@
+"""The noise floor of a residual: against the noise that was put in, filtered, quantised, heavy-tailed or stated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter, sosfilt
+
+import seaopt as so
+from seaopt.estimation.problem.fit_problem import pose_problem
+from seaopt.estimation.problem.losses import Huber, Squares
+from seaopt.estimation.problem.noise_floor import measure_excess, measure_floor
+from seaopt.estimation.problem.residual_statistics import compute_residuals
+
+N = 20_000
+SUM = so.Plant(
+    name="sum", states={"z": "-"}, inputs={"u": "-"}, outputs={"y": "-"}, parameters={"a": "-"},
+    f=lambda t, x, u, p: {"z": u.u - x.z}, h=lambda t, x, u, p: {"y": p.a * u.u + 0 * x.z},
+)  # fmt: skip
+SLOW = np.sin(np.arange(N) * 2e-3)
+
+
+def pose(error, *, loss=None, band_hz=None, **options):
+    """Return a problem whose residual at its start is the error."""
+    log = so.Log.from_arrays(time=np.arange(N) * 1e-3, u=SLOW, y=2.0 * SLOW + error)
+    bench = so.Experiment(plant=SUM, log=log, initial_state="rest", offset=False, name="log", **options)
+    problem = pose_problem(
+        (bench,), so.ParameterSet.of(a=(2.0, "-")).free("a"), loss=loss or Squares(), band_hz=band_hz
+    )
+    return problem, problem.unknowns.start
+
+
+def floor(error, **options):
+    problem, z = pose(error, **options)
+    (experiment,) = problem.experiments
+    found = measure_floor(experiment, compute_residuals(problem, z)["log"])
+    sigma = float(experiment.sigma[0])
+    return float(found.noise[0]) * sigma, float(found.rms[0]) * sigma, found
+
+
+def noise(std, seed=0):
+    return np.random.default_rng(seed).normal(scale=std, size=N)
+
+
+def test_white_noise_is_its_own_floor():
+    found, rms, _ = floor(noise(0.3))
+    assert found == pytest.approx(0.3, rel=0.02)
+    assert rms == pytest.approx(0.3, rel=0.02)
+
+
+def test_what_changes_slowly_is_excess():
+    """A slow error of 1 beside noise of 0.1: the excess is the root of 1 + (0.7/0.1)^2."""
+    excess = measure_excess(*pose(noise(0.1) + np.sin(np.arange(N) * 0.01)))
+    assert excess["log.y"] == pytest.approx(np.sqrt(1 + 0.5 / 0.01), rel=0.03)
+
+
+def test_a_coarse_step_that_a_slow_signal_rests_on_is_noise():
+    step = 0.5
+    quantised = step * np.round(2.0 * SLOW / step) - 2.0 * SLOW
+    found, _, floors = floor(quantised)
+    assert found == pytest.approx(step / np.sqrt(12), rel=0.02)
+    assert floors.excess[0] < 1.1
+
+
+def test_a_band_has_its_own_part_of_the_noise():
+    found, rms, floors = floor(noise(0.3), band_hz=(0.0, 50.0))
+    filtered = np.std(sosfilt(butter(4, 50.0, fs=1000.0, output="sos"), noise(0.3)))
+    assert found == pytest.approx(filtered, rel=0.05)
+    assert floors.excess[0] == pytest.approx(1.0, abs=0.08)
+    assert rms < 0.15
+
+
+def test_outliers_of_a_robust_loss_are_no_excess():
+    heavy = np.where(np.random.default_rng(1).uniform(size=N) < 0.03, noise(5.0, 2), noise(0.3))
+    _, _, floors = floor(heavy, loss=Huber(), sigma={"y": 0.3})
+    assert floors.excess[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_coloured_noise_counts_where_it_is_stated_and_a_weight_does_not():
+    coloured = lfilter([0.3 * np.sqrt(1 - 0.9**2)], [1.0, -0.9], noise(1.0))
+    assert measure_excess(*pose(coloured))["log.y"] > 3.0
+    assert measure_excess(*pose(coloured, sigma={"y": 0.3}))["log.y"] == pytest.approx(1.0, abs=0.05)
+    slow = noise(0.01) + 0.3 * SLOW
+    assert measure_excess(*pose(slow, sigma={"y": 100.0}))["log.y"] > 3.0
+
+
+def test_the_floor_does_not_depend_on_the_scale_of_the_weights():
+    problem, z = pose(noise(0.3) + 0.5 * SLOW)
+    other = replace(problem, experiments=tuple(replace(e, sigma=7.0 * e.sigma) for e in problem.experiments))
+    assert measure_excess(other, z)["log.y"] == pytest.approx(measure_excess(problem, z)["log.y"], rel=1e-12)
