@@ -198,7 +198,7 @@ def anti_windup() -> None:
     axes[1].set_ylabel("current [A]")
     roots = {"k_r/k_i = 3.2 s": None, "sqrt(T_i T_d) = 0.16 s": 0.158, "none": 1e9}
     for (label, tracking), colour in zip(roots.items(), ("#0072b2", "#d55e00", "#777777"), strict=True):
-        law = realise(GAINS.law("pid", 1e-3), per_effort=gain, current_limit_A=9.0, tracking_time_s=tracking)
+        law = realise(GAINS.law("pid", 1e-3), per_effort=gain, command_limit=9.0, tracking_time_s=tracking)
         x, state, forces, currents = np.zeros(b.size), law.reset(), [], []
         for t in time:
             force = float(c @ x)

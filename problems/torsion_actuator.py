@@ -197,7 +197,7 @@ def tune(bandwidth_hz: float, noise_gain: float) -> so.Controller:
 def run_tuned(controller: so.Controller) -> np.ndarray:
     """Return the step of `step` under a tuned law as it is exported, with its anti-windup."""
     a, b, c = sample_plant()
-    law = runnable(controller, current_limit_A=MOTOR_LIMIT / TORQUE_PER_AMPERE)
+    law = runnable(controller, command_limit=MOTOR_LIMIT / TORQUE_PER_AMPERE)
     x, state = np.zeros(2), law.reset()
     out = np.empty(int(DURATION / PERIOD))
     for i in range(out.size):

@@ -1,8 +1,9 @@
 """Records to what JSON holds and back, by their annotations.
 
 A record has in its file the keys that its class lists in `json_keys`, names of fields and properties in the order of
-the file; without such a list, all its fields. Reading makes a pydantic model of the annotations, which checks a file
-and makes the records of it. What is a property is computed again: `check_agrees` compares it with the file's.
+the file; without such a list, all its fields. `json_names` has the names in the file of fields that are called another
+way there. Reading makes a pydantic model of the annotations, which checks a file and makes the records of it. What is a
+property is computed again: `check_agrees` compares it with the file's.
 
 - a float is a number; `OrInfinite`, `OrMinusInfinite` and `OrNaN` are null in the file where they are not finite
 - a tuple of any length is a list, a tuple of two a range, a Mapping a table, a jaxtyping array lists of numbers
@@ -191,8 +192,9 @@ def _agree(one: Any, other: Any, rtol: float) -> bool:
 
 def list_keys(cls: type[Any]) -> Iterator[Key]:
     """Yield the keys that a record has in its file."""
+    names: Mapping[str, str] = getattr(cls, "json_names", {})
     for each in getattr(cls, "json_keys", ()) or [field.name for field in fields(cls)]:
-        yield each if isinstance(each, Key) else Key(field=each, name=each)
+        yield each if isinstance(each, Key) else Key(field=each, name=names.get(each, each))
 
 
 def json_schema(cls: type[Any]) -> dict[str, Any]:

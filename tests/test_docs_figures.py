@@ -101,9 +101,7 @@ def simulate(matrices, gains, per_effort, tracking):
     k, mass, damping, _ = matrices
     block = np.array([[0, 1, 0], [-k / mass, -damping / mass, 1 / mass], [0, 0, 0]])
     step = expm(block * PERIOD)
-    law = realise(
-        Gains(**gains).law("pid", PERIOD), per_effort=per_effort, current_limit_A=9.0, tracking_time_s=tracking
-    )
+    law = realise(Gains(**gains).law("pid", PERIOD), per_effort=per_effort, command_limit=9.0, tracking_time_s=tracking)
     limit = 9.0 / per_effort
     x, late, state, forces = np.zeros(2), 0.0, law.reset(), []
     for i in range(6000):

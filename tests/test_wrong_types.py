@@ -112,7 +112,7 @@ CASES = {
     "swept bandwidths": lambda: so.control.sweep(PLANT, THOR, SPEC, None),
     "swept bandwidth": lambda: so.control.sweep(PLANT, THOR, SPEC, [None]),
     "run with no gate": lambda: runnable(tuned(), gate="x"),
-    "run with a limit": lambda: runnable(tuned(), current_limit_A="x"),
+    "run with a limit": lambda: runnable(tuned(), command_limit="x"),
     **{
         f"reset at {name} = 'x'": lambda name=name: runnable(tuned(), gate=PlausibilityGate(**GATE)).reset(
             **{name: "x"}

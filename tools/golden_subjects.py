@@ -127,7 +127,7 @@ def run_law(name: str) -> dict[str, Any]:
         measured = readings[k, : law.measured]
         reading = float(measured[0]) if law.measured == 1 else measured
         commands[k], state = law.step(state, float(references[k]), reading, readings[k, law.measured :].tolist())
-    limit = law.current_limit_A
+    limit = law.command_limit
     said = strip(controller.to_dict())
     return {
         "gains": said["gains"], "achieved": said["achieved"], "feasible": said["feasible"],

@@ -371,7 +371,7 @@ def certify_problem(
     read = list_readings(law, plants)
     options: dict[str, Any] = {
         "ranges": problem.ranges, "others": problem.parameters, "samples": table.samples, "seed": table.seed,
-        "max_failure_probability": table.max_failure_probability, "current_step_A": table.step,
+        "max_failure_probability": table.max_failure_probability, "command_step": table.step,
         "sensors": problem.sensors.of(read),  # the file may name those of its other laws
         "executor": executor, "progress": progress,
     }  # fmt: skip

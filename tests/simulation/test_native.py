@@ -47,7 +47,7 @@ den = np.array([1.0, -1.5, 0.5])
 tops = [19.001, -35.9995, 16.9995], [18.001, -34.4995, 16.4995]
 pair = [TransferFunction(num=np.array(num), den=den) for num in tops]
 law = realise(
-    Law.from_transfer_functions(*pair, sample_time_s=1e-3), per_effort=1 / 240.3318, current_limit_A=9.0,
+    Law.from_transfer_functions(*pair, sample_time_s=1e-3), per_effort=1 / 240.3318, command_limit=9.0,
 )
 loop = SampledLoop(plant=so.plants.moving_output(), law=law, measured="F1", delay_samples=1)
 params = [so.plants.thor().update(I_p=value) for value in np.linspace(0.2, 0.6, 16)]

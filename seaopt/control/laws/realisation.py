@@ -106,7 +106,7 @@ class RunnableLaw:
         Seconds.
     per_effort : float
         The command is this times F: A/N or A/(N m) of a current.
-    current_limit_A : float
+    command_limit : float
         The command's largest magnitude, in its unit; infinite where there is no limit.
     gate : PlausibilityGate, optional
         Which readings are believed.
@@ -130,7 +130,7 @@ class RunnableLaw:
     tracking_time_s: float | None
     sample_time_s: float
     per_effort: float
-    current_limit_A: float
+    command_limit: float
     gate: PlausibilityGate | None = None
     command: tuple[str, str] = ("I", "A")
     heat: HeatGuard | None = None
@@ -144,12 +144,12 @@ class RunnableLaw:
     @property
     def force_limit_N(self) -> float:
         """The motor force at the limit."""
-        return self.current_limit_A / self.per_effort
+        return self.command_limit / self.per_effort
 
     def __repr__(self) -> str:
         tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
-        limit = f"limited to {show_command(self.current_limit_A, *self.command)}"
-        if math.isinf(self.current_limit_A):
+        limit = f"limited to {show_command(self.command_limit, *self.command)}"
+        if math.isinf(self.command_limit):
             limit = f"no limit of the {name_command(*self.command)}"
         return (
             f"RunnableLaw of order {self.c.size} ({self.integrators} of it integrators{tracking}) at "
@@ -195,8 +195,8 @@ class RunnableLaw:
                 f"reference = {reference:g}, measurement = {measurement}, current_A = {current_A:g}, readings = "
                 f"{list(readings)}: give finite numbers, within +-{LARGEST:g}"
             )
-        if not abs(current_A) <= self.current_limit_A:
-            limit = show_command(self.current_limit_A, *self.command)
+        if not abs(current_A) <= self.command_limit:
+            limit = show_command(self.command_limit, *self.command)
             raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
         added = 0.0
         if self.compensation is not None:
@@ -234,8 +234,8 @@ class RunnableLaw:
         `readings` are of the outputs that the compensation reads, in their order.
         """
         if self.heat is None:
-            return self._decide(state, reference, measurement, readings, self.current_limit_A)
-        limit = min(self.current_limit_A, self.heat.limit(state.heat))
+            return self._decide(state, reference, measurement, readings, self.command_limit)
+        limit = min(self.command_limit, self.heat.limit(state.heat))
         current, following = self._decide(state, reference, measurement, readings, limit)
         current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
         return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
@@ -286,7 +286,7 @@ class RunnableLaw:
 def runnable(
     controller: Controller,
     *,
-    current_limit_A: float | None = None,
+    command_limit: float | None = None,
     tracking_time_s: float | None = None,
     gate: PlausibilityGate | None = None,
     heat: HeatGuard | None = None,
@@ -297,7 +297,7 @@ def runnable(
     ----------
     controller : Controller
         As tuned or read.
-    current_limit_A : float, optional
+    command_limit : float, optional
         Of the command, in its unit: the specification's if left out, and no more than the range of the command;
         infinite where none of them is given.
     tracking_time_s : float, optional
@@ -325,7 +325,7 @@ def runnable(
     return realise(
         controller.law,
         per_effort=controller.command.per_effort,
-        current_limit_A=choose_limit(controller.command, controller.spec, current_limit_A),
+        command_limit=choose_limit(controller.command, controller.spec, command_limit),
         command=(controller.command.input, controller.command.unit),
         tracking_time_s=tracking_time_s,
         gate=gate,
@@ -336,7 +336,7 @@ def runnable(
 
 def choose_limit(command: Command, spec: ControllerSpec, requested: float | None) -> float | None:
     """Return the limit of a running law: the one asked for, infinite for none at all, else the controller's own."""
-    if requested is not None and not 0.0 < require_number(requested, "current_limit_A", ControlError) < math.inf:
+    if requested is not None and not 0.0 < require_number(requested, "command_limit", ControlError) < math.inf:
         return requested  # none at all, or for `realise` to refuse
     return command.limit(spec.limit_asked if requested is None else requested)
 
@@ -354,7 +354,7 @@ def realise(
     law: Law,
     *,
     per_effort: float = 1.0,
-    current_limit_A: float | None = None,
+    command_limit: float | None = None,
     tracking_time_s: float | None = None,
     gate: PlausibilityGate | None = None,
     command: tuple[str, str] = ("I", "A"),
@@ -369,7 +369,7 @@ def realise(
         From (reference, measured) to effort; of two transfer functions: `Law.from_transfer_functions`.
     per_effort : float
         The command for one unit of effort: A/N or A/(N m).
-    current_limit_A : float, optional
+    command_limit : float, optional
         Of the command, in its unit; None: no limit.
     tracking_time_s : float, optional
         T_t; the module's docstring has the default.
@@ -397,7 +397,7 @@ def realise(
     for name, value in (
         ("sample_time_s", law.sample_time_s),
         ("per_effort", per_effort),
-        ("current_limit_A", current_limit_A),
+        ("command_limit", command_limit),
         ("tracking_time_s", tracking_time_s),
     ):
         if value is not None and not require_number(value, name, ControlError) > 0.0:
@@ -425,7 +425,7 @@ def realise(
         tracking_time_s=tracking if m else None,
         sample_time_s=law.sample_time_s,
         per_effort=per_effort,
-        current_limit_A=math.inf if current_limit_A is None else current_limit_A,
+        command_limit=math.inf if command_limit is None else command_limit,
         gate=gate,
         command=command,
         heat=heat,

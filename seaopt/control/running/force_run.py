@@ -108,8 +108,8 @@ def close_loop(
     delay_samples: int = 1,
     preview_samples: int = 0,
     sensors: Sensors | None = None,
-    current_step_A: float = 0.0,
-    current_limit_A: float = np.inf,
+    command_step: float = 0.0,
+    command_limit: float = np.inf,
     disturbance_A: float | Float[np.ndarray, " n"] = 0.0,
     seed: int = 0,
     start_state: Float[np.ndarray, " nx"] | None = None,
@@ -143,9 +143,9 @@ def close_loop(
     sensors : Sensors, optional
         Noise, offset, range and quantisation of the measured output, and of the encoders that it is computed from;
         ideal if left out.
-    current_step_A : float
+    command_step : float
         What the amplifier rounds the command to, in its unit; 0 for not at all.
-    current_limit_A : float
+    command_limit : float
         The amplifier's; with a step the largest is the last whole one within it.
     disturbance_A : float or array, shape (n,)
         Added to the current inside the plant.
@@ -164,7 +164,7 @@ def close_loop(
     ------
     ControlError
         `preview_samples` is no number of samples, the plant has no such output or state, or that output responds to the
-        current at once, the parameters contain another condition than delays, a sensor's error or current_step_A is
+        current at once, the parameters contain another condition than delays, a sensor's error or command_step is
         negative, that step is above the limit, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
@@ -182,12 +182,12 @@ def close_loop(
     read = _place_sensor(devices, plant, values, measured)
     noise_std, _ = devices.combine_errors(plant, values, measured)
     noise = noise_std * np.random.default_rng(require_seed(seed, ControlError)).normal(size=n)
-    if not current_step_A >= 0.0:
-        raise ControlError(f"current_step_A = {current_step_A:g} is negative; give the amplifier's step, 0 for none")
-    most = largest_current(current_limit_A, current_step_A)
+    if not command_step >= 0.0:
+        raise ControlError(f"command_step = {command_step:g} is negative; give the amplifier's step, 0 for none")
+    most = largest_current(command_limit, command_step)
     if not most:
         raise ControlError(
-            f"current_step_A = {current_step_A:g} is above the limit of the command, {current_limit_A:g}, so that "
+            f"command_step = {command_step:g} is above the limit of the command, {command_limit:g}, so that "
             "every command is zero; give the amplifier's step"
         )
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
@@ -209,7 +209,7 @@ def close_loop(
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
         command, law = step(law, coming, read(outputs, float(noise[k])), *x[seen].tolist())
         law_time_s[k] = time.perf_counter() - call_start_s
-        current[k] = _convert_command(command, current_step_A, most)
+        current[k] = _convert_command(command, command_step, most)
         states[k] = x
         if rest_s > 0.0:
             x = integrator.advance(time_s[k], x, inputs(k, older), p, rest_s)

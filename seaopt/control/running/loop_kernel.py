@@ -119,10 +119,10 @@ def _structure_of(loop: SampledLoop) -> _Structure:
         fed_back=loop.law.measured,
         law_states=loop.law.c.size,
         waiting=loop.waiting,
-        rounds_current=bool(loop.current_step_A),
+        rounds_current=bool(loop.command_step),
         devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
-        limits_current=math.isfinite(loop.law.current_limit_A),
+        limits_current=math.isfinite(loop.law.command_limit),
         sticks=loop.sticks,
         compensation=CompensationShape() if loop.law.compensation is None else loop.law.compensation.shape,
     )
@@ -181,8 +181,8 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
 
 def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     law = loop.law
-    limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.current_limit_A) else (0.0, 0.0)
-    numbers = [law.d_reference, *np.ravel(law.d_measurement), limit, law.per_effort, loop.current_step_A, most]
+    limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.command_limit) else (0.0, 0.0)
+    numbers = [law.d_reference, *np.ravel(law.d_measurement), limit, law.per_effort, loop.command_step, most]
     for name in (*loop.signals, *loop.encoders):
         numbers += _describe_device(loop.sensors, name)[1]
     if law.compensation is not None:

@@ -40,7 +40,7 @@ class SampledLoop:
     sensors : Sensors
         Noise, offset, range and quantisation of the measured output, and of the encoders that it is computed from,
         whose noise is the output's.
-    current_step_A : float
+    command_step : float
         What the command is rounded to, in its unit; 0 for not at all. The largest is the last whole step within the
         law's limit.
     longest_delay_s : float
@@ -64,7 +64,7 @@ class SampledLoop:
     measured: Measured
     delay_samples: int
     sensors: Sensors = field(default_factory=Sensors)
-    current_step_A: float = 0.0
+    command_step: float = 0.0
     longest_delay_s: float = 0.0
     sticks: bool = False
     link: str | None = None
@@ -88,14 +88,14 @@ class SampledLoop:
             raise SimulationError(
                 f"sticks = True, but {plant.name} has no friction that jumps at rest; give its Friction a jump"
             )
-        for name in ("current_step_A", "longest_delay_s"):
+        for name in ("command_step", "longest_delay_s"):
             if not getattr(self, name) >= 0.0:
                 raise SimulationError(f"{name} = {getattr(self, name):g} is negative; give zero or more")
         self.sensors.refuse_negative((*self.signals, *self.encoders), SimulationError)
-        if self.current_step_A and not self.most_A:
-            limit = show_command(self.law.current_limit_A, *self.law.command)
+        if self.command_step and not self.most_A:
+            limit = show_command(self.law.command_limit, *self.law.command)
             raise SimulationError(
-                f"current_step_A = {self.current_step_A:g} is above the limit of {limit}, so that every command but "
+                f"command_step = {self.command_step:g} is above the limit of {limit}, so that every command but "
                 "zero is; give the amplifier's step"
             )
         for name in self.signals if self.delay_samples == 0 else ():
@@ -153,7 +153,7 @@ class SampledLoop:
     @property
     def most_A(self) -> float:
         """The largest current: the law's limit, or the last whole step of the amplifier within it."""
-        return largest_current(self.law.current_limit_A, self.current_step_A)
+        return largest_current(self.law.command_limit, self.command_step)
 
 
 def find_longest_delay(plant: Plant, params: Iterable[ParameterSet]) -> float:

@@ -215,7 +215,7 @@ def make_runnable(
         realise(
             table.law(point),
             per_effort=per_effort,
-            current_limit_A=limit,
+            command_limit=limit,
             tracking_time_s=tracking_time_s,
             command=command,
         )
@@ -226,6 +226,6 @@ def make_runnable(
         anti_windup=np.array([law.anti_windup[0] if law.integrators else 0.0 for law in each]),
         fallback=float(table.points[0]) if fallback is None else fallback,
         per_effort=per_effort,
-        limit=each[0].current_limit_A,
+        limit=each[0].command_limit,
         command=command,
     )

@@ -160,7 +160,7 @@ class Certificate(Result, Worded):
         self,
         *,
         sensors: Sensors | None = None,
-        current_step_A: float = 0.0,
+        command_step: float = 0.0,
         seed: int = 1,
         executor: Executor | None = None,
         progress: Progress = ignore,
@@ -175,7 +175,7 @@ class Certificate(Result, Worded):
         ----------
         sensors : Sensors, optional
             Of the measured output; ideal if left out.
-        current_step_A : float
+        command_step : float
             What the current is rounded to; 0 for not at all.
         seed : int
             Of noise and random excitations.
@@ -203,7 +203,7 @@ class Certificate(Result, Worded):
             self.parameters,
             draws=self.list_draws(),
             sensors=sensors,
-            current_step_A=current_step_A,
+            command_step=command_step,
             seed=seed,
             steps=self.steps if isinstance(self.steps, Verification) else None,
             executor=executor,
@@ -220,7 +220,7 @@ class Certificate(Result, Worded):
         executor: Executor | None = None,
         *,
         sensors: Sensors | None = None,
-        current_step_A: float = 0.0,
+        command_step: float = 0.0,
         seed: int = 1,
     ) -> Certificate:
         """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
@@ -239,7 +239,7 @@ class Certificate(Result, Worded):
                 executor=executor,
                 progress=progress,
                 sensors=sensors,
-                current_step_A=current_step_A,
+                command_step=command_step,
                 seed=seed,
             )
         except SeaoptError as error:

@@ -87,7 +87,7 @@ class CertifyOptions:
     min_rate: float | None = option("Of the schedule's variable, in its unit per second.", default=None, above=0.0)
     runs: int = option("Runs with limits active.", default=100, least=1)
     bound_tolerance: float = option("Share of half the width of a signal's bounds.", default=0.1, least=0.0)
-    current_step_A: float = option("What the command is rounded to, in its unit.", default=0.0, least=0.0)
+    command_step: float = option("What the command is rounded to, in its unit.", default=0.0, least=0.0)
     rounds: int = option("Of tuning and certifying.", default=6, least=1)
 
 
@@ -111,7 +111,7 @@ def certify(
     bounds: Budget | None = None,
     simulations: bool = True,
     sensors: Sensors | None = None,
-    current_step_A: float = 0.0,
+    command_step: float = 0.0,
     measured: Mapping[str, MeasuredResponse] | None = None,
     executor: Executor | None = None,
     progress: Progress = ignore,
@@ -156,7 +156,7 @@ def certify(
     simulations : bool
         Play every scenario on the nonlinear plants, with large signals, passivity and environments, as
         `Certificate.with_simulation` does. False plays steps of several sizes alone, which takes a few seconds less.
-    sensors, current_step_A
+    sensors, command_step
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     measured : mapping of name to MeasuredResponse, optional
         Measured frequency responses on which stability, Ms, Mt and disk margin are required too, of every response in
@@ -211,10 +211,8 @@ def certify(
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
     require_type(simulations, bool, "simulations", "give True or False", ControlError)
     check_executor(executor, ControlError)
-    if not simulations and (sensors is not None or current_step_A):
-        raise ControlError(
-            "sensors and current_step_A are of the simulations, which are left out; give simulations=True"
-        )
+    if not simulations and (sensors is not None or command_step):
+        raise ControlError("sensors and command_step are of the simulations, which are left out; give simulations=True")
     slopes = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
     min_friction_margin = max((slope for slope in slopes if slope is not None), default=None)
     design, values = controller.design
@@ -297,7 +295,7 @@ def certify(
     certificate = certificate.with_steps(stepping, executor)
     if simulations:
         certificate = certificate.with_simulation(
-            sensors=sensors, current_step_A=current_step_A, seed=seed, executor=executor, progress=simulating
+            sensors=sensors, command_step=command_step, seed=seed, executor=executor, progress=simulating
         )
     progress(f"{samples} draws, {format_count(monte_carlo.failures, 'failure')}", 1.0)
     return certificate

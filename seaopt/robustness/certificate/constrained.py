@@ -42,7 +42,7 @@ from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_floor
 from seaopt.robustness.verification.linear import view_loop
 from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
-from seaopt.robustness.verification.playback import Stage
+from seaopt.robustness.verification.playback import STEP_IN_FILE, Stage
 from seaopt.units import LINEAR
 
 CONSTRAINED_STREAM = 0x3C  # the runs' own stream of random numbers, whatever the seed
@@ -77,7 +77,7 @@ class ConstrainedRuns(Result):
         Share of the samples with the command at its limit or its slew limit, and without a plan that keeps the limits.
     iterations : int
         The most of any step.
-    sensors, current_step_A
+    sensors, command_step
         What the law reads with, and what its command is rounded to.
     unit : str
         Of the ring: N, or N m of a torque.
@@ -90,6 +90,8 @@ class ConstrainedRuns(Result):
         Bounded signals that a plant does not have, and conditions that are not drawn.
 
     """
+
+    json_names = STEP_IN_FILE
 
     runs: int
     failures: int
@@ -107,7 +109,7 @@ class ConstrainedRuns(Result):
     ringing: int = 0
     largest_ring: float = 0.0
     sensors: Sensors = field(default_factory=Sensors)
-    current_step_A: float = 0.0
+    command_step: float = 0.0
     unit: str = LINEAR.unit
     plant: str = ""
     run: str = ""
@@ -185,17 +187,17 @@ class _Bench:
     law: Controller
     tolerance: float
     sensors: Sensors
-    current_step_A: float
+    command_step: float
 
     @property
     def ideal(self) -> _Bench:
         """The same with an ideal sensor and amplifier."""
-        return replace(self, sensors=Sensors(), current_step_A=0.0)
+        return replace(self, sensors=Sensors(), command_step=0.0)
 
     @property
     def is_ideal(self) -> bool:
         """Whether sensor and amplifier add nothing of their own."""
-        return self.sensors == Sensors() and not self.current_step_A
+        return self.sensors == Sensors() and not self.command_step
 
 
 @record(eq=False)
@@ -255,8 +257,8 @@ class _Case:
             delay_samples=mpc.compute_delay_samples,
             preview_samples=mpc.spec.preview_samples,
             sensors=self.bench.sensors,
-            current_step_A=self.bench.current_step_A,
-            current_limit_A=mpc.command_limit,
+            command_step=self.bench.command_step,
+            command_limit=mpc.command_limit,
             disturbance_A=self.drawn.disturbance,
             seed=self.drawn.seed,
         )
@@ -294,9 +296,7 @@ class _Case:
         fading = not (swing.sustained or swing.growing)
         if fading and bench.is_ideal:
             return 0.0, ""
-        stage = Stage(
-            controller=bench.law, plant=self.plant, sensors=bench.sensors, current_step_A=bench.current_step_A
-        )
+        stage = Stage(controller=bench.law, plant=self.plant, sensors=bench.sensors, command_step=bench.command_step)
         view = view_loop(stage, self.plant, self.values)
         floor = find_noise_floor(stage, float(np.max(np.abs(run.force))))
         if not view.instability:
@@ -354,7 +354,7 @@ def run_constrained(
     confidence: float,
     tolerance: float,
     sensors: Sensors,
-    current_step_A: float,
+    command_step: float,
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> ConstrainedRuns:
@@ -367,7 +367,7 @@ def run_constrained(
         draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
         reference, disturbance = _draw_references(mpc, rng)
         parts.append(_Run(draw=draw, seed=seed + k, reference=reference, disturbance=disturbance))
-    bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, current_step_A=current_step_A)
+    bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, command_step=command_step)
     played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, executor)
     kinds: list[str] = []
     failed_run, outcomes = dict[str, Any](), list[_Outcome]()
@@ -407,7 +407,7 @@ def run_constrained(
         fallback=sum(outcome.unsolved for outcome in outcomes) / steps,
         iterations=max(outcome.iterations for outcome in outcomes),
         sensors=sensors,
-        current_step_A=current_step_A,
+        command_step=command_step,
         unit=law.command.reference_unit,
         **failed_run,
         left_out=(*missing, *kept),
@@ -452,7 +452,7 @@ def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[st
     # Of a bound the room that it needs is named.
     if not over_bound and not bench.is_ideal and not replace(case, bench=bench.ideal).play().kind:
         return (
-            "finer sensors of less offset and more range, a finer current_step_A, or a lower bandwidth_hz: with ideal "
+            "finer sensors of less offset and more range, a finer command_step, or a lower bandwidth_hz: with ideal "
             "ones that run passes"
         )
     design, values = mpc.design

@@ -85,7 +85,7 @@ def certify_mpc(
     max_failure_probability: float | None = None,
     bound_tolerance: float = 0.1,
     sensors: Sensors | None = None,
-    current_step_A: float = 0.0,
+    command_step: float = 0.0,
     executor: Executor | None = None,
     progress: Progress = ignore,
     **linear: Any,
@@ -106,7 +106,7 @@ def certify_mpc(
     bound_tolerance : float
         By how much a bounded signal may leave its bounds, as a share of half their width: a wrong model, and noise,
         make the estimate of it wrong.
-    sensors, current_step_A
+    sensors, command_step
         As in `certify`: of the runs, and of steps that are simulated in the linear region.
     executor, progress
         As in `certify`; runs are parts, too.
@@ -135,9 +135,9 @@ def certify_mpc(
 
     """
     require_type(mpc, ForceMPC, "mpc", "give a ForceMPC", ControlError)
-    check_numbers(runs=runs, bound_tolerance=bound_tolerance, current_step_A=current_step_A)
+    check_numbers(runs=runs, bound_tolerance=bound_tolerance, command_step=command_step)
     require_type(sensors, (Sensors, NoneType), "sensors", "give Sensors", ControlError)
-    real = sensors not in (None, Sensors()) or current_step_A > 0.0
+    real = sensors not in (None, Sensors()) or command_step > 0.0
     linearly, stepping, simulating = divide(
         progress, LINEAR_RUN, STEPS * real, CONSTRAINED_RUN * runs * max(len(plants), 1)
     )
@@ -159,7 +159,7 @@ def certify_mpc(
     )
     if real:
         certificate = certificate.with_steps(
-            sensors=sensors, current_step_A=current_step_A, seed=seed, executor=executor, progress=stepping
+            sensors=sensors, command_step=command_step, seed=seed, executor=executor, progress=stepping
         )
     models, (_, values), others = certificate.models, mpc.design, others or ParameterSet()
     others = others.with_parameters(*(values[name] for name in values if name not in others))
@@ -174,7 +174,7 @@ def certify_mpc(
         confidence=confidence,
         tolerance=bound_tolerance,
         sensors=sensors or Sensors(),
-        current_step_A=current_step_A,
+        command_step=command_step,
         executor=executor,
         progress=simulating,
     )

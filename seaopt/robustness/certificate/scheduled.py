@@ -307,7 +307,7 @@ def certify_schedule(
     min_rate: float | None = None,
     simulations: bool = True,
     sensors: Sensors | None = None,
-    current_step_A: float = 0.0,
+    command_step: float = 0.0,
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> ScheduleCertificate:
@@ -319,7 +319,7 @@ def certify_schedule(
         The gains.
     plants : mapping of name to Plant
         Plants on which it must pass; the design plant is certified too.
-    parameters, ranges, others, samples, seed, confidence, max_failure_probability, sensors, current_step_A
+    parameters, ranges, others, samples, seed, confidence, max_failure_probability, sensors, command_step
         As in `seaopt.certify`; the draws are spread evenly over the points and the values between them. What the
         schedule is over has no range: its points are it.
     min_rate : float, optional
@@ -398,7 +398,7 @@ def certify_schedule(
                 seed=seed,
                 simulations=simulations,
                 sensors=sensors if simulations else None,
-                current_step_A=current_step_A if simulations else 0.0,
+                command_step=command_step if simulations else 0.0,
                 executor=executor,
             )
             required = {(row.name, row.plant, row.state) for row in place.requirements}

@@ -26,6 +26,7 @@ from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, requ
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
+from seaopt.robustness.verification.playback import STEP_IN_FILE
 from seaopt.robustness.verification.verification import (
     Verification,
     check_plants,
@@ -57,7 +58,7 @@ class Simulated(Result):
     passivity, environments : Passivity and StabilityMap, or None
         None for a plant without a port at link 2.
     left_out : mapping of what to reason
-    sensors, current_step_A, seed
+    sensors, command_step, seed
         What the scenarios were played with.
 
     """
@@ -68,7 +69,7 @@ class Simulated(Result):
     environments: StabilityMap | None
     left_out: Mapping[str, str]
     sensors: Sensors
-    current_step_A: float
+    command_step: float
     seed: int
 
     @property
@@ -79,10 +80,9 @@ class Simulated(Result):
     def simulation_dict(self) -> dict[str, Any]:
         """Return what goes into robustness.json under "simulation"."""
         played = {} if self.verification is None else self.verification.to_dict()
-        others = ("large_signal", "sensors", "current_step_A", "seed", "left_out")
-        return (
-            {"met": self.met, "passed": self.met} | played | {name: to_content(getattr(self, name)) for name in others}
-        )
+        names = ("large_signal", "sensors", "command_step", "seed", "left_out")
+        parts = {STEP_IN_FILE.get(name, name): to_content(getattr(self, name)) for name in names}
+        return {"met": self.met, "passed": self.met} | played | parts
 
     def passivity_dict(self) -> dict[str, Any] | None:
         """Return what goes into robustness.json under "passivity"; None for a plant without a port."""
@@ -119,7 +119,7 @@ def run_simulations(
     *,
     draws: Mapping[str, Sequence[ParameterSet]] | None = None,
     sensors: Sensors | None = None,
-    current_step_A: float = 0.0,
+    command_step: float = 0.0,
     seed: int = 1,
     steps: Verification | None = None,
     executor: Executor | None = None,
@@ -129,7 +129,7 @@ def run_simulations(
 
     Parameters
     ----------
-    controller, plants, parameters, draws, sensors, current_step_A, seed
+    controller, plants, parameters, draws, sensors, command_step, seed
         As in `verify`; the controller knows its design plant.
     steps : Verification, optional
         Runs of steps that were played before: on the same devices they are not played again.
@@ -155,7 +155,7 @@ def run_simulations(
         )
     check_plants(plants, draws or {}, {})
     check_sensors(sensors, controller, plants)
-    devices: dict[str, Any] = {"sensors": sensors or Sensors(), "current_step_A": current_step_A, "seed": seed}
+    devices: dict[str, Any] = {"sensors": sensors or Sensors(), "command_step": command_step, "seed": seed}
     sweeps = _list_sweeps(controller, plants, parameters)
     jobs = sweeps | _list_port_jobs(controller)
     sweeping, playing = divide(progress, SWEEP * len(sweeps) + PORT, SCENARIOS * len(plants))

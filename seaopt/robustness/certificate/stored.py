@@ -46,6 +46,7 @@ from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_wo
 from seaopt.robustness.verification.impedance_steps import ImpedanceStep
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.limit_cycles import FoundCycle
+from seaopt.robustness.verification.playback import STEP_IN_FILE
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
 from seaopt.robustness.verification.verification import Verification, make_stages
@@ -120,8 +121,10 @@ class StoredPlant:
 class StoredSimulation:
     """The devices of the scenarios, sweeps of amplitudes, and why something is missing."""
 
+    json_names = STEP_IN_FILE
+
     sensors: Sensors
-    current_step_A: float
+    command_step: float
     seed: int
     large_signal: tuple[LargeSignal, ...]
     left_out: Mapping[str, str]
@@ -239,11 +242,11 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     runs, played = certificate.constrained, stored.simulation
     draws = {name: (certificate.parameters, *drawn) for name, drawn in certificate.list_draws().items()}
 
-    def restore(rows: Mapping[str, Any], sensors: Sensors | None, current_step_A: float) -> Verification | None:
-        stages = make_stages(certificate.controller, certificate.models, sensors, current_step_A)
+    def restore(rows: Mapping[str, Any], sensors: Sensors | None, command_step: float) -> Verification | None:
+        stages = make_stages(certificate.controller, certificate.models, sensors, command_step)
         return Verification.from_dict(rows, stages, draws, FILE, CERTIFY_AGAIN) if "rows" in rows else None
 
-    devices = (None, 0.0) if runs is None else (runs.sensors, runs.current_step_A)
+    devices = (None, 0.0) if runs is None else (runs.sensors, runs.command_step)
     cycles = {
         name: friction.limit_cycles
         for name, friction in stored.friction.items()
@@ -255,7 +258,7 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     if played is None:
         return certificate
     simulated = Simulated(
-        verification=restore(content["simulation"], played.sensors, played.current_step_A),
+        verification=restore(content["simulation"], played.sensors, played.command_step),
         **{each.name: getattr(played, each.name) for each in fields(played)},
         **find_port_figures(certificate.controller),
     )

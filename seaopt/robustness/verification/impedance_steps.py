@@ -90,7 +90,7 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
     for effort in efforts:
         size = min(effort / outer.stiffness, farthest)
         run = run_loop(loop, [params], np.full(samples, size))
-        limit = law.current_limit_A * (1.0 - 1e-9)
+        limit = law.command_limit * (1.0 - 1e-9)
         steps.append(_judge(run.outputs[motion][0], size, bool(np.max(np.abs(run.current)) >= limit)))
     return tuple(steps)
 

@@ -272,7 +272,7 @@ def _judge_extremes(run: _Run, findings: _Findings) -> None:
     force = float(trace.peaks[run.regulated][index])
     angles = [float(trace.peaks[name][index]) for name, unit in run.stage.plant.outputs.items() if unit == "rad"]
     current, limit = np.abs(trace.current[index]), run.stage.controller.command_limit
-    most = largest_current(math.inf if limit is None else limit, run.stage.current_step_A)
+    most = largest_current(math.inf if limit is None else limit, run.stage.command_step)
     hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[index]), default=None)
     findings.figures.update(
         peak_force_N=force,
@@ -380,7 +380,7 @@ def find_judged_window(trace: Playback) -> slice:
 
 def find_noise_floor(stage: Stage, peak: float) -> float:
     """Return the amplitude (N) that noise, quantisation and rounding make without an oscillation in a run's peak."""
-    rounding = 0.5 * stage.current_step_A / stage.controller.command.per_effort
+    rounding = 0.5 * stage.command_step / stage.controller.command.per_effort
     std, step = stage.reading_errors
     return max(2.0 * std + 1.5 * step + rounding, 1e-3 * peak)
 
@@ -425,7 +425,7 @@ def _judge_final_error(run: _Run, ideal: _Run, findings: _Findings) -> None:
     findings.figures["final_error_N"] = error
     if most is None:
         return
-    (noise, count), rounding = stage.reading_errors, stage.current_step_A / stage.controller.command.per_effort
+    (noise, count), rounding = stage.reading_errors, stage.command_step / stage.controller.command.per_effort
     spare = MEAN_SIGMAS * noise / math.sqrt(end.stop - end.start) + 0.5 * (count + rounding)
     for value, allowed, what in ((error, most + spare, ""), (alone, most, " without noise")):
         if not abs(value) <= allowed:

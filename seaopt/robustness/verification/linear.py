@@ -79,7 +79,7 @@ def view_loop(stage: Stage, plant: Plant, params: ParameterSet) -> LinearView:
     return LinearView(
         loop=Loop(plant=controller.plant(plant, params), law=controller.law),
         noise=tuple(_combine_std(*stage.find_errors(name)) for name in controller.signals),
-        step_N=_combine_std(0.0, stage.current_step_A / controller.command.per_effort),
+        step_N=_combine_std(0.0, stage.command_step / controller.command.per_effort),
     )
 
 

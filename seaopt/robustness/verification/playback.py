@@ -27,6 +27,7 @@ from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 
 RunSamples = Float[np.ndarray, "runs n"]
+STEP_IN_FILE = {"command_step": "current_step_A"}  # key of robustness.json, from when every command was a current
 
 
 @record(eq=False)
@@ -37,7 +38,7 @@ class Stage:
     plant: Plant  # with the link at its port as it is
     partner: Plant | None = None  # the same actuator with that link fixed, for phases in which it is held
     sensors: Sensors = field(default_factory=Sensors)
-    current_step_A: float = 0.0
+    command_step: float = 0.0
 
     def loop(self, held: bool, longest_delay_s: float = 0.0, *, sticks: bool = False) -> SampledLoop:
         """Return the loop with the link held or not, with friction as its curve says or one that sticks."""
@@ -52,7 +53,7 @@ class Stage:
             measured=self.controller.signals,
             delay_samples=self.controller.compute_delay_samples,
             sensors=self.sensors,
-            current_step_A=self.current_step_A,
+            command_step=self.command_step,
             longest_delay_s=longest_delay_s,
             sticks=sticks and can_stick(plant),  # bristles hold by themselves
             link=None if self.controller.link is None else self.controller.link.measured,
@@ -61,7 +62,7 @@ class Stage:
     @property
     def ideal(self) -> Stage:
         """The stage with a sensor and an amplifier that only have a range: no noise, no offset, no steps."""
-        return replace(self, sensors=Sensors(saturation=self.sensors.saturation), current_step_A=0.0)
+        return replace(self, sensors=Sensors(saturation=self.sensors.saturation), command_step=0.0)
 
     @property
     def unlimited(self) -> Stage:
@@ -76,7 +77,7 @@ class Stage:
         signals = self.controller.signals
         sources = {*signals, *(name for signal in signals for name in weigh_encoders(self.plant, signal))}
         offset = any(self.sensors.offset.get(name) for name in sources)
-        return not (self.current_step_A or offset or any(any(self.find_errors(name)) for name in signals))
+        return not (self.command_step or offset or any(any(self.find_errors(name)) for name in signals))
 
     @property
     def reading_errors(self) -> tuple[float, float]:

@@ -107,7 +107,7 @@ class Verification(Result, Worded):
         before = self.stages.get(name)
         if before is None or before.controller is not stage.controller or before.plant is not stage.plant:
             return []
-        devices, same = ((each.sensors, each.current_step_A) for each in (before, stage))
+        devices, same = ((each.sensors, each.command_step) for each in (before, stage))
         same_draws = list(map(id, self.draws[name])) == list(map(id, draws))
         held = any(phase.held for phase in scenario.phases)  # by a partner, which may be another one
         if held or devices != same or self.seed != seed or not same_draws or scenario not in self.scenarios[name]:
@@ -211,7 +211,7 @@ def make_stages(
     controller: Controller,
     plants: Plants,
     sensors: Sensors | None,
-    current_step_A: float,
+    command_step: float,
     partners: Plants | None = None,
 ) -> dict[str, Stage]:
     """Return where a controller is played: on plants as it sees them, with what holds their links."""
@@ -222,7 +222,7 @@ def make_stages(
             plant=plant,
             partner=_partner(plant, (partners or {}).get(name)),
             sensors=sensors or Sensors(),
-            current_step_A=current_step_A,
+            command_step=command_step,
         )
         for name, plant in seen.items()
     }
@@ -236,7 +236,7 @@ def verify(
     scenarios: Sequence[Scenario] | ChooseScenarios | None = None,
     draws: Mapping[str, Sequence[ParameterSet]] | None = None,
     sensors: Sensors | None = None,
-    current_step_A: float = 0.0,
+    command_step: float = 0.0,
     partners: Plants | None = None,
     seed: int = 1,
     known: Verification | None = None,
@@ -261,7 +261,7 @@ def verify(
         set where those runs start, and how late the loop is (`seaopt.robustness.verification.playback.play`).
     sensors : Sensors, optional
         Noise, offset, range and quantisation of the measured output; ideal if left out.
-    current_step_A : float
+    command_step : float
         Step that the current is rounded to; 0 for none.
     partners : mapping of plant name to Plant, optional
         The same actuator with its link fixed, for scenarios of contact; what the plant's port makes where left out.
@@ -299,7 +299,7 @@ def verify(
     """
     check_plants(plants, draws or {}, partners or {})
     check_sensors(sensors, controller, plants)
-    stages = make_stages(controller, plants, sensors, current_step_A, partners)
+    stages = make_stages(controller, plants, sensors, command_step, partners)
     sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
     skipped: list[tuple[str, str, str]] = []
     parts: list[tuple[str, Scenario, list[Outcome]]] = []  # with the rows that are known

@@ -133,7 +133,7 @@ def check_law(integrators, matrices, response, last):
     if integrators:
         assert law.b[integrators - 1, 0] == pytest.approx(last, rel=1e-5)
         assert law.b[integrators - 1, 1] == -law.b[integrators - 1, 0]  # it rests at its reference, to the last bit
-    running = realise(law, current_limit_A=1.0)
+    running = realise(law, command_limit=1.0)
     assert running.integrators == integrators and (running.tracking_time_s is None) == (not integrators)
 
 
@@ -245,7 +245,7 @@ def find_recovery(law):
     """Return the samples until the force is back within 5 % of a reference in reach after 1 s of one out of reach."""
     # 1/(0.01 s + 1)^2 behind its hold and a sample of delay, by hand.
     pole = np.exp(-TS / 0.01)
-    running, first, second, held = realise(law, current_limit_A=1.0), 0.0, 0.0, 0.0
+    running, first, second, held = realise(law, command_limit=1.0), 0.0, 0.0, 0.0
     state = running.reset()
     for k in range(5000):
         if k > 1000 and abs(second - 0.5) < 0.025:

@@ -33,7 +33,7 @@ def tf(num, den):
 
 
 def run_law(structure="pid", limit=None, **gains):
-    return realise(Gains(**GAINS | gains).law(structure, TS).balanced(), current_limit_A=limit)
+    return realise(Gains(**GAINS | gains).law(structure, TS).balanced(), command_limit=limit)
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +205,7 @@ def test_a_disturbance_observer_sees_the_saturated_command(signals):
     lam, k = 0.93, 4.0
     q_num, one_minus_q = [0.0, 1 - lam], [1.0, -1.0]  # Q = (1 - lam) q / (1 - lam q)
     c_r, c_y = tf(k * np.array([1.0, -lam]), one_minus_q), tf(k * np.array([1.0, -lam]) + q_num, one_minus_q)
-    law = realise(Law.from_transfer_functions(c_r, c_y, TS), current_limit_A=3.0)
+    law = realise(Law.from_transfer_functions(c_r, c_y, TS), command_limit=3.0)
     estimate, out = 0.0, []
     for ref, meas in zip(r, y, strict=True):
         sat = np.clip(k * (ref - meas) + estimate, -3.0, 3.0)
@@ -243,7 +243,7 @@ def test_after_an_unreachable_reference_the_force_returns_at_once(tuned):
     error, wound, free = (
         closed(candidate, tuned, references)[1500:] / limit - 0.5
         for candidate in (
-            law, replace(law, anti_windup=0 * law.anti_windup), replace(law, current_limit_A=np.inf),
+            law, replace(law, anti_windup=0 * law.anti_windup), replace(law, command_limit=np.inf),
         )
     )  # fmt: skip
     late = slice(150, None)
@@ -299,7 +299,7 @@ def test_numbers_that_are_not_finite_hold_the_command(tuned, signals):
         ([np.nan], [1.0], {}, "not finite"),
         ([1.0, 0.5], np.poly([0.99999, 0.99999, 0.99999]), {}, "too close together"),
         ([1.0], [2.0], {}, r"den\[0\] is not 1"),
-        ([1.0], [1.0], {"current_limit_A": 0.0}, "current_limit_A = 0 is not positive"),
+        ([1.0], [1.0], {"command_limit": 0.0}, "command_limit = 0 is not positive"),
         ([1.0], [1.0], {"tracking_time_s": -1.0}, "tracking_time_s = -1 is not positive"),
     ],
 )

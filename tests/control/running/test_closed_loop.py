@@ -23,7 +23,7 @@ GAIN = 1 / 240.3318
 
 
 def law(limit=9.0, **changes):
-    options = {"per_effort": GAIN, "current_limit_A": limit, **changes}
+    options = {"per_effort": GAIN, "command_limit": limit, **changes}
     return realise(LAW, **options)
 
 
@@ -57,7 +57,7 @@ def swing_by_hand(params):
 
 def hard_case(swing, thor, friction, sensors, step):
     """0.4 s with friction, the pendulum's sine, two samples of delay and saturation with anti-windup."""
-    loop = SampledLoop(plant=swing, law=law(3.0), measured="F1", delay_samples=2, sensors=sensors, current_step_A=step)
+    loop = SampledLoop(plant=swing, law=law(3.0), measured="F1", delay_samples=2, sensors=sensors, command_step=step)
     reference = np.where(np.arange(400) < 200, 120.0, -60.0)
     start = np.array([1e-4, 0.0, 0.8, -1.0])
     start[0] -= 0.0725 * np.sin(0.8)
@@ -229,7 +229,7 @@ def test_bristles_that_slip_fast_are_no_loop_that_runs_away(speed):
     params = plant.defaults.update(
         N=50.0, K_tau=0.03, J_m=2e-5, b_r=6e-5, f_c=0.006, k_s=250.0, c_s=0.3, sigma_0=0.3, sigma_1=1e-4, eta=1.0
     )
-    loop = SampledLoop(plant=plant, law=realise(LAW, per_effort=1 / 1.5, current_limit_A=9.0), measured="tau_s",
+    loop = SampledLoop(plant=plant, law=realise(LAW, per_effort=1 / 1.5, command_limit=9.0), measured="tau_s",
                        delay_samples=1)  # fmt: skip
     x = np.array([-60.0, speed, -0.02])
     start = LoopState(x=x[None], z=np.zeros((1, loop.law.c.size + 1)))
@@ -292,7 +292,7 @@ def test_a_loop_that_runs_away_is_left_where_it_does(stand, thor):
     [
         ({"measured": "F9"}, "F9"),
         ({"measured": "F2", "delay_samples": 0}, "without delay"),
-        ({"current_step_A": -1.0}, "current_step_A"),
+        ({"command_step": -1.0}, "command_step"),
         ({"longest_delay_s": -1.0}, "longest_delay_s"),
         ({"sensors": so.Sensors(noise_std={"F1": -1.0})}, "negative"),
     ],

@@ -65,9 +65,9 @@ def test_sensors_and_amplifier_err_here_as_there(thor):
     reference = np.where(np.arange(120) < 60, 6.0, -2.0)
     one = close_loop(
         runnable.step, runnable.reset(), knee, params, reference, measured="tau_d", sensors=sensors,
-        current_step_A=0.4, current_limit_A=4.3,
+        command_step=0.4, command_limit=4.3,
     )  # fmt: skip
-    loop = SampledLoop(plant=knee, law=runnable, measured="tau_d", delay_samples=1, sensors=sensors, current_step_A=0.4)
+    loop = SampledLoop(plant=knee, law=runnable, measured="tau_d", delay_samples=1, sensors=sensors, command_step=0.4)
     other = run_loop(loop, [params], reference)
     np.testing.assert_allclose(one.force, other.outputs["tau_d"][0], atol=1e-6)
     assert np.max(np.abs(one.current)) == pytest.approx(4.0)  # the last whole step within the limit
@@ -76,9 +76,9 @@ def test_sensors_and_amplifier_err_here_as_there(thor):
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"current_step_A": -1.0}, "current_step_A"),
+        ({"command_step": -1.0}, "command_step"),
         ({"sensors": so.Sensors(noise_std={"F1": -1.0})}, "noise_std of F1"),
-        ({"current_step_A": 5.0, "current_limit_A": 4.0}, "above the limit of the command, 4"),
+        ({"command_step": 5.0, "command_limit": 4.0}, "above the limit of the command, 4"),
     ],
 )
 def test_devices_that_cannot_be_are_refused(swing, thor, options, named):

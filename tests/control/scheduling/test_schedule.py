@@ -96,7 +96,7 @@ class TestRunnableSchedule:
 
     def test_at_a_point_its_anti_windup_is_that_of_the_plain_law(self):
         table = make_table()
-        scheduled, frozen = make_runnable(table, limit=50.0), realise(table.law(0.7), current_limit_A=50.0)
+        scheduled, frozen = make_runnable(table, limit=50.0), realise(table.law(0.7), command_limit=50.0)
         state, other = scheduled.reset(place=0.7), frozen.reset()
         for k in range(600):
             r = 5.0 if k < 300 else 0.2

@@ -147,7 +147,7 @@ def test_a_simulated_step_is_that_of_the_equations(certificate):
 
 def test_one_law_runs_as_force_law_and_outer_loop_do(force):
     controller = add_impedance(force, FREE, VALUES, Impedance(stiffness=40.0, damping=2.0), name="free")
-    law = runnable(controller, current_limit_A=2.0)
+    law = runnable(controller, command_limit=2.0)
     rng = np.random.default_rng(3)
     wanted, torque, place = rng.normal(size=(3, 200)) * np.array([[0.02], [0.5], [0.001]])
     together, _ = enclose_law(law, controller.outer).run(wanted, np.column_stack([torque, place]))

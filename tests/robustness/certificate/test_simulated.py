@@ -35,7 +35,7 @@ def linear(controller, stand, swing, thor):
 
 @pytest.fixture(scope="module")
 def certificate(linear):
-    return linear.with_simulation(sensors=CELL, current_step_A=0.01, seed=4)
+    return linear.with_simulation(sensors=CELL, command_step=0.01, seed=4)
 
 
 def test_every_plant_and_the_worst_draw_are_played(certificate, linear):

@@ -31,21 +31,21 @@ def chosen(controller, plant, name):
 
 def test_an_amplifier_that_rounds_stays_within_the_limit(controller, stand, thor):
     """The law's own commands, rounded by NumPy to whole steps and cut at 8.96 A = 128 steps of 0.07 A."""
-    stage = Stage(controller=controller, plant=stand, current_step_A=0.07)
+    stage = Stage(controller=controller, plant=stand, command_step=0.07)
     trace = play(stage, chosen(controller, stand, "saturating doublet"), [thor])
     commands, _ = runnable(controller).run(trace.reference[0], trace.outputs["F1"][0])
     rounded = np.clip(0.07 * np.round(commands / 0.07), -8.96, 8.96)
     np.testing.assert_allclose(trace.current[0, 1:], rounded[:-1], atol=1e-9)
     assert np.max(np.abs(commands)) == 9.0 and np.max(np.abs(trace.current)) == pytest.approx(8.96)
     scenarios = [chosen(controller, stand, name) for name in ("saturating doublet", "saturating hold")]
-    verification = verify(controller, {"stand": stand}, thor, current_step_A=0.07, scenarios=scenarios)
+    verification = verify(controller, {"stand": stand}, thor, command_step=0.07, scenarios=scenarios)
     assert max(row.peak_current_A for row in verification.rows) <= 9.0
     assert verification.rows[1].saturated > 0.1
 
 
 def test_a_step_above_the_limit_leaves_no_current(controller, stand, thor):
     with pytest.raises(SimulationError, match="every command but zero"):
-        verify(controller, {"stand": stand}, thor, current_step_A=9.5)
+        verify(controller, {"stand": stand}, thor, command_step=9.5)
 
 
 def test_a_load_is_no_bound_on_what_is_known(controller, stand, swing, thor):
@@ -141,7 +141,7 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
 
     stage = Stage(
         controller=controller, plant=stand, sensors=so.Sensors(noise_std={"F1": 2.0}, quantisation={"F1": 3.0}),
-        current_step_A=0.1,
+        command_step=0.1,
     )  # fmt: skip
     view = linearise_last_phase(stage, default_scenarios(controller, stand)[0], thor)
     system = controller.close(stand, thor).system()

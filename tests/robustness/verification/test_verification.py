@@ -94,7 +94,7 @@ def test_a_row_is_its_own_witness(verification):
 
 def test_the_step_limit_is_where_the_current_saturates(controller, stand, thor):
     """The first samples of the law by hand: the largest motor force for a step, before the plant answers and after."""
-    law = runnable(controller, current_limit_A=math.inf)
+    law = runnable(controller, command_limit=math.inf)
     loop = controller.close(stand, thor)
     a, b, (c,), _ = loop.plant.delayed()
     x, memory, largest = np.zeros(len(b)), law.reset(), 0.0
