@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import numbers
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,14 @@ class PlantError(SeaoptError):
 
 
 class LogError(SeaoptError):
-    """A log cannot be read, or does not hold what is asked of it."""
+    """A log cannot be read, or does not hold what is asked of it.
+
+    `keys` are the remedies as options of whoever reads the log from a file of settings, each by itself enough.
+    """
+
+    def __init__(self, *args: object, keys: Sequence[Mapping[str, Any]] = ()) -> None:
+        super().__init__(*args)
+        self.keys = tuple(keys)
 
 
 class SimulationError(SeaoptError):

@@ -7,6 +7,7 @@ missing number, an infinite one and a range look the same everywhere.
 from __future__ import annotations
 
 import html
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -93,6 +94,53 @@ def format_count(count: int, noun: str) -> str:
 
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def format_toml(value: Any) -> str:
+    """Return a value as a problem file writes it.
+
+    Examples
+    --------
+    >>> print(format_toml({"rate_hz": 400.0, "rule": "restamp", "F1 [N]": [1, True]}))
+    { rate_hz = 400, rule = "restamp", "F1 [N]" = [1, true] }
+
+    """
+    if isinstance(value, Mapping):
+        return f"{{ {format_keys(value)} }}" if value else "{}"  # pyright: ignore[reportUnknownArgumentType]
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(format_toml, value))}]"  # pyright: ignore[reportUnknownArgumentType]
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+    return str(value).lower() if isinstance(value, bool) else f"{value:.10g}"
+
+
+def format_keys(keys: Mapping[str, Any]) -> str:
+    """Return keys with their values as a problem file writes them, on one line.
+
+    Examples
+    --------
+    >>> format_keys({"resample": {"rate_hz": 400}, "decimate": 2})
+    'resample = { rate_hz = 400 }, decimate = 2'
+
+    """
+    return ", ".join(f"{_format_key(name)} = {format_toml(value)}" for name, value in keys.items())
+
+
+def _format_key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else format_toml(name)
+
+
+def format_remedies(text: str, remedies: Sequence[Mapping[str, Any]]) -> str:
+    """Return a text with what to write in a problem file at its end: one remedy, or another.
+
+    Examples
+    --------
+    >>> format_remedies("call log.restamp()", [{"resample": "restamp"}])
+    'call log.restamp(); in a problem file: resample = "restamp"'
+
+    """
+    ways = [" and ".join(format_keys({name: value}) for name, value in keys.items()) for keys in remedies]
+    return f"{text}; in a problem file: {', or '.join(ways)}" if ways else text
 
 
 def join_words(words: Sequence[str]) -> str:

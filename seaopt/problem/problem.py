@@ -15,7 +15,7 @@ from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
 from seaopt.control.laws.delay import DelayedSpec, find_drive, find_drive_delay, take_own_delays
 from seaopt.control.loops.sampled_plant import add_drive_delay, list_names
-from seaopt.errors import ProblemError, SeaoptError, suggestion
+from seaopt.errors import LogError, ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
     Experiment,
     Fit,
@@ -27,6 +27,7 @@ from seaopt.estimation import (
     SoftL1,
     Squares,
 )
+from seaopt.formatting import format_remedies
 from seaopt.frequency import MeasuredResponse, measure_response
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
@@ -297,6 +298,15 @@ class Problem:
         return tables[like or next(iter(tables))]
 
     def _make_experiment(self, table: ExperimentTable, *, anywhere: bool = False) -> Experiment:
+        """Return an experiment; a log's error names the keys that are its remedy."""
+        try:
+            return self._read_experiment(table, anywhere=anywhere)
+        except LogError as error:
+            if not error.keys:
+                raise
+            raise LogError(format_remedies(str(error), error.keys)) from error
+
+    def _read_experiment(self, table: ExperimentTable, *, anywhere: bool) -> Experiment:
         plant = self.plants[table.plant]
         if table.virtual:
             values = {name: value for name, value in table.parameters.items() if isinstance(value, float | int)}

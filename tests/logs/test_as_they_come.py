@@ -203,15 +203,16 @@ def swap(content):
     return out
 
 
-def test_irregular_logs_say_that_gaps_are_what_is_wrong_and_how_to_bridge_them():
+def test_irregular_logs_say_that_their_clock_is_what_is_wrong_and_are_resampled_in_one_piece():
     rng = np.random.default_rng(3)
     time = np.cumsum(0.0025 * np.clip(1 + 0.4 * rng.normal(size=4000), 0.1, 3))
     log = so.Log.from_arrays(time=time, I=rng.normal(size=4000), F1=rng.normal(size=4000))
     (finding,) = log.quality.of("unjudged")
-    assert "gaps" in finding.sentence and "bridge_s" in finding.sentence and "too few" not in finding.sentence
-    split = log.resample(rate_hz=400)
+    assert "too uneven for spectra" in finding.sentence and "resample" in finding.sentence
+    assert log.rate_hz == pytest.approx(3999 / np.ptp(time), rel=0.01) and not log.gaps
+    assert len(log.resample(rate_hz=400).segments) == 1
+    split = log.resample(rate_hz=400, bridge_s=0.004)
     assert len(split.segments) > 100 and "bridge_s" in split.notes[-1]
-    assert len(log.resample(rate_hz=400, bridge_s=0.05).segments) == 1
 
 
 def test_the_excited_band_goes_on_past_a_dip_below_the_resonance():

@@ -110,3 +110,30 @@ def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):
     path = tmp_path / "problem.toml"
     path.write_bytes(b"\xef\xbb\xbf" + b'schema = 1\n[plant.a]\nkind = "high_impedance"\n')
     assert list(so.read_problem(path).plants) == ["a"]
+
+
+def test_an_uneven_clock_is_answered_with_the_keys_that_mend_it(problem, tmp_path):
+    """The advice is final: what it says is taken as it is."""
+    rng = np.random.default_rng(0)
+    for name, stamps in (("late", T + 4e-4 * rng.random(400)), ("rounded", np.round(T, 3))):
+        rows = "".join(f"{t:.7f},1,{np.cos(t):.9f}\n" for t in stamps)
+        (tmp_path / f"{name}.csv").write_text("t [s],I [A],F1 [N]\n" + rows)
+    keys = 'log = "{}.csv"\ninputs = {{ I = "I [A]" }}\noutputs = {{ F1 = "F1 [N]" }}\n'
+    with pytest.raises(LogError, match=r"experiment x: .*call log.resample") as late:
+        problem(keys.format("late")).experiments()
+    advice = str(late.value).rsplit("in a problem file: ", 1)[1].split(", or ")
+    assert advice == ["resample = { rate_hz = 400 }", 'resample = { rate_hz = 400, rule = "restamp" }']
+    for line in advice:
+        (experiment,) = problem(keys.format("late") + line).experiments()
+        assert len(experiment.log.segments) == 1
+    with pytest.raises(LogError, match=r'call log.restamp\(\); in a problem file: resample = "restamp"'):
+        problem(keys.format("rounded")).experiments()
+    with pytest.raises(LogError, match=r"resample = \{ rate_hz = 400 \} and decimate = 4") as slow:
+        problem(keys.format("late") + "resample = { rate_hz = 100 }").experiments()
+    assert "..." not in str(slow.value)
+
+
+def test_columns_on_two_clocks_are_answered_with_the_key_that_aligns_them(problem):
+    keys = KEYS.replace(", align = { linear = { max_gap_s = 0.01 } }", "")
+    with pytest.raises(LogError, match=r"align = \{ hold = \{\} \}, or align = \{ linear = \{\} \}"):
+        problem(keys).experiments()

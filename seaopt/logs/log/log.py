@@ -13,7 +13,16 @@ from seaopt.errors import LogError, require_number, require_type, suggestion
 from seaopt.formatting import format_count, html_list, html_paragraph, html_table
 from seaopt.logs.log import decimation, frames, resampling
 from seaopt.logs.log.alignment import Rule
-from seaopt.logs.quality.clock import GAP, JITTER_LIMIT, sample_rate_hz, split_at_gaps
+from seaopt.logs.quality.clock import (
+    GAP,
+    JITTER_LIMIT,
+    OFTEN,
+    advise_clock,
+    assess_clock,
+    measure_steps,
+    sample_rate_hz,
+    split_at_gaps,
+)
 from seaopt.logs.quality.report import Quality, assess_quality
 from seaopt.records import PlotAccessor, record
 from seaopt.signals import Signal
@@ -58,6 +67,7 @@ class Log:
     source: str = "arrays"
     notes: tuple[str, ...] = ()
     period: float = field(init=False)
+    gap_s: float = field(init=False)
 
     def __post_init__(self) -> None:
         n = self.time.size
@@ -72,7 +82,8 @@ class Log:
                     "give arrays of one length"
                 )
         self.time.setflags(write=False)
-        object.__setattr__(self, "period", _mean_period(self.time))
+        for name, value in zip(("period", "gap_s"), _measure_steps(self.time), strict=True):
+            object.__setattr__(self, name, value)
 
     @classmethod
     def from_arrays(
@@ -142,7 +153,7 @@ class Log:
     @property
     def gaps(self) -> list[tuple[float, float]]:
         """Times (s) of the samples before and after each gap."""
-        rows = np.flatnonzero(np.diff(self.time) > GAP * self.period)
+        rows = np.flatnonzero(np.diff(self.time) > self.gap_s)
         return [(float(self.time[row]), float(self.time[row + 1])) for row in rows]
 
     @property
@@ -155,15 +166,16 @@ class Log:
             Inside a segment a step differs by more than 5 % from the period: the log is not uniformly sampled.
 
         """
-        segments = split_at_gaps(self.time, GAP * self.period)
+        segments = split_at_gaps(self.time, self.gap_s)
         for segment in segments:
             worst = float(np.max(np.abs(np.diff(self.time[segment]) - self.period)))
             if worst > JITTER_LIMIT * self.period:
-                round_rate = float(f"{1.0 / self.period:.3g}")
+                clock = assess_clock(self.time, self.source)
+                remedy, keys = advise_clock(clock.period, rounded=clock.rounded_only)
                 raise LogError(
                     f"{self.source}: a step of time differs by {worst / self.period:.0%} from the period "
-                    f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={round_rate:g}), or "
-                    "log.restamp() where only the timestamps are rounded or late"
+                    f"{self.period:.4g} s (5 % is allowed); {remedy}",
+                    keys=keys,
                 )
         return segments
 
@@ -210,8 +222,9 @@ class Log:
             Linear if left out. A line between samples is a low-pass filter: it attenuates by 0.9 dB at a quarter of the
             sample rate and 3.9 dB at half.
         bridge_s : float, optional
-            Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out. A log
-            sampled at irregular times needs a longer one, or it falls apart into many short segments.
+            Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out, or twice
+            the steps that are usual where their lengths vary. A log sampled at irregular times may need a longer one,
+            or it falls apart into short segments.
 
         Returns
         -------
@@ -231,7 +244,8 @@ class Log:
         ([0.0, 1.0, 2.0, 3.0, 4.0], ('resampled from 10 Hz to 10 Hz by Linear(max_gap_s=inf)',))
 
         """
-        return self.with_values(*resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, bridge_s=bridge_s))
+        longest = self.gap_s if bridge_s is None else bridge_s
+        return self.with_values(*resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, longest_s=longest))
 
     def restamp(self, *, rate_hz: float | None = None) -> Log:
         """Replace rounded or late timestamps by the uniform clock behind them; samples are not changed.
@@ -264,7 +278,7 @@ class Log:
         """
         if rate_hz is not None and not (isinstance(rate_hz, int | float) and 0.0 < rate_hz < 1e12):
             raise LogError(f"{self.source}: rate_hz = {rate_hz!r} is not a sample rate; give samples per second")
-        time, note = resampling.restamp(self, self.period, rate_hz)
+        time, note = resampling.restamp(self, self.period, self.gap_s, rate_hz)
         return self.with_values(time, {name: self[name] for name in self.signals}, note)
 
     def decimate(self, factor: int) -> Log:
@@ -435,11 +449,11 @@ def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
     return f"time {how} at sample {row + 1} (t = {time[row]:g} s); {remedy}"
 
 
-def _mean_period(time: Float[np.ndarray, " n"]) -> float:
-    """Return the sample period: the mean step between samples that are not across a gap.
+def _measure_steps(time: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return the sample period and the step above which there is a gap: see `measure_steps`.
 
-    The mean over gap-free steps is insensitive to timestamps rounded to a few digits; the median is not. The median
-    that tells the gaps is over at most `STEPS_PER_BLOCK` steps; the odd stride meets both of two steps that alternate.
+    The median that tells the gaps is over at most `STEPS_PER_BLOCK` steps; the odd stride meets both of two steps that
+    alternate.
     """
     first = np.arange(0, time.size - 1, (time.size - 2) // STEPS_PER_BLOCK | 1)
     longest = GAP * float(np.median(time[first + 1] - time[first]))
@@ -448,7 +462,9 @@ def _mean_period(time: Float[np.ndarray, " n"]) -> float:
         short = step[step <= longest] if step.max() > longest else step
         total += float(short.sum())
         count += short.size
-    return total / count
+    if time.size - 1 - count > OFTEN * (time.size - 1):
+        return measure_steps(np.diff(time))
+    return total / count, GAP * total / count
 
 
 def _array(name: str, values: Any, source: str) -> Float[np.ndarray, " n"]:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError, require_number
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule
-from seaopt.logs.quality.clock import GAP, sample_rate_hz, split_at_gaps, timestamp_resolution
+from seaopt.logs.quality.clock import GAP, advise_clock, sample_rate_hz, split_at_gaps, timestamp_resolution
 from seaopt.signals import Recording
 
 AROUND = 20  # samples on either side of a long step that tell a gap from a late stamp
@@ -25,9 +25,10 @@ HOW_TO_BRIDGE = "bridge_s interpolates across longer ones"
 Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]
 
 
-def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None, bridge_s: float | None) -> Resampled:
+def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None, longest_s: float) -> Resampled:
     """Return time and channels on a uniform clock, and a note of what was done: see `Log.resample`.
 
+    `longest_s`: the longest step of time that is interpolated across.
     Raises LogError: the rate is not positive, or so low that interpolation would alias, or no segment is long enough.
     """
     chosen = rule if rule is not None else Linear()
@@ -37,26 +38,29 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
         )
     old_rate_hz = sample_rate_hz(period)
     rate_hz = require_number(rate_hz, "rate_hz", LogError)
-    if bridge_s is not None and not require_number(bridge_s, "bridge_s", LogError) > 0.0:
-        raise LogError(f"{log.source}: bridge_s = {bridge_s:g} is not a time; give seconds")
+    if not require_number(longest_s, "bridge_s", LogError) > 0.0:
+        raise LogError(f"{log.source}: bridge_s = {longest_s:g} is not a time; give seconds")
     if not 0.0 < rate_hz < np.inf:
         raise LogError(f"{log.source}: rate_hz = {rate_hz:g} is not positive; give the rate of the new clock")
+    round_rate = float(f"{old_rate_hz:.3g}")
     if rate_hz < LEAST_RATE * old_rate_hz:
+        every = max(round(old_rate_hz / rate_hz), 2)
         raise LogError(
-            f"{log.source}: rate_hz = {rate_hz:g} is far below the log's {old_rate_hz:.6g} Hz and would alias; "
-            "resample near its own rate, then call decimate"
+            f"{log.source}: rate_hz = {rate_hz:g} is far below the log's {old_rate_hz:.6g} Hz and would alias; call "
+            f"log.resample(rate_hz={round_rate:g}).decimate({every})",
+            keys=[{"resample": {"rate_hz": round_rate}, "decimate": every}],
         )
     time = log.time
     if (time[-1] - time[0]) * rate_hz > MOST_RESAMPLED * time.size:
         raise LogError(
             f"{log.source}: rate_hz = {rate_hz:g} would make more than {MOST_RESAMPLED} samples of each of the log's, "
-            f"which come at {old_rate_hz:.6g} Hz; resample near its own rate"
+            f"which come at {old_rate_hz:.6g} Hz; call log.resample(rate_hz={round_rate:g})",
+            keys=[{"resample": {"rate_hz": round_rate}}],
         )
-    longest_step = bridge_s if bridge_s is not None else GAP * period
-    gaps = int(np.count_nonzero(np.diff(time) > longest_step))
+    gaps = int(np.count_nonzero(np.diff(time) > longest_s))
     new_time: list[Float[np.ndarray, " _"]] = []
     new_values: dict[str, list[Float[np.ndarray, " _"]]] = {name: [] for name in log.signals}
-    for segment in split_at_gaps(time, longest_step):
+    for segment in split_at_gaps(time, longest_s):
         grid = _uniform_grid(time[segment], float(time[0]), rate_hz)
         if grid.size < 2:
             continue
@@ -68,7 +72,7 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
     note = f"resampled from {old_rate_hz:.6g} Hz to {rate_hz:g} Hz by {chosen}"
     if gaps:
         times = "1 step of time is" if gaps == 1 else f"{gaps} steps of time are"
-        note += f"; {times} longer than {longest_step:.3g} s and stay gaps: {HOW_TO_BRIDGE}"
+        note += f"; {times} longer than {longest_s:.3g} s and stay gaps: {HOW_TO_BRIDGE}"
     return np.concatenate(new_time), {name: np.concatenate(parts) for name, parts in new_values.items()}, note
 
 
@@ -80,7 +84,9 @@ def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) 
     return np.clip(origin + np.arange(first, last + 1) / rate_hz, time[0], time[-1])
 
 
-def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tuple[Float[np.ndarray, " n"], str]:
+def restamp(
+    log: Recording, period: float, gap_s: float, rate_hz: float | None = None
+) -> tuple[Float[np.ndarray, " n"], str]:
     """Return the uniform clock behind rounded or late timestamps, and a note of what was done: see `Log.restamp`.
 
     Raises LogError: rounding alone does not explain the timestamps, and no rate is stated; or the stated one is not
@@ -90,16 +96,17 @@ def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tupl
         return _restamp_at(log, period, rate_hz)
     resolution = timestamp_resolution(log.time)
     uniform = log.time.copy()
-    for segment in split_at_gaps(log.time, GAP * period):
+    for segment in split_at_gaps(log.time, gap_s):
         stamps = log.time[segment]
         line = period * np.arange(stamps.size)
         # Rounding moves a stamp by at most half a step, so all of them lie within one step; two allow for the period.
         deviations = stamps - line
         if np.ptp(deviations) > 2.0 * resolution + 1e-9 * period:
+            remedy, keys = advise_clock(period)
             raise LogError(
                 f"{log.source}: the timestamps deviate by {np.ptp(deviations) / 2:.3g} s from a uniform clock, more "
-                f"than their rounding to {resolution:.3g} s explains; call log.resample(rate_hz=...), or "
-                "log.restamp(rate_hz=...) where a PC stamped the samples of a perfect clock"
+                f"than their rounding to {resolution:.3g} s explains; {remedy}",
+                keys=keys,
             )
         uniform[segment] = line + 0.5 * (np.min(deviations) + np.max(deviations))
     rounded = f", rounded to {resolution:.3g} s," if resolution else ""
@@ -125,11 +132,13 @@ def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Flo
     lost[jumps] = 0.0  # two late samples at one gap
     line = period * (np.arange(time.size) + np.cumsum(lost))
     drift, left = _measure_drift(line, time - line)
+    round_rate = float(f"{sample_rate_hz(mean_period):.3g}")
     if abs(drift) > MOST_DRIFT or left > 0.5 * period:  # a half, and samples would be counted wrongly
         raise LogError(
             f"{log.source}: rate_hz = {rate_hz:g} is not the rate of the timestamps, which drift from it by "
             f"{np.ptp(line) * abs(drift) + left:.3g} s and rise at {sample_rate_hz(mean_period):.6g} Hz on "
-            "average; correct it, or call log.resample(rate_hz=...)"
+            f"average; correct it, or call log.resample(rate_hz={round_rate:g})",
+            keys=[{"resample": {"rate_hz": round_rate}}],
         )
     clock = f"the stated clock of {rate_hz:g} Hz"
     if drift:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,6 +12,9 @@ from seaopt.errors import LogError
 from seaopt.records import record
 
 GAP = 1.5  # periods between two samples that make a gap
+LONG = 2.0  # times a step that is usual, where their lengths vary: what is longer is a gap
+OFTEN = 0.05  # share of longer steps from which they are usual themselves
+WHOLE = 0.1  # of a period, off a whole number of them: a longer step is that of lost samples
 JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
 ROUNDING_STEPS = 200_000  # steps of time that are enough to see the rounding of timestamps
 
@@ -21,6 +25,7 @@ class ClockQuality:
 
     samples: int
     period: float  # mean step between samples that are not across a gap, in s
+    gap_s: float  # step above which it is a gap
     # jitter_rms, jitter_max: of those steps, from the period, in s
     jitter_rms: float
     jitter_max: float
@@ -39,10 +44,34 @@ class ClockQuality:
         """Sample rate in Hz."""
         return sample_rate_hz(self.period)
 
+    @property
+    def irregular(self) -> bool:
+        """Whether its steps vary so much that samples in a row mean little: it has no rate but on average."""
+        return self.gap_s > (1.0 + JITTER_LIMIT) * GAP * self.period and not self.rounded_only
+
 
 def sample_rate_hz(period: float) -> float:
     """Return the sample rate of a period in s, to nine digits."""
     return float(f"{1.0 / period:.9g}")
+
+
+def advise_clock(period: float, *, rounded: bool = False) -> tuple[str, list[dict[str, Any]]]:
+    """Return how an uneven clock is made uniform, as calls and as keys; `rounded`: only its timestamps are.
+
+    Examples
+    --------
+    >>> advise_clock(0.0025, rounded=True)
+    ('call log.restamp()', [{'resample': 'restamp'}])
+    >>> print(advise_clock(0.0025)[0])
+    call log.resample(rate_hz=400), or log.restamp(rate_hz=400) where a PC stamped the samples of a perfect clock
+
+    """
+    if rounded:
+        return "call log.restamp()", [{"resample": "restamp"}]
+    rate_hz = float(f"{1.0 / period:.3g}")
+    text = f"call log.resample(rate_hz={rate_hz:g}), or log.restamp(rate_hz={rate_hz:g}) where a PC stamped the "
+    uniform = {"rate_hz": rate_hz}
+    return text + "samples of a perfect clock", [{"resample": uniform}, {"resample": {**uniform, "rule": "restamp"}}]
 
 
 def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
@@ -63,15 +92,15 @@ def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
     onward = step[step > 0.0]
     if not onward.size:
         raise LogError(f"{source}: time never increases; name the column that is the clock")
-    # The mean is insensitive to rounded stamps, the median only tells the gaps.
-    period = float(np.mean(onward[onward <= GAP * np.median(onward)]))
-    across = step > GAP * period
+    period, gap_s = measure_steps(onward)
+    across = step > gap_s
     inside = step[(step > 0.0) & ~across]
     deviations = inside - period
     rounding = timestamp_resolution(stamps)
     return ClockQuality(
         samples=time.size,
         period=period,
+        gap_s=gap_s,
         jitter_rms=float(np.sqrt(np.mean(deviations**2))),
         jitter_max=float(np.max(np.abs(deviations))),
         rounding=rounding,
@@ -82,6 +111,33 @@ def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
         gaps=finite[1:][across],
         lost=np.maximum(np.round(step[across] / period).astype(int) - 1, 1),
     )
+
+
+def measure_steps(step: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return the mean of steps of time that are not across a gap, and the length above which one is.
+
+    The mean is insensitive to rounded stamps, the median only tells the gaps. Longer steps that come often are of the
+    clock itself, as where two devices' times alternate, unless they are whole periods: samples were lost there. Whole
+    periods that come in turn are those of timestamps rounded to nearly a period.
+
+    Examples
+    --------
+    >>> period, gap_s = measure_steps(np.tile([2.7e-3, 2.7e-3, 10e-3], 100))
+    >>> round(1.0 / period, 1), round(gap_s, 4)
+    (194.8, 0.02)
+
+    """
+    usual = float(np.median(step))
+    short = step <= GAP * usual
+    if np.mean(~short) > OFTEN:
+        longer = step[~short] / usual
+        stamps, row = np.cumsum(step), np.arange(step.size)
+        rounded = np.ptp(stamps - np.polyval(np.polyfit(row, stamps, 1), row)) <= (1.0 + WHOLE) * usual
+        if rounded or np.median(np.abs(longer - np.round(longer))) > WHOLE:
+            longest = LONG * float(np.quantile(step, 1.0 - OFTEN))
+            return float(np.mean(step[step <= longest])), longest
+    period = float(np.mean(step[short]))
+    return period, GAP * period
 
 
 def split_at_gaps(time: Float[np.ndarray, " n"], longest_step: float) -> list[slice]:

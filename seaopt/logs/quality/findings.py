@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from seaopt.formatting import format_count, format_figure
 from seaopt.logs.quality.channel import BEYOND, ChannelQuality
-from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality
+from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality, advise_clock
 from seaopt.logs.quality.excitation import InputExcitation
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.lags import ChannelPair
@@ -50,6 +50,8 @@ class Finding:
         First places, from and to, in s of the log's time.
     sentence : str
         What it is and what to do.
+    keys : tuple of dict
+        The same remedy in a problem file: keys of an [[experiment]], each set by itself enough.
 
     """
 
@@ -61,6 +63,7 @@ class Finding:
     value: float = 0.0
     unit: str = ""
     where_s: tuple[tuple[float, float], ...] = ()
+    keys: tuple[dict[str, Any], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as plain data."""
@@ -81,11 +84,18 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
     if share > JITTER_LIMIT:
         text = f"steps of time differ by up to {share:.0%} from the period of {clock.period:.4g} s"
         if clock.rounded_only:
-            text += f", which the rounding of the timestamps to {clock.rounding:.3g} s explains; call log.restamp()"
+            text += f", which the rounding of the timestamps to {clock.rounding:.3g} s explains"
         else:
-            rate = float(f"{clock.rate_hz:.3g}")
-            text += f" (rms {clock.jitter_rms / clock.period:.1%}); to fit it call log.resample(rate_hz={rate:g})"
-        yield Finding(kind="jitter", severity="error", value=100.0 * share, unit="% of the period", sentence=text)
+            text += f" (rms {clock.jitter_rms / clock.period:.1%})"
+        remedy, keys = advise_clock(clock.period, rounded=clock.rounded_only)
+        yield Finding(
+            kind="jitter",
+            severity="error",
+            value=100.0 * share,
+            unit="% of the period",
+            sentence=f"{text}; {remedy}",
+            keys=tuple(keys),
+        )
     if clock.gaps.size:
         total, longest = int(np.sum(clock.lost)), int(np.max(clock.lost))
         yield _locate(
@@ -110,10 +120,13 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
         yield fault(missing, kind="missing", severity="error", unit=unit, sentence=text)
     elif len(missing):
         text = (
-            f"{name} lacks {format_count(missing.samples, 'sample')} of {time.size}; in an output they have no weight, "
-            "in an input cut the log there (log.between)"
+            f"{name} lacks {format_count(missing.samples, 'sample')} of {time.size}; in an output they have no weight; "
+            "an input must have none"
         )
-        yield fault(missing, kind="missing", severity="warning", unit=unit, sentence=text)
+        start, stop = _find_longest_without(missing, time)
+        text += f": cut the log to its longest part without, log.between({start:g}, {stop:g})"
+        keys = ({"slice_s": [start, stop]},)
+        yield fault(missing, kind="missing", severity="warning", unit=unit, sentence=text, keys=keys)
     if beyond.size:
         count = format_count(beyond.size, "sample")
         text = (
@@ -154,14 +167,14 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
     losses = channel.counter
     if losses is not None and losses.rows.size:
         total = int(np.sum(losses.lost))
-        per_count = f", samples_per_count={losses.held}" if losses.held > 1 else ""
+        counter = {"column": name} | ({"samples_per_count": losses.held} if losses.held > 1 else {})
+        spelt = ", ".join(f"{key}={json.dumps(value, ensure_ascii=False)}" for key, value in counter.items())
         text = (
             f"{name} counts, and skips at {format_count(losses.rows.size, 'place')}: {format_count(total, 'sample')} "
-            f'lost that the clock does not show; read the log with counter=Counter(column="{name}"{per_count}), which '
-            "opens the gaps"
+            f"lost that the clock does not show; read the log with counter=Counter({spelt}), which opens the gaps"
         )
-        runs = RowRanges(start=losses.rows, stop=losses.rows + 1)
-        yield fault(runs, kind="gap", severity="error", value=float(total), unit="samples", sentence=text)
+        runs, keys = RowRanges(start=losses.rows, stop=losses.rows + 1), ({"counter": counter},)
+        yield fault(runs, kind="gap", severity="error", value=float(total), unit="samples", sentence=text, keys=keys)
     if channel.hum is not None:
         lines = ", ".join(f"{line:g} Hz" for line in channel.hum.lines_hz)
         yield Finding(
@@ -175,6 +188,16 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
             f"{max(channel.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it "
             "(band_hz)",
         )
+
+
+def _find_longest_without(runs: RowRanges, time: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return from where to where, in s of the log, the longest part reaches that none of the runs interrupts."""
+    starts, stops = np.concatenate([[0], runs.stop]), np.concatenate([runs.start, [time.size]])
+    longest = int(np.argmax(stops - starts))
+    first, last = int(starts[longest]), int(stops[longest]) - 1
+    begin = float(np.nanmin(time))
+    # Rounded inwards, so that the samples beside are not in it.
+    return np.ceil(1e6 * (time[first] - begin)) / 1e6, np.floor(1e6 * (time[last] - begin)) / 1e6
 
 
 def _spell_key(name: str) -> str:

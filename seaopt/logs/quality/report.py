@@ -181,7 +181,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     correlating("spectra and pairs of channels", 0.0)
     inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)
     segments = split_rows(np.unique(np.concatenate([clock.gaps, clock.backwards, clock.not_numbers])), len(data))
-    spectra = compute_spectra(varying, segments, clock.period)
+    spectra = None if clock.irregular else compute_spectra(varying, segments, clock.period)
     if spectra is not None:
         hums = {name: find_hum(spectra, name, inputs) for name in spectra.channels}
         channels = {name: replace(channel, hum=hums.get(name)) for name, channel in channels.items()}
@@ -191,7 +191,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     findings += [finding for channel in channels.values() for finding in find_channel_faults(channel, data.time)]
     findings += [finding for pair in pairs for finding in find_pair_faults(pair, clock.period, pair.first in inputs)]
     findings += [describe_excitation(bands) for bands in excitation.values()]
-    findings += _list_unjudged(inputs, spectra, [rows.stop - rows.start for rows in segments])
+    findings += _list_unjudged(inputs, spectra, [rows.stop - rows.start for rows in segments], clock)
     finite = data.time[np.isfinite(data.time)]
     progress(format_count(len(channels), "channel"), 1.0)
     return Quality(
@@ -271,14 +271,20 @@ def _assess_inputs(spectra: Spectra, inputs: Sequence[str]) -> dict[str, InputEx
     return {name: excitation for name, excitation in bands.items() if excitation is not None}
 
 
-def _list_unjudged(inputs: Sequence[str], spectra: Spectra | None, lengths: Sequence[int]) -> list[Finding]:
+def _list_unjudged(
+    inputs: Sequence[str], spectra: Spectra | None, lengths: Sequence[int], clock: ClockQuality
+) -> list[Finding]:
     """Return what could not be looked at, and why; `lengths` are those of the segments between gaps."""
     total = sum(lengths)
-    if spectra is None and total >= ENOUGH_SAMPLES and len(lengths) > 1:
+    if clock.irregular:
+        text = (
+            "steps of time are too uneven for spectra: hum, delays, signs and excitation were not looked at; resample "
+            "the log first"
+        )
+    elif spectra is None and total >= ENOUGH_SAMPLES and len(lengths) > 1:
         text = (
             f"{len(lengths) - 1} gaps leave segments of at most {max(lengths)} samples, too short for spectra: hum, "
-            "delays, signs and excitation were not looked at; where the sampling is irregular, resample the log with "
-            "bridge_s"
+            "delays, signs and excitation were not looked at; to bridge them resample the log with bridge_s"
         )
     elif spectra is None:
         text = f"{total} samples are too few for spectra: hum, delays, signs and excitation were not looked at"

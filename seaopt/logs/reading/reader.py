@@ -22,7 +22,15 @@ from seaopt.logs.log.log import Log
 from seaopt.logs.quality.faults import find_counter_losses
 from seaopt.logs.reading.column import Column, spell_column, suspect_wrap
 from seaopt.logs.reading.counter import Counter
-from seaopt.logs.reading.selection import HOW_TO_ALIGN, ClockColumn, SelectedChannel, Selection, advise_time, select
+from seaopt.logs.reading.selection import (
+    ALIGNED,
+    HOW_TO_ALIGN,
+    ClockColumn,
+    SelectedChannel,
+    Selection,
+    advise_time,
+    select,
+)
 from seaopt.signals import Origin, Signal, Table
 from seaopt.units import factor, si_unit
 
@@ -249,7 +257,7 @@ def _read_channels(
         check_increasing(time, where)
         for name, channel in group.items():
             if channel.rule is None:
-                raise LogError(f"{where}: has other instants than the log's clock; {HOW_TO_ALIGN}")
+                raise LogError(f"{where}: has other instants than the log's clock; {HOW_TO_ALIGN}", keys=ALIGNED)
             arrays[name] = channel.rule(clock, time, columns[channel.file_column.field.name])
             outside = int(np.sum(~((clock >= time[0]) & (clock <= time[-1]))))
             note = f'{name}: brought from clock "{other.name}" by {channel.rule}'

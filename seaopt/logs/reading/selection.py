@@ -23,6 +23,7 @@ from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
 MAX_NAMES = 20  # in a message
 HOW_TO_ALIGN = "align it by Hold(), Linear() or Nearest(tolerance_s=...)"
+ALIGNED = ({"align": {"hold": {}}}, {"align": {"linear": {}}})  # the same as keys
 
 
 class ClockError(LogError):
@@ -147,7 +148,8 @@ def _select_channel(clock: ClockColumn, file_column: FileColumn, align: Rule | N
     if rule is None and not (source.rows and clock.rows and source.path == clock.path):
         raise LogError(
             f'{source.path}: "{file_column.field.name}" is on the clock "{channel_clock.name}", the log on '
-            f'"{clock.name}" of {clock.path.name}; {HOW_TO_ALIGN}'
+            f'"{clock.name}" of {clock.path.name}; {HOW_TO_ALIGN}',
+            keys=ALIGNED,
         )
     return SelectedChannel(file_column=file_column, unit=file_column.unit, clock=channel_clock, rule=rule)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from seaopt.formatting import MISSING, format_count, join_words
+from seaopt.formatting import MISSING, format_count, format_remedies, join_words
 from seaopt.logs import Quality
 from seaopt.logs.quality.channel import ChannelQuality
 from seaopt.logs.quality.clock import ClockQuality
@@ -20,7 +20,10 @@ def describe(quality: Quality) -> list[Section]:
             title=f"{quality.source}: {_count_faults(quality)}",
             part="logs",
             sentences=(size,),
-            items=tuple(Item(severity=finding.severity, text=finding.sentence) for finding in quality.findings),
+            items=tuple(
+                Item(severity=finding.severity, text=format_remedies(finding.sentence, finding.keys))
+                for finding in quality.findings
+            ),
         ),
         Section(
             title="Channels",
