@@ -76,22 +76,7 @@ OrNaN = Annotated[float, NullIs(value=math.nan)]
 
 
 def to_content(value: Any) -> Any:
-    """Return a record as what its file holds; `files.plain` makes lists of the arrays in it.
-
-    Examples
-    --------
-    >>> @record
-    ... class Band:
-    ...     json_keys = ("low_hz", "centre_hz")
-    ...     low_hz: float
-    ...     high_hz: float = 20.0
-    ...     @property
-    ...     def centre_hz(self):
-    ...         return (self.low_hz + self.high_hz) / 2.0
-    >>> to_content(Band(low_hz=10.0))
-    {'low_hz': 10.0, 'centre_hz': 15.0}
-
-    """
+    """Return a record as what its file holds; `files.plain` makes lists of the arrays in it."""
     if is_dataclass(value) and not isinstance(value, type):
         pairs = [(key, to_content(getattr(value, key.field))) for key in list_keys(type(value))]
         return {key.name: item for key, item in pairs if item is not None or not key.omit_none}
@@ -103,22 +88,7 @@ def to_content(value: Any) -> Any:
 
 
 def from_content(cls: type[T], content: Any, source: str, *, remedy: str) -> T:
-    """Return the record of a file's content, as `read_fields` reads it.
-
-    Examples
-    --------
-    >>> @record
-    ... class Band:
-    ...     low_hz: float
-    ...     high_hz: OrInfinite = 20.0
-    >>> from_content(Band, {"low_hz": 10.0, "high_hz": None}, "band.json", remedy="tune again")
-    Band(low_hz=10.0, high_hz=inf)
-    >>> from_content(Band, {"low_hz": "low"}, "band.json", remedy="tune again")
-    Traceback (most recent call last):
-    ...
-    seaopt.errors.FileError: band.json: low_hz = 'low': should be a valid number; tune again
-
-    """
+    """Return the record of a file's content, as `read_fields` reads it."""
     try:
         return cls(**read_fields(cls, content, source, remedy=remedy))
     except FileError:
@@ -128,13 +98,8 @@ def from_content(cls: type[T], content: Any, source: str, *, remedy: str) -> T:
 
 
 def read_fields(cls: type[Any], content: Any, source: str, *, remedy: str) -> dict[str, Any]:
-    """Return the fields of a record that a file holds.
-
-    Raises
-    ------
-    FileError
-        A key is missing, a value is of the wrong kind, or the file has a digest that is not that of its content.
-
+    """Return the fields of a record that a file holds. Raises FileError: a key is missing, a value is of the wrong
+    kind, or the file has a digest that is not that of its content.
     """
     from seaopt.documents import check_table
 
@@ -144,26 +109,9 @@ def read_fields(cls: type[Any], content: Any, source: str, *, remedy: str) -> di
 
 
 def check_agrees(content: Any, own: Any, source: str, *, remedy: str, place: str = "", rtol: float = EXACT) -> None:
-    """Refuse a file of which a key is not what the record that was made of it writes.
-
-    Parameters
-    ----------
-    content : mapping
-        Of the file. Keys that it has not are not asked for: an older file may have fewer.
-    own : mapping
-        What `to_content` makes of the record.
-    source, remedy : str
-        For messages.
-    place : str
-        Where in the file both stand.
-    rtol : float
-        Relative difference that two numbers may have.
-
-    Raises
-    ------
-    FileError
-        Names the first key that differs.
-
+    """Refuse a file of which a key is not what `own`, `to_content` of the record made of it, has; absent keys are not
+    asked for, as an older file may have fewer. `source`, `remedy`, `place`: for the message. `rtol`: relative
+    difference that two numbers may have. Raises FileError, with the first key that differs.
     """
     from seaopt.documents import shorten
 

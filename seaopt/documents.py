@@ -55,24 +55,10 @@ def check_table(
     remedy: str = "",
     error: type[SeaoptError] = FileError,
 ) -> Document:
-    """Return a table as a model.
-
-    `model`: what the table may hold. `content`: as read from the file. `source`: the file, for messages. `remedy`: what
-    to do about any mistake; left out where the place is the user's own, to be corrected there. `error`: what is raised.
-    Raises SeaoptError: a key is unknown or missing, or a value is of the wrong kind or out of range; of the kind asked
-    for.
-
-    Examples
-    --------
-    >>> class Gains(ResultTable):
-    ...     k_p: Number
-    >>> check_table(Gains, {"k_p": 2.0}, "gains.json").k_p
-    2.0
-    >>> check_table(Gains, {"k_p": "x"}, "gains.json", remedy="tune again")
-    Traceback (most recent call last):
-    ...
-    seaopt.errors.FileError: gains.json: k_p = 'x': should be a valid number; tune again
-
+    """Return a table as a model. `model`: what the table may hold. `content`: as read from the file. `source`: the
+    file, for messages. `remedy`: what to do about any mistake; left out where the place is the user's own, to be
+    corrected there. `error`: what is raised. Raises SeaoptError: a key is unknown or missing, or a value is of the
+    wrong kind or out of range; of the kind asked for.
     """
     try:
         return model.model_validate(content)

@@ -167,10 +167,9 @@ class _Cluster(Executor):
 
 
 def solve_ipopt(solver: Any, **arguments: Any) -> Any:
-    """Return what a solver of CasADi's that is IPOPT finds, one at a time in a process.
-
-    Raises KeyboardInterrupt: it was interrupted: by Ctrl-C, or by any signal whose handler raises. CasADi takes that
-    for a failure of the solver, and drops the exception.
+    """Return what a solver of CasADi's that is IPOPT finds, one at a time in a process. Raises KeyboardInterrupt: it
+    was interrupted: by Ctrl-C, or by any signal whose handler raises. CasADi takes that for a failure of the solver,
+    and drops the exception.
     """
     with IPOPT:
         try:

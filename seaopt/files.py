@@ -30,10 +30,7 @@ _ESCAPED = re.compile(r"[\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\
 
 
 def check_regular(path: Path) -> None:
-    """Refuse what is there and is not a regular file: reading a pipe or a device may never end.
-
-    Raises FileError: it is a pipe, a device, a socket or a folder.
-    """
+    """Refuse what is there and is not a regular file (FileError): reading a pipe or a device may never end."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):  # whoever reads it says why it cannot be read
@@ -52,10 +49,7 @@ def exists(path: Path) -> bool:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a path of results at which no folder is or can be.
-
-    Raises FileError: it is a file, or no path of this system.
-    """
+    """Refuse a path of results at which no folder is or can be (FileError): a file, or no path of this system."""
     try:
         is_file = path.exists() and not path.is_dir()
     except (OSError, ValueError) as error:
@@ -65,10 +59,7 @@ def check_folder(path: Path) -> None:
 
 
 def check_name(path: Path | str, remedy: str, error: type[SeaoptError] = FileError) -> None:
-    """Refuse a name that is not UTF-8: it is one of a file, but none that Polars, a table or a problem file can hold.
-
-    Raises SeaoptError: of the kind `error`.
-    """
+    """Refuse a name that is not UTF-8 (`error`): no Polars, table or problem file can hold it."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -76,9 +67,8 @@ def check_name(path: Path | str, remedy: str, error: type[SeaoptError] = FileErr
 
 
 def write_bytes(path: Path | str, content: bytes) -> Path:
-    """Write `content` to `path` in one step: a reader sees the old file or the new one, never a part.
-
-    Raises FileError: the folder cannot be made or written.
+    """Write `content` to `path` in one step: a reader sees the old file or the new one, never a part. Raises FileError:
+    the folder cannot be made or written.
     """
     target = Path(path)
     temporary = target.with_name(f".seaopt-{secrets.token_hex(8)}")
@@ -104,9 +94,8 @@ def describe_os_error(error: OSError | ValueError) -> str:
 
 
 def write_text(path: Path | str, content: str) -> Path:
-    """Write text as UTF-8, as `write_bytes` does.
-
-    Raises FileError: it holds half a character, as a name that is no text does; or as of `write_bytes`.
+    """Write text as UTF-8, as `write_bytes` does. Raises FileError: it holds half a character, as a name that is no
+    text does; or as of `write_bytes`.
     """
     try:
         raw = content.encode()
@@ -140,14 +129,7 @@ def to_json(content: dict[str, Any]) -> str:
 
 
 def digest_content(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a result and of what it says that it was made from; clock and machine have no part in it.
-
-    Examples
-    --------
-    >>> digest_content({"met": True, "provenance": {"wall_s": 1.0}}) == digest_content({"met": True})
-    True
-
-    """
+    """Return the SHA-256 of a result and of what it says that it was made from, but for clock and machine."""
     counted = {name: value for name, value in content.items() if name not in ("made_from", "provenance")}
     made_from = content.get("made_from") or {}
     if isinstance(made_from, Mapping) and (sources := {k: v for k, v in made_from.items() if k != CONTENT}):
@@ -166,9 +148,8 @@ def seal(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_seal(content: Mapping[str, Any], source: Path | str, remedy: str) -> None:
-    """Refuse a result without a digest, which somebody wrote by hand, and one that was edited since.
-
-    Raises FileError: the digest is missing or damaged, or another one than the content has.
+    """Refuse a result without a digest, which somebody wrote by hand, and one that was edited since. Raises FileError:
+    the digest is missing or damaged, or another one than the content has.
     """
     made_from = content.get("made_from")
     if not isinstance(made_from, Mapping) or CONTENT not in made_from:
@@ -191,11 +172,10 @@ def write_json(path: Path | str, content: dict[str, Any]) -> Path:
 def parse_file(
     path: Path | str, parse: Callable[[str], Any], form: str, *, remedy: str, error: type[SeaoptError] = FileError
 ) -> Any:
-    """Read a small file of text and parse it, or say in one line why that cannot be.
-
-    `path`: the file. `parse`: `json.loads` or `tomllib.loads`. `form`: what it should be: "JSON" or "TOML". `remedy`:
-    where such a file comes from. `error`: what is raised. Raises SeaoptError: the file is missing, is no regular file,
-    is larger than `MOST_BYTES`, or is not what it should be.
+    """Read a small file of text and parse it, or say in one line why that cannot be. `path`: the file. `parse`:
+    `json.loads` or `tomllib.loads`. `form`: what it should be: "JSON" or "TOML". `remedy`: where such a file comes
+    from. `error`: what is raised. Raises SeaoptError: the file is missing, is no regular file, is larger than
+    `MOST_BYTES`, or is not what it should be.
     """
     source = Path(path)
     check_regular(source)
@@ -218,9 +198,8 @@ def parse_file(
 
 
 def check_content(content: Any) -> None:
-    """Refuse what Python can read but not always print: deep nesting, and integers of any size.
-
-    Raises ValueError: it is nested deeper than `MOST_LEVELS`, or an integer has more than 64 bits.
+    """Refuse what Python can read but not always print: deep nesting, and integers of any size. Raises ValueError: it
+    is nested deeper than `MOST_LEVELS`, or an integer has more than 64 bits.
     """
     level, depth = [content], 0
     while level:
@@ -235,9 +214,8 @@ def check_content(content: Any) -> None:
 
 
 def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage again") -> dict[str, Any]:
-    """Read a result file; check its "schema" field and its digest.
-
-    Raises FileError: the file is missing, is not JSON, carries another schema, was edited, or was written by hand.
+    """Read a result file; check its "schema" field and its digest. Raises FileError: the file is missing, is not JSON,
+    carries another schema, was edited, or was written by hand.
     """
     source = Path(path)
     content = parse_file(source, json.loads, "JSON", remedy=remedy)

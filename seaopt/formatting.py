@@ -20,14 +20,7 @@ _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202
 
 
 def format_number(value: Any, digits: int = 4, missing: str = MISSING) -> str:
-    """Return a number in few digits, "yes" or "no" for a flag, and `missing` where there is none.
-
-    Examples
-    --------
-    >>> format_number(1.23456), format_number(True), format_number(None), format_number(float("inf"))
-    ('1.235', 'yes', '–', '∞')
-
-    """
+    """Return a number in few digits, "yes" or "no" for a flag, and `missing` where there is none."""
     if value is None or np.isnan(value) or value == -np.inf:
         return missing
     if isinstance(value, (bool, np.bool_)):
@@ -36,63 +29,28 @@ def format_number(value: Any, digits: int = 4, missing: str = MISSING) -> str:
 
 
 def format_figure(value: Any, unit: str = "", digits: int = 4, missing: str = MISSING) -> str:
-    """Return a number with its unit.
-
-    Examples
-    --------
-    >>> format_figure(1.23456, "Hz"), format_figure(None, "Hz"), format_figure(7)
-    ('1.235 Hz', '–', '7')
-
-    """
+    """Return a number with its unit."""
     number = format_number(value, digits, missing)
     return number if number == missing else f"{number} {unit}".rstrip()
 
 
 def printable(text: str) -> str:
-    r"""Return a text that a terminal shows and does not obey: control characters, and bytes of a name that are no text.
-
-    Examples
-    --------
-    >>> print(printable("F1\x1b]0;title\x07"))
-    F1\x1b]0;title\x07
-
-    """
+    r"""Return a text that a terminal shows and does not obey: no control characters, nor bytes that are no text."""
     return _UNPRINTABLE.sub(lambda match: match.group().encode("unicode_escape").decode(), text)
 
 
 def format_band(ends: tuple[float, float] | None, unit: str = "", missing: str = "none") -> str:
-    """Return a range with its unit, three digits of its low end and four of its high end.
-
-    Examples
-    --------
-    >>> format_band((0.5, 30.123), "Hz"), format_band(None, "Hz")
-    ('0.5 to 30.12 Hz', 'none')
-
-    """
+    """Return a range with its unit, three digits of its low end and four of its high end."""
     return missing if ends is None else f"{format_number(ends[0], 3)} to {format_figure(ends[1], unit)}"
 
 
 def format_values(values: Mapping[str, float], digits: int = 4, missing: str = MISSING) -> str:
-    """Return names and their values.
-
-    Examples
-    --------
-    >>> format_values({"I_p": 0.3, "eta": 0.95}), format_values({}, missing="nominal")
-    ('I_p = 0.3, eta = 0.95', 'nominal')
-
-    """
+    """Return names and their values."""
     return ", ".join(f"{name} = {format_number(value, digits)}" for name, value in values.items()) or missing
 
 
 def format_count(count: int, noun: str) -> str:
-    """Return a count with its noun.
-
-    Examples
-    --------
-    >>> format_count(1, "sample"), format_count(3, "gap")
-    ('1 sample', '3 gaps')
-
-    """
+    """Return a count with its noun."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
@@ -144,31 +102,13 @@ def format_remedies(text: str, remedies: Sequence[Mapping[str, Any]]) -> str:
 
 
 def join_words(words: Sequence[str]) -> str:
-    """Return an enumeration.
-
-    Examples
-    --------
-    >>> join_words(["a"]), join_words(["a", "b", "c"])
-    ('a', 'a, b and c')
-
-    """
+    """Return an enumeration."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def format_table(rows: Iterable[Sequence[str]], head: Sequence[str] | None = None, align: str = "") -> list[str]:
-    """Return the lines of a table in aligned columns.
-
-    `rows`: all of the same length. `head`: titles of the columns. `align`: "<" or ">" for each column; those without
-    one are left aligned.
-
-    Examples
-    --------
-    >>> for line in format_table([("stand", "1.6"), ("swing", "1.45")], ("plant", "Ms"), "<>"):
-    ...     print(line)
-    plant    Ms
-    stand   1.6
-    swing  1.45
-
+    """Return the lines of a table in aligned columns. `rows`: all of the same length. `head`: titles of the columns.
+    `align`: "<" or ">" for each column; those without one are left aligned.
     """
     cells = [*([head] if head is not None else []), *rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -181,51 +121,23 @@ def format_table(rows: Iterable[Sequence[str]], head: Sequence[str] | None = Non
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of texts, its first row as head.
-
-    Examples
-    --------
-    >>> html_table(["name"], [["Ms < 1.6"]])
-    '<table><thead><tr><th>name</th></tr></thead><tbody><tr><td>Ms &lt; 1.6</td></tr></tbody></table>'
-
-    """
+    """Return a table of texts, its first row as head."""
     top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def html_paragraph(text: str) -> str:
-    """Return a paragraph.
-
-    Examples
-    --------
-    >>> html_paragraph("a & b")
-    '<p>a &amp; b</p>'
-
-    """
+    """Return a paragraph."""
     return f"<p>{html.escape(text)}</p>"
 
 
 def html_list(texts: Iterable[str]) -> str:
-    """Return a list, or nothing where there is nothing to list.
-
-    Examples
-    --------
-    >>> html_list(["a"]), html_list([])
-    ('<ul><li>a</li></ul>', '')
-
-    """
+    """Return a list, or nothing where there is nothing to list."""
     lines = "".join(f"<li>{html.escape(text)}</li>" for text in texts)
     return f"<ul>{lines}</ul>" if lines else ""
 
 
 def html_text(result: object) -> str:
-    """Return what a result prints, for notebooks; a class whose text is a table takes it as its `_repr_html_`.
-
-    Examples
-    --------
-    >>> html_text({"a": 1})
-    '<pre>{&#x27;a&#x27;: 1}</pre>'
-
-    """
+    """Return what a result prints, for notebooks; a class whose text is a table takes it as its `_repr_html_`."""
     return f"<pre>{html.escape(repr(result))}</pre>"

@@ -58,23 +58,7 @@ class Option:
 
 
 def option(text: str, *, default: Any = MISSING, default_factory: Any = MISSING, **described: Any) -> Any:
-    """Return a field of a record that is an option; `described` are fields of `Option`.
-
-    Examples
-    --------
-    >>> from seaopt.records import record
-    >>> @record
-    ... class Filter:
-    ...     '''A low-pass.'''
-    ...     corner_hz: float = option("Where its asymptotes meet.", default=10.0, unit="Hz", above=0.0)
-    ...     def __post_init__(self):
-    ...         check_options(self, SeaoptError)
-    >>> Filter(corner_hz=-1.0)
-    Traceback (most recent call last):
-    ...
-    seaopt.errors.SeaoptError: corner_hz = -1 is not above 0; give corner_hz = 10
-
-    """
+    """Return a field of a record that is an option; `described` are fields of `Option`."""
     given: dict[str, Any] = {"default": default, "default_factory": default_factory}
     return field(**given, metadata={"option": Option(text=text, **described)})
 
@@ -113,9 +97,8 @@ def split_union(kind: Any) -> tuple[Any, ...]:
 
 
 def check_options(record: Any, error: type[SeaoptError], prefix: str = "") -> None:
-    """Refuse numbers and words of a record that its options do not take; `prefix` stands before names in messages.
-
-    What is neither (lists, tables, numbers that may be lifted by False) is left to the record.
+    """Refuse numbers and words of a record that its options do not take; `prefix` stands before names in messages. What
+    is neither (lists, tables, numbers that may be lifted by False) is left to the record.
     """
     for one in list_options(type(record)):
         value = getattr(record, one.name)

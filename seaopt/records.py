@@ -31,27 +31,9 @@ def record(cls: type[T], /) -> type[T]: ...
 def record(*, eq: bool = True, repr: bool = True, keywords: bool = False) -> Callable[[type[T]], type[T]]: ...
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field, option))
 def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = True, keywords: bool = False) -> Any:
-    """Make a class a frozen, slotted dataclass with keyword-only fields.
-
-    Parameters
-    ----------
-    cls : type, optional
-        The class, where the decorator stands without brackets.
-    eq : bool
-        Compare by value. Give False where fields are arrays or symbols: such records compare, and hash, by identity.
-    repr : bool
-        Write a repr of all fields; False where the class prints itself.
-    keywords : bool
-        Answer an unknown keyword with the nearest field. For what users write: it costs a microsecond at each call.
-
-    Examples
-    --------
-    >>> @record
-    ... class Point:
-    ...     x_m: float
-    >>> Point(x_m=1.0)
-    Point(x_m=1.0)
-
+    """Make a class a frozen, slotted dataclass with keyword-only fields. `eq`: compare by value; False, by identity,
+    where fields are arrays or symbols. `repr`: of all fields; False where the class prints itself. `keywords`: answer
+    an unknown keyword with the nearest field, for what users write: it costs a microsecond per call.
     """
     decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=eq, repr=repr)
 
@@ -134,10 +116,9 @@ class Result:
 
 
 class PlotAccessor:
-    """The attribute `plot` of a result: all figures of it when called, each by itself by name, listed by `dir`.
-
-    What draws lies above the results in the layers. It is imported by its name when `plot` is read, so that nothing
-    below imports it, and a plotting library is loaded when something is drawn.
+    """The attribute `plot` of a result: all figures of it when called, each by itself by name, listed by `dir`. What
+    draws lies above the results in the layers. It is imported by its name when `plot` is read, so that nothing below
+    imports it, and a plotting library is loaded when something is drawn.
     """
 
     def __get__(self, result: object, owner: type | None = None) -> Any:

@@ -98,7 +98,6 @@ class Table:
 
 def check_distinct(channels: Mapping[str, tuple[tuple[str, str], str]]) -> list[str]:
     """Refuse one column for two channels; say so where they are two quantities, each with a conversion of its own.
-
     `channels`: ((file, column), SI unit) by name. A screw's angle (rad) and its nut's place (m) may come of one
     encoder; two forces do not come of one load cell. Raises LogError: two channels of one column have the same SI unit.
     """

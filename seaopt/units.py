@@ -64,18 +64,9 @@ def _parse(unit: str) -> Any:
 
 @lru_cache(maxsize=1024)
 def factor(unit: str, to: str) -> float:
-    """Return the number that turns a value in `unit` into one in `to`.
-
-    `unit`, `to`: unit texts; "", "-" and "1" are dimensionless. Raises UnitError: a unit is unknown, the dimensions
-    differ, or the scale has an offset (degrees Celsius).
-
-    Examples
-    --------
-    >>> factor("mA", "A")
-    0.001
-    >>> round(factor("deg", "rad"), 6)
-    0.017453
-
+    """Return the number that turns a value in `unit` into one in `to`. `unit`, `to`: unit texts; "", "-" and "1" are
+    dimensionless. Raises UnitError: a unit is unknown, the dimensions differ, or the scale has an offset (degrees
+    Celsius).
     """
     if unit.strip() == to.strip():
         return 1.0
@@ -93,14 +84,7 @@ COMMON_SI = ("", "m", "s", "kg", "N", "A", "rad", "N m", "m/s", "rad/s", "m/s^2"
 
 @lru_cache(maxsize=1024)
 def si_unit(unit: str) -> str:
-    """Return the SI unit of the same dimension, as text: "mA" gives "A", "deg" gives "rad"; "degC" is its own.
-
-    Examples
-    --------
-    >>> si_unit("mA"), si_unit("deg"), si_unit("N"), si_unit("us")
-    ('A', 'rad', 'N', 's')
-
-    """
+    """Return the SI unit of the same dimension, as text: "mA" gives "A", "deg" gives "rad"; "degC" is its own."""
     if unit.strip() in CELSIUS:  # the offset against K makes it a unit of its own
         return "degC"
     parsed = _parse(unit)
@@ -126,51 +110,23 @@ def same_dimension(first: str, second: str) -> bool:
 
 
 def unit_after(unit: str) -> str:
-    """Return a unit as it follows a number in a sentence: a space and the unit, or nothing for a pure number.
-
-    Examples
-    --------
-    >>> f"{0.3:g}{unit_after('m')}", f"{0.3:g}{unit_after('-')}"
-    ('0.3 m', '0.3')
-
-    """
+    """Return a unit as it follows a number in a sentence: a space and the unit, or nothing for a pure number."""
     return "" if unit.strip() in DIMENSIONLESS else f" {unit.strip()}"
 
 
 def divide_units(unit: str, by: str) -> str:
-    """Return the text of a unit over another.
-
-    Examples
-    --------
-    >>> divide_units("A", "N m"), divide_units("-", "N"), divide_units("N m", "N m")
-    ('A/(N m)', '1/N', 'N m/(N m)')
-
-    """
+    """Return the text of a unit over another."""
     over, under = unit_after(unit).strip() or "1", unit_after(by).strip() or "1"
     return f"{over}/({under})" if " " in under or "/" in under else f"{over}/{under}"
 
 
 def name_command(source: str, unit: str) -> str:
-    """Return what to call the input that a controller commands: by its unit, else by its own name.
-
-    Examples
-    --------
-    >>> name_command("I", "A"), name_command("V", "V"), name_command("duty", "-")
-    ('current', 'voltage', 'duty')
-
-    """
+    """Return what to call the input that a controller commands: by its unit, else by its own name."""
     return {"A": "current", "V": "voltage"}.get(unit, source)
 
 
 def show_command(value: float, source: str, unit: str) -> str:
-    """Return a value of a commanded input as text, with its unit; a pure number with what it is.
-
-    Examples
-    --------
-    >>> show_command(9.0, "I", "A"), show_command(0.8, "duty", "-")
-    ('9 A', '0.8 of duty')
-
-    """
+    """Return a value of a commanded input as text, with its unit; a pure number with what it is."""
     return f"{value:.4g}{unit_after(unit) or f' of {name_command(source, unit)}'}"
 
 
@@ -188,28 +144,14 @@ def header_unit(header: str) -> str | None:
 
 
 def bare_name(header: str) -> str:
-    """Return a header without its unit.
-
-    Examples
-    --------
-    >>> bare_name("F1 [N]"), bare_name("cur")
-    ('F1', 'cur')
-
-    """
+    """Return a header without its unit."""
     match = _HEADER.match(header)
     return match["name"].strip() or header if match else header
 
 
 @record
 class Mechanics:
-    """How a linear or a rotary actuator's quantities are called: its effort (force, N), its inertia (mass, kg).
-
-    Examples
-    --------
-    >>> LINEAR.damping, ROTARY.damping, ROTARY.stiffness, ROTARY.impulse
-    ('N s/m', 'N m s/rad', 'N m/rad', 'N m s')
-
-    """
+    """How a linear or a rotary actuator's quantities are called: its effort (force, N), its inertia (mass, kg)."""
 
     word: str
     unit: str
@@ -246,12 +188,5 @@ ROTARY = Mechanics(
 
 
 def mechanics_of(unit: str) -> Mechanics:
-    """Return how quantities are called where efforts, or places, have a unit: N or m, N m or rad.
-
-    Examples
-    --------
-    >>> mechanics_of("N m").word, mechanics_of("rad").inertia, mechanics_of("N").word
-    ('torque', 'kg m^2', 'force')
-
-    """
+    """Return how quantities are called where efforts, or places, have a unit: N or m, N m or rad."""
     return ROTARY if unit in (ROTARY.unit, ROTARY.place) else LINEAR

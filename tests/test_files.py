@@ -8,7 +8,7 @@ import stat
 import pytest
 
 from seaopt.errors import FileError
-from seaopt.files import check_content, write_bytes
+from seaopt.files import check_content, digest_content, write_bytes
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
@@ -45,3 +45,8 @@ def test_integers_of_64_bits_are_read(value):
 def test_integers_of_more_are_refused(value):
     with pytest.raises(ValueError, match="an integer has 64 bits, and 63 beside its sign are the most"):
         check_content({"seed": [value]})
+
+
+def test_the_clock_has_no_part_in_a_digest():
+    assert digest_content({"met": True, "provenance": {"wall_s": 1.0}}) == digest_content({"met": True})
+    assert digest_content({"met": True}) != digest_content({"met": False})

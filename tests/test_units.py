@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from seaopt import units
 from seaopt.errors import UnitError
 from seaopt.units import factor, same_dimension, si_unit
 
@@ -44,3 +45,24 @@ def test_dimensions_are_compared():
     assert not same_dimension("N", "A")
     assert si_unit("kN") == "N"
     assert si_unit("m^3") == "m^3"
+
+
+def test_texts_of_units():
+    assert [f"{0.3:g}{units.unit_after(unit)}" for unit in ("m", "-")] == ["0.3 m", "0.3"]
+    assert units.divide_units("A", "N m") == "A/(N m)"
+    assert units.divide_units("-", "N") == "1/N"
+    assert units.divide_units("N m", "N m") == "N m/(N m)"
+    assert [units.bare_name(header) for header in ("F1 [N]", "cur")] == ["F1", "cur"]
+
+
+def test_commands_are_called_by_their_unit_else_by_their_name():
+    commands = [("I", "A"), ("V", "V"), ("duty", "-")]
+    assert [units.name_command(*command) for command in commands] == ["current", "voltage", "duty"]
+    assert [units.show_command(9.0, "I", "A"), units.show_command(0.8, "duty", "-")] == ["9 A", "0.8 of duty"]
+
+
+def test_quantities_of_linear_and_rotary_actuators():
+    assert (units.LINEAR.damping, units.ROTARY.damping) == ("N s/m", "N m s/rad")
+    assert (units.ROTARY.stiffness, units.ROTARY.impulse) == ("N m/rad", "N m s")
+    assert units.mechanics_of("N m").word == "torque"
+    assert (units.mechanics_of("rad").inertia, units.mechanics_of("N").word) == ("kg m^2", "force")

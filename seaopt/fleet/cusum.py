@@ -55,17 +55,8 @@ def _make_chain(threshold: float, allowance: float) -> Float[np.ndarray, "m m"]:
 
 
 def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
-    """Return after how many runs a one-sided chart raises an alarm on average, where nothing has changed.
-
-    `threshold`, `allowance`: h and k, in standard deviations.
-
-    Examples
-    --------
-    Two sides halve it, to the 465 that textbooks have for k = 0.5 and h = 5:
-
-    >>> round(average_run_length(5.0) / 2)
-    465
-
+    """Return after how many runs a one-sided chart raises an alarm on average, where nothing has changed. `threshold`,
+    `allowance`: h and k, in standard deviations.
     """
     chain = _make_chain(threshold, allowance)
     return float(np.linalg.solve(np.eye(STATES) - chain, np.ones(STATES))[0])
@@ -73,14 +64,7 @@ def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
 
 def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> Float[np.ndarray, " n"]:
     """Return the probabilities that a one-sided chart raises an alarm within 0, 1, ... runs, where nothing has changed.
-
     `threshold`: h, in standard deviations. `runs`: how many, at most. `allowance`: k, in standard deviations.
-
-    Examples
-    --------
-    >>> alarm_probabilities(5.0, 100)[[0, 10, 100]].round(4)
-    array([0.    , 0.0047, 0.0967])
-
     """
     chain, left = _make_chain(threshold, allowance), np.eye(STATES)[0]
     within = np.zeros(runs + 1)
@@ -92,17 +76,10 @@ def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANC
 
 @lru_cache(maxsize=64)
 def choose_threshold(probability: float, runs: int, charts: int, allowance: float = ALLOWANCE) -> float:
-    """Return the threshold h with which an actuator raises a false alarm with at most this probability.
-
-    `probability`: of an alarm of any of its charts within `runs` runs. `runs`, `charts`: how many runs; how many
-    parameters of an actuator have a chart. `allowance`: k, in standard deviations. Raises SeaoptError: the probability
-    is not between 0 and 1, or smaller than 1e-6.
-
-    Examples
-    --------
-    >>> round(choose_threshold(0.01, 100, 2), 2)
-    8.61
-
+    """Return the threshold h with which an actuator raises a false alarm with at most this probability. `probability`:
+    of an alarm of any of its charts within `runs` runs. `runs`, `charts`: how many runs; how many parameters of an
+    actuator have a chart. `allowance`: k, in standard deviations. Raises SeaoptError: the probability is not between 0
+    and 1, or smaller than 1e-6.
     """
     if not 0.0 < probability < 1.0:
         raise SeaoptError(f"false_alarms = {probability:g} is no probability above 0 and below 1; give 0.01")
@@ -151,18 +128,6 @@ def chart_runs(
     the correlation of that in runs that follow each other. `scale`, `dof`: of Student's t, of which innovations over
     their stds are; 1 and infinite where they are normal. `start`: runs that a baseline starts from, without a chart of
     them: of heavy tails several, by Student's t.
-
-    Examples
-    --------
-    A value of unit variance that rises by three standard deviations at its 21st run:
-
-    >>> values = np.random.default_rng(1).normal(size=(1, 40)) + 3.0 * (np.arange(40) >= 20)
-    >>> charts = chart_runs(values, np.ones((1, 40)), choose_threshold(0.01, 100, 1))
-    >>> charts.alarm
-    array([23])
-    >>> find_change(values[0, :24], np.ones(24))
-    20
-
     """
     count, runs = values.shape
     ratios, innovations = np.full((2, count, runs), np.nan)
@@ -211,9 +176,8 @@ def _start(
     scale: float,
     dof: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the mean of the first runs, its variance, and its covariance with u of the last of them.
-
-    They tell mean and u together, and nothing of u alone. Of several runs it is the most likely mean of Student's t.
+    """Return the mean of the first runs, its variance, and its covariance with u of the last of them. They tell mean
+    and u together, and nothing of u alone. Of several runs it is the most likely mean of Student's t.
     """
     present = np.isfinite(values)
     if values.shape[1] == 1:
@@ -241,7 +205,6 @@ def _normalise(ratio: Float[np.ndarray, " n"], dof: float) -> Float[np.ndarray, 
 
 def find_change(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> int:
     """Return from which run on a mean is another one: the step that is most likely, if there is one (Hinkley 1970).
-
     `weights`: one over the variances of the values, of at least two runs.
     """
     before = np.cumsum(weights)[:-1]

@@ -50,14 +50,7 @@ class Dispatcher:
         self.workers, self.counted = 1, float("-inf")
 
     def run(self) -> Generator[list[Row]]:
-        """Yield the rows of each batch as it is done.
-
-        Raises
-        ------
-        SeaoptError
-            The executor takes no more work.
-
-        """
+        """Yield the rows of each batch as it is done. Raises SeaoptError: the executor takes no more work."""
         try:
             while self.waiting or self.suspects or self.flying:
                 self._fill()

@@ -490,9 +490,8 @@ def _list_alarms(
 def _measure_change(
     values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], raised: int, *, rises: bool
 ) -> tuple[int, int, float, float]:
-    """Return the runs of a change, first and one past the last, and the means before it and of these.
-
-    They go on to the last run, unless the value has come back since, further than it was: then to the alarm.
+    """Return the runs of a change, first and one past the last, and the means before it and of these. They go on to the
+    last run, unless the value has come back since, further than it was: then to the alarm.
     """
     start = find_change(values[: raised + 1], weights[: raised + 1])
     before = float(np.average(values[:start], weights=weights[:start]))

@@ -237,10 +237,7 @@ def _rank(texts: Sequence[str]) -> list[int]:
 
 
 def parse_time(text: str | float, history: History) -> float:
-    """Return a time in the unit of a history.
-
-    Raises SeaoptError: it is no time.
-    """
+    """Return a time in the unit of a history. Raises SeaoptError: it is no time."""
     days = _read_dates([str(text)]) if history.unit == DAY else None
     numbers = days or _read_numbers([str(text)])
     if numbers is None or numbers[0] is None:
@@ -250,14 +247,7 @@ def parse_time(text: str | float, history: History) -> float:
 
 
 def format_time(time: float, unit: str) -> str:
-    """Return a time as people write it.
-
-    Examples
-    --------
-    >>> format_time(20484.0, "day"), format_time(20484.5, "day"), format_time(12.0, "run")
-    ('2026-01-31', '2026-01-31 12:00', 'run 12')
-
-    """
+    """Return a time as people write it."""
     if unit != DAY:
         return f"{unit} {time:.10g}"
     moment = datetime.fromtimestamp(time * DAY_S, tz=UTC)

@@ -128,7 +128,6 @@ def read_manifest(path: Path | str, column: str = "log") -> tuple[FleetLog, ...]
 @contextmanager
 def open_local(path: str) -> Generator[tuple[Path, str]]:
     """Yield a local file with a log's content and its SHA-256; what lies elsewhere is fetched, and deleted afterwards.
-
     Raises FileError: it cannot be read or fetched.
     """
     if not _ADDRESS.match(path):

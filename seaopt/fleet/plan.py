@@ -56,9 +56,8 @@ class Columns:
 
 
 def make_plan(problem: Problem, like: str | None, time_limit_s: float | None, client: str) -> Plan:
-    """Return the plan of a fleet.
-
-    Raises ProblemError: no experiment says how to read a log, or it reads more files than one.
+    """Return the plan of a fleet. Raises ProblemError: no experiment says how to read a log, or it
+    reads several files.
     """
     template = problem.choose_template(like)
     if list_log_files(template) != [template.log]:
@@ -97,14 +96,7 @@ def list_columns(problem: Problem) -> Columns:
 
 
 def name_correlation(first: str, second: str) -> str:
-    """Return the column with the correlation of two parameters' errors, whichever is named first.
-
-    Examples
-    --------
-    >>> name_correlation("b_r", "J"), name_correlation("J", "b_r")
-    ('J:b_r_corr', 'J:b_r_corr')
-
-    """
+    """Return the column with the correlation of two parameters' errors, whichever is named first."""
     return ":".join(sorted((first, second))) + "_corr"  # no parameter's name has a colon
 
 

@@ -316,9 +316,8 @@ def _renew_within(logs: _Logs, posterior: _Posterior, within: Float[np.ndarray, 
 def _propagate_sampling(
     posterior: _Posterior, between: Float[np.ndarray, "p p"], count: int
 ) -> Float[np.ndarray, "k p p"]:
-    """Return the covariance of the posterior values by the sampling error of T, of which REML's information tells.
-
-    With E_a the derivative of T by its a-th entry, dm_i/dT_a = (I - B_i) E_a (T + V_i)^-1 (y_i - mu).
+    """Return the covariance of the posterior values by the sampling error of T, of which REML's information tells. With
+    E_a the derivative of T by its a-th entry, dm_i/dT_a = (I - B_i) E_a (T + V_i)^-1 (y_i - mu).
     """
     size = between.shape[0]
     entries = [(i, j) for i in range(size) for j in range(i, size)]

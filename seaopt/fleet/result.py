@@ -163,10 +163,8 @@ class Fleet(Result, Worded):
 def count_reasons(
     rows: Iterable[tuple[str, str | None, Sequence[Mapping[str, Any]] | None]],
 ) -> tuple[tuple[str, int, str], ...]:
-    """Return the kinds of reasons, the most frequent first, with how many logs have each and one of them.
-
-    Reasons of one kind of finding at one place are one, whatever their figures; so are errors that differ in the
-    log's name alone.
+    """Return the kinds of reasons, the most frequent first, with how many logs have each and one of them. Reasons of
+    one kind of finding at one place are one, whatever their figures; so are errors that differ in the log's name alone.
     """
     counts, examples = Counter[str](), dict[str, tuple[str, str]]()
     for log, reason, findings in rows:

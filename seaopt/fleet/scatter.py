@@ -115,18 +115,8 @@ class Between:
 
 
 def estimate_between_runs(runs: Sequence[tuple[Runs, Runs]]) -> Between | None:
-    """Return how much values differ from run to run beyond the variances of their fits; None of too few runs.
-
-    `runs`: a row per actuator in the order of time, nan where there is no run.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> values = rng.normal(size=(50, 1)) + 0.3 * rng.normal(size=(50, 40)) + 0.4 * rng.normal(size=(50, 40))
-    >>> between = estimate_between_runs([(values, np.full((50, 40), 0.3**2))])
-    >>> round(between.std, 2), round(between.correlation, 2)
-    (0.4, 0.04)
-
+    """Return how much values differ from run to run beyond the variances of their fits; None of too few runs. `runs`: a
+    row per actuator in the order of time, nan where there is no run.
     """
     first = _list_differences(runs, 1)
     if first[0].size < FEWEST_PAIRS or not first[0].any():
@@ -185,7 +175,6 @@ def _fit_variogram(variogram: Float[np.ndarray, " n"], fit: float, pairs: int) -
 
 def _count_freedom(fits: Float[np.ndarray, " n"], variance: float) -> float:
     """Return the degrees of freedom of a run's variance, from the sampling variance of the clipped mean square.
-
     Differences that share a run are correlated by -1/2, their squares by 1/4: half as much again as if they were not.
     """
     slope = np.mean(2.0 / (2.0 * variance + fits)) * chi2.cdf(CLIP_SQUARE, 3)
@@ -194,17 +183,8 @@ def _count_freedom(fits: Float[np.ndarray, " n"], variance: float) -> float:
 
 
 def estimate_tails(ratios: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return degrees of freedom and scale of Student's t; infinite and 1 where ratios may as well be normal.
-
-    `ratios`: standardised innovations of healthy runs, before they are clipped.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> dof, scale = estimate_tails(0.7 * rng.standard_t(3, 5000))
-    >>> round(dof, 1), round(scale, 2), estimate_tails(rng.normal(size=5000))
-    (3.0, 0.69, (inf, 1.0))
-
+    """Return degrees of freedom and scale of Student's t; infinite and 1 where ratios may as well be normal. `ratios`:
+    standardised innovations of healthy runs, before they are clipped.
     """
     if ratios.size < FEWEST_OF_SHAPE:
         return np.inf, 1.0
@@ -224,11 +204,9 @@ def estimate_tails(ratios: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 
 def differ_in_scatter(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bool:
-    """Return whether some actuators scatter more than others, by more than chance and enough to matter.
-
-    What differs shows in both halves of an actuator's history alike, chance does not.
-
-    `runs`: as in `estimate_between_runs`. `between`: of all of them.
+    """Return whether some actuators scatter more than others, by more than chance and enough to matter. What differs
+    shows in both halves of an actuator's history alike, chance does not. `runs`: as in `estimate_between_runs`.
+    `between`: of all of them.
     """
     halves = np.concatenate([_measure_halves(values, variances, between) for values, variances in runs])
     halves = halves[np.isfinite(halves).all(axis=1)]
@@ -241,9 +219,8 @@ def differ_in_scatter(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bo
 
 
 def wander(runs: Sequence[tuple[Runs, Runs]], between: Between) -> bool:
-    """Return whether the halves of histories differ by more than chance, and by enough to matter to a chart.
-
-    `runs`: as in `estimate_between_runs`, of actuators that have not changed. `between`: of all of them.
+    """Return whether the halves of histories differ by more than chance, and by enough to matter to a chart. `runs`: as
+    in `estimate_between_runs`, of actuators that have not changed. `between`: of all of them.
     """
     squares = np.concatenate([_compare_halves(values, variances, between) for values, variances in runs])
     squares = _select(squares)

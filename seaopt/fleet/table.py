@@ -80,9 +80,8 @@ def make_frame(rows: Sequence[Row], schema: Mapping[str, Any], plan: Plan) -> pl
 
 
 class FleetTable:
-    """A table that rows are added to: the folder ``fleet`` in that of the results, for the problem of a plan.
-
-    Raises FileError: the folder cannot be made, another client has it, or a file of it is damaged.
+    """A table that rows are added to: the folder ``fleet`` in that of the results, for the problem of a plan. Raises
+    FileError: the folder cannot be made, another client has it, or a file of it is damaged.
     """
 
     def __init__(self, folder: Path, schema: Mapping[str, Any], plan: Plan) -> None:
@@ -247,9 +246,8 @@ def _put(rows: pl.DataFrame, newer: pl.DataFrame) -> pl.DataFrame:
 
 
 def read_rows(folder: Path) -> pl.DataFrame:
-    """Return the rows of a table that nobody writes, in order of their logs.
-
-    Raises FileError: there is none, or a file of it is damaged.
+    """Return the rows of a table that nobody writes, in order of their logs. Raises FileError: there is none, or a file
+    of it is damaged.
     """
     parts = [_read(path) for path in sorted((folder / "fleet").glob("part-*.parquet"))]
     if not parts:
@@ -294,10 +292,7 @@ def _read(path: Path) -> pl.DataFrame:
 
 
 def _lock(path: Path) -> int:
-    """Return the open lock of a table, which ends with the process.
-
-    Raises FileError: another process has it.
-    """
+    """Return the open lock of a table, which ends with the process. Raises FileError: another process has it."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         if os.name == "nt":

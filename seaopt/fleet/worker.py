@@ -48,10 +48,8 @@ def name_process() -> str:
 
 
 def fit_batch(plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> list[Row]:
-    """Return a row for each log.
-
-    `logs`: the batch. `known`: the contents that are fitted already; a log that still has it is not fitted again.
-    Returned: rows with status "met", "not met", "failed" or "unchanged".
+    """Return a row for each log, with status "met", "not met", "failed" or "unchanged". `known`: the contents that are
+    fitted already; a log that still has it is not fitted again.
     """
     return [_fit_log(plan, log, known.get(log.path)) for log in logs]
 
@@ -116,7 +114,6 @@ def _find_gaps(experiment: Experiment) -> list[dict[str, str]]:
 
 def describe(fitted: Fit, name: str) -> Row:
     """Return a fit as a row: values, standard deviations and units of its unknowns and figures, verdict and findings.
-
     `fitted`: of one experiment. `name`: of its experiment, which the names of what is of this log alone begin with.
     """
     row: Row = {"status": MET if fitted.met else NOT_MET, "reason": None if fitted.met else fitted.verdict}

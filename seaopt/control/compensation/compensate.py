@@ -117,7 +117,6 @@ def find_compensation_margins(
     controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", enough: float = 1.0
 ) -> list[CompensationMargin]:
     """Return how steep a compensation from the measured speed stability is shown for, at sets of parameters.
-
     `controller`: with a compensation of friction from the measured speed. `plant`: any on which it runs, with its own
     friction. `sets`: all with the same conditions among them. `first`: a multiplier that is tried first. `enough`: a
     margin of so many times what is asked ends the search for a better one.

@@ -42,16 +42,8 @@ class MotorFriction:
 
 
 def find_motor_friction(plant: Plant, params: ParameterSet) -> MotorFriction:
-    """Return the friction of a plant that acts where the motor's effort does.
-
-    Raises ControlError: there is none, or it is nothing at these values.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> round(find_motor_friction(so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)).level, 6)
-    50.0
-
+    """Return the friction of a plant that acts where the motor's effort does. Raises ControlError: there is none, or it
+    is nothing at these values.
     """
     values = plant.complete(params)
     x, u = find_rest(plant, values)
@@ -92,13 +84,10 @@ def _is_parallel(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]
 def make_friction_term(
     plant: Plant, params: ParameterSet, regulated: str, spec: CompensateFriction, loop: FrictionLoop | None
 ) -> FrictionTerm:
-    """Return the compensation of a design plant's friction.
-
-    `plant`, `params`: the design plant and its parameters. `regulated`: the output that the reference is of. `loop`:
-    the design plant's, for the smoothing of the measured speed; unused of the reference's.
-
-    Raises ControlError: no friction is where the motor acts, no output is the motor's position, the reference asks for
-    no velocity at rest, or stability is shown for no smoothing at all.
+    """Return the compensation of a design plant's friction. `plant`, `params`: the design plant and its parameters.
+    `regulated`: the output that the reference is of. `loop`: the design plant's, for the smoothing of the measured
+    speed; unused of the reference's. Raises ControlError: no friction is where the motor acts, no output is the motor's
+    position, the reference asks for no velocity at rest, or stability is shown for no smoothing at all.
     """
     friction = find_motor_friction(plant, params)
     effort = spec.fraction * friction.level
@@ -144,11 +133,8 @@ def _choose_speed(friction: MotorFriction, effort: float, loop: FrictionLoop | N
 
 
 def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
-    """Return the output that is the motor's position.
-
-    `wanted`: what would be compensated by it, for the message. `otherwise`: what else there is to do, for the message.
-
-    Raises ControlError: the plant has none.
+    """Return the output that is the motor's position. `wanted`: what would be compensated by it, for the message.
+    `otherwise`: what else there is to do, for the message. Raises ControlError: the plant has none.
     """
     position = plant.sensing.motor_position if plant.sensing is not None else None
     if position is None or position not in plant.outputs:
@@ -160,9 +146,8 @@ def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
 
 
 def find_reading(plant: Plant, params: ParameterSet, output: str, friction: MotorFriction) -> float:
-    """Return the velocity at a friction per rate of an output that moves with it.
-
-    Raises ControlError: the output moves otherwise than the friction does.
+    """Return the velocity at a friction per rate of an output that moves with it. Raises ControlError: the output moves
+    otherwise than the friction does.
     """
     values = plant.complete(params)
     x, u = find_rest(plant, values)
@@ -178,19 +163,10 @@ def find_reading(plant: Plant, params: ParameterSet, output: str, friction: Moto
 
 
 def find_velocity_per_rate(plant: Plant, params: ParameterSet, regulated: str, name: str) -> float:
-    r"""Return the velocity at a friction per rate of the regulated output, slowly and with the link held.
-
-    With the plant :math:`\dot x = A x + b u`, y = c x and the velocity v x, slowly
-    :math:`v x / \dot y = v A^{-2} b / (c A^{-1} b)`: of a spring k between motor and link it is 1/k and the gear.
-
-    Raises ControlError: the plant with its link held has no stiffness, or its friction does not move.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> 1.0 / find_velocity_per_rate(so.plants.moving_output(), so.plants.thor().update(f_c=50.0), "F1", "F_f")
-    655000.0
-
+    r"""Return the velocity at a friction per rate of the regulated output, slowly and with the link held. With the
+    plant :math:`\dot x = A x + b u`, y = c x and the velocity v x, slowly :math:`v x / \dot y = v A^{-2} b / (c A^{-1}
+    b)`: of a spring k between motor and link it is 1/k and the gear. Raises ControlError: the plant with its link held
+    has no stiffness, or its friction does not move.
     """
     locked = plant
     while locked.port is not None and locked.port.held is not None:

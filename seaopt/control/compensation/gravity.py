@@ -29,20 +29,9 @@ NOTHING = 1e-9  # of an effort, N or N m, that is none
 
 
 def make_gravity_term(plant: Plant, params: ParameterSet, regulated: str, spec: CompensateGravity) -> GravityTerm:
-    """Return the compensation of the weight of a plant's link.
-
-    `plant`, `params`: a plant whose link moves, and its parameters. `regulated`: the output that the reference is of.
-
-    Raises ControlError: the plant holds its link, no output is its position, or it rests without effort.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> knee = so.plants.rotary(link="pendulum")
-    >>> term = make_gravity_term(knee, knee.defaults, "tau_s", CompensateGravity(fraction=0.5))
-    >>> round(term.effort(0.5), 5), round(0.5 * 3.0 * 9.81 * 0.15 * math.sin(0.5), 5)  # half of m g L sin(theta)
-    (1.05821, 1.05821)
-
+    """Return the compensation of the weight of a plant's link. `plant`, `params`: a plant whose link moves, and its
+    parameters. `regulated`: the output that the reference is of. Raises ControlError: the plant holds its link, no
+    output is its position, or it rests without effort.
     """
     port = plant.port
     if port is None or port.motion is None or port.coordinate is None:

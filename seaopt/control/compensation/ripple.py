@@ -11,20 +11,9 @@ from seaopt.plants import Plant
 
 
 def make_ripple_term(plant: Plant, per_effort: float, spec: CompensateRipple) -> RippleTerm:
-    """Return the compensation of ripple over a plant's motor position.
-
-    `plant`: any whose motor position is an output. `per_effort`: the command for one unit of effort. `asked`:
-    coefficients in the command's unit.
-
-    Raises ControlError: no output is the motor's position, or it is not in rad and no period is given.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> asked = CompensateRipple(cycles=(6,), cos=(0.2,), sin=(0.0,), fraction=0.5)
-    >>> make_ripple_term(so.plants.rotary(), 0.01, asked).effort(0.0)
-    10.0
-
+    """Return the compensation of ripple over a plant's motor position. `plant`: any whose motor position is an output.
+    `per_effort`: the command for one unit of effort. `asked`: coefficients in the command's unit. Raises ControlError:
+    no output is the motor's position, or it is not in rad and no period is given.
     """
     reads = find_motor_position(plant, "ripple")
     unit = plant.outputs[reads]

@@ -195,10 +195,9 @@ def _read(controller: Controller | Mapping[str, Any]) -> tuple[dict[str, Any], l
 
 
 def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard | None:
-    """Return the heat guard of a controller.json, where it has one, made again from its network with a margin.
-
-    Raises FileError: the file's own guard is not that of its network.
-    Raises ControlError: a number is missing or out of range.
+    """Return the heat guard of a controller.json, where it has one, made again from its network with a margin. Raises
+    FileError: the file's own guard is not that of its network. Raises ControlError: a number is missing or out of
+    range.
     """
     heat = content.get("heat")
     guard = heat.get("guard") if isinstance(heat, Mapping) else None

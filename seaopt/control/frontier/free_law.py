@@ -234,9 +234,8 @@ def _make_terms(
 
 
 def _orthogonalise(terms: _Terms) -> Float[np.ndarray, "n k"]:
-    """Return the combinations of functions that differ at the frequencies, each of the same size.
-
-    Many functions are nearly combinations of others, and a program in their coefficients cannot be solved.
+    """Return the combinations of functions that differ at the frequencies, each of the same size. Many functions are
+    nearly combinations of others, and a program in their coefficients cannot be solved.
     """
     both = np.concatenate([terms.basis / np.max(np.abs(terms.basis)), terms.p[:, None] * terms.basis])
     _, sizes, turns = np.linalg.svd(np.concatenate([np.real(both), np.imag(both)]), full_matrices=False)

@@ -92,9 +92,8 @@ def critical_impedance(
 
 
 def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
-    """Return critically damped impedances up to the stiffest, beyond which something slower oscillates.
-
-    A slow integral of the force law leaves a real pole that is slower, of next to no weight.
+    """Return critically damped impedances up to the stiffest, beyond which something slower oscillates. A slow integral
+    of the force law leaves a real pole that is slower, of next to no weight.
     """
     p = np.geomspace(SLOWEST_POLE, FASTEST_POLE, POLES)
     loop = close_link(link, velocity_filter_s)
@@ -110,9 +109,8 @@ def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
 
 
 def find_critical(link: Link, velocity_filter_s: float, stiffness: float) -> Impedance:
-    """Return the critically damped impedance of a stiffness.
-
-    Raises ControlError: there is none of this stiffness; the error names those that there are.
+    """Return the critically damped impedance of a stiffness. Raises ControlError, with those that there are: it has
+    none.
     """
     scan = scan_critical(link, velocity_filter_s)
     stiffnesses = scan.stiffness

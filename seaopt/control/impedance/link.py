@@ -77,12 +77,9 @@ class Link:
 
 
 def find_link(controller: Controller, plant: Plant, params: ParameterSet, link_damping: float | None = None) -> Link:
-    """Return the link of a plant under a controller, linearised at rest, sliding where it has friction.
-
-    `link_damping`: the damper at the link, in place of its own.
-
-    Raises ControlError: the link is held, the plant has no port, the link is not a mass on a spring and a damper, or
-    the damper is negative.
+    """Return the link of a plant under a controller, linearised at rest, sliding where it has friction. `link_damping`:
+    the damper at the link, in place of its own. Raises ControlError: the link is held, the plant has no port, the link
+    is not a mass on a spring and a damper, or the damper is negative.
     """
     if link_damping is not None and not 0.0 <= link_damping < np.inf:
         raise ControlError(f"link_damping = {link_damping:g} is not a damper; give zero or more")

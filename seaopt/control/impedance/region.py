@@ -208,9 +208,8 @@ def passive_region(
 
 
 def needed_damper(port: SampledPort, impedance: Impedance) -> float:
-    """Return the least damper at the link with which an impedance is passive; infinite where none makes it so.
-
-    More of it leaves the world less to choose from, so that what is passive with one is so with a larger one.
+    """Return the least damper at the link with which an impedance is passive; infinite where none makes it so. More of
+    it leaves the world less to choose from, so that what is passive with one is so with a larger one.
     """
     if not port.held_stable():
         return np.inf

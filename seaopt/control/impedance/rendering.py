@@ -246,9 +246,8 @@ def add_impedance(
 
 
 def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
-    """Return F_e/v of the actuator under force law and outer loop at frequencies (Hz), without the link itself.
-
-    It is the response at the frequency itself; what sampling folds onto others is left out.
+    """Return F_e/v of the actuator under both loops at frequencies (Hz), without the link and without what sampling
+    folds.
     """
     response = link.port.response(f)
     reference, feedback = link.law.reference_response(f), link.law.feedback_responses(f)

@@ -71,7 +71,6 @@ class PortTerms:
 
     def margin(self, stiffness: Points, damping: Points) -> Float[np.ndarray, "n m"]:
         """Return (|2 + sum c_k|^2 - (sum |c_k|)^2)/4 at every angle for n pairs of gains, positive where it is passive.
-
         Of one alias it is 1 + Re c: 1 without control, 0 where nothing is left of the damping. Of the far aliases the
         sizes of p_k and W q_k are added, which is more than that of their sum. Where nothing dissipates it is -inf.
         """
@@ -226,9 +225,8 @@ def _about_dips(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
 
 
 def _add_beyond(terms: Aliases, over_floor: Float[np.ndarray, "m k"], theta: Angles) -> Complex[np.ndarray, "m new"]:
-    """Return terms that fall at least like 1/omega^2 with the sum beyond the last alias on either side.
-
-    It is summed as if they fell no faster from there, and as if the port dissipated its least.
+    """Return terms that fall at least like 1/omega^2 with the sum beyond the last alias on either side. It is summed as
+    if they fell no faster from there, and as if the port dissipated its least.
     """
     turns = theta / (2 * np.pi)
     sides = [

@@ -101,7 +101,6 @@ class Assembly:
 
     def with_reference_behind(self, part: TransferFunction, difference: TransferFunction) -> Assembly:
         """Return this, the inputs being error, reference and further signals, with the reference behind a filter.
-
         `part`: the filter F, stable and of unit static gain. `difference`: (F - 1)/delta, over the same denominator.
         """
         a, b, row, through = difference.state_space()

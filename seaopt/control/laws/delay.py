@@ -144,9 +144,8 @@ def count_loop_samples(spec: DelayedSpec) -> int:
 
 
 def count_response_samples(spec: DelayedSpec, measured: MeasuredResponse) -> float:
-    """Return the samples that a measured response is turned by: the program's, for the drive's delay is in it.
-
-    Raises ControlError: the older key is given, the whole loop, and the log alone has more.
+    """Return the samples that a measured response is turned by: the program's, for the drive's delay is in it. Raises
+    ControlError: the older key is given, the whole loop, and the log alone has more.
     """
     if spec.delay_samples is None:
         return count_loop_samples(spec)
@@ -190,9 +189,8 @@ def find_drive(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> D
 def split_delayed(
     spec: DelayedSpec, design: Plant, plants: Mapping[str, Plant], source: Fit | ParameterSet
 ) -> dict[str, Plant]:
-    """Return plants with the delays that their own experiments have; one twice whose experiments differ.
-
-    The parameters have the longest delay of the design plant, from which each plant's own is counted.
+    """Return plants with the delays that their own experiments have; one twice whose experiments differ. The parameters
+    have the longest delay of the design plant, from which each plant's own is counted.
     """
     if not isinstance(source, Fit) or find_given_drive_delay(spec) is not None:
         return dict(plants)
@@ -228,11 +226,10 @@ def take_own_delays(
 def settle_delays(
     spec: SpecT, plant: Plant, source: Fit | ParameterSet, *, plans: bool = False
 ) -> tuple[SpecT, ParameterSet]:
-    """Return a specification with its samples, and values with the drive's delay: what a loop is closed with.
-
-    Samples that are left out are none where the design plant's log shows what a program does that reads and writes in
-    one tick: a delay behind a command that is held. It takes an output without the present command in it, and a law
-    that does not plan; else it is 1.
+    """Return a specification with its samples, and values with the drive's delay: what a loop is closed with. Samples
+    that are left out are none where the design plant's log shows what a program does that reads and writes in one tick:
+    a delay behind a command that is held. It takes an output without the present command in it, and a law that does not
+    plan; else it is 1.
     """
     require_plant(plant, "plant", ControlError)
     require_type(source, (Fit, ParameterSet), "params", "give a Fit, or a ParameterSet", ControlError)
@@ -251,16 +248,7 @@ def settle_delays(
 def describe_delays(
     compute_delay_samples: int, drive_delay_s: float, sample_time_s: float, *, older: bool = False
 ) -> str:
-    """Return both delays and their sum, in the words of terminal, page and header; of an `older` key the sum alone.
-
-    Examples
-    --------
-    >>> describe_delays(0, 1.32e-3, 1e-3)
-    'compute delay 0 samples + drive delay 1.32 ms = 1.32 samples'
-    >>> describe_delays(1, 0.0, 1e-3)
-    'compute delay 1 sample, no drive delay'
-
-    """
+    """Return both delays and their sum, in the words of terminal, page and header; of an `older` key the sum alone."""
     if older:
         return f"delay {format_count(compute_delay_samples, 'sample')} in all, the drive's among them"
     computing = f"compute delay {format_count(compute_delay_samples, 'sample')}"

@@ -20,15 +20,6 @@ def find_friction_margin(controller: Controller, plant: Plant, params: Parameter
     its friction, and parameters, conditions among them. Returned: with a factor of zero where the sliding loop is not
     stable itself, where the loop has an `seaopt.control.loops.friction_loop.FrictionLoop.obstacle`, or where nothing
     was shown: that does not show an oscillation.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, params = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
-    >>> controller = so.tune(stand, params, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
-    >>> find_friction_margin(controller, stand, params).shown
-    True
-
     """
     return find_friction_margins(controller, plant, [params])[0]
 
@@ -36,9 +27,8 @@ def find_friction_margin(controller: Controller, plant: Plant, params: Parameter
 def find_friction_margins(
     controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
 ) -> list[FrictionMargin | None]:
-    """Return `find_friction_margin` at several sets of parameters, all with the same conditions among them.
-
-    `first` and `least`: as in `friction_margin`.
+    """Return `find_friction_margin` at several sets of parameters, all with the same conditions among them. `first` and
+    `least`: as in `friction_margin`.
     """
     return [
         None if loop is None else friction_margin(loop, first, least)

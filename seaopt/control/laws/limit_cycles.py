@@ -49,18 +49,7 @@ class LimitCycle:
 def describe_friction(
     plant: Plant, params: ParameterSet, name: str, amplitude: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, " m"]:
-    """Return the describing function N (N s/m) of a friction above its flattest slope, at velocity amplitudes.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, params = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0, v_s=1e-4)
-    >>> v = np.array([1e-6, 0.1])
-    >>> n = describe_friction(stand, params, "F_f", v)
-    >>> n.round(0), 4 * 50 / (np.pi * 0.1)  # stuck f_c/v_s; sliding like Coulomb's 4 f_c/(pi V)
-    (array([499988.,    637.]), 636.6197723675814)
-
-    """
+    """Return the describing function N (N s/m) of a friction above its flattest slope, at velocity amplitudes."""
     values = plant.complete(params)
     flattest = friction_slopes(plant, values)[0][list(plant.friction).index(name)]
     friction, v = plant.friction[name], ca.SX.sym("v")
@@ -74,7 +63,6 @@ def describe_friction(
 
 def predict_limit_cycles(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[LimitCycle, ...]:
     """Return the limit cycles that the describing function of a plant's friction predicts, the fastest last.
-
     `controller`: its measurement path closes the loop; the reference stands still. `plant`, `params`: the plant with
     its friction. Where several of its frictions change with velocity nothing is predicted, nor where one has bristles:
     before they slip they are a spring, which the curve of steady sliding knows nothing of.

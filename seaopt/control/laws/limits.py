@@ -167,7 +167,6 @@ class Limit:
 
     def allow(self, level: Any, bandwidth_hz: float) -> float | None:
         """Return what a specification's level allows, None being its default; None where nothing is imposed.
-
         `bandwidth_hz` is the one that is asked for. A limit without a field has no level.
         """
         if level is False or (self.allowed is not None and self.has_field and level is None):

@@ -34,9 +34,8 @@ LARGEST, MOST_HELD = 1e15, 1_000_000  # what float and unsigned long of every ta
 
 
 def is_number(value: float) -> bool:
-    """Tell whether a running law takes a number: finite, and so small that nothing which follows overflows.
-
-    A law that took 1e308 once would have a state from which every later command overflows.
+    """Tell whether a running law takes a number: finite, and so small that nothing which follows overflows. A law that
+    took 1e308 once would have a state from which every later command overflows.
     """
     return bool(-LARGEST <= value <= LARGEST)
 
@@ -60,13 +59,8 @@ class GateState:
 
 @record(keywords=True)
 class GateSpec:
-    """The options of a gate: which readings a running law is to believe, and what it does about the others.
-
-    Raises
-    ------
-    ControlError
-        A value is out of range.
-
+    """The options of a gate: which readings a running law is to believe, and what it does about the others. Raises
+    ControlError: a value is out of range.
     """
 
     range_N: tuple[float, float] = option(
@@ -232,9 +226,8 @@ class PlausibilityGate:
 
 
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:
-    """Return how far a plant's output moves at most between two samples while its effort is within a limit.
-
-    Raises ControlError: the plant does not come to rest by itself.
+    """Return how far a plant's output moves at most between two samples while its effort is within a limit. Raises
+    ControlError: the plant does not come to rest by itself.
     """
     if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) >= 1.0:
         raise ControlError("the plant does not come to rest by itself, so that no step is the largest; give max_step_N")

@@ -339,9 +339,8 @@ class ControllerSpec:
 
 
 def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, float]) -> None:
-    """Refuse the numbers of a filter that are not above zero and up to the largest; what is None is tuned.
-
-    Frequencies are not below those that limits are kept from.
+    """Refuse the numbers of a filter that are not above zero and up to the largest; what is None is tuned. Frequencies
+    are not below those that limits are kept from.
     """
     for field, value in numbers.items():
         if value is None:

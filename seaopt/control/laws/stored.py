@@ -129,9 +129,8 @@ class StoredController:
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a `Controller` that a controller.json holds; not what it achieves.
-
-    Raises FileError: a field is missing or malformed, or two contradict each other: the gains must give the law.
+    """Return the fields of a `Controller` that a controller.json holds; not what it achieves. Raises FileError: a field
+    is missing or malformed, or two contradict each other: the gains must give the law.
     """
     table = from_content(StoredController, content, FILE, remedy=TUNE_AGAIN)
     command, link, outer = table.command, table.link_feedforward, table.impedance
@@ -186,9 +185,8 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_link(link: LinkPath, spec: ControllerSpec, plant: Plant) -> None:
-    """Refuse a signal that is not the link's motion on the design plant, or of the same actuator with its link free.
-
-    Of a signal that the specification names, and neither knows, it is checked on the plants that it is closed on.
+    """Refuse a signal that is not the link's motion on the design plant, or of the same actuator with its link free. Of
+    a signal that the specification names, and neither knows, it is checked on the plants that it is closed on.
     """
     port = plant.port
     free = plant if port is None or port.motion is not None or port.probe is None else port.probe()
@@ -271,9 +269,8 @@ def _check_reading(table: StoredController, law: Law) -> None:
 
 
 def check_achieved(stated: Any, figures: Mapping[str, Any]) -> None:
-    """Refuse figures, those of controller.json's `achieved`, that are not the ones that its law has.
-
-    Raises FileError: one of them is another, or missing.
+    """Refuse figures, those of controller.json's `achieved`, that are not the ones that its law has. Raises FileError:
+    one of them is another, or missing.
     """
     if not isinstance(stated, Mapping):
         raise FileError(f"{FILE}: achieved is missing or not a table; {TUNE_AGAIN}")
@@ -282,9 +279,8 @@ def check_achieved(stated: Any, figures: Mapping[str, Any]) -> None:
 
 
 def check_friction_margin(stated: Any, margin: FrictionMargin | None) -> None:
-    """Refuse a friction margin that the law does not have, but for the precision to which it is known.
-
-    A file that states none claims none; without friction any one holds.
+    """Refuse a friction margin that the law does not have, but for the precision to which it is known. A file that
+    states none claims none; without friction any one holds.
     """
     if stated is not None and margin is not None:
         figures, rtol = {"friction_margin": margin.least_slope}, 2.0 * MARGIN_PRECISION

@@ -286,9 +286,8 @@ class InnerLoop:
         return math.isfinite(self.T_v)
 
     def close(self, law: Assembly, sample_time_s: float) -> Assembly:
-        """Return the law around which this loop is closed, of the inputs error, reference and what is read.
-
-        `law` is k_v v_ref, of error and reference.
+        """Return the law around which this loop is closed, of the inputs error, reference and what is read. `law` is
+        k_v v_ref, of error and reference.
         """
         read = Assembly.of_gains(np.array([0.0, 0.0, -self.k_v]))
         if self.speed.differenced:
@@ -434,10 +433,8 @@ def _factors(roots: Complex[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:
 
 
 class LawTerms(NamedTuple):
-    """The parts of a law at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer).
-
-    `ahead` is in series with feedforward: `series` but for the integral of a speed loop. C_r is behind the `prefilter`
-    besides.
+    """The parts of a law at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer). `ahead` is in
+    series with feedforward: `series` but for the integral of a speed loop. C_r is behind the `prefilter` besides.
     """
 
     series: Any
@@ -457,11 +454,10 @@ def evaluate_terms(
     speed_rate: Any = 0.0,
     prefilter: tuple[Any, Any | None] | None = None,
 ) -> LawTerms:
-    """Return the terms of a law at q, for numbers that may be arrays or symbols.
-
-    `observer`: the time constant, and the two parts of the nominal plant at q. `notch`: w = tan(pi f T_s) of its
-    frequency. `speed_rate`: 1/T_v of a speed loop, rad/s; 0 where it does not integrate. `prefilter`: the same w of its
-    corner; the damping is None in one of first order.
+    """Return the terms of a law at q, for numbers that may be arrays or symbols. `observer`: the time constant, and the
+    two parts of the nominal plant at q. `notch`: w = tan(pi f T_s) of its frequency. `speed_rate`: 1/T_v of a speed
+    loop, rad/s; 0 where it does not integrate. `prefilter`: the same w of its corner; the damping is None in one of
+    first order.
     """
     series: Any = 1.0
     more: Any = 0.0

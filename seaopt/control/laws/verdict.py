@@ -113,9 +113,8 @@ class PossibleBandwidths:
 
 
 def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
-    """Judge a loop by every limit of a scope that the specification imposes.
-
-    With `stuck`, only by those that also hold where the design plant is stuck by its friction.
+    """Judge a loop by every limit of a scope that the specification imposes. With `stuck`, only by those that also hold
+    where the design plant is stuck by its friction.
     """
     verdicts: list[Verdict] = []
     for limit in spec.limits:
@@ -129,9 +128,8 @@ def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False
 
 
 def judge_all(spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[Verdict]:
-    """Judge every plant's loop, and the design plant's, which is the first, by its own limits too.
-
-    Of several `design_states` the first is the design plant sliding, the others the same plant stuck by friction.
+    """Judge every plant's loop, and the design plant's, which is the first, by its own limits too. Of several
+    `design_states` the first is the design plant sliding, the others the same plant stuck by friction.
     """
     verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant")]
     verdicts += judge(spec, loops[0], "design plant")
@@ -167,7 +165,6 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
 
 def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop | DiscLoop) -> list[str]:
     """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
-
     `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says more.
     """
     broken: dict[str, list[Verdict]] = {}
@@ -185,14 +182,7 @@ def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLo
 
 
 def join_labels(labels: Sequence[str]) -> str:
-    """Return limits, as `Verdict.label` names them, each once with its plants.
-
-    Examples
-    --------
-    >>> join_labels(["max_sensitivity (sliding)", "max_sensitivity (stuck)", "max_noise_gain"])
-    'max_sensitivity (sliding and stuck), max_noise_gain'
-
-    """
+    """Return limits, as `Verdict.label` names them, each once with its plants."""
     plants: dict[str, list[str]] = {}
     for label in labels:
         name, _, plant = label.removesuffix(")").partition(" (")

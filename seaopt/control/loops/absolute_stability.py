@@ -160,7 +160,6 @@ def _settle(
     loop: FrictionLoop, theta: Angles, test: Test, multiplier: Multiplier, inverse: float
 ) -> tuple[Float[np.ndarray, " new"], Test, float, int]:
     """Look between the angles, where the test may fail, and give way until it holds; infinite where it never does.
-
     Returns the last angles, the test at them, 1/kappa and the number of all angles looked at.
     """
     count = theta.size
@@ -179,9 +178,8 @@ def _settle(
 
 @record(eq=False)
 class LoopResponses:
-    """The loop's responses at m angles and k aliases, efforts in units that make each curve's steepest slope 1.
-
-    b (`sensed`) is that of the law's feedback; or one for each of y signals, per unit of its feedback.
+    """The loop's responses at m angles and k aliases, efforts in units that make each curve's steepest slope 1. b
+    (`sensed`) is that of the law's feedback; or one for each of y signals, per unit of its feedback.
     """
 
     theta: Angles
@@ -266,9 +264,8 @@ def _compare(
     beta: Float[np.ndarray, "a n"],
     gamma: Complex[np.ndarray, "a n"],
 ) -> Angles:
-    """Return |2 + gamma|^2 - alpha beta of the terms at the aliases, scaled, with what is beyond them against it.
-
-    The terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
+    """Return |2 + gamma|^2 - alpha beta of the terms at the aliases, scaled, with what is beyond them against it. The
+    terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
     """
     product = np.sum(alpha, axis=1) + bound_rest(at, alpha, angles)
     product = product * (np.sum(beta, axis=1) + bound_rest(at, beta, angles))
@@ -286,7 +283,6 @@ def bound_rest(
 
 def _least_inverse(test: Test, bar: float) -> float | None:
     """Return the least 1/kappa, in units of the curves' own 1/slope, that holds at all angles; None if none below bar.
-
     More of it adds the Hermitian part of M, which is not negative: what holds at one value holds above it, so that only
     angles that fail at the lower end are looked at in between. What is returned is tested at all of them.
     """
@@ -373,7 +369,6 @@ class FeedbackLimit:
 
 def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: float) -> FeedbackLimit:
     """Return what is asked of C so that a multiplier shows stability for curves `factor` times as steep as they are.
-
     `loop`: the loop with its friction taken out; its own law does not matter. `theta`: shape (m,). `factor`: of the
     curves' own steepest slopes.
     """

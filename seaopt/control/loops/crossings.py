@@ -13,15 +13,8 @@ ROUNDING_DISTANCE = 1e-11  # of a frequency: nearer, values of a curve differ by
 def find_crossings(
     curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, " k"]:
-    """Return the zeros of a curve between grid points of opposite sign, ascending.
-
-    Two zeros between the same two points are not seen: the grid has to resolve the curve.
-
-    Examples
-    --------
-    >>> find_crossings(lambda f: f**2 - 2.0, np.array([0.0, 1.0, 3.0])).round(6).tolist()
-    [1.414214]
-
+    """Return the zeros of a curve between grid points of opposite sign, ascending. Two zeros between the same two
+    points are not seen: the grid has to resolve the curve.
     """
     from scipy.optimize import elementwise
 
@@ -35,16 +28,9 @@ def add_minima(
     f: Float[np.ndarray, " m"],
     shallow: float = np.inf,
 ) -> Float[np.ndarray, " k"]:
-    """Return f with every local minimum of the curve on that grid, refined by thirds, ascending.
-
-    Who looks for crossings of zero can leave out minima that do not reach it: on the grid they are above zero by more
-    than `shallow` times what they are below their neighbours.
-
-    Examples
-    --------
-    >>> add_minima(lambda f: (f - 0.7) ** 2, np.array([0.0, 1.0, 3.0])).round(6).tolist()
-    [0.0, 0.7, 1.0, 3.0]
-
+    """Return f with every local minimum of the curve on that grid, refined by thirds, ascending. Who looks for
+    crossings of zero can leave out minima that do not reach it: on the grid they are above zero by more than `shallow`
+    times what they are below their neighbours.
     """
     distinct = f[np.concatenate([[True], np.diff(f) > ROUNDING_DISTANCE * np.abs(f[1:])])]
     values = curve(distinct)

@@ -83,10 +83,8 @@ class FrictionLoop:
     def respond(
         self, theta: Float[np.ndarray, " m"], orders: Int[np.ndarray, " k"], seen: Float[np.ndarray, "y n"]
     ) -> FrictionResponse:
-        """Return what friction efforts and motor commands do to some rows of the states, the loop open.
-
-        `theta`: angles, 2 pi times frequency over sample rate. `orders`: which aliases: that of order k is theta + 2 pi
-        k.
+        """Return what friction efforts and motor commands do to some rows of the states, the loop open. `theta`:
+        angles, 2 pi times frequency over sample rate. `orders`: which aliases: that of order k is theta + 2 pi k.
         """
         period = self.plant.sample_time_s
         s = 1j * (theta[:, None] + 2 * np.pi * orders) / period
@@ -139,7 +137,6 @@ def make_friction_loops(
     plant: Plant, sets: Sequence[ParameterSet], measured: Measured, per_effort: float, delay_samples: int, law: Law
 ) -> list[FrictionLoop | None]:
     """Return, per set of parameters, the sliding loop with what friction has above its flattest slope taken out.
-
     `sets`: all with the same conditions among them. `measured`: the outputs that are fed back, the regulated one first.
     `per_effort`: the command that the law's effort becomes, per unit. `delay_samples`: whole samples from measurement
     to output, besides the hold. `law`: its sample time is the loop's. Returned: None where there is no friction.

@@ -370,10 +370,9 @@ def _set_apart(original: Law) -> Law:
 
 
 def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -> Float[np.ndarray, "l k"]:
-    """Return a chain's gains without what rounding made: differences of two, and integrals of nothing.
-
-    Those of reference and regulated signal are alike, or that of the reference zero, where only rounding parts them; a
-    last integral is left out that is below rounding in the response at `LOWEST`, `slowest`.
+    """Return a chain's gains without what rounding made: differences of two, and integrals of nothing. Those of
+    reference and regulated signal are alike, or that of the reference zero, where only rounding parts them; a last
+    integral is left out that is below rounding in the response at `LOWEST`, `slowest`.
     """
     out = chain.copy()
     while len(out) and np.all(np.abs(out[-1]) <= EQUAL_GAINS * slowest * (2 * np.pi * LOWEST) ** len(out)):
@@ -444,16 +443,8 @@ def make_static_law(gain: float, sample_time_s: float, measured: int = 1) -> Law
 
 def count_filter_samples(law: Law) -> float:
     """Return the shortest time constant of a law, in samples, that can be a derivative's filter; infinite without one.
-
     Such a filter is a real pole between 0 and 1, T/(T + 1) of T samples. A pole at zero is a delay, as averages over
     samples have it, and a negative or complex one no lag at all.
-
-    Examples
-    --------
-    >>> lag = TransferFunction(num=np.array([2.0, -2.0]), den=np.array([1.0, -0.75]))
-    >>> round(count_filter_samples(Law.from_transfer_functions(lag, lag, sample_time_s=1e-3)), 9)
-    3.0
-
     """
     # Poles at zero are computed apart from it, far apart where they are many; their polynomial still ends in zeros.
     polynomial = np.atleast_1d(np.poly(law.poles[law.integrators :])).real
@@ -463,17 +454,8 @@ def count_filter_samples(law: Law) -> float:
 
 
 def find_integral_rate(law: Law) -> float:
-    """Return k_i/(1 + k_p), rad/s, of a law: how fast its slowest integral acts; infinite without one.
-
-    The gains are those of powers of 1/s, s = (2/T_s)(z - 1)/(z + 1): of two integrals it is the ratio of their gains.
-
-    Examples
-    --------
-    >>> gains = TransferFunction(num=np.array([0.503, -0.497]), den=np.array([1.0, -1.0]))  # k_p 0.5, k_i 6
-    >>> pi = Law.from_transfer_functions(gains, gains, sample_time_s=1e-3)
-    >>> round(find_integral_rate(pi), 9)
-    4.0
-
+    """Return k_i/(1 + k_p), rad/s, of a law: how fast its slowest integral acts; infinite without one. The gains are
+    those of powers of 1/s, s = (2/T_s)(z - 1)/(z + 1): of two integrals it is the ratio of their gains.
     """
     m = law.integrators
     if not m:

@@ -49,9 +49,8 @@ class SplitLaw:
 
 
 def split(name: str, tf: TransferFunction) -> SplitLaw:
-    """Take a transfer function apart as the module's docstring does, m as small as the numerator lets it be.
-
-    Raises ControlError: a coefficient is not finite, den[0] is not 1, or slow poles make a root at 1 of rounding.
+    """Take a transfer function apart as the module's docstring does, m as small as the numerator lets it be. Raises
+    ControlError: a coefficient is not finite, den[0] is not 1, or slow poles make a root at 1 of rounding.
     """
     num, den, m = tf.num.astype(float), np.trim_zeros(tf.den.astype(float), "b"), 0
     if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
@@ -84,10 +83,9 @@ def refuse_slow_poles(name: str) -> ControlError:
 
 
 def _count_roots_at_one(name: str, den: Float[np.ndarray, " n"]) -> int:
-    """Return how many roots at 1 a denominator has.
-
-    A value p(1) of rounding alone is that of a root there, or the product of the distances of slow poles. What it is
-    known to, over the value that is left without the root, is how far from 1 the root may lie.
+    """Return how many roots at 1 a denominator has. A value p(1) of rounding alone is that of a root there, or the
+    product of the distances of slow poles. What it is known to, over the value that is left without the root, is how
+    far from 1 the root may lie.
     """
     count, reach = 0, 0.0
     while den.size > 1 and _has_root_at_one(den, POLE_AT_ONE):
@@ -103,7 +101,6 @@ def realise_rest(
     parts: list[SplitLaw],
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
     """Return Y/R of all in observer form, each of its input: on shared states where R is the same, else side by side.
-
     The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles have digits
     that they do not have in z, with its states scaled.
     """
@@ -204,7 +201,6 @@ def read_companion(
     a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"], d: Float[np.ndarray, " k"]
 ) -> list[TransferFunction]:
     """Return the transfer function of each input of a companion form, whose entries are coefficients; of others none.
-
     The coefficients may stand in the first or last row (controllable) or column (observable).
     """
     if not c.size:
@@ -260,11 +256,9 @@ def _expand(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " k"], terms: i
 def balance(
     a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"], gain: float
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"], Float[np.ndarray, " m"]]:
-    """Return a stable system balanced and of least order.
-
-    What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the largest Hankel singular value, is rounding.
-
-    Raises LinAlgError: a pole is so close to the unit circle that a Gramian is not finite.
+    """Return a stable system balanced and of least order. What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the
+    largest Hankel singular value, is rounding. Raises LinAlgError: a pole is so close to the unit circle that a Gramian
+    is not finite.
     """
     a, turn = (np.asarray(part) for part in schur(a))  # powers of a triangle keep its poles, of a companion form not
     b, c = turn.T @ b, c @ turn

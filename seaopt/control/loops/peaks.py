@@ -65,10 +65,7 @@ class Extremes:
 
 
 def find_extremes(system: ClosedLoop) -> Extremes:
-    """Return the peaks and crossings of a stable closed loop.
-
-    Raises ControlError: a peak cannot be proved.
-    """
+    """Return the peaks and crossings of a stable closed loop. Raises ControlError: a peak cannot be proved."""
     peaks, at = _find_candidates(system)
     ends = system.curves(np.array([0.0, np.pi]))
     static = float(np.abs(ends[TRACKING, 0]))
@@ -108,9 +105,8 @@ def find_extremes(system: ClosedLoop) -> Extremes:
 
 
 def find_least(system: ClosedLoop, curve: int, until: float) -> float:
-    """Return the least magnitude of a curve from 0 to an angle, to a ten-millionth.
-
-    From the least of some angles the level is lowered to the least on its own level set's arcs until none is below.
+    """Return the least magnitude of a curve from 0 to an angle, to a ten-millionth. From the least of some angles the
+    level is lowered to the least on its own level set's arcs until none is below.
     """
     modes = np.abs(np.angle(system.poles))
     theta = np.concatenate([until * COARSE_ANGLES / np.pi, modes[modes < until]])
@@ -155,11 +151,9 @@ def _phases(system: ClosedLoop, theta: Float[np.ndarray, " k"]) -> Float[np.ndar
 def _gain_factors(
     system: ClosedLoop, turns: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
-    """Return the factors -1/L at angles where L is real and negative, and these angles.
-
-    A pole of L on the circle, an integrator at angle 0, is no crossing, and a zero is none: what -1/L has there is
-    rounding. A pole is on the circle if it is no further from it than it is known; next to a light mode, which is off
-    it, a crossing is one.
+    """Return the factors -1/L at angles where L is real and negative, and these angles. A pole of L on the circle, an
+    integrator at angle 0, is no crossing, and a zero is none: what -1/L has there is rounding. A pole is on the circle
+    if it is no further from it than it is known; next to a light mode, which is off it, a crossing is one.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         factors = -np.real(system.sensitivity(turns) / system.curves(turns)[1])
@@ -201,9 +195,8 @@ def _climb(
     high: Float[np.ndarray, " m"],
     wanted: Bool[np.ndarray, " m"] | None = None,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in.
-
-    Maxima that are not `wanted` are followed for as long as others are.
+    """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in. Maxima that
+    are not `wanted` are followed for as long as others are.
     """
     if not curve.size:
         return peaks, at
@@ -230,9 +223,8 @@ def _prove(
     curves: Int[np.ndarray, " k"],
     edges: list[Float[np.ndarray, " _"]],
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return the peaks, raised until no arc of the level set just above them holds a larger value.
-
-    Raises ControlError: that does not come to an end.
+    """Return the peaks, raised until no arc of the level set just above them holds a larger value. Raises ControlError:
+    that does not come to an end.
     """
     for _ in range(MAX_PROOF_ROUNDS):
         curve = np.repeat(curves, [row.size - 1 for row in edges])

@@ -64,9 +64,8 @@ class PortModel:
     place_unit: str = LINEAR.place  # of the port's motion: m or rad
 
     def response(self, f: Frequencies) -> PortResponse:
-        """Return the responses to motor force and to motion, F_e being what that motion takes.
-
-        They are infinite at an undamped pole, though Z under feedback is not: there they are those just beside it.
+        """Return the responses to motor force and to motion, F_e being what that motion takes. They are infinite at an
+        undamped pole, though Z under feedback is not: there they are those just beside it.
         """
         n, s = self.motor.size, 2j * np.pi * self._beside(f)
         inner = np.zeros((f.size, n + 1, n + 1), dtype=complex)
@@ -115,11 +114,9 @@ class PortModel:
 
 
 def probe_of(plant: Plant) -> Plant:
-    """Return the plant that shows what the port is to the world: a bare inertia on it, the other links held.
-
-    It is without heat, as all that looks at linear loops.
-
-    Raises ControlError: the plant states no port, or its port states no probe.
+    """Return the plant that shows what the port is to the world: a bare inertia on it, the other links held. It is
+    without heat, as all that looks at linear loops. Raises ControlError: the plant states no port, or its port states
+    no probe.
     """
     if plant.port is None or plant.port.probe is None:
         missing = "has no port at link 2" if plant.port is None else "has a port that states no probe"
@@ -131,10 +128,7 @@ def probe_of(plant: Plant) -> Plant:
 
 
 def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: float) -> PortModel:
-    """Return a plant's port, driven by the command for an effort.
-
-    Raises ControlError: the plant has no such port or output.
-    """
+    """Return a plant's port, driven by the command for an effort. Raises ControlError: no such port or output."""
     probe = probe_of(plant)
     values, rows, port = probe.complete(params), find_rows(probe, measured), bare_port(probe)
     a, b, c, d = state_space(probe, values)
@@ -163,10 +157,7 @@ class BarePort:
 
 
 def bare_port(probe: Plant) -> BarePort:
-    """Return the names of a probe's port.
-
-    Raises ControlError: the probe does not state them.
-    """
+    """Return the names of a probe's port. Raises ControlError: the probe does not state them."""
     port = probe.port
     if port is None or not (port.effort and port.coordinate and port.rate) or len(port.payload) != 1:
         raise ControlError(
@@ -184,7 +175,6 @@ def hold_response(f: Frequencies, sample_time_s: float, delay_samples: int) -> R
 @record(eq=False)
 class PassivityCondition:
     r"""Re Z >= 0 as a condition on the feedback C, one row per signal: Re[unit (1 + forces C) conj(1 + loops C)] >= 0.
-
     :math:`Z/|G_{22}|` is that over :math:`|1 + \text{loops}\,C|^2`.
     """
 

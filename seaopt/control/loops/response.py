@@ -67,10 +67,9 @@ class Curves:
 
 @cache
 def list_curves(measured: int) -> Curves:
-    """Return S, T, S - T, C_y S and F/F_ref, and of further measured signals C_y S each.
-
-    Of one signal the inputs are noise and reference, the outputs measured and effort. Of several the inputs are w,
-    reference and one noise each; the outputs command, effort and regulated force.
+    """Return S, T, S - T, C_y S and F/F_ref, and of further measured signals C_y S each. Of one signal the inputs are
+    noise and reference, the outputs measured and effort. Of several the inputs are w, reference and one noise each; the
+    outputs command, effort and regulated force.
     """
     if measured == 1:
         noises, regulated = [0], 0
@@ -118,9 +117,8 @@ class ClosedLoop:
         return self.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
 
     def resolution(self) -> Float[np.ndarray, " n"]:
-        """Return how well each pole of plant and law is known: rounding times its condition, large of a double one.
-
-        The first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
+        """Return how well each pole of plant and law is known: rounding times its condition, large of a double one. The
+        first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
         7.2.2).
         """
         plant, law = (_resolution(block) for block in self.blocks)
@@ -129,10 +127,9 @@ class ClosedLoop:
     def differentiate(
         self, theta: Float[np.ndarray, " m"], which: Indices | None = None
     ) -> tuple[Complex[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
-        """Return the curves and half the derivatives of -1/abs(curve)^2 along the angle.
-
-        These have the sign of the curve's own slope, and about a resonance they are close to a straight line. Of all
-        curves, shape (k, m), or of the curve number `which` of each angle, shape (m,).
+        """Return the curves and half the derivatives of -1/abs(curve)^2 along the angle. These have the sign of the
+        curve's own slope, and about a resonance they are close to a straight line. Of all curves, shape (k, m), or of
+        the curve number `which` of each angle, shape (m,).
         """
         z = np.exp(1j * theta)
         distance = self._from_poles(z)
@@ -203,9 +200,8 @@ class ClosedLoop:
 
 
 def close(plant: StateSpace, law: Law) -> ClosedLoop:
-    """Return the loop of a plant (with its delay) and the law u = C_r r - C_y m.
-
-    A plant that is not finite, of absurd parameters, has every pole at infinity: its loop is not stable.
+    """Return the loop of a plant (with its delay) and the law u = C_r r - C_y m. A plant that is not finite, of absurd
+    parameters, has every pole at infinity: its loop is not stable.
     """
     from scipy.linalg import matrix_balance, schur
 
@@ -309,9 +305,8 @@ def _on_circle(m: Float[np.ndarray, "p k k"], k: Float[np.ndarray, "p k k"]) -> 
 
 
 def find_sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) -> list[Float[np.ndarray, " _"]]:
-    """Return, for each set of arcs, the angles at which its function changes sign.
-
-    `function(theta, which)` is the function number `which` of each angle; rounding about zero has no sign.
+    """Return, for each set of arcs, the angles at which its function changes sign. `function(theta, which)` is the
+    function number `which` of each angle; rounding about zero has no sign.
     """
     middles = [0.5 * (row[:-1] + row[1:]) for row in edges]
     which = np.repeat(np.arange(len(middles)), [row.size for row in middles])
@@ -346,11 +341,9 @@ def find_zeros(
     tolerance: float,
     wanted: Bool[np.ndarray, " m"] | None = None,
 ) -> Float[np.ndarray, " m"]:
-    """Return a zero in every bracket (Chandrupatla, Advances in Engineering Software 28, 1997).
-
-    `function(x, i)` is evaluated at x for the brackets number i only. A bracket is done when it, or the function
-    in it, is smaller than `tolerance` as a fraction of where it is, or of what it was; and all are when those `wanted`
-    are.
+    """Return a zero in every bracket (Chandrupatla, Advances in Engineering Software 28, 1997). `function(x, i)` is
+    evaluated at x for the brackets number i only. A bracket is done when it, or the function in it, is smaller than
+    `tolerance` as a fraction of where it is, or of what it was; and all are when those `wanted` are.
     """
     # scipy's elementwise.find_root gives the same zeros; its overhead would make `margins` of a loop 70 % slower.
     a, b, c = high.copy(), low.copy(), high.copy()  # b is the newest, a across the zero from it, c the one before

@@ -145,7 +145,6 @@ def linearise_sets(
     plant: Plant, sets: Sequence[CompletedParameters], measured: Measured, gain: float
 ) -> tuple[LinearPlants, Float[np.ndarray, " k"]]:
     """Return what `linearise` does at k sets of parameters with the same conditions among them, and their delays (s).
-
     Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised.
     """
     places = [read_conditions(plant, values) for values in sets]
@@ -175,10 +174,8 @@ def sample_linear(
 
 def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float:
     """Return an output of a constant unit of the first input, linearised at rest; infinite where it integrates.
-
-    Bristles slide, which at rest carry a part of the input.
-
-    Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised.
+    Bristles slide, which at rest carry a part of the input. Raises ControlError: the plant has no such output, or
+    cannot rest where it is to be linearised.
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items()}
     return _compute_static_gain(
@@ -195,15 +192,7 @@ def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
 
 
 def find_delay(plant: Plant, at: Mapping[str, Any]) -> Any:
-    """Return the seconds of delay besides the controller's samples where a plant's conditions are, numbers or arrays.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> find_delay(so.plants.high_impedance(), {"drive_delay_s": 0.002, "delay_s": 0.001})
-    0.003
-
-    """
+    """Return the delay (s) besides the controller's samples where a plant's conditions are, numbers or arrays."""
     late = at.get(DELAY, 0.0) + at.get(DRIVE_DELAY, 0.0)
     return np.maximum(late + plant.drive_offset_s, 0.0) if plant.drive_offset_s else late
 
@@ -236,17 +225,8 @@ def _list_given(params: ParameterSet) -> ParameterSet:
 
 
 def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
-    """Return the conditions that parameters hold, in SI units, by name.
-
-    Raises ControlError: one is not finite, a delay is negative, or a unit is of another dimension.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> late = so.plants.thor().with_parameters(so.Parameter(name="delay_s", value=0.2, unit="ms"))
-    >>> read_conditions(so.plants.high_impedance(), late)
-    {'delay_s': 0.0002}
-
+    """Return the conditions that parameters hold, in SI units, by name. Raises ControlError: one is not finite, a delay
+    is negative, or a unit is of another dimension.
     """
     params = _list_given(params)
     values: dict[str, float] = {}
@@ -269,10 +249,9 @@ def linearise(
     measured: Measured,
     gain: float,
 ) -> LinearPlants:
-    """Return (a, b, c, d) from motor force to what is measured of k plants, one column of parameters each.
-
-    Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised. Raises PlantError:
-    the plant holds samples.
+    """Return (a, b, c, d) from motor force to what is measured of k plants, one column of parameters each. Raises
+    ControlError: the plant has no such output, or cannot rest where it is to be linearised. Raises PlantError: the
+    plant holds samples.
     """
     refuse_samples(plant)
     plant = leave_out_drift(freeze_heat(plant), measured)
@@ -293,18 +272,8 @@ def list_names(measured: Measured) -> tuple[str, ...]:
 
 def find_signals(plant: Plant, measured: Measured) -> tuple[str, ...]:
     """Return the outputs that a law reads for what is measured: of a motor's speed that is no output, its position.
-
     `plant`: the design plant, whose `sensing` states which position has which speed. `measured`: the regulated output,
-    and what else is measured.
-
-    Raises ControlError: the plant has no such output, and no encoder for it.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> find_signals(so.plants.rotary(link="locked"), ("tau_s", "thetad_m"))
-    ('tau_s', 'theta_m')
-
+    and what else is measured. Raises ControlError: the plant has no such output, and no encoder for it.
     """
     sensing, encoders = plant.sensing, dict[str | None, str]()
     if sensing is not None and sensing.motor_position is not None and sensing.motor_position in plant.outputs:
@@ -316,10 +285,7 @@ def find_signals(plant: Plant, measured: Measured) -> tuple[str, ...]:
 
 
 def find_rows(plant: Plant, measured: Measured) -> list[int]:
-    """Return which of a plant's outputs are measured, by their numbers.
-
-    Raises ControlError: the plant has no such output.
-    """
+    """Return which of a plant's outputs are measured, by number. Raises ControlError: the plant has no such output."""
     names = list(plant.outputs)
     for name in list_names(measured):
         if name not in names:
@@ -330,20 +296,8 @@ def find_rows(plant: Plant, measured: Measured) -> list[int]:
 
 
 def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
-    """Return states and inputs at rest where the conditions among `params` are; zeros without any.
-
-    Raises ControlError: the plant cannot rest there.
-
-    Examples
-    --------
-    >>> import math, seaopt as so
-    >>> swing, thor = so.plants.moving_output(), so.plants.thor()
-    >>> raised = thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad"))
-    >>> x, u = find_rest(swing, swing.complete(raised))
-    >>> force = -4.0 * 9.81 * 0.3 * math.tan(0.5) / 0.0725  # -m g L sin(phi) / (L_a cos(phi))
-    >>> print(f"{force:.2f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.2f} N")
-    -88.70 N, -88.70 N
-
+    """Return states and inputs at rest where the conditions among `params` are; zeros without any. Raises ControlError:
+    the plant cannot rest there.
     """
     x, u = find_rests(plant, params, {}, 1)
     return x[:, 0], u[:, 0]
@@ -494,7 +448,6 @@ def hold(
     delay_s: Inexact[np.ndarray, " k"],
 ) -> SampledPlants:
     """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's.
-
     Imaginary parts come through as derivatives do: with 1e-20 of a direction added as one, those of the result are
     1e-20 of its derivative (complex step).
     """

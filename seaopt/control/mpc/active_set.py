@@ -117,19 +117,10 @@ def find_nearest(
     sides: Int[np.ndarray, " m"],
     max_iterations: int,
 ) -> Solution:
-    """Return the point nearest to `start` within bounds.
-
-    `low`, `high`: their bounds, low <= high: of a row that is held at one end the other is not looked at. `sides`:
-    where rows are held to begin with, as `Solution.sides`; the held ones are linearly independent. `max_iterations`:
-    changes of the held rows at most, besides the rows that are let go at the start.
-
-    Examples
-    --------
-    >>> high = np.array([2.0, 2.0])
-    >>> nearest = find_nearest(np.array([3.0, 1.0]), np.eye(2), -high, high, np.zeros(2, int), max_iterations=10)
-    >>> nearest.x.tolist(), nearest.sides.tolist(), nearest.status
-    ([2.0, 1.0], [1, 0], 'solved')
-
+    """Return the point nearest to `start` within bounds. `low`, `high`: their bounds, low <= high: of a row that is
+    held at one end the other is not looked at. `sides`: where rows are held to begin with, as `Solution.sides`; the
+    held ones are linearly independent. `max_iterations`: changes of the held rows at most, besides the rows that are
+    let go at the start.
     """
     bounds = _Bounds(start=start, normals=normals, low=low, high=high)
     state = bounds.hold({row: side for row, side in enumerate(sides.tolist()) if side})

@@ -7,16 +7,7 @@ from jaxtyping import Float, Int
 
 
 def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
-    """Return `moves` samples from 0 to samples - 1, each step longer than the last by about a constant factor.
-
-    Examples
-    --------
-    >>> spread_knots(50, 8).tolist()
-    [0, 1, 3, 5, 10, 17, 29, 49]
-    >>> spread_knots(5, 5).tolist()
-    [0, 1, 2, 3, 4]
-
-    """
+    """Return `moves` samples from 0 to samples - 1, each step longer than the last by about a constant factor."""
     low, high = 1.0, 10.0
     for _ in range(80):  # the factor for which `moves` - 1 steps reach the end
         factor = 0.5 * (low + high)

@@ -59,10 +59,8 @@ class OutputBounds:
     def limits(
         self, start: Float[np.ndarray, " nx1"], at_rest: float, wide: float
     ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
-        """Return lower and upper ends of these rows.
-
-        `start`: the state's distance from its target, and the last command's. `at_rest`: the command that reaches the
-        plant at rest, with its disturbance.
+        """Return lower and upper ends of these rows. `start`: the state's distance from its target, and the last
+        command's. `at_rest`: the command that reaches the plant at rest, with its disturbance.
         """
         k = len(self.names)
         base = np.repeat(self.static * at_rest - self.middle / self.half, self.samples) + self.free @ start
@@ -73,9 +71,8 @@ class OutputBounds:
         )
 
     def admissible_rest(self, drift: float, limit: float) -> tuple[float, float]:
-        """Return the commands at rest, least and largest, that keep the bounds; within the limit of the command.
-
-        Where no command keeps them all, it is the one that breaks them least.
+        """Return the commands at rest, least and largest, that keep the bounds; within the limit of the command. Where
+        no command keeps them all, it is the one that breaks them least.
         """
         moves = np.abs(self.static) > 0.0
         ends = (self.middle[moves] / self.half[moves] + np.array([[-1.0], [1.0]])) / self.static[moves] - drift
@@ -92,12 +89,9 @@ def bound_outputs(
     W: Float[np.ndarray, "samples n"],
     limit: float,
 ) -> OutputBounds:
-    """Return the rows of bounds by name.
-
-    `bounds`: of outputs and states of the plant, deflection and rate of its spring, in their units. `W`: from the knots
-    to the command at each sample of the horizon. `limit`: of the command, the unit of the knots.
-
-    Raises ControlError: a name is not one of the estimates.
+    """Return the rows of bounds by name. `bounds`: of outputs and states of the plant, deflection and rate of its
+    spring, in their units. `W`: from the knots to the command at each sample of the horizon. `limit`: of the command,
+    the unit of the knots. Raises ControlError: a name is not one of the estimates.
     """
     nx, N = plant.b.size, len(W)
     available = [name for name, row in zip(kalman.names, kalman.G, strict=True) if np.any(row[:nx])]

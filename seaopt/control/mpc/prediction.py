@@ -53,10 +53,9 @@ class Regulator:
 
 @record(eq=False)
 class HorizonProgram:
-    """The quadratic program in theta, the knots' deviations from u_s in units of the current limit.
-
-    Minimise theta' H theta / 2 + (F s + R delta)' theta, s = [xi_0, mu_-1], with rows theta and M theta within bounds,
-    and those of `outputs`, whose slacks are variables too.
+    """The quadratic program in theta, the knots' deviations from u_s in units of the current limit. Minimise theta' H
+    theta / 2 + (F s + R delta)' theta, s = [xi_0, mu_-1], with rows theta and M theta within bounds, and those of
+    `outputs`, whose slacks are variables too.
     """
 
     knots: Int[np.ndarray, " n"]  # samples at which the current is free
@@ -140,10 +139,8 @@ def condense(
     previewed: int,
     outputs: OutputBounds,
 ) -> HorizonProgram:
-    """Return the quadratic program of a horizon.
-
-    `limit` and `slew_per_sample` are in A, the latter infinite if there is none; references are known at
-    `previewed` samples besides the last.
+    """Return the quadratic program of a horizon. `limit` and `slew_per_sample` are in A, the latter infinite if there
+    is none; references are known at `previewed` samples besides the last.
     """
     W = interpolate_knots(knots)
     N, n, size = len(W), knots.size, plant.b.size + 1

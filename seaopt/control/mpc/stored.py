@@ -24,13 +24,10 @@ def describe_mpc(mpc: ForceMPC) -> dict[str, Any]:
 
 
 def check_described(content: Any, mpc: ForceMPC, *, source: str, problem: str, remedy: str) -> None:
-    """Refuse what a controller.json says of a plan (`describe_mpc`) where it is not that of a controller.
-
-    `content`: the file's `mpc`. `source`, `problem`, `remedy`: the file, the problem's file, and what to do, for
-    messages.
-
-    Raises FileError: the specification is another; or the C code's numbers are, which other parameters make; or they
-    are malformed.
+    """Refuse what a controller.json says of a plan (`describe_mpc`) where it is not that of a controller. `content`:
+    the file's `mpc`. `source`, `problem`, `remedy`: the file, the problem's file, and what to do, for messages. Raises
+    FileError: the specification is another; or the C code's numbers are, which other parameters make; or they are
+    malformed.
     """
     stored, expected = plain(content), plain(describe_mpc(mpc))
     spec = stored.get("spec") if isinstance(stored, dict) else None
@@ -60,8 +57,5 @@ def _is_same(stored: Any, expected: Any) -> bool:
 
 
 def read_code(content: Any) -> MPCCode:
-    """Return the numbers of the C code that a controller.json holds.
-
-    Raises FileError: a field is missing or malformed.
-    """
+    """Return the numbers of a controller.json's C code. Raises FileError: a field is missing or malformed."""
     return from_content(MPCCode, content, "controller.json: mpc.code", remedy=TUNE_AGAIN)

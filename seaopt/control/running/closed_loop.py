@@ -212,10 +212,9 @@ def run_loop(
 
 
 def _errors(arrays: LoopArrays, motion: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " runs"]:
-    """Return the largest difference of two numbers of steps in a sample, over the state's largest value.
-
-    A state that rests, or that friction holds, has rounding for a value: it is measured by the largest of the others
-    and by `motion`, what an ampere would make of it in a sample without friction.
+    """Return the largest difference of two numbers of steps in a sample, over the state's largest value. A state that
+    rests, or that friction holds, has rounding for a value: it is measured by the largest of the others and by
+    `motion`, what an ampere would make of it in a sample without friction.
     """
     free = motion * np.max(np.abs(arrays.applied), axis=1, keepdims=True, initial=0.0)
     with np.errstate(invalid="ignore"):
@@ -232,10 +231,9 @@ def _first_lost_sample(arrays: LoopArrays) -> Int[np.ndarray, " runs"]:
 
 
 def _lose_alike(before: LoopArrays, after: LoopArrays, *, shortest: bool) -> Bool[np.ndarray, " runs"]:
-    """Tell which runs two numbers of steps lose in the same way: about the same sample, and alike until there.
-
-    Steps that are too long for what is fast lose a loop at once, too, with about the same largest state; but not with
-    the same values of what is fast. Where a run is lost before a sample tells, steps as short as can be have to tell.
+    """Tell which runs two numbers of steps lose in the same way: about the same sample, and alike until there. Steps
+    that are too long for what is fast lose a loop at once, too, with about the same largest state; but not with the
+    same values of what is fast. Where a run is lost before a sample tells, steps as short as can be have to tell.
     """
     lost = np.stack([_first_lost_sample(before), _first_lost_sample(after)])
     alike = (np.abs(lost[1] - lost[0]) <= 1) & ((np.min(lost, axis=0) > 1) | shortest)

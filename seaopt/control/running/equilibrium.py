@@ -48,24 +48,10 @@ class Equilibrium:
 
 
 def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equilibrium:
-    """Return where a loop rests at the conditions among each run's parameters; at zero without any.
-
-    `loop`: plant and law; the current's limit is not looked at. `params`: one per run, given with a state of the plant
-    (phi) where it is to rest elsewhere.
-
-    Raises ControlError: the plant cannot rest there, or no reference makes the law command what it takes.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> from seaopt.control.laws.realisation import runnable
-    >>> stand, swing, thor = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
-    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    >>> loop = SampledLoop(plant=swing, law=runnable(controller), measured="F1", delay_samples=1)
-    >>> raised = thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad"))
-    >>> equilibrium(loop, [swing.complete(raised)])
-    Equilibrium at -88.7 N, -0.3691 A
-
+    """Return where a loop rests at the conditions among each run's parameters; at zero without any. `loop`: plant and
+    law; the current's limit is not looked at. `params`: one per run, given with a state of the plant (phi) where it is
+    to rest elsewhere. Raises ControlError: the plant cannot rest there, or no reference makes the law command what it
+    takes.
     """
     law, plant = loop.law, loop.plant
     observe = observe_function(plant, sticks=False)

@@ -38,10 +38,8 @@ Rows = Float[np.ndarray, "runs n"]
 
 @record(eq=False)
 class Job:
-    """The data of runs, checked.
-
-    `lag` picks, of the newest command and those that wait, the one in force at the start of a sample and the one after
-    `late_s` seconds of it.
+    """The data of runs, checked. `lag` picks, of the newest command and those that wait, the one in force at the start
+    of a sample and the one after `late_s` seconds of it.
     """
 
     reference: Rows
@@ -130,7 +128,6 @@ def _structure_of(loop: SampledLoop) -> _Structure:
 
 def _sample_function(plant: Plant, structure: _Structure) -> Any:
     """Return the CasADi function (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y): sensor, law and delay at a sample.
-
     `u` holds the current in force at first, `late` is the one after it.
     """
     n, queue, measured, fed_back = structure.law_states, structure.waiting, len(structure.measured), structure.fed_back

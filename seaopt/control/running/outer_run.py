@@ -18,22 +18,9 @@ from seaopt.control.loops.outer_loop import OuterLoop
 
 
 def enclose_law(law: RunnableLaw, outer: OuterLoop, place: int | None = None) -> RunnableLaw:
-    """Return the law of x_0, of what a force law measures and of the link's position, that both loops make.
-
-    `law`: of one measured signal or several. `place`: which of the measured signals is the link's position; it is one
-    more, the last, where none of them is.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> from seaopt.control import Impedance, add_impedance
-    >>> from seaopt.control.laws.realisation import runnable
-    >>> knee, values = so.plants.rotary(), so.plants.rotary().defaults.update(N=50.0, k_s=300.0, d_l=1.0)
-    >>> force = so.tune(so.plants.rotary("locked"), values, so.ControllerSpec(measured="tau_s", bandwidth_hz=20))
-    >>> whole = add_impedance(force, knee, values, Impedance(stiffness=40.0, damping=2.0))
-    >>> enclose_law(runnable(whole), whole.outer).measured
-    2
-
+    """Return the law of x_0, of what a force law measures and of the link's position, that both loops make. `law`: of
+    one measured signal or several. `place`: which of the measured signals is the link's position; it is one more, the
+    last, where none of them is.
     """
     n = law.c.size
     by_position = outer.direction * (outer.stiffness + outer.damping * outer.rate)
@@ -64,10 +51,8 @@ def enclose_law(law: RunnableLaw, outer: OuterLoop, place: int | None = None) ->
 
 
 def enclose_controller(controller: Controller, position: str) -> tuple[RunnableLaw, tuple[str, ...]]:
-    """Return the law of a controller with its outer loop, and the outputs that it reads.
-
-    `controller`: with an outer loop; its law may read the link's position itself. `position`: the output that is the
-    link's position.
+    """Return the law of a controller with its outer loop, and the outputs that it reads. `controller`: with an outer
+    loop; its law may read the link's position itself. `position`: the output that is the link's position.
     """
     assert controller.outer is not None
     signals = controller.signals

@@ -181,14 +181,7 @@ def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None
 
 
 def largest_current(limit_A: float, step_A: float) -> float:
-    """Return the last whole step within a current limit; the limit itself without a step.
-
-    Examples
-    --------
-    >>> round(largest_current(9.0, 0.07), 9), largest_current(9.0, 0.0)
-    (8.96, 9.0)
-
-    """
+    """Return the last whole step within a current limit; the limit itself without a step."""
     if not step_A or math.isinf(limit_A):
         return limit_A
     return step_A * math.floor(limit_A / step_A * (1.0 + 1e-12))

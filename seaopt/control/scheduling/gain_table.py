@@ -153,10 +153,7 @@ class GainTable:
 
 
 def check_points(over: str, points: Float[np.ndarray, " n"]) -> None:
-    """Refuse points that no table can have.
-
-    Raises ControlError: there are fewer than two or too many, or they do not ascend.
-    """
+    """Refuse points that no table can have (ControlError): fewer than two or too many, or not ascending."""
     values = np.asarray(points)
     if values.ndim != 1 or not 2 <= values.size <= MOST_POINTS:
         raise ControlError(

@@ -187,29 +187,11 @@ def make_runnable(
     tracking_time_s: float | None = None,
     command: tuple[str, str] = ("I", "A"),
 ) -> RunnableSchedule:
-    """Return a table of gains ready to run.
-
-    `per_effort`: the command for one unit of effort. `limit`: of the command, in its unit; None: no limit. `fallback`:
-    the scheduling variable that counts until there was a finite one; the first point if left out. `tracking_time_s`: of
-    the anti-windup, at every point; that of `seaopt.control.laws.realisation` at each if left out. `command`: name and
-    unit of the input that is commanded.
-
-    Raises ControlError: a number is out of range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> rows = {"k_p": [1.0, 3.0], "k_i": [8.0, 4.0], "k_d": [0.0, 0.0],
-    ...         "T_f": [1e-3] * 2, "k_r": [2.0, 4.0], "c": [1.0] * 2}
-    >>> table = GainTable(
-    ...     over="phi", unit="rad", points=np.array([0.0, 1.0]), gains={k: np.array(v) for k, v in rows.items()},
-    ...     structure="pid", sample_time_s=1e-3,
-    ... )
-    >>> law = make_runnable(table, limit=9.0)
-    >>> command, state = law.step(law.reset(place=0.0), reference=1.0, measurement=0.0, place=0.5)
-    >>> round(command, 6)
-    3.003
-
+    """Return a table of gains ready to run. `per_effort`: the command for one unit of effort. `limit`: of the command,
+    in its unit; None: no limit. `fallback`: the scheduling variable that counts until there was a finite one; the first
+    point if left out. `tracking_time_s`: of the anti-windup, at every point; that of `seaopt.control.laws.realisation`
+    at each if left out. `command`: name and unit of the input that is commanded. Raises ControlError: a number is out
+    of range.
     """
     each = [
         realise(

@@ -281,10 +281,8 @@ class ScheduledController(Result, Worded):
 
 
 def make_table(over: str, unit: str, points: Sequence[float], controllers: Sequence[Controller]) -> GainTable:
-    """Return the gains of controllers at points.
-
-    Raises ControlError: their gains cannot be interpolated, they run at different rates, or command an effort
-    differently.
+    """Return the gains of controllers at points. Raises ControlError: their gains cannot be interpolated, they run at
+    different rates, or command an effort differently.
     """
     first = controllers[0]
     for point, controller in zip(points, controllers, strict=True):
@@ -315,7 +313,6 @@ def freeze(
     table: GainTable, value: float, spec: ControllerSpec, design: tuple[Plant, ParameterSet], others: Plants
 ) -> Controller:
     """Return the controller of a table's gains at a value, judged on the plants there by all but the bandwidth asked.
-
     The limits that depend on the bandwidth, such as a droop up to a third of it, are those of the bandwidth it has.
     """
     plant, params = design[0], place_variable(*design, table.over, value)
@@ -340,18 +337,7 @@ def freeze(
 
 
 def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) -> ParameterSet:
-    """Return a plant's parameters with the scheduling variable at a value; as they are of a plant without it.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> swing = so.plants.moving_output()
-    >>> place_variable(swing, so.plants.thor(), "phi", 0.5)["phi"].value  # a state
-    0.5
-    >>> place_variable(swing, so.plants.thor(), "m", 2.0)["m"].value  # a parameter
-    2.0
-
-    """
+    """Return a plant's parameters with the scheduling variable at a value; as they are of a plant without it."""
     chosen = params.given if isinstance(params, CompletedParameters) else params
     if over in plant.parameters:
         return chosen.with_parameters(replace(plant.complete(chosen)[over], value=value))
@@ -379,12 +365,5 @@ def find_unit(over: str, plants: Mapping[str, Plant]) -> str:
 
 
 def list_inner(points: Sequence[float], parts: int) -> list[float]:
-    """Return the inner ends of so many equal parts of every stretch between two points.
-
-    Examples
-    --------
-    >>> list_inner([0.0, 1.0, 3.0], 2)
-    [0.5, 2.0]
-
-    """
+    """Return the inner ends of so many equal parts of every stretch between two points."""
     return [low + (high - low) * k / parts for low, high in pairwise(points) for k in range(1, parts)]

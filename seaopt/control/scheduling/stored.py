@@ -40,9 +40,8 @@ class StoredSchedule:
 
 
 def read_schedule(content: Mapping[str, Any]) -> StoredSchedule:
-    """Return the fields of a schedule.json.
-
-    Raises FileError: a field is missing or malformed, or the gains are not those of the controllers.
+    """Return the fields of a schedule.json. Raises FileError: one is missing, malformed, or gains are not the
+    controllers'.
     """
     table = from_content(StoredSchedule, content, "schedule.json", remedy=TUNE_AGAIN)
     try:

@@ -20,6 +20,7 @@ from seaopt.control import (
     run_loop,
     runnable,
 )
+from seaopt.control.compensation.gravity import make_gravity_term
 from seaopt.control.deploy.export import export
 from seaopt.control.running.equilibrium import equilibrium
 from seaopt.files import to_json
@@ -111,3 +112,8 @@ def test_a_link_that_is_held_has_no_weight(plain):
     free = so.plants.rotary()
     with pytest.raises(so.SeaoptError, match="rests without effort"):
         add_compensation(plain, gravity=CompensateGravity(), link=(free, VALUES))
+
+
+def test_half_of_the_weight_of_a_pendulum():
+    term = make_gravity_term(KNEE, VALUES, "tau_s", CompensateGravity(fraction=0.5))
+    assert term.effort(0.5) == pytest.approx(0.5 * WEIGHT * math.sin(0.5))

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import CompensateFriction, SampledLoop, add_compensation, run_loop, runnable
 from seaopt.control.compensation.compensate import find_compensation_margins
+from seaopt.control.compensation.friction import find_motor_friction, find_velocity_per_rate
 from seaopt.control.laws.friction_margin import take_friction_out
 from seaopt.control.loops.compensation import stability
 from seaopt.control.loops.compensation.stability import SpeedReading, compensation_margin
@@ -141,3 +142,9 @@ def test_plant_that_is_not_shown_stable_by_itself_shows_nothing(controller):
     faster = replace(chosen, law=chosen.law.scaled(20.0))
     (margin,) = find_compensation_margins(faster, STAND, [PARAMETERS])
     assert (margin.slope, margin.multiplier) == (0.0, "unstable without friction")
+
+
+def test_friction_is_that_of_the_motor_and_its_velocity_that_of_the_spring():
+    assert find_motor_friction(so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)).level == pytest.approx(50)
+    per_rate = find_velocity_per_rate(so.plants.moving_output(), so.plants.thor().update(f_c=50.0), "F1", "F_f")
+    assert 1 / per_rate == pytest.approx(so.plants.thor()["k"].value)

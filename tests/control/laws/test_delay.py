@@ -13,11 +13,11 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import MPCSpec, draw, force_mpc, read_law
-from seaopt.control.laws.delay import find_drive, settle_delays, split_delayed, warn_delays
+from seaopt.control.laws.delay import describe_delays, find_drive, settle_delays, split_delayed, warn_delays
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.passivity import passivity
 from seaopt.control.loops.port import probe_of
-from seaopt.control.loops.sampled_plant import add_drive_delay, read_conditions
+from seaopt.control.loops.sampled_plant import add_drive_delay, find_delay, read_conditions
 from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, ProblemError
 from seaopt.files import to_json
@@ -447,3 +447,9 @@ def test_a_delay_that_the_plant_has_as_a_part_counts_once(fit, stand):
     (warning,) = warn_delays(replace(SPEC, drive_delay_s=DELAY_S), late, known)
     assert "T_c = 2.04 ms of the plant counts besides drive_delay_s = 0.00204" in warning
     assert "counts besides delay_samples = 3" in warn_delays(replace(SPEC, delay_samples=3), late, known)[1]
+
+
+def test_both_delays_are_added_and_described():
+    assert find_delay(so.plants.high_impedance(), {"drive_delay_s": 0.002, "delay_s": 0.001}) == pytest.approx(0.003)
+    assert describe_delays(0, 1.32e-3, 1e-3) == "compute delay 0 samples + drive delay 1.32 ms = 1.32 samples"
+    assert describe_delays(1, 0.0, 1e-3) == "compute delay 1 sample, no drive delay"

@@ -13,7 +13,14 @@ import seaopt as so
 from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import LIFTABLE
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal
-from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken, shorten_blocked
+from seaopt.control.laws.verdict import (
+    explain_broken,
+    join_labels,
+    judge_all,
+    list_active,
+    list_broken,
+    shorten_blocked,
+)
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.spec import MPC_LIMITS, MPCSpec
@@ -247,3 +254,8 @@ def test_a_level_that_is_not_a_finite_number_is_refused_and_the_way_to_lift_it_n
     for name in {limit.name for limit in MPC_LIMITS if limit.has_field} - {"bandwidth_hz"}:
         with pytest.raises(ControlError, match=rf"{name} = .*false"):
             MPCSpec(bandwidth_hz=20, current_limit_A=9.0, **{name: level})
+
+
+def test_a_limit_is_named_once_with_its_plants():
+    labels = ["max_sensitivity (sliding)", "max_sensitivity (stuck)", "max_noise_gain"]
+    assert join_labels(labels) == "max_sensitivity (sliding and stuck), max_noise_gain"

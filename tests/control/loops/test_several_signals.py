@@ -20,6 +20,7 @@ from seaopt.control.impedance.sampled_port import SampledPort
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limit_cycles import predict_limit_cycles
+from seaopt.control.loops.sampled_plant import find_signals
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ControlError, FileError
 from seaopt.robustness.bounds.bracket import Budget, bracket
@@ -281,3 +282,7 @@ def test_what_does_not_fit_is_refused(speed):
             so.ControllerSpec(measured=wrong)
     with pytest.raises(ControlError, match="2 numbers"):
         realise(speed.law).reset(measurement=1.0)
+
+
+def test_a_speed_that_is_no_output_is_read_from_its_position():
+    assert find_signals(so.plants.rotary(link="locked"), ("tau_s", "thetad_m")) == ("tau_s", "theta_m")

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import linprog
 
 from seaopt.control import MPCSpec, force_mpc
-from seaopt.control.mpc.active_set import INFEASIBLE, SOLVED, UNFINISHED
+from seaopt.control.mpc.active_set import INFEASIBLE, SOLVED, UNFINISHED, find_nearest
 from seaopt.control.mpc.quadratic_program import factor_program, stack_hessian
 
 AGREES = 1e-8
@@ -149,3 +149,9 @@ def test_a_plan_without_a_limit_in_its_way_is_one_product(mpc):
     solution = far.solve(q, np.minimum(low, -1e-3), np.maximum(high, 1e-3), np.zeros(low.size, dtype=int), 0)
     assert solution.status == SOLVED and solution.iterations == 0
     assert solution.x == pytest.approx(-np.linalg.solve(stack_hessian(mpc.prediction), q), rel=1e-10)
+
+
+def test_the_nearest_point_of_a_box():
+    high = np.array([2.0, 2.0])
+    nearest = find_nearest(np.array([3.0, 1.0]), np.eye(2), -high, high, np.zeros(2, int), max_iterations=10)
+    assert (nearest.x.tolist(), nearest.sides.tolist(), nearest.status) == ([2.0, 1.0], [1, 0], SOLVED)

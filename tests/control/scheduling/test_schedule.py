@@ -11,6 +11,7 @@ import seaopt as so
 from seaopt.control import GainTable, ScheduledController, realise, tune_schedule
 from seaopt.control.laws.structures import Gains
 from seaopt.control.scheduling.runnable_schedule import make_runnable
+from seaopt.control.scheduling.scheduled_controller import list_inner
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from tests.schedules import read_knee, tune_knee
@@ -228,3 +229,7 @@ def test_a_schedule_keeps_limits_that_one_law_cannot():
         assert so.tune(stand, bent, replace(problem.spec, bandwidth_hz=hz), others).feasible is feasible
     schedule = tune_schedule(stand, values, problem.spec, "phi", points, {"swing": swing})
     assert schedule.feasible and {one.spec.bandwidth_hz for one in schedule.controllers} == {30.0}
+
+
+def test_inner_ends_are_those_of_equal_parts():
+    assert list_inner([0.0, 1.0, 3.0], 2) == [0.5, 2.0]

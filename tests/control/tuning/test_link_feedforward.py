@@ -12,6 +12,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import LinkFeedforward, runnable, sweep
 from seaopt.control.deploy.export import export
+from seaopt.control.loops.compensation.link_feedforward import model_link_path
 from seaopt.control.loops.loop import Loop
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.tuner import make_task
@@ -337,3 +338,11 @@ def test_a_schedule_of_it_is_refused(tmp_path):
     (tmp_path / "problem.toml").write_text(f"schema = 1\n{plants}{asked}{schedule}")
     with pytest.raises(SeaoptError, match="leave one of them out"):
         read_problem(tmp_path / "problem.toml")
+
+
+def test_the_path_has_the_inertia_and_the_damping_of_the_motor_on_the_link():
+    swing, thor = so.plants.moving_output(), so.plants.thor()
+    per_newton = 0.002 / (2 * np.pi * 3.0 * 0.0255)  # A: F_m = N_p K_tau 2 pi/l I
+    path = model_link_path(LinkFeedforward(), swing, thor, "F1", per_newton, 30.0)
+    assert path.measured == "x_2"
+    assert (path.inertia, path.damping) == pytest.approx((-294.0, -11636.0), rel=1e-4)  # -J/r^2 and -b_r/r^2

@@ -19,7 +19,7 @@ from seaopt.control import Gains, Loop
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import count_response_samples
 from seaopt.control.loops.measured.figures import measure_discs
-from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
+from seaopt.control.loops.measured.loop import LEFT, DiscLoop, bound_disc, leave_positive
 from seaopt.control.loops.measured.plant import sample_measured
 from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, LogError
@@ -252,3 +252,11 @@ def test_a_log_without_excitation_or_confidence_is_refused():
         so.measure_response(STAND, log, "F1", confidence=1.0)
     with pytest.raises(LogError, match="coherent"):
         so.measure_response(STAND, noisy_log(1, duration_s=10.0, noise=1e4), "F1")
+
+
+def test_what_is_left_of_a_measured_loop_is_positive_and_smooth():
+    at, step = np.array([0.5, LEFT, -0.1]), 1e-6
+    assert leave_positive(at)[:2] == pytest.approx(at[:2])
+    assert leave_positive(at)[2] > 0
+    slopes = (leave_positive(LEFT + np.array([0.0, step])) - leave_positive(LEFT - np.array([step, 0.0]))) / step
+    assert slopes == pytest.approx([1.0, 1.0], abs=1e-4)

@@ -177,9 +177,8 @@ class LinkPath:
 
 
 def multiply_out(law: Law, link: LinkPath | None) -> tuple[TransferFunction, ...]:
-    """Return C_r and C_y of every signal, multiplied out; the link's, the last, with its own poles alone.
-
-    Its double zero at 0 Hz would lose all digits there beside the poles of the rest.
+    """Return C_r and C_y of every signal, multiplied out; the link's, the last, with its own poles alone. Its double
+    zero at 0 Hz would lose all digits there beside the poles of the rest.
     """
     whole = law.transfer_functions()
     return whole if link is None else (*whole[:-1], link.feedback(law.sample_time_s))
@@ -213,20 +212,8 @@ def model_link_path(
     per_effort: float,
     bandwidth_hz: float,
 ) -> LinkPath:
-    """Return the path of a plant whose link moves, of a fraction of 1 where none is asked.
-
-    Raises ControlError: what is measured is not the link's position or speed, or the effort is not that of an inertia
-    and a damper.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> swing, thor = so.plants.moving_output(), so.plants.thor()
-    >>> per_newton = 0.002 / (2 * np.pi * 3.0 * 0.0255)  # A: F_m = N_p K_tau 2 pi/l I
-    >>> path = model_link_path(LinkFeedforward(), swing, thor, "F1", per_newton, 30.0)
-    >>> print(path.measured, f"{path.inertia:.1f} kg, {path.damping:.0f} N s/m")  # -J/r^2 and -b_r/r^2
-    x_2 -294.0 kg, -11636 N s/m
-
+    """Return the path of a plant whose link moves, of a fraction of 1 where none is asked. Raises ControlError: what is
+    measured is not the link's position or speed, or the effort is not that of an inertia and a damper.
     """
     name = name_link_signal(feedforward, plant)
     assert name is not None, "the plant has been asked"
@@ -293,7 +280,6 @@ def limit_fraction(
     max_sensitivity: float,
 ) -> float:
     """Return the largest fraction, in hundredths, that leaves Ms where the loop has next to nothing but the path.
-
     `motions`: responses of what is measured, from the command, of every plant. `beyond`: where the regulated force does
     not answer to the command, so that S is 1/B. `f`: frequencies in Hz.
     """

@@ -95,15 +95,7 @@ def check_cycles(cycles: Sequence[int], name: str) -> None:
 
 @record
 class RippleTerm:
-    """Compensation of torque ripple as it runs.
-
-    Examples
-    --------
-    >>> term = RippleTerm(cycles=(2,), cos=(0.0,), sin=(3.0,), period=4.0, reads="q", unit="m", fraction=1.0)
-    >>> round(term.effort(0.5), 12), round(term.slope(0.0) / math.pi, 12)  # 3 sin(2 * 2 pi * 0.5 / 4)
-    (3.0, 3.0)
-
-    """
+    """Compensation of torque ripple as it runs."""
 
     # harmonics, in cycles per revolution
     cycles: Annotated[tuple[Cycles, ...], Limits(min_length=1, max_length=MOST_CYCLES)]
@@ -161,9 +153,8 @@ class RippleTerm:
 
 
 def sum_ripple(cycles: Sequence[int], numbers: Sequence[Any], position: Any, operations: Any) -> Any:
-    """Return the series at a position, of floats or expressions.
-
-    `operations`: what has fmin, fmax and floor for them: the modules numpy or casadi.
+    """Return the series at a position, of floats or expressions. `operations`: what has fmin, fmax and floor for them:
+    the modules numpy or casadi.
     """
     count = len(cycles)
     turns = operations.fmax(operations.fmin(numbers[0] * position, MOST_TURNS), -MOST_TURNS)

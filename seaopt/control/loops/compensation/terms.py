@@ -101,15 +101,7 @@ class CompensateGravity:
 
 @record
 class GravityTerm:
-    """Compensation of gravity as it runs.
-
-    Examples
-    --------
-    >>> term = GravityTerm(coefficients=(0.0, 3.0), low=-0.5, high=0.5, reads="theta_l", unit="rad", fraction=1.0)
-    >>> term.effort(0.25), term.effort(2.0), term.slope(0.25)
-    (1.5, 3.0, 6.0)
-
-    """
+    """Compensation of gravity as it runs."""
 
     # of Chebyshev's polynomials, the fraction in them, in the unit of the reference
     coefficients: Annotated[tuple[float, ...], Limits(min_length=1, max_length=100)]
@@ -328,7 +320,6 @@ def compensate(
     operations: Any,
 ) -> tuple[Any, Any, list[Any]]:
     """Return the law's reference, the effort that is added, and the next memory, of floats or expressions.
-
     `operations`: what has fmin, fmax and floor for them: the module casadi for expressions.
     """
     shaped, added, rubs = reference, 0.0, 0 if shape.friction is None else 2

@@ -48,15 +48,8 @@ SLOWEST_HZ = 1e-6
 
 
 def leave_positive(left: Any, least: Any = np.minimum, most: Any = np.maximum) -> Any:
-    """Return a number, or where it is less than `LEFT` a positive one that continues it smoothly.
-
-    `least` and `most` are those of arrays, or of a solver's expressions.
-
-    Examples
-    --------
-    >>> leave_positive(np.array([0.5, 0.1, -0.1])).round(4).tolist()
-    [0.5, 0.1, 0.0333]
-
+    """Return a number, or where it is less than `LEFT` a positive one that continues it smoothly. `least` and `most`
+    are those of arrays, or of a solver's expressions.
     """
     return most(left, LEFT) - LEFT + LEFT * LEFT / (2.0 * LEFT - least(left, LEFT))
 
@@ -107,12 +100,11 @@ class DiscLoop:
         return abs(float(np.sum(turns)) / (0.5 * np.pi) - self.law.integrators) < ROUND
 
     def figures(self, asked_hz: float | None = None) -> LoopFigures:
-        r"""Return the worst figures of all responses in the discs; of a loop that is not shown to be stable, none.
-
-        The bandwidth is that asked for where the discs cannot tell it from their own: it lies between their least and
-        their largest, and the least is above 0.97 of it. Else it is the least. The crossover is that of the centres.
-        Gain and phase margins are those that Ms and Mt leave at least, and the delay margin that of
-        :math:`|1 - e^{-j\omega\tau}| < 1/|T|` at every frequency.
+        r"""Return the worst figures of all responses in the discs; of a loop that is not shown to be stable, none. The
+        bandwidth is that asked for where the discs cannot tell it from their own: it lies between their least and their
+        largest, and the least is above 0.97 of it. Else it is the least. The crossover is that of the centres. Gain and
+        phase margins are those that Ms and Mt leave at least, and the delay margin that of :math:`|1 -
+        e^{-j\omega\tau}| < 1/|T|` at every frequency.
         """
         if not self.is_stable():
             return make_unstable_figures(np.inf)
@@ -173,9 +165,8 @@ class DiscLoop:
 def bound_disc(
     of: str, p: Any, r: Any, c_y: Any, c_r: Any, constant: Any = 1.0
 ) -> tuple[Float[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
-    """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table.
-
-    1 + L is `rest` + P C_y: of a model, without a disc, what the law reads besides is in the rest.
+    """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table. 1 + L is
+    `rest` + P C_y: of a model, without a disc, what the law reads besides is in the rest.
     """
     open_loop = constant - 1.0 + p * c_y
     a, reach = 1.0 + open_loop, r * np.abs(c_y)

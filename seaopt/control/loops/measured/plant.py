@@ -77,12 +77,10 @@ class MeasuredPlant:
 def sample_measured(
     measured: MeasuredResponse, gain: float, sample_time_s: float, delay_samples: float
 ) -> MeasuredPlant:
-    """Return what a controller sees of a measured response.
-
-    `gain`: the input for one unit of what the controller gives. `delay_samples`: samples from a reading to the command
-    being put out, besides the hold. What is between a command and its effect is in the log.
-
-    Raises ControlError: its band ends beyond the controller's Nyquist frequency, or its lowest point is not at rest.
+    """Return what a controller sees of a measured response. `gain`: the input for one unit of what the controller
+    gives. `delay_samples`: samples from a reading to the command being put out, besides the hold. What is between a
+    command and its effect is in the log. Raises ControlError: its band ends beyond the controller's Nyquist frequency,
+    or its lowest point is not at rest.
     """
     clock, f = measured.clock, measured.frequency_hz
     late = delay_samples * sample_time_s
