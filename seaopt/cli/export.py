@@ -33,11 +33,10 @@ def export_controller(
     gate: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> bool:
-    """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
-
-    It may where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail.
-    Raises SeaoptError: there is no controller, it was edited or made from another fit than the one beside it, or it
-    cannot be written.
+    """Write the controller of `results` to `target`, say what was written, and tell whether it may be used. It may
+    where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail. Raises
+    SeaoptError: there is no controller, it was edited or made from another fit than the one beside it, or it cannot be
+    written.
     """
     path, schema, certificate = _find_law(results)
     of_problem = f"PROBLEM -o {shlex.quote(str(results))}"
@@ -95,9 +94,8 @@ def export_controller(
 def choose_gate(
     content: Mapping[str, Any], gate: Mapping[str, Any], options: Mapping[str, Any]
 ) -> PlausibilityGate | Literal[False] | None:
-    """Return the gate that is typed; False for none, None for that of the controller.
-
-    `gate` has the keys of [controller.gate], None where nothing is typed, its range as LOW:HIGH, and `leave_out`.
+    """Return the gate that is typed; False for none, None for that of the controller. `gate` has the keys of
+    [controller.gate], None where nothing is typed, its range as LOW:HIGH, and `leave_out`.
     """
     typed = {name: value for name, value in gate.items() if value is not None and value is not False}
     leave_out, ends = typed.pop("leave_out", False), typed.pop("range_N", None)
@@ -186,9 +184,8 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
 
 
 def _find_law(results: Path) -> tuple[Path, str, Path]:
-    """Return the file of the law or of the schedule in a folder, its schema, and the file of its certificate.
-
-    Raises ProblemError: the folder has both.
+    """Return the file of the law or schedule in a folder, its schema, and its certificate's file. Raises ProblemError:
+    both are there.
     """
     law, scheduled = results / FILES["tune"], results / SCHEDULE_FILES["tune"]
     if not exists(scheduled):
@@ -203,7 +200,6 @@ def _find_law(results: Path) -> tuple[Path, str, Path]:
 
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
     """Return the requirements that the certificate of this controller says are not met; None without a certificate.
-
     Raises SeaoptError: the certificate was edited or written by hand, or is of another controller.
     """
     from seaopt.robustness.certificate.stored import list_requirements  # deferred: pydantic

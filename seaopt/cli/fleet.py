@@ -41,9 +41,8 @@ def run_fleet(
     json: bool,
     amount: Amount,
 ) -> bool:
-    """Fit the logs, write tables and page, and print verdict and spread; return whether every log is met.
-
-    `drift` has the options of `seaopt.fleet.find_drift`.
+    """Fit the logs, write tables and page, print verdict and spread; return whether all logs are met. `drift`: options
+    of `find_drift`.
     """
     # Before workers start, who inherit it: threads of BLAS would fight over cores that all have a log.
     for name in THREADS:

@@ -10,13 +10,8 @@ MAX_BANDWIDTHS = 200
 
 
 def parse_bandwidths(text: str) -> tuple[float, ...]:
-    """Return the bandwidths of LOW:HIGH:STEP, both ends included.
-
-    Raises ControlError: it is not three numbers, or not an ascending range of a reasonable length.
-
-    >>> parse_bandwidths("15:25:5")
-    (15.0, 20.0, 25.0)
-
+    """Return the bandwidths of LOW:HIGH:STEP, both ends included. Raises ControlError: it is not three numbers, or not
+    an ascending range of a reasonable length.
     """
     try:
         low, high, step = (float(number) for number in text.split(":"))

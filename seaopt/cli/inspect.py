@@ -42,10 +42,9 @@ def inspect_log(
     json: bool = False,
     amount: Amount = "usual",
 ) -> bool:
-    """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked.
-
-    Returns whether it has no error, with which a fit refuses it or is wrong.
-    Raises SeaoptError: the log cannot be read, or an option is malformed.
+    """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked. Returns whether
+    it has no error, with which a fit refuses it or is wrong. Raises SeaoptError: the log cannot be read, or an option
+    is malformed.
     """
     if folder is not None:
         check_folder(folder)
@@ -87,9 +86,8 @@ def inspect_log(
 
 
 def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:
-    """Read a table; where its clock is not clear the error is the command to type, and seconds may be assumed.
-
-    Raises LogError: no column, or more than one, is named like a time, or it has another unit.
+    """Read a table; where its clock is not clear the error is the command to type, and seconds may be assumed. Raises
+    LogError: no column, or more than one, is named like a time, or it has another unit.
     """
     if time is None and unit is not None:
         named = [field.name for field in contents(path).fields if field.numeric and is_time_name(field.name)]

@@ -21,9 +21,8 @@ GUESS_HEAD = ("guess", "value", "why")
 
 
 def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force: bool, json: bool) -> Path:
-    """Write a problem file for logs and return its path; without `yes` what they leave open is asked.
-
-    Raises SeaoptError: a log cannot be read, a file is there already, or an answer is missing.
+    """Write a problem file for logs and return its path; without `yes` what they leave open is asked. Raises
+    SeaoptError: a log cannot be read, a file is there already, or an answer is missing.
     """
     target = _choose_target(logs, output, force=force)
     folder, answers = target.parent, dict[str, str]()
@@ -103,10 +102,7 @@ def _interview(
 
 
 def _ask(console: Terminal, question: Question) -> str:
-    """Return an answer that counts, "" for the guess.
-
-    Raises ProblemError: nobody answers.
-    """
+    """Return an answer that counts, "" for the guess. Raises ProblemError: nobody answers."""
     choices = f" ({', '.join(question.choices)})" if question.choices else ""
     console.say(f"{question.text}{choices}", style="bold")
     console.say(f"  Enter: {question.guess}" + (f", {question.why}" if question.why else ""), style="dim")

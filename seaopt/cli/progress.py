@@ -27,13 +27,6 @@ class TimeLeft:
 
     A stage may turn slow late: a fit that is done searching in a second looks for causes for half a minute. Nothing is
     told before the share `told_from`: what comes before has no scale.
-
-    >>> now = iter([0.0, 10.0, 10.0])
-    >>> left = TimeLeft(lambda: next(now))
-    >>> left.move(0.25)
-    >>> left.tell()
-    '30 s left'
-
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, told_from: float = LEAST_SHARE) -> None:
@@ -70,7 +63,6 @@ def show_progress(
     console: Terminal, label: str, note: Callable[[str], None], *, brief: bool = False, told_from: float = LEAST_SHARE
 ) -> Generator[Progress]:
     """Show a stage's progress on a terminal, with the time left; elsewhere write lines. Remarks go to `note`, and stay.
-
     A stage that ends in an error is not done. Of a `brief` one nothing is written where it ends before the first line.
     The time left is told from the share `told_from`.
     """

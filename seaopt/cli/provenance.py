@@ -46,10 +46,9 @@ def digest(path: Path) -> str:
 
 
 def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]:
-    """Return digests of what a stage reads: of the problem, and of the results before it in the folder, by file.
-
-    What a design takes from [robustness] is apart, for a certificate may ask a controller about another one. `stage` is
-    one of `FILES`; a result that is not in the folder has no digest.
+    """Return digests of what a stage reads: of the problem, and of the results before it in the folder, by file. What a
+    design takes from [robustness] is apart, for a certificate may ask a controller about another one. `stage` is one of
+    `FILES`; a result that is not in the folder has no digest.
     """
     read, earlier = _READ_BY_STAGE[stage]
     out = {"problem": digest_plain(read(problem))}

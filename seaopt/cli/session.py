@@ -232,10 +232,9 @@ class Session:
         return self.results["mpc"]
 
     def take_law(self, path: Path) -> None:
-        """Take a law of the user's own in place of a tuned one, and write it as the folder's controller.
-
-        A controller that was tuned there is kept: the law then needs another folder. Of predictive control it is the
-        controller.json of the problem's own.
+        """Take a law of the user's own in place of a tuned one, and write it as the folder's controller. A controller
+        that was tuned there is kept: the law then needs another folder. Of predictive control it is the controller.json
+        of the problem's own.
         """
         if self.problem.mpc is not None:
             check_mpc_file(self.problem, self.plan(), path, f"run {self._spell('tune')}, and certify that")
@@ -287,9 +286,8 @@ class Session:
         self.written.append(write_json(self._path(stage), content | {"made_from": made_from}))
 
     def _read(self, stage: str) -> dict[str, Any]:
-        """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused.
-
-        A controller made for another [robustness] is taken, as a certificate may ask about it.
+        """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused. A
+        controller made for another [robustness] is taken, as a certificate may ask about it.
         """
         path, again = self._path(stage), f"run {self._spell(stage)}"
         if not path.exists():

@@ -64,7 +64,6 @@ def make_table(rows: Iterable[Sequence[str]], head: Sequence[str], align: str = 
 
 def prepare_streams() -> None:
     """Let stdout and stderr write a character that their encoding lacks as its escape; open what a shell has closed.
-
     The next file that is opened would have the number of a closed stream, and get what libraries print.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):

@@ -213,9 +213,8 @@ def _list_segments(samples: int, period: float) -> list[float]:
 
 
 def _choose_discs(estimates: Sequence[FrequencyResponse], confidence: float, highest_hz: float) -> Discs:
-    """Return frequencies, centres, radii and averages: in every part of an octave those of the smallest discs.
-
-    As the discs of all estimates hold the truth together, any choice among them does.
+    """Return frequencies, centres, radii and averages: in every part of an octave those of the smallest discs. As the
+    discs of all estimates hold the truth together, any choice among them does.
     """
     lines = sum(np.count_nonzero(estimate.frequency_hz < highest_hz) for estimate in estimates)
     discs: list[Discs] = []
@@ -238,9 +237,8 @@ def _select(discs: Any, chosen: Any) -> Discs:  # whose lengths differ
 
 
 def _place_discs(estimate: FrequencyResponse, alpha: float, highest_hz: float) -> Discs:
-    """Return the band of an estimate in which discs are small, its centres, radii and averages.
-
-    Each disc alone misses the truth with probability `alpha`.
+    """Return the band of an estimate in which discs are small, its centres, radii and averages. Each disc alone misses
+    the truth with probability `alpha`.
     """
     from scipy.ndimage import median_filter  # deferred: 0.2 s
 

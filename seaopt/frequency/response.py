@@ -114,9 +114,8 @@ def responses(
     stretch_s: float | None = None,
     rough: bool = False,
 ) -> list[FrequencyResponse]:
-    """Estimate the frequency responses from u to several outputs: `h1`, with the spectra of u made once.
-
-    A rough estimate is made in single precision, in half the time.
+    """Estimate the frequency responses from u to several outputs: `h1`, with the spectra of u made once. A rough
+    estimate is made in single precision, in half the time.
     """
     n = u.size
     if stretch_s is not None and not 0.0 < stretch_s < n * period:

@@ -20,11 +20,9 @@ from seaopt.simulation import Clock, Model, transition
 def sampled_response(
     model: Model, theta: Float[np.ndarray, " np"], clock: Clock, f: Float[np.ndarray, " m"], source: int = 0
 ) -> tuple[Complex[np.ndarray, "m ny"], Complex[np.ndarray, "nd m ny"]]:
-    """Return the response from one input to every output of a linear model, and its derivatives.
-
-    `model`: linear; see `seaopt.simulation.linearise`. `theta`: its free parameters. `clock`: period, hold and delay.
-    `f`: frequencies in Hz. `source`: number of the input. Returned: with respect to theta, then to the delay where
-    ``clock.delay_free``.
+    """Return the response from one input to every output of a linear model, and its derivatives. `model`: linear; see
+    `seaopt.simulation.linearise`. `theta`: its free parameters. `clock`: period, hold and delay. `f`: frequencies in
+    Hz. `source`: number of the input. Returned: with respect to theta, then to the delay where ``clock.delay_free``.
     """
     outputs = sampled_signals(model, theta, clock, f, source)[:, :, model.nx :]
     return outputs[0], outputs[1:]

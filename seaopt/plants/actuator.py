@@ -264,10 +264,7 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
 
 
 def check_choices(*choices: tuple[str, object, tuple[str, ...]]) -> None:
-    """Refuse an option that is not among those known, each given as (name, choice, known).
-
-    Raises PlantError: it is not; the message names it.
-    """
+    """Refuse an option that is not among those known (PlantError), each given as (name, choice, known)."""
     for what, choice, valid in choices:
         if choice not in valid:
             raise PlantError(f'{what} = "{choice}" is not known; use ' + " or ".join(f'"{name}"' for name in valid))
@@ -284,11 +281,10 @@ def make_plant(
     inputs: tuple[str, ...] = (),
     ports: tuple[Port, ...] = (),
 ) -> Plant:
-    """Return the plant of an actuator: its equations and roles, then the parts that wrap any plant.
-
-    `outputs`: what can be measured. `derived`, `sensing`, `ports`: as in `Plant`. `second_order`: the derived figures
-    that are mass and damping of the second-order response with the links fixed. `inputs`: efforts of the world on the
-    links, which a log may leave out.
+    """Return the plant of an actuator: its equations and roles, then the parts that wrap any plant. `outputs`: what can
+    be measured. `derived`, `sensing`, `ports`: as in `Plant`. `second_order`: the derived figures that are mass and
+    damping of the second-order response with the links fixed. `inputs`: efforts of the world on the links, which a log
+    may leave out.
     """
     drive, parts = actuator.transmission, actuator.parts
     place, effort = drive.place_unit, drive.effort_unit
@@ -359,9 +355,8 @@ def _rest(actuator: Actuator) -> SimpleNamespace:
 
 
 def _list_frictions(actuator: Actuator, states: Collection[str], names: Sequence[str]) -> dict[str, Friction]:
-    """Return what rubs: the drive, and within a spring with hysteresis what gives way.
-
-    `states` are those of the motion, `names` those of the parameters.
+    """Return what rubs: the drive, and within a spring with hysteresis what gives way. `states` are those of the
+    motion, `names` those of the parameters.
     """
     drive, parts = actuator.transmission, actuator.parts
     slips = (SLIPPING,) if "hysteresis" in parts else ()

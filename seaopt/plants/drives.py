@@ -80,10 +80,8 @@ class _Drive:
 
 
 def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
-    """Return a plant whose input is the voltage or the duty of its motor.
-
-    Raises PlantError: the plant does not state its actuation, or not the speed on which its effort works; or has such
-    an input.
+    """Return a plant whose input is the voltage or the duty of its motor. Raises PlantError: the plant does not state
+    its actuation, or not the speed on which its effort works; or has such an input.
     """
     part = "duty_input" if "duty_input" in parts else "voltage_input"
     actuation, inductive = plant.actuation, "inductance" in parts
@@ -129,9 +127,8 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
 
 
 def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
-    """Return a plant whose input is the goal of a position that a firmware holds.
-
-    Raises PlantError: the plant's sensing names no position.
+    """Return a plant whose input is the goal of a position that a firmware holds. Raises PlantError: the plant's
+    sensing names no position.
     """
     sensing = plant.sensing
     position = sensing and (sensing.motor_position or sensing.link_position)

@@ -46,9 +46,8 @@ FORGETTING = 1.0  # rad/s: by which bristles of a linear plant go back; nothing 
 
 
 def bound_slopes(friction: Friction, p: Any) -> tuple[Any, Any]:
-    """Return the flattest and the steepest slope of a friction curve at parameters p, numbers or expressions.
-
-    They are what the role states; else the least and largest at `SAMPLED_SPEEDS` in both directions.
+    """Return the flattest and the steepest slope of a friction curve at parameters p, numbers or expressions. They are
+    what the role states; else the least and largest at `SAMPLED_SPEEDS` in both directions.
     """
     p = friction.add_rated(p)
     if friction.slopes is not None:
@@ -60,16 +59,7 @@ def bound_slopes(friction: Friction, p: Any) -> tuple[Any, Any]:
 
 
 def friction_slopes(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Return the flattest and the steepest slope of each friction of a plant, in the order of its roles.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> flattest, steepest = friction_slopes(so.plants.high_impedance(), so.plants.thor().update(f_c=50.0))
-    >>> float(flattest[0]), float(steepest[0])  # N s/m: f_c / v_s
-    (0.0, 50000.0)
-
-    """
+    """Return the flattest and the steepest slope of each friction of a plant, in the order of its roles."""
     p = plant.complete(params).by_attribute
     bounds = [[float(ca.DM(bound)) for bound in bound_slopes(friction, p)] for friction in plant.friction.values()]
     flattest, steepest = np.reshape(np.array(bounds, dtype=float), (-1, 2)).T
@@ -83,16 +73,7 @@ def name_slope_unit(plant: Plant) -> str:
 
 def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, float]:
     """Return the effort at the spring that each dry friction takes, by name; what is linear in its velocity is not dry.
-
     It is the largest force at low speeds, less viscous friction of the flattest slope.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> plant = so.plants.high_impedance()
-    >>> find_dry_friction(plant, plant.complete(so.plants.thor().update(f_c=50.0)))
-    {'F_f': 50.0}
-
     """
     p = params.by_attribute
     efforts: dict[str, float] = {}
@@ -108,18 +89,8 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
 
 
 def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
-    """Return the effort at the spring that is needed to let every joint that can stick slide, N or N m.
-
-    It is the largest force of each friction that declares its jump, at low speeds.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> plant = so.plants.high_impedance(parts=["stribeck"])
-    >>> f_s, v_st = so.Parameter(name="f_s", value=30.0, unit="N"), so.Parameter(name="v_st", value=0.01, unit="m/s")
-    >>> find_breakaway(plant, plant.complete(so.plants.thor().update(f_c=20.0).with_parameters(f_s, v_st)))
-    30.0
-
+    """Return the effort at the spring that is needed to let every joint that can stick slide, N or N m. It is the
+    largest force of each friction that declares its jump, at low speeds.
     """
     p = params.by_attribute
     return sum(
@@ -137,10 +108,9 @@ def _list_low_speeds(friction: Friction, params: CompletedParameters) -> list[fl
 
 
 def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, " n"]:
-    """Return the frequencies (Hz) at which the plant swings at rest while every joint that can stick does so.
-
-    With A of the sliding plant, B the effect of the friction forces and C the rows of their velocities, a force that
-    keeps C x at zero leaves A - B (C B)^-1 C A. Where bristles hold it, the plant is the stuck one.
+    """Return the frequencies (Hz) at which the plant swings at rest while every joint that can stick does so. With A of
+    the sliding plant, B the effect of the friction forces and C the rows of their velocities, a force that keeps C x at
+    zero leaves A - B (C B)^-1 C A. Where bristles hold it, the plant is the stuck one.
     """
     a = state_space(friction_states(plant)[SLIDING if can_stick(plant) else STUCK], params)[0]
     if can_stick(plant):
@@ -155,10 +125,9 @@ def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, "
 
 @memo
 def friction_states(plant: Plant) -> Mapping[str, Plant]:
-    """Return the plant with every friction at its flattest slope and at its steepest, as "sliding" and "stuck".
-
-    Beside others a friction with bristles is in either state by itself: "NAME stuck" is where it sticks alone. The
-    sliding plant is the first.
+    """Return the plant with every friction at its flattest slope and at its steepest, as "sliding" and "stuck". Beside
+    others a friction with bristles is in either state by itself: "NAME stuck" is where it sticks alone. The sliding
+    plant is the first.
     """
     bristled = _list_bristles(plant)
     curves = [name for name in plant.friction if name not in bristled]
@@ -182,10 +151,9 @@ def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Co
 def name_states(
     plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()
 ) -> dict[str, tuple[str, str]]:
-    """Return plant and state of friction, "" without, behind each name of `split_friction`.
-
-    `params`: a plant whose friction is nothing there has none. `varied`: parameters that may take other values:
-    friction that depends on one of them is there.
+    """Return plant and state of friction, "" without, behind each name of `split_friction`. `params`: a plant whose
+    friction is nothing there has none. `varied`: parameters that may take other values: friction that depends on one of
+    them is there.
     """
     return {
         (f"{name} {state}" if state else name): (name, state)
@@ -308,16 +276,7 @@ def _friction_parameters(plant: Plant) -> frozenset[str]:
 
 
 def list_fall_parameters(plant: Plant, friction: Friction) -> tuple[str, ...]:
-    """Return the parameters of a plant on which the flattest slope of one of its frictions depends.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> plant = so.plants.high_impedance(parts=["stribeck"])
-    >>> list_fall_parameters(plant, plant.friction["F_f"])
-    ('f_c', 'f_s', 'v_st')
-
-    """
+    """Return the parameters of a plant on which the flattest slope of one of its frictions depends."""
     flattest, _ = bound_slopes(friction, name_parameters(plant, plant.p))
     return _list_parameters(plant, ca.SX(flattest))
 
@@ -399,7 +358,6 @@ def separate_friction(plant: Plant) -> SeparatedFriction:
 @memo
 def friction_matrices(plant: Plant) -> Any:
     """Return the CasADi function (x, u, p) -> (effect of each friction force on f, on h; velocities' rows), at t = 0.
-
     The effects are those of a force in the direction of its velocity, shapes (nx, p) and (ny, p); the rows are
     derivatives of the velocities by the states, shape (p, nx).
     """
@@ -413,10 +371,9 @@ def friction_matrices(plant: Plant) -> Any:
 
 @memo
 def rest_jacobians(plant: Plant) -> Any:
-    """Return the CasADi function (x, u, p) -> (A, B, C, D) at rest, where bristles stick and are not bent.
-
-    A deflection follows its coordinate from the rest on. Linearised as it is it would be a mode that nothing moves and
-    nothing damps; the stuck plant's own rest is another, where bristles bend all the way from a coordinate of zero.
+    """Return the CasADi function (x, u, p) -> (A, B, C, D) at rest, where bristles stick and are not bent. A deflection
+    follows its coordinate from the rest on. Linearised as it is it would be a mode that nothing moves and nothing
+    damps; the stuck plant's own rest is another, where bristles bend all the way from a coordinate of zero.
     """
     if not remembers(plant):
         return jacobians(plant)

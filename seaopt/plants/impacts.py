@@ -41,20 +41,9 @@ HeldState = Float[np.ndarray, " m"]
 
 
 def strike(plant: Plant, params: CompletedParameters, state: State, output: str, impulse: float) -> State:
-    """Return the state after a blow along an output, a position such as x_2.
-
-    `state`: before the blow. `output`: the position that is struck. `impulse`: N s (N m s along an angle), positive
-    along the output. Raises PlantError: the plant has no such output or no energy, or the output depends on more than
-    positions.
-
-    Examples
-    --------
-    >>> import numpy as np, seaopt as so
-    >>> plant = so.plants.two_link("fixed", "mass")
-    >>> after = strike(plant, plant.complete(plant.defaults), np.zeros(4), "x_2", 1.0)
-    >>> round(float(after[3]), 5)  # 10 kg and the 0.646 kg that go along, next to nothing of the screw
-    0.09394
-
+    """Return the state after a blow along an output, a position such as x_2. `state`: before the blow. `output`: the
+    position that is struck. `impulse`: N s (N m s along an angle), positive along the output. Raises PlantError: the
+    plant has no such output or no energy, or the output depends on more than positions.
     """
     inertia, slope = (np.array(block) for block in _inertia(plant, output)(state, params.vector))
     after = state.copy()
@@ -64,12 +53,11 @@ def strike(plant: Plant, params: CompletedParameters, state: State, output: str,
 
 
 def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -> tuple[HeldState, float, float]:
-    """Return the state of the plant with a port held after its link is stopped where it is.
-
-    `plant`: with the moving link; it declares its energy. `state`: before the contact. `port`: of the link that is
-    caught. Returned: the state of the plant with the port held, the drive's coordinate counted from where the link is
-    held; what stops the link, along its coordinate (N m s of a pendulum, N s of a mass); the kinetic energy (J) that is
-    lost. Raises PlantError: the port does not move, or the plant declares no energy.
+    """Return the state of the plant with a port held after its link is stopped where it is. `plant`: with the moving
+    link; it declares its energy. `state`: before the contact. `port`: of the link that is caught. Returned: the state
+    of the plant with the port held, the drive's coordinate counted from where the link is held; what stops the link,
+    along its coordinate (N m s of a pendulum, N s of a mass); the kinetic energy (J) that is lost. Raises PlantError:
+    the port does not move, or the plant declares no energy.
     """
     motion, coordinate, rate = _read_motion(plant, port)
     inertia = np.array(_inertia(plant, motion)(state, params.vector)[0])
@@ -91,7 +79,6 @@ def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -
 
 def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldState, link: Mapping[str, float]) -> State:
     """Return the state of a plant after the link at a port is let go at the position `link`, as the reverse of `catch`.
-
     `plant`: with the link free. `port`: of the link that is let go. `held`: the state of the plant with the port held.
     `link`: the link's coordinate when it is let go, such as {"phi": 0.3}; zero where left out, as its rate is. Raises
     PlantError: the port does not move, or `link` names no state of its link.
@@ -119,11 +106,9 @@ def offset(plant: Plant, params: CompletedParameters, state: State, port: Port) 
 
 
 def check_held(plant: Plant, held: Plant) -> None:
-    """Refuse a plant that is not another with its first port held.
-
-    It is compared with the one that the port makes; where the port makes none, only the names of the states tell.
-
-    Raises PlantError: the states are not the same but for the link's.
+    """Refuse a plant that is not another with its first port held. It is compared with the one that the port makes;
+    where the port makes none, only the names of the states tell. Raises PlantError: the states are not the same but for
+    the link's.
     """
     port = plant.port
     if port is not None and port.held is not None:

@@ -30,21 +30,7 @@ Result = TypeVar("Result")
 def memo(
     function: Callable[Concatenate[Owner, Arguments], Result],
 ) -> Callable[Concatenate[Owner, Arguments], Result]:
-    """Make a function of a plant, and of hashable arguments, compute its result once for each of them.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> @memo
-    ... def count_states(plant: so.Plant) -> int:
-    ...     print("counting")
-    ...     return len(plant.states)
-    >>> plant = so.plants.high_impedance()
-    >>> count_states(plant), count_states(plant)
-    counting
-    (2, 2)
-
-    """
+    """Make a function of a plant, and of hashable arguments, compute its result once for each of them."""
 
     @wraps(function)
     def remember(owner: Owner, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

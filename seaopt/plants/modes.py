@@ -146,9 +146,8 @@ def _compute_static_gain(
 def _find_zeros(
     a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
 ) -> Complex[np.ndarray, " m"]:
-    """Return the finite generalised eigenvalues of the system pencil [[A, b], [c, d]] - z diag(1, 0).
-
-    The pencil is scaled first: forces in newtons and strains in metres stand ten decades apart.
+    """Return the finite generalised eigenvalues of the system pencil [[A, b], [c, d]] - z diag(1, 0). The pencil is
+    scaled first: forces in newtons and strains in metres stand ten decades apart.
     """
     from scipy.linalg import eig
 

@@ -41,9 +41,8 @@ def _radius(p: Any) -> Any:
 
 
 def derived_figures(p: Any, *, housing_rides: bool = False) -> dict[str, tuple[Any, str]]:
-    """Return r (2), m_k (1), b_m (4), and the natural frequency and damping ratio with both links fixed (13).
-
-    Where the housing rides on link 1 (unlumped, spring at link 2), only M = J/r^2 swings then, not m_k.
+    """Return r (2), m_k (1), b_m (4), and the natural frequency and damping ratio with both links fixed (13). Where the
+    housing rides on link 1 (unlumped, spring at link 2), only M = J/r^2 swings then, not m_k.
     """
     rotor, b_m = SCREW.inertia(p), SCREW.damping(p)
     m_k = p.m_l + rotor

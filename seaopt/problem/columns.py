@@ -21,10 +21,7 @@ def list_log_files(table: ExperimentTable) -> list[str]:
 
 
 def check_inside(place: str, table: ExperimentTable) -> None:
-    """Refuse a file outside the problem file's folder.
-
-    Raises ProblemError: a path is absolute, or climbs out.
-    """
+    """Refuse a file outside the problem file's folder. Raises ProblemError: a path is absolute, or climbs out."""
     for name in list_log_files(table):
         for kind in (PurePosixPath, PureWindowsPath):  # a problem file reads the same on every system
             if kind(name).anchor or ".." in kind(name).parts:
@@ -32,10 +29,7 @@ def check_inside(place: str, table: ExperimentTable) -> None:
 
 
 def check_links(folder: Path, names: list[str]) -> None:
-    """Refuse a log that a symbolic link puts outside the problem file's folder.
-
-    Raises ProblemError: the file that is meant lies elsewhere.
-    """
+    """Refuse a log that a symbolic link puts outside the problem file's folder (ProblemError)."""
     for name in names:
         try:
             inside = (folder / name).resolve().is_relative_to(folder.resolve())

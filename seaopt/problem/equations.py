@@ -34,9 +34,8 @@ Read = Callable[[str, Formula], Any]  # returns the expression of a formula, giv
 
 
 def order_plants(tables: Mapping[str, AnyPlant]) -> list[str]:
-    """Return the names of a file's plants, those that others name as held or probe before these.
-
-    Raises PlantError: a plant that is named is not there, or plants name each other in a circle.
+    """Return the names of a file's plants, those that others name as held or probe before these. Raises PlantError: a
+    plant that is named is not there, or plants name each other in a circle.
     """
     named = {name: set(list_partners(table)) for name, table in tables.items()}
     for name, partners in named.items():
@@ -53,11 +52,9 @@ def list_partners(table: AnyPlant) -> list[str]:
 
 
 def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) -> Plant:
-    """Return the plant of a table.
-
-    `name`: of the plant. `partners`: the plants that its ports name.
-    Raises PlantError: a name, an equation or a role is not as it must be; the message names the place. Raises
-    UnitError: a unit is unknown, or not SI.
+    """Return the plant of a table. `name`: of the plant. `partners`: the plants that its ports name. Raises PlantError:
+    a name, an equation or a role is not as it must be; the message names the place. Raises UnitError: a unit is
+    unknown, or not SI.
     """
     _check_names(table)
     _check_units(table)

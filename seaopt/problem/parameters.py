@@ -17,10 +17,9 @@ from seaopt.units import ROTARY, factor, unit_after
 
 
 def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> ParameterSet:
-    """Return the file's values over the plants' defaults, in the plants' units.
-
-    Raises ProblemError: a name is of no plant, or a value is missing that has no default, or several. Raises UnitError:
-    a value's unit has another dimension than its parameter's.
+    """Return the file's values over the plants' defaults, in the plants' units. Raises ProblemError: a name is of no
+    plant, or a value is missing that has no default, or several. Raises UnitError: a value's unit has another dimension
+    than its parameter's.
     """
     tables = table.parameters
     for experiment in table.experiment:

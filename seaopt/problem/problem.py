@@ -410,14 +410,7 @@ def _find_delay(experiment: Experiment, source: Fit | ParameterSet) -> float:
 
 
 def name_after(stem: str) -> str:
-    """Return the name of an experiment that is named after a log file.
-
-    Examples
-    --------
-    >>> name_after("knee left.2"), name_after("7")
-    ('knee_left_2', 'log_7')
-
-    """
+    """Return the name of an experiment that is named after a log file."""
     name = re.sub(r"[^A-Za-z0-9_-]", "_", stem)
     return name if name[:1].isalpha() else f"log_{name}"
 

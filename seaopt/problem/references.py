@@ -31,7 +31,6 @@ RESPONSE = "frf:"  # before the name of an experiment whose frequency response i
 
 def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
     """Refuse names of plants, inputs, outputs and ranges that the file's plants do not have, and ranges out of bounds.
-
     Raises ProblemError: the message names the key.
     """
     places = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
@@ -278,9 +277,8 @@ def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
 def range_remarks(
     ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant], nominal: ParameterSet
 ) -> list[str]:
-    """Return a remark on each range that turns an angle past a right one, or leaves out a nominal mode.
-
-    A nominal value outside its range is among the notes of the certificate.
+    """Return a remark on each range that turns an angle past a right one, or leaves out a nominal mode. A nominal value
+    outside its range is among the notes of the certificate.
     """
     remarks: list[str] = []
     modes = find_modes(plants)
@@ -311,10 +309,8 @@ def guess_remarks(
     plants: Mapping[str, Plant],
     nominal: ParameterSet,
 ) -> list[str]:
-    """Return a remark that names the guesses that are not varied, with ranges to vary them in.
-
-    `guessed`: names of parameters, among words for other entries. What has a std in `nominal`, of a fit or as a prior,
-    is drawn.
+    """Return a remark that names the guesses that are not varied, with ranges to vary them in. `guessed`: names of
+    parameters, among words for other entries. What has a std in `nominal`, of a fit or as a prior, is drawn.
     """
     used = {name for plant in plants.values() for name in plant.parameters} - {parameter.name for parameter in HEAT}
     unknown = [nominal[name] for name in guessed if name in used and name not in ranges]

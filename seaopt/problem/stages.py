@@ -154,9 +154,8 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
 
 
 def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:
-    """Refuse a file that is not the controller.json of the predictive controller that a problem asks for.
-
-    Raises SeaoptError: the file cannot be read, or is of something else.
+    """Refuse a file that is not the controller.json of the predictive controller that a problem asks for. Raises
+    SeaoptError: the file cannot be read, or is of something else.
     """
     is_json = path.suffix.lower() == ".json"
     content = parse_file(path, json.loads, "JSON", remedy="give a controller.json") if is_json else None
@@ -232,9 +231,8 @@ def tune_problem(
 
 
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
-    """Return a controller with the problem's outer loop, its plausibility gate, and with what it compensates.
-
-    Raises SeaoptError: as `seaopt.control.add_compensation`, or the stiffness has no critically damped impedance.
+    """Return a controller with the problem's outer loop, its plausibility gate, and with what it compensates. Raises
+    SeaoptError: as `seaopt.control.add_compensation`, or the stiffness has no critically damped impedance.
     """
     outer, values = problem.table.impedance, problem.values(source)
     if outer is not None:
@@ -268,9 +266,8 @@ def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> Plausibil
 def list_plants(
     problem: Problem, source: Fit | ParameterSet, spec: DelayedSpec | None = None
 ) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
-    """Return what the controller is designed on, and what it must be robust to, models and measured responses.
-
-    `spec`: whose delays count in place of the problem's.
+    """Return what the controller is designed on, and what it must be robust to, models and measured responses. `spec`:
+    whose delays count in place of the problem's.
     """
     measured, plants = problem.measure_responses(source), problem.robust_to(source, spec)
     responses = {name: response for name, response in measured.items() if name in problem.controller_table.robust_to}
@@ -279,10 +276,9 @@ def list_plants(
 
 
 def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet) -> Controller:
-    """Measure a law of one's own against the problem's limits, as `seaopt certify --controller` does.
-
-    `given`: what `seaopt.control.read_law` returned; its rate and its delay are the loop's.
-    Raises ProblemError: the problem has no [controller], or the law measures something else than it does.
+    """Measure a law of one's own against the problem's limits, as `seaopt certify --controller` does. `given`: what
+    `seaopt.control.read_law` returned; its rate and its delay are the loop's. Raises ProblemError: the problem has no
+    [controller], or the law measures something else than it does.
     """
     if problem.schedule is not None:
         raise ProblemError(

@@ -86,7 +86,6 @@ def response_panels(
     experiment: Experiment, measured: Survey, fits: Mapping[str, Fit], *, pair: str | None = None
 ) -> list[Panel]:
     """Return a panel for every pair of an experiment, and for outputs of one unit over each other, with models on top.
-
     `experiment`: of the first fit, with its measurement. `fits`: drawn over it, each has an experiment of that name.
     `pair`: the only one wanted, by its name.
     """
@@ -154,7 +153,6 @@ def survey_panels(
     fitted: Mapping[str, tuple[Survey, Fit]] | None = None,
 ) -> list[Panel]:
     """Return a panel for every pair of the surveys with its second-order fit, the plant as given, and as fitted.
-
     `given`: values before a fit. `fitted`: by experiment the survey under the fit's delay and gains, and the fit.
     """
     panels: list[Panel] = []

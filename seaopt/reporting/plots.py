@@ -53,38 +53,15 @@ class Kind:
 
 
 class Plots:
-    """Figures of one result: call it for a sheet of the main ones, or one of its methods for a figure by itself.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
-    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    >>> dir(controller.plot)
-    ['bode', 'complementary', 'impedance', 'noise', 'nyquist', 'sensitivity', 'step', 'tracking']
-    >>> axis = controller.plot.sensitivity(plants={"stand": (stand, thor), "swing": (so.plants.moving_output(), thor)})
-    >>> axis.get_ylabel(), [line.get_label() for line in axis.lines][:2]
-    ('|S| [dB]', ['stand', 'swing'])
-
-    """
+    """Figures of one result: call it for a sheet of the main ones, or one of its methods for a figure by itself."""
 
     def __init__(self, result: object) -> None:
         self._result = result
         self._kind = KINDS[type(result).__name__]
 
     def __call__(self, *, columns: int = 2) -> PlainFigure:
-        """Draw the main figures on one sheet of so many columns.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            ``savefig`` writes it as SVG, PDF or PNG, with text as text.
-
-        Raises
-        ------
-        SeaoptError
-            The result lacks what a figure needs.
-
+        """Return the main figures on one sheet of so many columns; `savefig` writes it as SVG, PDF or PNG, with text as
+        text. Raises SeaoptError: the result lacks what a figure needs.
         """
         panels = self._list_panels()
         if not panels:
@@ -197,9 +174,8 @@ def _draw_diagnostics(panel: Callable[[Diagnostics, str], Panel]) -> Make:
 
 
 def _draw_responses(fit: Fit, experiment: str | None = None, pair: str | None = None) -> list[Panel]:
-    """Draw measured frequency responses (H1) and the fitted model: magnitude, phase and coherence.
-
-    `pair`: by its name, such as F1/I; all if left out. `ax`: a sequence of three Axes, for one pair.
+    """Draw measured frequency responses (H1) and the fitted model: magnitude, phase and coherence. `pair`: by its name,
+    such as F1/I; all if left out. `ax`: a sequence of three Axes, for one pair.
     """
     experiments = _choose_experiments(fit, experiment)
     surveys = {each.name: experiment_survey(each, fit) for each in experiments}

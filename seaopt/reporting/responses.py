@@ -65,13 +65,8 @@ class Responses:
 def estimate_responses(
     experiments: tuple[Experiment, ...], problem: Problem, fit: Fit | None, stretch_s: float | None, progress: Progress
 ) -> Responses:
-    """Estimate the frequency responses of every experiment.
-
-    Raises
-    ------
-    LogError
-        A log does not allow one: nothing is excited, it has gaps or missing samples, or is too short.
-
+    """Estimate the frequency responses of every experiment. Raises LogError: a log does not allow one: nothing is
+    excited, it has gaps or missing samples, or is too short.
     """
     surveys: dict[str, Survey] = {}
     fitted: dict[str, tuple[Survey, Fit]] = {}

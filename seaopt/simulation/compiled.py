@@ -252,7 +252,6 @@ class Program:
         room: Pass | None = None,
     ) -> Pass:
         """Run the samples from `first` to before `last`; with `resume`, go on where the samples before them stopped.
-
         Outputs are those of the first `output_rows` samples, of all if it is left out. Outputs and columns are written
         into the `room` of a pass that is not needed any more, if there is one.
         """
@@ -287,9 +286,8 @@ class Program:
     def double_sum(
         self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
     ) -> Float[np.ndarray, "2 p p"]:
-        """Return the sum over t and s of a(t)' R(t - s) a(s), and of it what t = s gives.
-
-        The a are the influences into v of the samples that count.
+        """Return the sum over t and s of a(t)' R(t - s) a(s), and of it what t = s gives. The a are the influences into
+        v of the samples that count.
         """
         ny, p, nc = into.shape
         width = _pad_to_vectors(p)
@@ -319,7 +317,6 @@ class Program:
 
     def _split(self, first: int, last: int, x0: Float[np.ndarray, " nx"], *, halve: bool) -> tuple[Any, Any, Any]:
         """Return edges, starts and run-up of what runs at once: two halves where the state is soon forgotten, or one.
-
         The second half starts at zero and forgets it before it counts.
         """
         if not (halve and self.run_up):

@@ -88,7 +88,6 @@ def expm_with_derivatives(
     n: Float[np.ndarray, "m m"], dn: Float[np.ndarray, "np m m"]
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "np m m"]]:
     """Return exp(n) and its derivatives along each dn: Taylor's polynomial by Horner's rule, scaled and squared.
-
     Products of small matrices only: a linear solver's threads would cost more than the matrices themselves.
     """
     norm = float(np.max(np.sum(np.abs(n), axis=1), initial=0.0))

@@ -196,9 +196,8 @@ def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
 
 
 def _correct(layout: Layout, z: Any, y: Any, w: Any, sensors: Any) -> Any:
-    """Return what the prediction errors take off the next state and its derivatives.
-
-    w ends in [measured, present, drift basis]; known is [offset, gain, drift, correction and its derivatives].
+    """Return what the prediction errors take off the next state and its derivatives. w ends in [measured, present,
+    drift basis]; known is [offset, gain, drift, correction and its derivatives].
     """
     nx, ny, nd = layout.nx, layout.ny, layout.drift_terms
     measured, present, basis = ca.vertsplit(w, [0, ny, 2 * ny, 2 * ny + nd])
@@ -220,9 +219,8 @@ def _correct(layout: Layout, z: Any, y: Any, w: Any, sensors: Any) -> Any:
 
 @memo
 def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, int, int]) -> tuple[Any, Any]:
-    """Return CasADi's (Z, w, data) -> Z+, over FOLDED_SAMPLES, and (Z, w, data) -> [y, derivatives], of one sample.
-
-    The sizes are those of w, of the plant's part of the data, and of all data.
+    """Return CasADi's (Z, w, data) -> Z+, over FOLDED_SAMPLES, and (Z, w, data) -> [y, derivatives], of one sample. The
+    sizes are those of w, of the plant's part of the data, and of all data.
     """
     z, w = ca.MX.sym("z", model.nx, layout.states), ca.MX.sym("w", sizes[0])
     data = ca.MX.sym("data", sizes[2])

@@ -109,10 +109,7 @@ def _is_private(path: Path) -> bool:
 
 @lru_cache(maxsize=64)
 def load_library(source: str, name: str) -> ctypes.CDLL | None:
-    """Return the shared library of a C source that exports `name`, compiled or from the cache.
-
-    None without compiler or folder.
-    """
+    """Return the library of a C source that exports `name`, compiled or cached. None without compiler or folder."""
     compiler, folder = find_compiler(), cache_folder()
     if compiler is None or folder is None:
         return None
@@ -207,9 +204,8 @@ def _run_compiler(command: list[str], source: str, name: str, folder: Path, key:
 
 
 def _succeeds(command: list[str], limit_s: float) -> bool:
-    """Run a command and tell whether it ends with status 0; one that does not end is killed with all it started.
-
-    Raises TimeoutExpired: it did not end in time. `Popen.wait` with a limit would look only every 50 ms.
+    """Run a command and tell whether it ends with status 0; one that does not end is killed with all it started. Raises
+    TimeoutExpired: it did not end in time. `Popen.wait` with a limit would look only every 50 ms.
     """
     silent, expired = subprocess.DEVNULL, threading.Event()
     process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)  # noqa: S603
@@ -258,13 +254,11 @@ class Kernel:
     library: ctypes.CDLL
 
     def run(self, jobs: Shaped[np.ndarray, " jobs"], buffers: object, *, parallel: bool = True) -> None:
-        """Do all jobs, in threads of their own if `parallel`; ctypes lets go of the interpreter's lock.
-
-        `jobs`: one row per job, laid out as the C structure; pointers are whole numbers; `buffers`: whatever owns the
-        memory that the jobs point to; `parallel`: whether the jobs are long enough for threads to pay.
-
-        Raises KeyboardInterrupt: once no thread works on these jobs any more; those that none has begun are left.
-        Raises MemoryError: there is no room for the stack that a plant of many states needs.
+        """Do all jobs, in threads of their own if `parallel`; ctypes lets go of the interpreter's lock. `jobs`: one row
+        per job, laid out as the C structure; pointers are whole numbers; `buffers`: whatever owns the memory that the
+        jobs point to; `parallel`: whether the jobs are long enough for threads to pay. Raises KeyboardInterrupt: once
+        no thread works on these jobs any more; those that none has begun are left. Raises MemoryError: there is no room
+        for the stack that a plant of many states needs.
         """
         inside = threading.current_thread().name.startswith(
             THREAD_NAME
@@ -297,9 +291,8 @@ def _call(future: Future[int], function: Any, address: int, count: int, owners: 
 
 
 def _join(futures: list[Future[int]], interrupt: BaseException | None) -> bool:
-    """Wait for all that have begun, and without an interrupt for all; the last interrupt is raised at the end.
-
-    Returns whether one failed.
+    """Wait for all that have begun, and without an interrupt for all; the last interrupt is raised at the end. Returns
+    whether one failed.
     """
     waiting = True
     while waiting:

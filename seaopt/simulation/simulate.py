@@ -25,7 +25,6 @@ ROUNDING = 1e-6  # of an output: below it an error is not held against the outpu
 
 def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
     """Return the plant's inputs from a log's channels of the same names, in the plant's order; zeros if it has none.
-
     Raises LogError: an input is missing from the log, or has missing samples.
     """
     columns: list[Float[np.ndarray, " n"]] = []

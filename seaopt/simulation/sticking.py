@@ -35,9 +35,8 @@ SWEEPS = 30  # over the forces of several joints that stop at once
 
 
 def separate_jumps(plant: Plant) -> tuple[Any, Any, Any]:
-    """Return f and h as the plant moves without its friction that jumps, and what holds each joint at rest.
-
-    All are expressions of the plant's own symbols.
+    """Return f and h as the plant moves without its friction that jumps, and what holds each joint at rest. All are
+    expressions of the plant's own symbols.
     """
     joints, arguments = _Joints(plant), [plant.t, plant.x, plant.u, plant.p]
     levels = joints.levels(*arguments[1:])
@@ -163,7 +162,6 @@ def _push_each(levels: Any) -> list[Any]:
 
 def _find_holding(speeds: Any, effects: Any, stopped: Any, limits: Any) -> Any:
     """Return the forces (in their units) that stop the joints in `stopped`, or their limits; the others' are zero.
-
     `speeds` are those without them, `effects` [i, j] what a unit of force j takes from speed i. Of several joints each
     is solved in turn, by Gauss' and Seidel's projected sweeps.
     """

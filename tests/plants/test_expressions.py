@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import pickle
 import time
+from types import SimpleNamespace
 
 import casadi as ca
 import pytest
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 
 from seaopt.errors import PlantError, SeaoptError
 from seaopt.plants.equations.expressions import FUNCTIONS, MAX_LENGTH, list_names, parse
+from seaopt.plants.equations.stored_equations import store_function
 
 X, Y = 0.7, -1.3
 SYMBOLS = {"x": ca.SX.sym("x"), "y": ca.SX.sym("y")}
@@ -200,3 +203,8 @@ def test_slopes_at_a_switch_are_those_that_the_documentation_states():
     for x in (-1.0, 0.0):
         assert slope("if_else(x > 0, sqrt(x), 0)", x) == slope("if_else(x > 0, log(x), 0)", x) == 0.0
     assert math.isnan(slope("sqrt(max(x, 0))", -1.0))
+
+
+def test_a_function_stored_as_expressions_survives_pickling():
+    again = pickle.loads(pickle.dumps(store_function(lambda x, p: {"v": p.k * x.q}, ["q", "v"], ["k"])))
+    assert float(again(SimpleNamespace(q=2.0, v=0.0), SimpleNamespace(k=3.0))["v"]) == 6.0

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.errors import PlantError
+from seaopt.plants.friction import list_fall_parameters
 
 LOAD = {"c_m": 0.12, "c_e": 0.25, "c_ms": 0.05, "c_es": 0.1, "q_m": 0.7, "q_e": 1.3}
 PARTS = {
@@ -118,3 +119,8 @@ def test_parts_that_need_others_are_refused():
         so.plants.rotary(parts=["load_stribeck"])
     with pytest.raises(PlantError, match="needs load_friction"):
         so.plants.high_impedance(parts=["stribeck", "load_square"])
+
+
+def test_the_parameters_that_friction_falls_with():
+    plant = so.plants.high_impedance(parts=["stribeck"])
+    assert list_fall_parameters(plant, plant.friction["F_f"]) == ("f_c", "f_s", "v_st")

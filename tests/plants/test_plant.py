@@ -8,6 +8,7 @@ import pytest
 
 import seaopt as so
 from seaopt.errors import ParameterError, PlantError
+from seaopt.plants.memo import memo
 
 GOOD = {
     "name": "cart",
@@ -102,3 +103,16 @@ def test_parameters_are_completed_once():
     assert swing.complete(values).given is given
     assert "delay_s" not in values.drop_conditions().given
     assert not isinstance(values.update(J=1e-6), type(values))
+
+
+def test_a_result_is_computed_once_for_each_plant():
+    counted = []
+
+    @memo
+    def count_states(plant: so.Plant) -> int:
+        counted.append(plant)
+        return len(plant.states)
+
+    plants = so.plants.high_impedance(), so.plants.moving_output()
+    assert [count_states(plant) for plant in (*plants, *plants)] == [2, 4, 2, 4]
+    assert counted == [*plants]

@@ -8,6 +8,7 @@ import pytest
 
 import seaopt as so
 from seaopt.problem import json_schema
+from seaopt.problem.problem import name_after
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = so.demo_path().read_text(encoding="utf-8")
@@ -316,3 +317,7 @@ def test_a_parameter_of_another_kind_of_actuator_is_noted(tmp_path):
     path.write_text('schema = 1\n[parameters]\nJ = 4e-5\nk_s = 350\n[plant.elbow]\nkind = "rotary"\n')
     (note,) = so.read_problem(path).notes
     assert "parameters.J " in note and "J_" in note
+
+
+def test_an_experiment_is_named_after_its_file():
+    assert (name_after("knee left.2"), name_after("7")) == ("knee_left_2", "log_7")

@@ -14,8 +14,9 @@ from seaopt.cli.terminal import Terminal
 from seaopt.estimation.result.findings import DerivedFigure
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Item, Mark, Reason, Section, Table, Verdict
-from seaopt.reporting.sections.glossary import GLOSSARY
+from seaopt.reporting.sections.glossary import GLOSSARY, explain_terms
 from seaopt.reporting.sections.html import render_section
+from seaopt.reporting.sections.kinds.fit import spell_cure
 from seaopt.reporting.sections.text import Most, join, render_sections, render_table, render_verdict
 
 WORDS = "a limit of the loop on the plant that swings is missed by some draws"
@@ -109,3 +110,13 @@ def test_terms_are_explained_under_the_pointer(fitted, certificate, tmp_path, wi
     assert all(html.unescape(meaning) == GLOSSARY[term] for meaning, term in explained)
     section = Section(title="", tables=(Table(head=("<Ms>", "Mss"), rows=(("worst Ms", "a"),)),))
     assert re.findall(r"<abbr[^>]*>(\w+)</abbr>", render_section(section)) == ["Ms", "Ms"]
+
+
+def test_a_term_is_marked_with_its_meaning():
+    assert explain_terms("whiteness p") == f'<abbr title="{html.escape(GLOSSARY["whiteness p"])}">whiteness p</abbr>'
+
+
+def test_a_cure_is_a_line_of_the_problem_file():
+    delay = spell_cure("chirp.delay_s", 0.004)
+    assert delay == "delay_s = { value = 0.004, free = true, max = 0.02 } in the [[experiment]] chirp"
+    assert spell_cure("f_c", 12.0) == "f_c = { value = 12, free = true } in [parameters]"

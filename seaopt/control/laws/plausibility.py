@@ -59,8 +59,9 @@ class GateState:
 
 @record(keywords=True)
 class GateSpec:
-    """The options of a gate: which readings a running law is to believe, and what it does about the others. Raises
-    ControlError: a value is out of range.
+    """The options of a gate: which readings a running law is to believe, and what it does about the others.
+
+    Raises ControlError: a value is out of range.
     """
 
     range_N: tuple[float, float] = option(

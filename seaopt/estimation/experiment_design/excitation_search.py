@@ -132,9 +132,8 @@ class Measure:
 
 
 def make_measure(bench: Bench, criterion: str) -> Measure:
-    """Return the criterion of a name: "A", "D" or a free parameter's.
-
-    Raises EstimationError: the name is unknown, or a parameter whose relative variance counts is zero.
+    """Return the criterion of a name: "A", "D" or a free parameter's. Raises EstimationError: the name is unknown, or a
+    parameter whose relative variance counts is zero.
     """
     names = bench.model.free
     if criterion == "D":
@@ -182,9 +181,8 @@ class ExcitationSearch:
         return float(np.max(shares)) if np.all(np.isfinite(shares)) else np.inf
 
     def scale_to_limits(self, excitation: Excitation) -> Candidate:
-        """Scale the excitation to be as large as the limits allow.
-
-        Raises EstimationError: no size was found within them.
+        """Scale the excitation to be as large as the limits allow. Raises EstimationError: no size was found within
+        them.
         """
         u = self.bench.samples(excitation)
         low, high, factor = 0.0, np.inf, 1.0
@@ -215,9 +213,8 @@ def _choose_better(best: Candidate | None, candidate: Candidate) -> Candidate:
 
 
 def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: Multisines) -> Candidate:
-    """Return the best multisine within the limits.
-
-    Raises EstimationError: nothing in the band distinguishes the free parameters, or a setting is out of range.
+    """Return the best multisine within the limits. Raises EstimationError: nothing in the band distinguishes the free
+    parameters, or a setting is out of range.
     """
     bench = search.bench
     if chosen.lines < 1 or not 0.0 <= chosen.spread < 1.0:

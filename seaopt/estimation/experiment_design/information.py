@@ -114,10 +114,7 @@ class Bench:
         )
 
     def refine_steps(self, u: Signal) -> Bench:
-        """Return the bench with integration steps that are fine enough for `u`.
-
-        Raises EstimationError: no step is.
-        """
+        """Return the bench with integration steps that are fine enough for `u`. Raises EstimationError: no step is."""
         substeps = self.substeps
         while not self.model.linear:
             coarse, fine = self._pass(u, substeps).outputs, self._pass(u, 2 * substeps).outputs
@@ -163,9 +160,8 @@ def make_bench(
     input_name: str | None,
     watched: tuple[str, ...] = (),
 ) -> Bench:
-    """Return a bench for the free parameters of `params`; the outputs in `sigma` are measured.
-
-    Raises EstimationError: nothing is free, or a name or a value is wrong.
+    """Return a bench for what is free in `params`; the outputs in `sigma` are measured. Raises EstimationError: nothing
+    is free, or a name or a value is wrong.
     """
     if not isinstance(sigma, Mapping) or not sigma:
         raise EstimationError(f"sigma = {sigma!r}; give a mapping of each measured output to its noise")

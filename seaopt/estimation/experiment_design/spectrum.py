@@ -49,15 +49,8 @@ class Spectrum:
 
 
 def choose_harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Harmonics:
-    """Return at most `lines` log-spaced multiples of rate_hz/n in a band.
-
-    Raises EstimationError: no multiple lies in the band.
-
-    Examples
-    --------
-    >>> choose_harmonics(400, 400.0, (1.0, 100.0), 3)
-    array([  1,  10, 100])
-
+    """Return at most `lines` log-spaced multiples of rate_hz/n in a band. Raises EstimationError: no multiple lies in
+    the band.
     """
     low, high = band_hz
     first, last = max(int(np.ceil(low * n / rate_hz - 1e-9)), 1), min(int(high * n / rate_hz + 1e-9), (n - 1) // 2)
@@ -80,11 +73,10 @@ def make_spectrum(
     channel: int,
     signals: list[int],
 ) -> Spectrum:
-    """Return the spectrum of a plant, linearised at rest where it is not linear.
-
-    `model`, `theta`, `clock`: the plant, its free parameters and the hold; `multiples`: the lines, in multiples of
-    1/(n period); `n`: samples; `sigma`: noise of the first nm outputs, those that are measured; `channel`: the
-    input that is excited; `signals`: limited signals: -1 is the input, then the outputs, then the states.
+    """Return the spectrum of a plant, linearised at rest where it is not linear. `model`, `theta`, `clock`: the plant,
+    its free parameters and the hold; `multiples`: the lines, in multiples of 1/(n period); `n`: samples; `sigma`: noise
+    of the first nm outputs, those that are measured; `channel`: the input that is excited; `signals`: limited signals:
+    -1 is the input, then the outputs, then the states.
     """
     nx = model.nx
     response = sampled_signals(linearise(model), theta, clock, multiples / (n * clock.period), channel)
@@ -101,21 +93,10 @@ def optimal_powers(
     weight: ParameterMatrix | None,
     prior: ParameterMatrix | None = None,
 ) -> Lines:
-    """Return the powers that minimise trace(W F^-1), or -log det F, within linear limits.
-
-    `information`: F = sum_k P_k information[k] + prior; `budget`: budget @ P <= 1; not negative, and no column
-    zero; `weight`: W; None for the determinant; `prior`: information from elsewhere.
-
-    Raises EstimationError: some direction of the parameters shows at no line.
-
-    Examples
-    --------
-    Of two lines, the one that informs four times as much gets twice the power if sum of variances counts less:
-
-    >>> lines = np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
-    >>> optimal_powers(lines, np.ones((1, 2)), weight=np.eye(2)).round(4)
-    array([0.3333, 0.6667])
-
+    """Return the powers that minimise trace(W F^-1), or -log det F, within linear limits. `information`: F = sum_k P_k
+    information[k] + prior; `budget`: budget @ P <= 1; not negative, and no column zero; `weight`: W; None for the
+    determinant; `prior`: information from elsewhere. Raises EstimationError: some direction of the parameters shows at
+    no line.
     """
     k, p = information.shape[:2]
     even = np.full(k, 1.0 / np.max(np.sum(budget, axis=1)))
@@ -157,10 +138,7 @@ def _substitute_forward(upper: Any, right: Any, p: int) -> Any:
 
 
 def _inverse_root(matrix: ParameterMatrix) -> ParameterMatrix:
-    """Return S with S' M S = 1.
-
-    Raises EstimationError: M is singular.
-    """
+    """Return S with S' M S = 1. Raises EstimationError: M is singular."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
     if not np.all(np.isfinite(values)) or values[0] <= SINGULAR * values[-1]:
@@ -177,10 +155,8 @@ def schroeder_phases(powers: Lines) -> Lines:
 
 
 def low_peak_phases(lines: Signals, multiples: Harmonics, n: int, start: Lines) -> Lines:
-    """Return phases that make the largest of m periodic signals over n samples small.
-
-    `lines`: signal m is Im sum_k lines[m, k] exp(i (phase_k + 2 pi places_k t/n)); `multiples`: harmonics; `n`:
-    samples; `start`: first phases.
+    """Return phases that make the largest of m periodic signals over n samples small. `lines`: signal m is Im sum_k
+    lines[m, k] exp(i (phase_k + 2 pi places_k t/n)); `multiples`: harmonics; `n`: samples; `start`: first phases.
     """
     from scipy.optimize import minimize  # deferred: 0.3 s
 

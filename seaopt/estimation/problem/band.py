@@ -17,11 +17,8 @@ def sees_level(band_hz: tuple[float, float] | None) -> bool:
 
 @lru_cache(maxsize=32)
 def design_filter(band_hz: tuple[float, float] | None, period: float) -> tuple[Float[np.ndarray, "m 5"], int]:
-    """Return the sections of a Butterworth filter of order 4 for a band, and the samples it takes to settle.
-
-    An edge at 0 or at the Nyquist frequency needs no filter.
-
-    Raises EstimationError: the band is empty.
+    """Return the sections of a Butterworth filter of order 4 for a band, and the samples it takes to settle. An edge at
+    0 or at the Nyquist frequency needs no filter. Raises EstimationError: the band is empty.
     """
     none = np.zeros((0, 5)), 0
     if band_hz is None:

@@ -389,14 +389,10 @@ def cut_into_shots(n: int, shots: int) -> Int[np.ndarray, " shots1"]:
 
 
 def check_shots(experiment: Experiment, longest: int, shots: int, setting: str) -> None:
-    """Refuse shots too short for the states they start from.
-
-    As many samples of one output as there are states determine the state at a shot's start, where it can be determined;
-    with no more than that, a shot would follow its log whatever the parameters are. Segments shorter than the longest
-    are cut into fewer.
-
-    Raises EstimationError: the longest segment does not have a sample more than the plant has states, and at least
-    four, for each shot.
+    """Refuse shots too short for the states they start from. As many samples of one output as there are states
+    determine the state at a shot's start, where it can be determined; with no more than that, a shot would follow its
+    log whatever the parameters are. Segments shorter than the longest are cut into fewer. Raises EstimationError: the
+    longest segment does not have a sample more than the plant has states, and at least four, for each shot.
     """
     states = len(experiment.plant.states)
     least = max(SHORTEST_SHOT, states + 1)

@@ -162,9 +162,8 @@ class FitProblem:
 
     @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which callers check
     def assemble(self, passes: PassSet, to: Vector | None = None) -> Evaluation:
-        """Return the evaluation that passes give: other sigmas need no other passes.
-
-        It is that of `to`, if given, as far as residuals are straight to there.
+        """Return the evaluation that passes give: other sigmas need no other passes. It is that of `to`, if given, as
+        far as residuals are straight to there.
         """
         z, n, unknowns = passes.z, passes.z.size, self.unknowns
         cost, gradient, hessian = unknowns.prior(z)
@@ -217,7 +216,6 @@ class FitProblem:
         self, params: ParameterSet, z: Vector, data: Mapping[str, Experiment] | None = None
     ) -> tuple[FitProblem, Float[np.ndarray, " m"]]:
         """Return the problem with other parameters free, and `z` in its unknowns; new ones are at their start.
-
         `params`: whose free ones are the unknowns; `z`: unknowns of this problem; `data`: experiments that take the
         place of those of the same name.
         """
@@ -245,7 +243,6 @@ def pose_problem(
     noise: bool = False,
 ) -> FitProblem:
     """Return the problem of fitting the free parameters to experiments; with `noise`, their process noise too.
-
     Parameters that are left out have their plants' defaults.
     """
     names = [experiment.name for experiment in experiments]

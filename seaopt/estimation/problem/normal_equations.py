@@ -51,11 +51,9 @@ M = TypeVar("M", bound=QuadraticModel, covariant=True)
 def add_gram(
     normal: Float[np.ndarray, "... m m"], gram: Float[np.ndarray, "... nc nc"], places: Int[np.ndarray, " nd"]
 ) -> None:
-    """Add a Gram matrix of [residual, derivatives] to the normal matrix of [residual, unknowns], in place.
-
-    `normal`: shape (..., 1 + n, 1 + n), row 0 the gradient behind the residual's square; `gram`: shape
-    (..., 1 + nd, 1 + nd), of one output of a pass, in sigma; `places`: the unknown of each derivative, -1 where that
-    is known.
+    """Add a Gram matrix of [residual, derivatives] to the normal matrix of [residual, unknowns], in place. `normal`:
+    shape (..., 1 + n, 1 + n), row 0 the gradient behind the residual's square; `gram`: shape (..., 1 + nd, 1 + nd), of
+    one output of a pass, in sigma; `places`: the unknown of each derivative, -1 where that is known.
     """
     used = np.flatnonzero(places >= 0)
     to, of = np.concatenate([[0], 1 + places[used]]), np.concatenate([[0], 1 + used])
@@ -133,18 +131,8 @@ class ArrowShape:
 
 
 def find_arrow(matrix: Matrix) -> ArrowShape | None:
-    """Return the shape of a matrix that is an arrow of many small blocks; None where that would save nothing.
-
-    Unknowns that meet far more others than the usual one does are the shaft; what is left falls apart into blocks.
-
-    Examples
-    --------
-    >>> matrix = np.eye(200)
-    >>> matrix[0, :] = matrix[:, 0] = 0.05
-    >>> shape = find_arrow(matrix)
-    >>> shape.shaft.tolist(), [rows.shape for rows in shape.blocks]
-    ([0], [(199, 1)])
-
+    """Return the shape of a matrix that is an arrow of many small blocks; None where that would save nothing. Unknowns
+    that meet far more others than the usual one does are the shaft; what is left falls apart into blocks.
     """
     if len(matrix) < FEWEST:
         return None

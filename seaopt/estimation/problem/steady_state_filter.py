@@ -42,9 +42,8 @@ class SteadyStateFilter:
     follows: bool = True  # whether to compute the gain's derivatives; False: a constant gain
 
     def correction(self, model: Model, point: Point, noise: Float[np.ndarray, " q"]) -> Float[np.ndarray, "ns1 nx ny"]:
-        """Return the gain, then its derivatives in the order of `Layout`: theta, a free delay, the noise.
-
-        `noise` is empty where it is not estimated: the filter then hardly trusts the plant.
+        """Return the gain, then its derivatives in the order of `Layout`: theta, a free delay, the noise. `noise` is
+        empty where it is not estimated: the filter then hardly trusts the plant.
         """
         free_delay = point.clock.delay_free
         base = np.concatenate([point.theta, noise])
@@ -107,13 +106,10 @@ def kalman_gain(
     q: Float[np.ndarray, "t nx"],
     r: PerOutput,
 ) -> Float[np.ndarray, "t nx ny"]:
-    """Return the predictor's steady-state gain of each plant; not finite where there is none.
-
-    What no output shows, as the place of a free body under force sensors, would drift without bound: it is left out of
-    the filter and not corrected.
-
-    `a`, `c`: the plants over one sample; `q`, `r`: variances of the process noise per state, and of the measurement
-    noise per output.
+    """Return the predictor's steady-state gain of each plant; not finite where there is none. What no output shows, as
+    the place of a free body under force sensors, would drift without bound: it is left out of the filter and not
+    corrected. `a`, `c`: the plants over one sample; `q`, `r`: variances of the process noise per state, and of the
+    measurement noise per output.
     """
     with np.errstate(all="ignore"):
         scaled = c / np.sqrt(r)[:, None]

@@ -136,14 +136,10 @@ def collect(
     noise: bool = False,
     band_hz: tuple[float, float] | None = None,
 ) -> tuple[Unknowns, tuple[tuple[Model, Slots], ...]]:
-    """Return the unknowns of a fit, and of each experiment its model in the free parameters, and its slots.
-
-    With `noise`, the process noise is unknown too.
-
-    A band that leaves out 0 Hz does not see offsets and drifts, nor an initial state that is forgotten before the band
-    filter has settled: those are then not estimated.
-
-    Raises EstimationError: a free parameter belongs to no plant of the experiments.
+    """Return the unknowns of a fit, and of each experiment its model in the free parameters, and its slots. With
+    `noise`, the process noise is unknown too. A band that leaves out 0 Hz does not see offsets and drifts, nor an
+    initial state that is forgotten before the band filter has settled: those are then not estimated. Raises
+    EstimationError: a free parameter belongs to no plant of the experiments.
     """
     used = {name for e in experiments for name in e.plant.parameters if name not in e.parameters}
     used |= {local.name for experiment in experiments for local in experiment.list_own().values()}
@@ -231,7 +227,6 @@ def _add_initial(
     builder: _Builder, experiment: Experiment, model: Model, forgotten: bool
 ) -> tuple[tuple[Slot, ...], ...]:
     """Add the initial states: a known one is that of each segment of the log; shots within one start from unknown ones.
-
     Friction that sticks soon stops a joint whatever its speed was: where no sample shows the speed, it started at rest.
     """
     plant, initial = experiment.plant, experiment.initial_state
@@ -254,10 +249,9 @@ def _add_initial(
 
 
 def _scale_stopped_speeds(builder: _Builder, experiment: Experiment, model: Model) -> dict[str, float]:
-    """Return how fast the states that sticking friction stops could move without it, where anything drives them.
-
-    That is what the log's largest input makes of the linearised plant within some hundred samples, at the first values
-    of what is free: a speed that no joint has at its start, and that holds one which no sample shows.
+    """Return how fast the states that sticking friction stops could move without it, where anything drives them. That
+    is what the log's largest input makes of the linearised plant within some hundred samples, at the first values of
+    what is free: a speed that no joint has at its start, and that holds one which no sample shows.
     """
     plant, nx = experiment.plant, model.nx
     if not model.sticks:

@@ -51,7 +51,6 @@ class _Target:
 
 def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple[list[Vector], bool]:
     """Return unknowns with shared parameters that match the frequency responses, the best first, and whether it does.
-
     None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
     """
     unknowns = problem.unknowns

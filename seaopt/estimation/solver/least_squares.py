@@ -78,12 +78,12 @@ def minimise(
 ) -> Solution[M]:
     """Minimise a sum of squares from `start`, inside the bounds.
 
-    `objective`: gives cost, gradient and Gauss-Newton Hessian at any point; `start`: first point, or the model
-    there; `low`, `high`: bounds; `first_radius`: of the region, over the size of the first point; `decrement`:
-    squared standard deviations to the minimum at which to stop; `max_iterations`: evaluations after the first;
-    `callback`: called with the iteration and the cost; `follow`: (model, z) -> what it says of a z nearby if
-    residuals are straight from there: then a last step needs no evaluation of its own once the whole steps before
-    it have shown how straight they are; `before`: of the search that this one goes on from.
+    `objective`: gives cost, gradient and Gauss-Newton Hessian at any point; `start`: first point, or the model there;
+    `low`, `high`: bounds; `first_radius`: of the region, over the size of the first point; `decrement`: squared
+    standard deviations to the minimum at which to stop; `max_iterations`: evaluations after the first; `callback`:
+    called with the iteration and the cost; `follow`: (model, z) -> what it says of a z nearby if residuals are straight
+    from there: then a last step needs no evaluation of its own once the whole steps before it have shown how straight
+    they are; `before`: of the search that this one goes on from.
     """
     current = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
     if not np.isfinite(current.cost):
@@ -154,7 +154,6 @@ def minimise(
 
 def _is_straight(distance: float, before: float, allowed: float) -> bool:
     """Tell from two distances to the minimum, squared, whether the next step may be followed without an evaluation.
-
     Whole steps square what is left of the distance: it falls by r = distance / before to the power of two, and then of
     four; all are squares. A tenth of the distance allowed is asked of that, for it is not quite so in many dimensions.
     If steps only shortened the distance by one factor, what is left would still be small.

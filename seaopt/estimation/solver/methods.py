@@ -216,11 +216,9 @@ class PredictionError(Method):
 
 
 def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Vector]]:
-    """Return the better of the given values and the best guess of the frequency responses, and all the guesses.
-
-    A guess that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode
-    a little off is out of phase after some periods. On short shots, or held to the log, such a guess finds the
-    mode.
+    """Return the better of the given values and the best guess of the frequency responses, and all the guesses. A guess
+    that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode a little
+    off is out of phase after some periods. On short shots, or held to the log, such a guess finds the mode.
     """
     if not method.search or not problem.unknowns.shared:
         return problem.evaluate(problem.unknowns.start), []
@@ -243,9 +241,8 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
 
 
 def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> Solved:
-    """Return the better of a minimum and one from where parameters that lost their effect are at their start again.
-
-    So friction's fall over a speed that becomes tiny: nothing brings it back, and the others have taken its place.
+    """Return the better of a minimum and one from where parameters that lost their effect are at their start again. So
+    friction's fall over a speed that becomes tiny: nothing brings it back, and the others have taken its place.
     """
     problem, evaluation, shared = solved.problem, solved.solution.evaluation, solved.problem.unknowns.shared
     if not np.isfinite(evaluation.cost) or not np.all(np.isfinite(evaluation.hessian)):
@@ -287,10 +284,9 @@ def _is_doubtful(solved: Solved, guesses: list[Vector]) -> bool:
 
 
 def _is_hopeless(problem: FitProblem, start: Evaluation, best: Solved) -> bool:
-    """Tell whether a start, settled roughly, explains little and no more than the best: most that go astray stay so.
-
-    To find its minimum all the same takes the longest: where nothing is explained the search creeps, and simulations
-    that run away ask for ever finer steps.
+    """Tell whether a start, settled roughly, explains little and no more than the best: most that go astray stay so. To
+    find its minimum all the same takes the longest: where nothing is explained the search creeps, and simulations that
+    run away ask for ever finer steps.
     """
     if not np.isfinite(best.misfit):
         return False

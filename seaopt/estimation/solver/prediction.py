@@ -26,10 +26,9 @@ LINEARISED_AT = 48  # over which a nonlinear plant is linearised for its filter
 
 
 def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -> Vector | None:
-    """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log.
-
-    The filter does not trust the plant, so that a plant that is far off predicts badly but cannot run away; its gain
-    is recomputed from the states visited, a few times. None where no step is finite.
+    """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log. The
+    filter does not trust the plant, so that a plant that is far off predicts badly but cannot run away; its gain is
+    recomputed from the states visited, a few times. None where no step is finite.
     """
     problem = problem.with_each(substeps=1, loss=Squares(), band_hz=None)
     z = start.copy()
@@ -60,9 +59,8 @@ def add_predictors(problem: FitProblem, z: Vector, *, follows: bool) -> FitProbl
 
 
 def _estimate_noise(experiment: FitExperiment) -> PerOutput:
-    """Return the standard deviation of white noise on each output, from its first samples that are not held out.
-
-    On a smooth signal that is the median third difference, over sqrt(20).
+    """Return the standard deviation of white noise on each output, from its first samples that are not held out. On a
+    smooth signal that is the median third difference, over sqrt(20).
     """
     used, noise = experiment.segments[0].mark_counted(0, slice(0, FIRST_SAMPLES)), list[float]()
     for o, channel in enumerate(experiment.segments[0].samples.y):

@@ -60,10 +60,9 @@ class Solved:
 
 
 def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
-    """Minimise; estimate the unknown sigmas and refine the step until neither changes.
-
-    What friction that sticks soon stops is at rest at first: a search that is far off would throw the joint, and end
-    where it swings in place of what drives it.
+    """Minimise; estimate the unknown sigmas and refine the step until neither changes. What friction that sticks soon
+    stops is at rest at first: a search that is far off would throw the joint, and end where it swings in place of what
+    drives it.
     """
 
     def solve(stage: FitProblem, evaluation: Evaluation) -> Solved:
@@ -79,12 +78,11 @@ def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback
 
 
 def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem, Evaluation], Solved]) -> Solved:
-    """Solve a problem; friction's free smoothing speeds fall by stages, as long as the logs gain by it.
-
-    The sharper friction is, the stiffer is the plant and the less do the logs tell how sharp: a search that went
-    straight down would end where nothing can be simulated. Each stage lets a speed fall to a quarter. The last is the
-    one that ends above that, beyond which the next gains no more than chance gives, as its slope or its minimum tells,
-    or takes too fine steps.
+    """Solve a problem; friction's free smoothing speeds fall by stages, as long as the logs gain by it. The sharper
+    friction is, the stiffer is the plant and the less do the logs tell how sharp: a search that went straight down
+    would end where nothing can be simulated. Each stage lets a speed fall to a quarter. The last is the one that ends
+    above that, beyond which the next gains no more than chance gives, as its slope or its minimum tells, or takes too
+    fine steps.
     """
     places, unknowns = problem.find_smoothing(), problem.unknowns
     if not places:

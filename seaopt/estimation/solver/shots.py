@@ -31,7 +31,6 @@ NEAR = 1.0  # squared standard deviations to the minimum, near enough to go on f
 
 def find_start_on_shots(problem: FitProblem, start: Vector) -> Vector | None:
     """Return the unknowns of a linear plant with shared parameters that follow longer and longer shots of the logs.
-
     None where the logs are too short to be cut, or where the plant runs away even so.
     """
     samples = max(e.longest for e in problem.experiments)
@@ -76,10 +75,9 @@ def grow_shots(
 
 
 def cut_problem(problem: FitProblem, z: Vector, count: int) -> tuple[FitProblem, Float[np.ndarray, " m"]]:
-    """Return the problem with `count` shots in place of each, and its unknowns.
-
-    Shots of a nonlinear plant start where a filter that hardly trusts the plant sees the state. Those of a linear one
-    start anywhere: their best initial states follow from one evaluation.
+    """Return the problem with `count` shots in place of each, and its unknowns. Shots of a nonlinear plant start where
+    a filter that hardly trusts the plant sees the state. Those of a linear one start anywhere: their best initial
+    states follow from one evaluation.
     """
     data = {e.name: replace(e.data, shots=e.data.shots * count) for e in problem.experiments}
     shots, values = problem.rebuild(problem.params, z, data)

@@ -79,10 +79,9 @@ def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most:
 
 
 def hold_bristles(problem: FitProblem) -> FitProblem:
-    """Return the problem with steps short enough for bristles at the start, which are stiff where they slip.
-
-    How fast they slip only a simulation tells: with steps too long for it that overflows, or makes a cost that half as
-    long ones change.
+    """Return the problem with steps short enough for bristles at the start, which are stiff where they slip. How fast
+    they slip only a simulation tells: with steps too long for it that overflows, or makes a cost that half as long ones
+    change.
     """
     if not any(remembers(experiment.data.plant) for experiment in problem.experiments):
         return problem
@@ -103,7 +102,6 @@ def hold_bristles(problem: FitProblem) -> FitProblem:
 
 def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
     """Return the problem with steps whose error is small, its evaluation there, and the errors that are known there.
-
     That of a step that was made finer is not: its order says how fine it must be, and the next minimum is looked at.
     """
     while True:
@@ -163,11 +161,10 @@ def _choose_steps(steps: int, error: StepError, allowed: float, order: int) -> i
 
 @np.errstate(all="ignore")
 def measure_step_error(problem: FitProblem, experiment: FitExperiment, evaluation: Evaluation) -> StepError:
-    """Return the integration error of an experiment, from the change that steps of half the length bring.
-
-    In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far
-    below the noise can add up over a long log. In an output it is the largest change, in sigma, over each segment's
-    first samples.
+    """Return the integration error of an experiment, from the change that steps of half the length bring. In a
+    parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far below
+    the noise can add up over a long log. In an output it is the largest change, in sigma, over each segment's first
+    samples.
     """
     if experiment.model.linear:
         return StepError()

@@ -216,10 +216,9 @@ class _ProfileCurve:
         return float(rise)
 
     def find_end(self, target: float) -> tuple[float, bool]:
-        """Return where tau reaches the target, and whether it does before the parameter's bound.
-
-        The value is smooth in tau, nearly straight: each trial is where the parabola through the nearest three points
-        reaches the target, kept inside what brackets it.
+        """Return where tau reaches the target, and whether it does before the parameter's bound. The value is smooth in
+        tau, nearly straight: each trial is where the parabola through the nearest three points reaches the target, kept
+        inside what brackets it.
         """
         estimate = self.values[0]
         limit = float((self.problem.unknowns.high if target > 0.0 else self.problem.unknowns.low)[self.index])

@@ -96,27 +96,11 @@ Explain = Callable[[str], str | None]  # why a name may not stand in a text; Non
 
 
 def parse(text: str, symbols: Mapping[str, Any], place: str, explain: Explain = lambda name: None) -> Any:
-    r"""Return the CasADi expression that a text stands for.
-
-    `text`: in the grammar above, of at most 10,000 characters. `symbols`: what the text may name, besides the functions
-    and `pi`. `place`: what the text is, for messages, such as "f.omega". `explain`: why a name that is not among the
-    symbols may not stand here, for messages; None where it is not known. Returned: a scalar. Raises PlantError: the
-    text is not in the grammar, names what is not known, is too long, or is no finite number; the message is one line,
-    and a note of the error shows the place in the text.
-
-    Examples
-    --------
-    >>> x = ca.SX.sym("x")
-    >>> parse("-x^2 + 2^-1", {"x": x}, "f.x")
-    SX((0.5-sq(x)))
-    >>> try:
-    ...     parse("2*(x + y)", {"x": x}, "f.x")
-    ... except PlantError as error:
-    ...     print(error, *error.__notes__, sep="\n")
-    f.x, column 8: unknown name "y"; known: x
-        f.x = 2*(x + y)
-                     ^
-
+    r"""Return the scalar CasADi expression that a text, of at most 10,000 characters, stands for in the grammar above.
+    `symbols`: what it may name, besides the functions and `pi`. `place`: what the text is, for messages, such as
+    "f.omega". `explain`: why a name that is not among the symbols may not stand here; None where it is not known.
+    Raises PlantError: the text is not in the grammar, names what is not known, is too long, or is no finite number; a
+    note of the error shows the place in the text.
     """
     if len(text) > MAX_LENGTH:
         raise PlantError(f"{place} has {len(text)} characters; give at most {MAX_LENGTH}, or use definitions")
@@ -124,14 +108,7 @@ def parse(text: str, symbols: Mapping[str, Any], place: str, explain: Explain = 
 
 
 def list_names(text: str) -> list[str]:
-    """Return the names in a text, functions among them, each once.
-
-    Examples
-    --------
-    >>> list_names("k*(x - sin(y)) + k")
-    ['k', 'x', 'sin', 'y']
-
-    """
+    """Return the names in a text, functions among them, each once."""
     names = (match["name"] for match in _TOKEN.finditer(text[:MAX_LENGTH]))
     return list(dict.fromkeys(name for name in names if name is not None))
 

@@ -36,19 +36,9 @@ class StoredFunction:
 
 
 def store_function(function: Callable[..., Any], *arguments: Iterable[str] | str) -> StoredFunction:
-    """Return a function as its expressions.
-
-    `function`: returns expressions, alone or in mappings and tuples (with texts among them). `*arguments`: the
-    attributes of each argument; a single text stands for an argument that is one symbol.
-
-    Examples
-    --------
-    >>> import pickle
-    >>> stored = store_function(lambda x, p: {"v": p.k * x.q}, ["q", "v"], ["k"])
-    >>> again = pickle.loads(pickle.dumps(stored))
-    >>> float(again(SimpleNamespace(q=2.0, v=0.0), SimpleNamespace(k=3.0))["v"])
-    6.0
-
+    """Return a function as its expressions. `function`: returns expressions, alone or in mappings and tuples (with
+    texts among them). `*arguments`: the attributes of each argument; a single text stands for an argument that is one
+    symbol.
     """
     symbols: dict[tuple[int, str | None], Any] = {}
     symbolic: list[Any] = []

@@ -54,20 +54,9 @@ class HeatGuard:
     def of_rating(
         cls, rating: MotorRating, sample_time_s: float, *, approach_s: float | None = None, margin_K: float = 0.0
     ) -> HeatGuard:
-        """Return the guard of a motor.
-
-        `sample_time_s`: of the law. `approach_s`: tau; a twentieth of the winding's time constant if left out.
-        `margin_K`: how far below its largest temperature the winding is to stay, for what the network leaves out.
-        Raises ControlError: a number is out of range.
-
-        Examples
-        --------
-        >>> import seaopt as so
-        >>> plant = so.plants.rotary(parts=["thermal"])
-        >>> guard = HeatGuard.of_rating(so.plants.rate_motor(plant, plant.defaults), 1e-3)
-        >>> print(f"{guard.limit((0.0, 0.0)):.1f} A cold, {guard.limit((100.0, 80.0)):.3f} A at 125 degC")
-        45.8 A cold, 3.789 A at 125 degC
-
+        """Return the guard of a motor. `sample_time_s`: of the law. `approach_s`: tau; a twentieth of the winding's
+        time constant if left out. `margin_K`: how far below its largest temperature the winding is to stay, for what
+        the network leaves out. Raises ControlError: a number is out of range.
         """
         tau = APPROACH * rating.time_constants_s()[0] if approach_s is None else approach_s
         for name, value in (("sample_time_s", sample_time_s), ("approach_s", tau)):

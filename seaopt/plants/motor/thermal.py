@@ -118,9 +118,8 @@ def winding() -> Plant:
 
 
 def add_heat(plant: Plant) -> Plant:
-    """Return a plant whose motor warms up.
-
-    Raises PlantError: the plant's actuation is no current, or it has one of the names.
+    """Return a plant whose motor warms up. Raises PlantError: the plant's actuation is no current, or it has one of the
+    names.
     """
     actuation = plant.actuation
     if actuation is None or plant.inputs[actuation.input] != "A":
@@ -427,11 +426,9 @@ def rate_motor(plant: Plant, params: ParameterSet, largest: float | None = None)
 
 
 def find_warm_range(plant: Plant, params: ParameterSet) -> tuple[float, float] | None:
-    """Return the winding's temperatures that a loop meets, from the ambient's to T_max, degC.
-
-    None where the winding does not warm up, or a current is commanded, which its resistance does not change. A plant
-    that is linearised has its winding at T_ambient: drawn from this range, that makes R warm, with whatever else is
-    uncertain of R.
+    """Return the winding's temperatures that a loop meets, from the ambient's to T_max, degC. None where the winding
+    does not warm up, or a current is commanded, which its resistance does not change. A plant that is linearised has
+    its winding at T_ambient: drawn from this range, that makes R warm, with whatever else is uncertain of R.
     """
     if plant.winding is None or plant.actuation is None or plant.inputs[plant.actuation.input] == "A":
         return None

@@ -37,9 +37,8 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
 
 
 def read_deflection(plant: Plant) -> Plant:
-    """Return a plant with one more output, tau_d or F_d: what two encoders make of the spring's deflection.
-
-    Raises PlantError: the plant states no spring, or not what is regulated, or has such an output.
+    """Return a plant with one more output, tau_d or F_d: what two encoders make of the spring's deflection. Raises
+    PlantError: the plant states no spring, or not what is regulated, or has such an output.
     """
     spring, sensing = plant.spring, plant.sensing
     if spring is None or sensing is None or not sensing.regulated:
@@ -67,7 +66,6 @@ def read_deflection(plant: Plant) -> Plant:
 
 def weigh_encoders(plant: Plant, output: str) -> dict[str, Any]:
     """Return how much an output moves with what each encoder reads: {output or state that is read: expression of p}.
-
     Empty where the output is not computed from encoders. Behind a delay or a load cell these are the weights inside.
     """
     sensing, port = plant.sensing, plant.port
@@ -106,17 +104,7 @@ def _weigh_inside(plant: Plant, output: str, p: Any) -> dict[str, Any]:
 
 
 def evaluate_weights(plant: Plant, params: CompletedParameters, output: str) -> dict[str, float]:
-    """Return the numbers of `weigh_encoders`.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> plant = so.plants.rotary(parts=["deflection_sensor"])
-    >>> params = plant.complete(so.ParameterSet.of(k_n=(300.0, "N m/rad")))
-    >>> evaluate_weights(plant, params, "tau_d")  # N m per radian of either encoder
-    {'theta_m': 6.0, 'theta_l': -300.0}
-
-    """
+    """Return the numbers of `weigh_encoders`."""
     weights = weigh_encoders(plant, output)
     values = ca.Function("weights", [plant.p], [ca.vertcat(*weights.values())])(params.vector) if weights else None
     return {} if values is None else dict(zip(weights, values.full().ravel().tolist(), strict=True))

@@ -78,9 +78,8 @@ class Difference:
 
 @memo
 def add_difference(plant: Plant, name: str, difference: Difference, period_s: float) -> Plant:
-    """Return a plant with one more output: the speed that a device which samples with this period computes.
-
-    Raises PlantError: the plant has such an output, or no such position, or samples with another period.
+    """Return a plant with one more output: the speed that a device which samples with this period computes. Raises
+    PlantError: the plant has such an output, or no such position, or samples with another period.
     """
     if name in plant.outputs:
         raise PlantError(f'plant {plant.name} has an output "{name}" of its own; name the difference otherwise')

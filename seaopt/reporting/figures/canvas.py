@@ -61,11 +61,10 @@ def add_axes(
     corner: tuple[float, float] = (0.0, 0.0),
     title: bool = True,
 ) -> tuple[Axes, ...]:
-    """Return axes one above the other, which share x, with this package's grid.
-
-    Margins are the same on every panel: axes stand in line on a sheet, and nothing has to be measured. `heights`: from
-    the top, in heights of a panel, margins included. `left`: inches for the tick labels and the label of y. `corner`:
-    inches from the figure's left and top edges to the panel's. `title`: leave room for one.
+    """Return axes one above the other, which share x, with this package's grid. Margins are the same on every panel:
+    axes stand in line on a sheet, and nothing has to be measured. `heights`: from the top, in heights of a panel,
+    margins included. `left`: inches for the tick labels and the label of y. `corner`: inches from the figure's left and
+    top edges to the panel's. `title`: leave room for one.
     """
     width, height = figure.get_size_inches()
     top = TOP if title else BARE_TOP

@@ -33,9 +33,8 @@ def _label_outputs(prediction: ModelledOutputs) -> tuple[str, ...]:
 
 
 def outputs_panel(prediction: ModelledOutputs, span_s: tuple[float, float] | None = None) -> Panel:
-    """Draw measured and model outputs from one time to another, seconds after the log's first sample.
-
-    Without `span_s`: the second with the largest motion of the first output.
+    """Draw measured and model outputs from one time to another, seconds after the log's first sample. Without `span_s`:
+    the second with the largest motion of the first output.
     """
     time = prediction.time - prediction.time[0]
     low, high = span_s if span_s is not None else _find_busiest(next(iter(prediction.measured.values())), time)
@@ -129,13 +128,8 @@ def spectrum_panel(prediction: ModelledOutputs) -> Panel:
 def amplitude_density(
     values: Float[np.ndarray, " n"], period: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return frequencies above zero and the root of the power density there, of the longest run without a gap.
-
-    Raises
-    ------
-    EstimationError
-        It has too few samples.
-
+    """Return frequencies above zero and the root of the power density there, of the longest run without a gap. Raises
+    EstimationError: it has too few samples.
     """
     from scipy.signal import welch  # deferred: 0.3 s
 

@@ -39,14 +39,7 @@ HALF_POWER_DB = -3.0103
 
 
 def design_of(controller: Controller) -> tuple[Plant, ParameterSet]:
-    """Return the design plant and its parameters.
-
-    Raises
-    ------
-    ControlError
-        The controller does not have it.
-
-    """
+    """Return the design plant and its parameters. Raises ControlError: the controller does not have it."""
     if controller.design is None:
         raise ControlError("the controller does not know its design plant; read it with Controller.from_dict")
     return controller.design
@@ -74,10 +67,9 @@ def list_frequencies(loop: Loop) -> Float[np.ndarray, " m"]:
 def step_panel(
     controller: Controller, plants: Plants | None = None, *, size: float = 1.0, duration_s: float | None = None
 ) -> Panel:
-    """Draw the output and the command after a step of the reference; linear, without limits and noise.
-
-    `plants`: mapping of name to (Plant, ParameterSet); the design plant if left out. `size`: of the step, in the
-    reference's unit. `duration_s`: until it has settled if left out. `ax`: a sequence of two Axes.
+    """Draw the output and the command after a step of the reference; linear, without limits and noise. `plants`:
+    mapping of name to (Plant, ParameterSet); the design plant if left out. `size`: of the step, in the reference's
+    unit. `duration_s`: until it has settled if left out. `ax`: a sequence of two Axes.
     """
     loops, period = close_loops(controller, plants), controller.sample_time_s
     if duration_s is None:

@@ -37,10 +37,8 @@ STABLE_COLOUR, UNSTABLE_COLOUR = "#cfe3f1", "#f6d9c6"
 
 
 def simulation_panel(verification: Verification, row: Outcome) -> Panel:
-    """Draw force (torque) and command of one run, simulated again.
-
-    Of a run that passed the end of the last phase is left out; a run that failed is drawn whole, with the window that
-    it is judged in.
+    """Draw force (torque) and command of one run, simulated again. Of a run that passed the end of the last phase is
+    left out; a run that failed is drawn whole, with the window that it is judged in.
     """
     controller = verification.stages[row.plant].controller
     name, limit = controller.spec.regulated, controller.command_limit

@@ -16,15 +16,8 @@ METHOD = "least and largest sample of each of {} stretches (min-max)"
 def thin_series(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], stretches: int = STRETCHES
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return a series of at most two samples per stretch, and its ends; a short one as it is.
-
-    `values`: NaN where a sample is missing; a stretch without a sample gives NaN. `stretches`: of equally many samples.
-
-    Examples
-    --------
-    >>> thin_series(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -3.0, 0.0]), 2)
-    (array([0., 1., 3., 4., 5.]), array([ 0.,  5.,  2., -3.,  0.]))
-
+    """Return a series of at most two samples per stretch, and its ends; a short one as it is. `values`: NaN where a
+    sample is missing; a stretch without a sample gives NaN. `stretches`: of equally many samples.
     """
     n = values.size
     if n <= 2 * stretches:

@@ -59,10 +59,9 @@ class Side:
 
 
 def simplify_ticks(axes: Iterable[Axes]) -> None:
-    """Replace the ticks of finished axes by a few artists that look the same, and no longer follow the limits.
-
-    Of axes that share a side give all or none. The artists have ids, which the script of a page knows:
-    ``xtick_0_grid``, ``xtick_0_marks`` and ``xtick_0_3`` on the first axes.
+    """Replace the ticks of finished axes by a few artists that look the same, and no longer follow the limits. Of axes
+    that share a side give all or none. The artists have ids, which the script of a page knows: ``xtick_0_grid``,
+    ``xtick_0_marks`` and ``xtick_0_3`` on the first axes.
     """
     finished = list(axes)
     for each in finished:

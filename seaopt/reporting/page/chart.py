@@ -63,14 +63,7 @@ def make_chart(panel: Panel) -> Chart:
 
 
 def make_id(name: str) -> str:
-    """Return a name as an id, another one for every name.
-
-    Examples
-    --------
-    >>> make_id("outputs_chirp"), make_id("a-b"), make_id("a.b")
-    ('outputs-chirp', 'a_2d_b', 'a_2e_b')
-
-    """
+    """Return a name as an id, another one for every name."""
     return re.sub(r"[^A-Za-z0-9]", lambda match: "-" if match[0] == "_" else f"_{ord(match[0]):x}_", name) or "figure"
 
 

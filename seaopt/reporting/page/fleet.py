@@ -74,10 +74,9 @@ def write_page(
     files: Sequence[Path | str] = (),
     command: str = "",
 ) -> Path:
-    """Write a page that needs no network and no other file; sections stand in their `PARTS`.
-
-    `glance`: name, figure, and what it is compared with. `files`, `command`: what it was made of, besides the logs, and
-    what was typed to make it. Raises FileError: the folder cannot be written.
+    """Write a page that needs no network and no other file; sections stand in their `PARTS`. `glance`: name, figure,
+    and what it is compared with. `files`, `command`: what it was made of, besides the logs, and what was typed to make
+    it. Raises FileError: the folder cannot be written.
     """
     html = render_template(
         "fleet.html.jinja",
@@ -100,15 +99,7 @@ def draw_trend(
     since: float | None = None,
 ) -> Markup:
     """Return values over time as a small SVG: points joined by a line, one std up and down, and where a change began.
-
     `times`: in order, of at least two runs. `label`: what a screen reader says. `since`: from when on it is shaded.
-
-    Examples
-    --------
-    >>> run = np.arange(3.0)
-    >>> draw_trend(run, run**2, 0.1 + 0 * run, label="J of the knee")[:60]
-    Markup('<svg class="trend" viewBox="0 0 132 30" role="img" aria-labe')
-
     """
     at, level, spread = _average(times, values, stds)
     low, high = float(np.min(level - spread)), float(np.max(level + spread))

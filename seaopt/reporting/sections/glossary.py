@@ -37,12 +37,5 @@ _TERM = re.compile("|".join(rf"(?<![\w|]){re.escape(term)}(?!\w)" for term in so
 
 
 def explain_terms(text: str) -> str:
-    """Return escaped HTML with each term of the glossary marked by its meaning.
-
-    Examples
-    --------
-    >>> explain_terms("whiteness p")
-    '<abbr title="Probability that residuals as coloured as these come from white noise alone.">whiteness p</abbr>'
-
-    """
+    """Return escaped HTML with each term of the glossary marked by its meaning."""
     return _TERM.sub(lambda match: f'<abbr title="{html.escape(GLOSSARY[match[0]])}">{match[0]}</abbr>', text)

@@ -306,9 +306,8 @@ def _step(search: _BranchAndBound) -> None:
 def _bound_block(
     search: _BranchAndBound, sampled: ImpulseTransfer, boxes: Boxes, arcs: Arcs, stable: Bool[np.ndarray, " b"]
 ) -> tuple[Arcs, Rows]:
-    """Return the arcs whose box has to be halved, and how much each coordinate of the box is to blame.
-
-    A box with an unstable centre, which is then outside the set, is halved whatever its bounds.
+    """Return the arcs whose box has to be halved, and how much each coordinate of the box is to blame. A box with an
+    unstable centre, which is then outside the set, is halved whatever its bounds.
     """
     hard = search.hardness * boxes.radius
     hard = hard / np.maximum(np.sum(hard, axis=1, keepdims=True), 1e-300)

@@ -18,10 +18,9 @@ LARGEST_POWER = 64
 
 
 def enclose(function: Any, arguments: Sequence[Sequence[Entry]]) -> list[list[Entry]]:
-    """Return enclosures of the entries of a function's outputs, column by column.
-
-    Entries that depend on nothing uncertain are numbers, computed as CasADi does, whatever the instruction. The
-    function is of SX, its outputs dense; an instruction on something uncertain may have no enclosure.
+    """Return enclosures of the entries of a function's outputs, column by column. Entries that depend on nothing
+    uncertain are numbers, computed as CasADi does, whatever the instruction. The function is of SX, its outputs dense;
+    an instruction on something uncertain may have no enclosure.
     """
     if not function.is_a("SXFunction"):
         raise ControlError(f"{function.name()} is not of scalar instructions (SX); no bound can be computed")
@@ -114,7 +113,6 @@ def _arctangent(a: Taylor) -> Taylor:
 
 def _absolute(a: Taylor) -> Taylor:
     """Return abs(a) where its sign is certain; else the strip between the chord of abs over the range and its parallel.
-
     With the range c +- h the chord's slope is c/h, and abs lies between it and it less (h^2 - c^2)/h.
     """
     reach = a.reach

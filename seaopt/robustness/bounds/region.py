@@ -59,10 +59,9 @@ class Region:
         return self.slopes.shape[1]
 
     def cover(self, sample_time_s: float) -> Boxes:
-        """Return boxes that cover the set, none of which has a whole number of samples of delay in its interior.
-
-        Where the output has a part that follows the command at once, the sampled plant jumps at such a delay, so that
-        each of them is also a box of its own, of no width.
+        """Return boxes that cover the set, none of which has a whole number of samples of delay in its interior. Where
+        the output has a part that follows the command at once, the sampled plant jumps at such a delay, so that each of
+        them is also a box of its own, of no width.
         """
         size = self.size
         boxes = Boxes(centre=np.zeros((1, size)), radius=np.ones((1, size)))
@@ -161,9 +160,8 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
 def _merge_delays(
     plant: Plant, unknown: Uncertainty, ends: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float]]:
-    """Return the ranges with one of the delay in all, where a fit's of the drive is uncertain: a range of its own.
-
-    That holds what the joint distribution does, as boxes are to be cut where the delay is a whole number of samples.
+    """Return the ranges with one of the delay in all, where a fit's of the drive is uncertain: a range of its own. That
+    holds what the joint distribution does, as boxes are to be cut where the delay is a whole number of samples.
     """
     if DRIVE_DELAY in ends:
         first, last = ends[DRIVE_DELAY]

@@ -154,7 +154,6 @@ class Taylor:
 
     def compose(self, series: list[Array], last: Array) -> Taylor:
         """Return a smooth function of this model, from its Taylor coefficients about the centre up to the degree.
-
         `last` is the largest size of the next coefficient over all values; not finite where it is not smooth.
         """
         centred = Taylor(self.basis, np.concatenate([np.zeros_like(self.a[:1]), self.a[1:]]), self.r)

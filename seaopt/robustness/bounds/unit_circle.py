@@ -135,9 +135,8 @@ def _keeps_degree(controller: Controller, plant: ImpulseTransfer) -> Bool[np.nda
 
 
 def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
-    """Return every arc's coefficients to second order, and their remainders.
-
-    Centre, slopes and half curvatures, as a whole symmetric matrix, are along one axis.
+    """Return every arc's coefficients to second order, and their remainders. Centre, slopes and half curvatures, as a
+    whole symmetric matrix, are along one axis.
     """
     over, k = model.basis, model.basis.size
     second = np.array([[over.index_of(i, j) for j in range(k)] for i in range(k)], dtype=int).reshape(k, k)
@@ -148,9 +147,8 @@ def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
 
 
 def _expand_law(law: Law) -> tuple[list[Coefficients], Coefficients]:
-    """Return the numerator of every C_y, and their denominator, in ascending powers of 1 - 1/z.
-
-    In these, as in w, nothing cancels near z = 1, where the law's slow poles and its integrators lie.
+    """Return the numerator of every C_y, and their denominator, in ascending powers of 1 - 1/z. In these, as in w,
+    nothing cancels near z = 1, where the law's slow poles and its integrators lie.
     """
     m, (a, b, c) = law.integrators, law.rest
     delta, q = np.array([0.0, 1.0]), np.array([1.0, -1.0])
@@ -176,11 +174,10 @@ def _expand_law(law: Law) -> tuple[list[Coefficients], Coefficients]:
 
 def _expand_powers(law: Coefficients, delay: Int[np.ndarray, " p"], arcs: Arcs, count: int) -> Powers:
     r"""Return law(1 - 1/z) z^-delay w^j for every j: value, first and second order, bounds on the remainder and on all.
-
     Each is a product of functions of the angle, whose derivatives up to the third are bounded over the arc: of
-    :math:`p(\delta) q^D`, :math:`q = 1/z`, :math:`\delta = 1 - q`, with :math:`\delta' = iq`, these are
-    :math:`i q^D (q p' - D p)`, :math:`q^D (-q^2 p'' + (2D + 1) q p' - D^2 p)`, and at most
-    :math:`|p^{(3)}| + 3(D + 1)|p''| + (3D^2 + 3D + 1)|p'| + D^3 |p|`.
+    :math:`p(\delta) q^D`, :math:`q = 1/z`, :math:`\delta = 1 - q`, with :math:`\delta' = iq`, these are :math:`i q^D (q
+    p' - D p)`, :math:`q^D (-q^2 p'' + (2D + 1) q p' - D^2 p)`, and at most :math:`|p^{(3)}| + 3(D + 1)|p''| + (3D^2 +
+    3D + 1)|p'| + D^3 |p|`.
     """
     z, half = np.exp(1j * arcs.middle), arcs.half
     w, turn = np.expm1(1j * arcs.middle), z[:, None]
@@ -286,10 +283,9 @@ def _bound_quadratic(
     at: BallCoordinates,
     width: BallCoordinates,
 ) -> PerArc:
-    """Return a bound on top + a e + e b e over the cube, where at + width e is in the unit ball.
-
-    A coordinate outside the ball along which it cannot but rise or fall is put at its end. What is left is split into
-    parabolas of one coordinate each; the ball enters by Lagrange's dual, any multiplier of which gives a bound.
+    """Return a bound on top + a e + e b e over the cube, where at + width e is in the unit ball. A coordinate outside
+    the ball along which it cannot but rise or fall is put at its end. What is left is split into parabolas of one
+    coordinate each; the ball enters by Lagrange's dual, any multiplier of which gives a bound.
     """
     count, size = a.shape
     ball = at.shape[1]

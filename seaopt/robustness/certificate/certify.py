@@ -336,9 +336,8 @@ def find_own_drive(controller: Controller, source: Source) -> Drive | None:
 
 
 def _remark_amplitude(controller: Controller, plant: Plant, models: Plants, nominal: ParameterSet) -> tuple[str, ...]:
-    """Say which bandwidth the design plant has at amplitudes of use, where friction makes it depend on them.
-
-    They are shares of the force that the current limit holds at rest, those of the simulated steps.
+    """Say which bandwidth the design plant has at amplitudes of use, where friction makes it depend on them. They are
+    shares of the force that the current limit holds at rest, those of the simulated steps.
     """
     name = next(name for name, model in models.items() if model is plant)
     rest, sliding = controller.force_limit(0.0), controller.achieved.bandwidth_hz
@@ -427,9 +426,8 @@ def _check_delay(controller: Controller, ranges: Ranges) -> None:
 
 
 def _digest(controller: Controller) -> int:
-    """Return a number of the law's own, so that another law meets other draws at the same seed.
-
-    To six digits: what two machines tune from the same file is the same law.
+    """Return a number of the law's own, so that another law meets other draws at the same seed. To six digits: what two
+    machines tune from the same file is the same law.
     """
     coefficients = (
         f"{value:.6g}" for part in (controller.reference, controller.measurement) for value in (*part.num, *part.den)

@@ -160,9 +160,8 @@ Measure = Callable[[Controller, Plant, ParameterSet, Draw], EigenvalueCase]
 def find_gravity_cases(
     loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
 ) -> dict[str, EigenvalueCase]:
-    """Return how fast the link of every plant runs away at most with its weight compensated; empty where none is.
-
-    Models whose link is held are left out.
+    """Return how fast each plant's link runs away at most with its weight compensated; nothing of
+    models that hold it.
     """
     compensation = loops.value.controller.compensation
     term = None if compensation is None else compensation.gravity
@@ -225,13 +224,8 @@ def measure_gravity(controller: Controller, plant: Plant, nominal: ParameterSet,
 
 
 def measure_ripple(controller: Controller, plant: Plant, nominal: ParameterSet, draw: Draw) -> EigenvalueCase:
-    """Return the largest eigenvalue over the slopes at one draw.
-
-    Raises
-    ------
-    ControlError
-        The plant has no output that is read.
-
+    """Return the largest eigenvalue over the slopes at one draw. Raises ControlError: the plant has no output that is
+    read.
     """
     compensation = controller.compensation
     assert compensation is not None and compensation.ripple is not None
@@ -265,9 +259,8 @@ def find_radius(
     weight: tuple[str, float] | None = None,
     ripple: tuple[str, float] | None = None,
 ) -> float:
-    """Return the largest eigenvalue of the sampled loop, sliding, with further feedback.
-
-    `weight` feeds the reference by the link's position, `ripple` the effort by the motor's: each an output and a slope.
+    """Return the largest eigenvalue of the sampled loop, sliding, with further feedback. `weight` feeds the reference
+    by the link's position, `ripple` the effort by the motor's: each an output and a slope.
     """
     law, signals, per_reference = runnable(controller), list(controller.signals), 1.0
     if controller.outer is not None and plant.port is not None and plant.port.motion in plant.outputs:

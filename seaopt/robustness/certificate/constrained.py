@@ -286,10 +286,9 @@ class _Case:
         return "", ""
 
     def _find_ring(self, run: ForceRun) -> tuple[float, str]:
-        """Return the peak of what swings at the end of a run, 0 for nothing, and a sentence where it is a fault.
-
-        What rounding makes comes and goes, so that half of the runs that ring look as if they died out. What dies out
-        is therefore no fault only where the same run on ideal devices has as much of it.
+        """Return the peak of what swings at the end of a run, 0 for nothing, and a sentence where it is a fault. What
+        rounding makes comes and goes, so that half of the runs that ring look as if they died out. What dies out is
+        therefore no fault only where the same run on ideal devices has as much of it.
         """
         bench = self.bench
         swing = _measure_ring(bench.mpc, run)

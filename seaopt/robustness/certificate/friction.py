@@ -32,9 +32,8 @@ Margin = TypeVar("Margin", FrictionMargin | None, CompensationMargin)
 
 @record
 class FrictionDraws:
-    """For how many draws stability is shown for every friction curve of their sector, and the least margin.
-
-    A draw without friction counts.
+    """For how many draws stability is shown for all friction of their sector (without friction it is), and the least
+    margin.
     """
 
     samples: int
@@ -70,7 +69,6 @@ def find_margins_at_draws(
     executor: Executor | None = None,
 ) -> dict[str, FrictionDraws]:
     """Return margins at draws, of plants for which stability, or the slope required, is shown at nominal parameters.
-
     Those that have friction at draws alone are among them.
     """
     unknown, count = loops.value.unknown, min(samples, MARGIN_DRAWS)

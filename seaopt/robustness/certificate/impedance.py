@@ -98,9 +98,8 @@ def certify_impedance(
     draws: ImpedanceDraws | None = None,
     steps: tuple[ImpedanceStep, ...] | None = None,
 ) -> CertifiedImpedance | None:
-    """Measure the impedance of a controller's outer loop at the nominal parameters; None where it has none.
-
-    `draws` is what `draw_impedance` found; `steps` what was simulated, which is simulated if left out.
+    """Measure the impedance of a controller's outer loop at the nominal parameters; None where it has none. `draws` is
+    what `draw_impedance` found; `steps` what was simulated, which is simulated if left out.
     """
     outer = controller.outer
     if outer is None:

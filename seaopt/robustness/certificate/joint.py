@@ -242,9 +242,8 @@ def tune_certified(
 def _list_new_witnesses(
     certificate: Certificate | None, tuned_on: Sequence[tuple[Plant, ParameterSet]], number: int
 ) -> dict[str, tuple[Plant, ParameterSet]]:
-    """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need.
-
-    Of friction it is the draw with the least margin, where that is not what is asked.
+    """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need. Of
+    friction it is the draw with the least margin, where that is not what is asked.
     """
     if certificate is None or certificate.passed:
         return {}

@@ -183,9 +183,8 @@ def group_failures(requirements: Sequence[Requirement]) -> list[Failure]:
 
 
 def usage_of(row: Requirement) -> float | None:
-    """Return which share of its limit a requirement uses, above 1 where it is not met; None where a share says nothing.
-
-    A stable loop's spectral radius is next to 1 however stable it is.
+    """Return which share of its limit a requirement uses, above 1 where it is not met; None where, as of a stable
+    loop's spectral radius, a share says nothing.
     """
     if not np.isfinite(row.value) or row.name == SPECTRAL_RADIUS or row.sense == "=":
         return None if row.met else np.inf

@@ -153,9 +153,8 @@ def draw_requirements(
 def friction_requirements(
     margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None, unit: str
 ) -> list[Requirement]:
-    """Return that stability is shown for friction as steep as asked, at the nominal values and over draws.
-
-    Without friction there is nothing to show: the row says so, with an infinite value.
+    """Return that stability is shown for friction as steep as asked, at the nominal values and over draws. Without
+    friction there is nothing to show: the row says so, with an infinite value.
     """
     if least is None:
         return []
@@ -176,9 +175,8 @@ def friction_requirements(
 def compensation_requirements(
     controller: Controller, margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
 ) -> list[Requirement]:
-    """Return that stability is shown with friction compensated from the speed, at nominal values and over draws.
-
-    Where it is, or is not, says the largest fraction of Coulomb friction that is shown at the compensation's speed.
+    """Return that stability is shown with friction compensated from the speed, at nominal values and over draws. Where
+    it is, or is not, says the largest fraction of Coulomb friction that is shown at the compensation's speed.
     """
     friction = None if controller.compensation is None else controller.compensation.friction
     rows: list[Requirement] = []
@@ -237,9 +235,8 @@ def eigenvalue_requirements(
 
 
 def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
-    """Return what is required of an impedance: the link is stable by itself, and no environment changes that.
-
-    Both hold with friction sliding and stuck, and at the draws, and simulated steps come to rest.
+    """Return what is required of an impedance: the link is stable by itself, and no environment changes that. Both hold
+    with friction sliding and stuck, and at the draws, and simulated steps come to rest.
     """
     if impedance is None:
         return []
@@ -353,9 +350,8 @@ def require_rate(sweeps: Sequence[Sweep], unit: str, least: float | None) -> Req
 
 
 def require_motion(motion: Motion, over: str, unit: str, least: float | None) -> Requirement:
-    """Return that a plant that moves the variable keeps its judgement: at the rate reached at all, or as asked.
-
-    What keeps its judgement at less than was asked is not met: nothing is known of the rate that was.
+    """Return that a plant that moves the variable keeps its judgement: at the rate reached at all, or as asked. What
+    keeps its judgement at less than was asked is not met: nothing is known of the rate that was.
     """
     row = require_at_least(
         MOTION_RATE,

@@ -482,9 +482,8 @@ def _certify_place(
     shared: Shared[tuple[ScheduledController, dict[str, Plant]]],
     part: tuple[float, Uncertainty, Points, np.random.Generator],
 ) -> tuple[PlaceCertificate, Bool[np.ndarray, "3 n"]]:
-    """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case.
-
-    Also return which draws fail in which way.
+    """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case. Also
+    return which draws fail in which way.
     """
     (schedule, models), (value, unknown, points, rng) = shared.value, part
     controller, point, plants = schedule.at(value), value in schedule.points, split_states(models, unknown)
@@ -513,9 +512,8 @@ def _certify_place(
 
 
 def list_held(schedule: ScheduledController, models: Plants, value: float) -> dict[str, Plant]:
-    """Return the plants that `certify` takes: at a point those that hold the variable, if the design plant does.
-
-    Where a plant moves the variable, a law that is frozen there is not what runs.
+    """Return the plants that `certify` takes: at a point those that hold the variable, if the design plant does. Where
+    a plant moves the variable, a law that is frozen there is not what runs.
     """
     held = {name: plant for name, plant in models.items() if schedule.over not in plant.states}
     design, _ = schedule.design

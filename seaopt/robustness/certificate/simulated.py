@@ -199,7 +199,6 @@ def _attempt(verb: Callable[[], Played]) -> tuple[Played | None, str]:
 
 def require_runs(runs: Verification | str) -> list[Requirement]:
     """Return what the runs require: the same fault in many runs of a plant is one requirement, with the worst of them.
-
     A text says why nothing could be played.
     """
     if isinstance(runs, str):

@@ -371,9 +371,8 @@ def list_requirements(content: Mapping[str, Any], source: str) -> tuple[Requirem
 
 
 def read_requirements(stored: Sequence[StoredRequirement], source: str = FILE) -> tuple[Requirement, ...]:
-    """Return the rows of a certificate.
-
-    Refuses one without any, which would pass whatever it is of, and a row that is called met but breaks its limit.
+    """Return the rows of a certificate. Refuses one without any, which would pass whatever it is of, and a row that is
+    called met but breaks its limit.
     """
     if not stored:
         raise FileError(f"{source}: requirements is empty, and a certificate requires something; {CERTIFY_AGAIN}")

@@ -82,9 +82,8 @@ class _DelayedLoop:
 
 
 def sampled_delay_margin(controller: Controller, plant: Plant, params: ParameterSet, reach_s: float) -> float | None:
-    """Return the smallest extra delay, s, that makes the sampled loop unstable; zero where it is without one.
-
-    None if no delay up to `reach_s` does. A delay among the parameters stays in the loop.
+    """Return the smallest extra delay, s, that makes the sampled loop unstable; zero where it is without one. None if
+    no delay up to `reach_s` does. A delay among the parameters stays in the loop.
     """
     period = controller.sample_time_s
     sliding, effort = take_sliding(plant, params), controller.command.per_effort

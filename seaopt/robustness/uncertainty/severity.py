@@ -51,9 +51,8 @@ class _SampledPlants:
 
 
 def severities(controller: Controller, figures: BatchFigures, by: Levels | None = None) -> Column:
-    """Return the severity of every draw: instability first, then the fraction of the limits that it uses.
-
-    With `by`, levels of Ms and Mt for all draws or for each, that is the fraction of these.
+    """Return the severity of every draw: instability first, then the fraction of the limits that it uses. With `by`,
+    levels of Ms and Mt for all draws or for each, that is the fraction of these.
     """
     ms, mt = levels(controller).T if by is None else by.T
     with np.errstate(invalid="ignore"):  # infinite over infinite, of unstable draws, which are ranked apart
@@ -86,21 +85,11 @@ def severity_slopes(
     points: Points,
     by: Levels | None = None,
 ) -> SeveritySlopes:
-    """Return the derivatives of each point's severity with respect to its coordinates.
+    """Return the derivatives of the severity of `points` (n, k), coordinates of `unknown`, with respect to these.
 
-    These are derivatives of the spectral radius where the loop is unstable, else of the larger of Ms and Mt as
-    fractions of their limits, or of Ms where there is no limit. They are zero where there is no derivative: at a plant
+    They are of the spectral radius where the loop is unstable, else of the larger of Ms and Mt as fractions of their
+    limits or of `by`, as in `severities`; of Ms without a limit. They are zero where there is no derivative: at a plant
     that is not finite, at a double pole.
-
-    Parameters
-    ----------
-    controller, plant, unknown
-        The loop's controller and plant, and what is uncertain of the plant.
-    points : array, shape (n, k)
-        Coordinates of `unknown`.
-    by : array, shape (2,) or (n, 2), optional
-        Levels of Ms and Mt, as in `severities`.
-
     """
     sampled, out = _sample_plants(controller, plant, unknown, points), np.zeros(points.shape)
     finite = np.flatnonzero(np.all(np.isfinite(sampled.a), axis=(1, 2)) & np.all(np.isfinite(sampled.b), axis=1))

@@ -87,9 +87,8 @@ class Worst(tuple[Plant, ParameterSet]):
         limited: bool,
         largest: tuple[Witness, Witness] | None = None,
     ) -> Worst:
-        """Return the pair with its figures; `limited` if the specification limits Ms or Mt.
-
-        `largest` are the witnesses of the largest Ms and Mt found; the pair's own where they are left out.
+        """Return the pair with its figures; `limited` if the specification limits Ms or Mt. `largest` are the witnesses
+        of the largest Ms and Mt found; the pair's own where they are left out.
         """
         self = super().__new__(cls, (plant, values))
         self.witness, self.limited, self.largest = witness, limited, largest or (witness, witness)
@@ -157,9 +156,8 @@ class Worst(tuple[Plant, ParameterSet]):
 
 
 def find_worst(controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Points) -> Worst:
-    """Return the worst of the draws and of the points that searches from the worst draws reach.
-
-    The draws hold those of the largest Ms and Mt; there is none if nothing is uncertain.
+    """Return the worst of the draws and of the points that searches from the worst draws reach. The draws hold those of
+    the largest Ms and Mt; there is none if nothing is uncertain.
     """
     if not unknown.size:
         return measure_worst(controller, plant, unknown.nominal, {})
@@ -282,9 +280,8 @@ def _project_slopes(unknown: Uncertainty, x: Starts, slope: SeveritySlopes) -> S
 
 
 def _propose_trials(unknown: Uncertainty, x: Starts, slope: SeveritySlopes, rng: np.random.Generator) -> Trials:
-    """Return points towards the set's vertex in the slope's direction, along the slope, and at random about x.
-
-    Random points serve the ridge between two peaks of S, where neither peak's slope leads up.
+    """Return points towards the set's vertex in the slope's direction, along the slope, and at random about x. Random
+    points serve the ridge between two peaks of S, where neither peak's slope leads up.
     """
     g = len(unknown.names)
     size = np.linalg.norm(slope, axis=1, keepdims=True)

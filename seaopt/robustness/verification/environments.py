@@ -139,9 +139,8 @@ class StabilityMap:
 
 
 def attach_environment(plant: Plant) -> Plant:
-    """Return a plant's probe with an environment on its inertia; its last two parameters are k_e and d_e.
-
-    Their names are `SPRING`'s and `DAMPER`'s, with underscores as long as the probe has the same name.
+    """Return a plant's probe with an environment on its inertia; its last two parameters are k_e and d_e. Their names
+    are `SPRING`'s and `DAMPER`'s, with underscores as long as the probe has the same name.
     """
     probe = probe_of(plant)
     port = bare_port(probe)

@@ -232,10 +232,9 @@ def judge_run(
     twin: Playback,
     unlimited: Playback | None = None,
 ) -> Outcome:
-    """Return the outcome of one run of a trace, played on the plant `name` with `sets`, nominal first.
-
-    `twin` is the same scenario on `stage.ideal`; the trace itself where the stage is ideal. `unlimited` is that one
-    without a current limit, where it `overshoots_at_limit`.
+    """Return the outcome of one run of a trace, played on the plant `name` with `sets`, nominal first. `twin` is the
+    same scenario on `stage.ideal`; the trace itself where the stage is ideal. `unlimited` is that one without a current
+    limit, where it `overshoots_at_limit`.
     """
     findings, drawn, nominal = _Findings(), sets[index], sets[0]
     view = linearise_last_phase(stage, scenario, drawn)

@@ -270,9 +270,8 @@ def _compute_onset(controller: Controller, loop: Loop, f: Float[np.ndarray, " f"
 def _find_bandwidth(
     f: Float[np.ndarray, " f"], gain: Float[np.ndarray, " f"], static: float, moves: bool
 ) -> float | None:
-    """Return where the gain falls through 3 dB below the static one, on straight lines in logarithms.
-
-    It is the first fall, and the last where the link moves: below its tracking band such a plant does not follow.
+    """Return where the gain falls through 3 dB below the static one, on straight lines in logarithms. It is the first
+    fall, and the last where the link moves: below its tracking band such a plant does not follow.
     """
     level = np.log(np.maximum(gain, 1e-300)) - math.log(HALF_POWER * static)
     falls = np.flatnonzero((level[:-1] >= 0.0) & (level[1:] < 0.0))

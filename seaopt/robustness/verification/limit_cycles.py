@@ -82,9 +82,8 @@ class FoundCycle:
 def seek_limit_cycles(
     controller: Controller, plant: Plant, params: ParameterSet, *, shown: bool = False
 ) -> tuple[FoundCycle, ...]:
-    """Return the limit cycles that friction, unless stability is shown, and play may make, at rest at zero.
-
-    They are predicted and simulated; a prediction whose simulation fails stands alone, with the reason.
+    """Return the limit cycles that friction, unless stability is shown, and play may make, at rest at zero. They are
+    predicted and simulated; a prediction whose simulation fails stands alone, with the reason.
     """
     predicted = () if shown else predict_limit_cycles(controller, plant, params)
     predicted += predict_play_cycles(controller, plant, params)

@@ -60,10 +60,9 @@ class LinearView:
 
 
 def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> LinearView:
-    """Return the linear loop of a scenario's last phase, with the load and the link as they are then.
-
-    It is that of the plant at rest, where the phase ends, with friction as steep as it is there; what the loop does in
-    motion the simulation shows. `drawn` has the parameters and conditions of the run.
+    """Return the linear loop of a scenario's last phase, with the load and the link as they are then. It is that of the
+    plant at rest, where the phase ends, with friction as steep as it is there; what the loop does in motion the
+    simulation shows. `drawn` has the parameters and conditions of the run.
     """
     last = scenario.phases[-1]
     plant = stage.partner if last.held and stage.partner is not None else stage.plant

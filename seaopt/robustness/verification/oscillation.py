@@ -36,12 +36,10 @@ class Oscillation:
 
 
 def find_oscillation(signal: Signal, sample_time_s: float, *, floor: float, lowest_hz: float) -> Oscillation | None:
-    """Return the oscillation that stands out in a window, or None.
-
-    It stands out if its amplitude is above `floor`, in both halves or only in the second, and if it explains at least
-    half of the power above `lowest_hz`; noise filtered by a loop does not. `floor` is the amplitude that noise and
-    quantisation alone make. Movement slower than `lowest_hz` is removed; at least two periods of it should fit into
-    half of the window.
+    """Return the oscillation that stands out in a window, or None. It stands out if its amplitude is above `floor`, in
+    both halves or only in the second, and if it explains at least half of the power above `lowest_hz`; noise filtered
+    by a loop does not. `floor` is the amplitude that noise and quantisation alone make. Movement slower than
+    `lowest_hz` is removed; at least two periods of it should fit into half of the window.
     """
     size = float(np.max(np.abs(signal)))
     spread = float(np.std(signal / size)) if size else 0.0
@@ -65,10 +63,8 @@ def find_oscillation(signal: Signal, sample_time_s: float, *, floor: float, lowe
 
 
 def measure_swing(signal: Signal, sample_time_s: float, *, lowest_hz: float) -> Oscillation:
-    """Return what swings in a window, whether it is a line or wanders as rounding makes it.
-
-    Its amplitude is that of a sine of the same power in the window's second half, its frequency that of the largest
-    line.
+    """Return what swings in a window, whether it is a line or wanders as rounding makes it. Its amplitude is that of a
+    sine of the same power in the window's second half, its frequency that of the largest line.
     """
     fast = _remove_slow(signal, sample_time_s, lowest_hz)
     halves = np.array_split(fast, 2)

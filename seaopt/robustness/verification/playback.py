@@ -130,12 +130,11 @@ class Playback:
 
 
 def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Playback:
-    """Simulate a scenario, once for each set of parameters.
-
-    A run starts at rest: at zero, or where a condition among its parameters (an angle such as phi) puts the plant, with
-    the law and the commands that wait at rest too, and the scenario's forces counted from the one that keeps it there.
-    A scenario with an `initial_state` starts in that, whatever the conditions. `delay_s` among the parameters is a
-    delay besides the controller's. `seed` is of the sensor noise and of random excitations.
+    """Simulate a scenario, once for each set of parameters. A run starts at rest: at zero, or where a condition among
+    its parameters (an angle such as phi) puts the plant, with the law and the commands that wait at rest too, and the
+    scenario's forces counted from the one that keeps it there. A scenario with an `initial_state` starts in that,
+    whatever the conditions. `delay_s` among the parameters is a delay besides the controller's. `seed` is of the sensor
+    noise and of random excitations.
     """
     obstacle = scenario.obstacle(stage.plant, stage.partner)
     if obstacle is not None:

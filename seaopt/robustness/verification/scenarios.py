@@ -339,10 +339,9 @@ def list_left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
 
 
 def find_step_limit(controller: Controller) -> float | None:
-    """Return the step of F_ref (N) that just reaches the current limit on the design plant; None without a limit.
-
-    It is that of the loop in which friction slides; one that is unstable, or runs away, reaches the limit with every
-    step, and what the limit holds at rest stands for it.
+    """Return the step of F_ref (N) that just reaches the current limit on the design plant; None without a limit. It is
+    that of the loop in which friction slides; one that is unstable, or runs away, reaches the limit with every step,
+    and what the limit holds at rest stands for it.
     """
     limit = controller.command_limit
     plant, params = _require_design(controller)

@@ -129,10 +129,7 @@ class _Pushing:
 def move_schedule(
     schedule: ScheduledController, name: str, plant: Plant, params: ParameterSet, rate: float
 ) -> Motion | None:
-    """Push a plant so that it moves its scheduling variable at a rate; None of one that holds it.
-
-    The rate is in the variable's unit per second.
-    """
+    """Push a plant so that it moves its scheduling variable at a rate, per second; None of one that holds it."""
     if schedule.over not in plant.states:
         return None
     pushing = _make_pushing(schedule, plant, params, rate)

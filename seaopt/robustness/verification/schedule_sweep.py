@@ -270,9 +270,8 @@ class RestStart:
 
 @memo
 def make_swept_plant(plant: Plant, over: str) -> Plant:
-    """Return a plant in which a parameter, or a state with its rate, follows a sweep of time.
-
-    Its parameters are those of the plant, and sweep_from, sweep_to and sweep_rad_s.
+    """Return a plant in which a parameter, or a state with its rate, follows a sweep of time. Its parameters are those
+    of the plant, and sweep_from, sweep_to and sweep_rad_s.
     """
     unit = plant.parameter_unit(over) if over in plant.parameters else plant.states[over]
     rate = _find_rate(plant, over)

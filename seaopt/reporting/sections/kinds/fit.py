@@ -177,9 +177,8 @@ def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
 
 
 def _list_cures(errors: Sequence[FitFinding]) -> tuple[str, ...]:
-    """Return the lines to write for the likely cause that is named first.
-
-    What is not told from zero is not to be freed: a search for how sharp friction is takes long and ends nowhere.
+    """Return the lines to write for the likely cause that is named first. What is not told from zero is not to be
+    freed: a search for how sharp friction is takes long and ends nowhere.
     """
     cause = next((finding for finding in errors if finding.kind == "cause" and finding.preferred), None)
     if cause is None:
@@ -189,14 +188,7 @@ def _list_cures(errors: Sequence[FitFinding]) -> tuple[str, ...]:
 
 
 def spell_cure(name: str, value: float) -> str:
-    """Return the line of a problem file that frees what a log would have otherwise; "" where there is no such line.
-
-    Examples
-    --------
-    >>> spell_cure("chirp.delay_s", 0.004), spell_cure("f_c", 12.0)
-    ('delay_s = { value = 0.004, free = true, max = 0.02 } in the [[experiment]] chirp', 'f_c = { value = 12, free = true } in [parameters]')
-
-    """  # noqa: E501
+    """Return the line of a problem file that frees what a log would have otherwise; "" where there is no such line."""
     *experiment, parameter = name.split(".")
     if not experiment:
         return f"{parameter} = {{ value = {value:.4g}, free = true }} in [parameters]"
