@@ -13,6 +13,8 @@ from seaopt.formatting import format_table, html_table
 from seaopt.records import record
 from seaopt.units import factor, unit_after
 
+QUANTILE = 1.959964  # of the standard normal, 95 % two-sided
+
 
 @record(keywords=True)
 class Parameter:
@@ -33,7 +35,9 @@ class Parameter:
     prior_std : float or None
         The value is known within this standard deviation (a Gaussian prior in the fit), in `unit`.
     std : float or None
-        Posterior standard deviation, where a fit gave one.
+        Posterior standard deviation, where a fit gave one: what noise moves the value by.
+    model_std : float or None
+        What the structure that a fit left in its residuals may move the value by, as a standard deviation.
     description : str
         A few words.
     identified : bool
@@ -44,8 +48,8 @@ class Parameter:
     """
 
     json_keys = (
-        *("value", "unit", "free", "std", "ci95", "at_bound", "min", "max", "prior_std", "description", "identified"),
-        "plausible",
+        *("value", "unit", "free", "std", "model_std", "ci95", "known", "at_bound", "min", "max", "prior_std"),
+        *("description", "identified", "plausible"),
     )
 
     name: str
@@ -56,6 +60,7 @@ class Parameter:
     max: OrInfinite = math.inf
     prior_std: float | None = None
     std: float | None = None
+    model_std: float | None = None
     description: str = ""
     identified: bool = True
     plausible: tuple[float, float] | None = None
@@ -64,7 +69,7 @@ class Parameter:
         for what, text in (("name", self.name), ("unit", self.unit)):
             if type(text) is not str:
                 require_type(text, str, f"{what} of a parameter", "give a text", ParameterError)
-        for what in ("value", "min", "max", "prior_std", "std"):
+        for what in ("value", "min", "max", "prior_std", "std", "model_std"):
             number = getattr(self, what)
             if number is not None and type(number) is not float:
                 require_number(number, f"{what} of parameter {self.name}", ParameterError)
@@ -90,11 +95,21 @@ class Parameter:
             )
 
     @property
+    def total_std(self) -> float | None:
+        """The standard deviation of noise and model together, where a fit gave one."""
+        return None if self.std is None else math.hypot(self.std, self.model_std or 0.0)
+
+    @property
     def ci95(self) -> tuple[OrMinusInfinite, OrInfinite] | None:
-        """The 95 % interval value ± 1.96 std, where a std is known."""
-        if self.std is None:
-            return None
-        return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
+        """The 95 % interval, value ± 1.96 standard deviations of noise and model together, where a fit gave them."""
+        std = self.total_std
+        return None if std is None else (self.value - QUANTILE * std, self.value + QUANTILE * std)
+
+    @property
+    def known(self) -> OrInfinite | None:
+        """Half the width of the 95 % interval over the value, where a fit gave a std."""
+        std = self.total_std
+        return None if std is None else QUANTILE * std / abs(self.value) if self.value else math.inf
 
     @property
     def at_bound(self) -> bool:

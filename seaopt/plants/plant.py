@@ -484,9 +484,13 @@ def _convert_unit(parameter: Parameter, unit: str, plant: str) -> Parameter:
         scale = factor(parameter.unit, unit)
     except UnitError as error:
         raise UnitError(f"parameter {parameter.name} of plant {plant}: {error}") from error
-    prior, std = (None if value is None else value * scale for value in (parameter.prior_std, parameter.std))
+    stds = {
+        name: value * scale
+        for name in ("prior_std", "std", "model_std")
+        if (value := getattr(parameter, name)) is not None
+    }
     low, high = parameter.min * scale, parameter.max * scale
-    return replace(parameter, value=parameter.value * scale, unit=unit, min=low, max=high, prior_std=prior, std=std)
+    return replace(parameter, value=parameter.value * scale, unit=unit, min=low, max=high, **stds)
 
 
 def _keep_bounds(parameter: Parameter, default: str | Parameter, plant: str) -> Parameter:

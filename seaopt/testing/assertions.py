@@ -59,7 +59,7 @@ def assert_recovered(
             raise SeaoptError(f'truth has no "{name}", which the fit estimated; {suggestion(name, truth)}')
         expected, fitted = truth[name], fit.parameters[name]
         true = expected.value if isinstance(expected, Parameter) else require_number(expected, f'truth["{name}"]')
-        std, error = math.nan if fitted.std is None else fitted.std, abs(fitted.value - true)
+        std, error = math.nan if fitted.total_std is None else fitted.total_std, abs(fitted.value - true)
         distance = error / std if std > 0.0 else math.inf
         relative = error / abs(true) if true else math.inf
         good = distance <= sigmas and math.isfinite(std) and (within is None or relative <= within)

@@ -159,7 +159,7 @@ def _judge_parameter(parameter: str, limits: tuple[float, float] | RangeTable, r
         remedy = "no experiment that is fitted has it"
         return Judgement(met=False, found="nothing", asked=_format_ends(ends, unit or ""), remedy=remedy)
     unit, scale = (estimate.unit, 1.0) if unit is None else (unit, factor(estimate.unit, unit))
-    value, std = estimate.value * scale, None if estimate.std is None else estimate.std * scale
+    value, std = estimate.value * scale, None if estimate.total_std is None else estimate.total_std * scale
     identified = std is None or math.isfinite(std)
     if identified:
         remedy = (

@@ -53,7 +53,7 @@ def test_a_fitted_delay_is_a_row_of_every_table_of_the_fit(fitted, tmp_path, cap
     for text in (page, fit._repr_html_()):
         (row,) = re.findall(r"<tr><td>chirp\.delay_s</td>.*?</tr>", text)
         cells = [html.unescape(cell) for cell in re.findall(r">([^<>]+)<", row)]
-        assert cells == ["chirp.delay_s", "0.00312", "± 2.5e-05", "0.003071 to 0.003169", "s", "of one log"]
+        assert cells == ["chirp.delay_s", "0.00312", "± 2.5e-05", "–", "0.003071 to 0.003169", "1.6 %", "s", "of one log"]
     show_sections(Terminal(), fit)
     for text in (repr(fit), capsys.readouterr().out):
         assert re.search(r"chirp\.delay_s +0\.00312 +± 2\.5e-05 .*s +of one log", text)

@@ -98,10 +98,10 @@ class Drive:
     fitted_in: str | None = None
 
     def take_covariance(self, fit: Fit) -> Covariance:
-        """Return a fit's covariance of the parameters, and of this delay with them."""
-        joint, fitted = fit.delay_covariance, f"{self.fitted_in}.delay_s"
+        """Return a fit's covariance, of noise and model, of the parameters, and of this delay with them."""
+        joint, fitted = fit.total_delay_covariance, f"{self.fitted_in}.delay_s"
         if joint is None or fitted not in joint.names:
-            return fit.covariance
+            return fit.total_covariance
         names = fit.covariance.names
         rows = [joint.names.index(name) for name in (*names, fitted)]
         return Covariance(names=(*names, DRIVE_DELAY), matrix=joint.matrix[np.ix_(rows, rows)])

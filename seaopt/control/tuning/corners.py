@@ -80,7 +80,7 @@ def draw(
     """
     rng, uniform = np.random.default_rng(require_seed(seed, ControlError)), dict(ranges or {})
     if isinstance(parameters, Fit):
-        values, covariance = parameters.parameters, parameters.covariance
+        values, covariance = parameters.parameters, parameters.total_covariance
         if drive is not None:
             covariance = drive.take_covariance(parameters)
             values = values.with_parameters(Parameter(name=DRIVE_DELAY, value=drive.delay_s, unit="s", min=0.0))

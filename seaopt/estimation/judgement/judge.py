@@ -22,10 +22,10 @@ from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
-from seaopt.estimation.problem.fit_experiment import FitOutput
-from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.result.model_error import estimate_model_error
+from seaopt.estimation.result.widening import widen
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
@@ -43,7 +43,7 @@ SYSTEMATIC = 0.5  # of a residual's power: more than its noise
 LARGE = 3e-3  # of an output's energy: a systematic residual of 5 % of its size
 VISIBLE = 1e-4  # of one of 1 %
 SMALL = 1e-5  # below which a systematic residual is worth no word
-FAR_ABOVE = 5.0  # times the noise between neighbouring samples, from third differences (variance 20 times the noise's)
+FAR_ABOVE = 5.0  # times the noise of its sensor (`noise_floor`)
 HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
@@ -70,7 +70,10 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ign
         for output, share in measure_coherence(experiment, residuals[experiment.name]).items()
     }
     fit = _score_held_out_shots(_state_shares(fit, shares), minimum.problem.holdout)
-    excess = {output.label: _measure_excess(output, residuals) for output in minimum.problem.outputs}
+    noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
+    error = estimate_model_error(minimum.problem, minimum.z, residuals, noise.matrix)
+    excess = error.excess
+    fit = widen(_state_excess(fit, excess), error.matrix)
     findings = [
         *_find_unexplained(fit, shares, excess),
         *_find_held_out(fit),
@@ -94,13 +97,13 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ign
     return _conclude(replace(fit, findings=order_findings(findings)))
 
 
-def _measure_excess(output: FitOutput, residuals: ResidualsByExperiment) -> float:
-    """Return how many times its noise between neighbouring samples an output's residual is."""
-    raw = [part[np.isfinite(part)] for part in residuals[output.experiment.name].raw_of(output.name)]
-    thirds = np.concatenate([np.diff(part, 3) for part in raw])
-    if not thirds.size:
-        return 0.0
-    return float(np.std(np.concatenate(raw))) / max(float(np.sqrt(np.mean(thirds**2) / 20.0)), 1e-300)
+def _state_excess(fit: Fit, excess: Mapping[str, float]) -> Fit:
+    """Return the fit with how many times its sensor's noise the residual of each output is."""
+    outputs = {
+        name: {output: replace(fitted, excess=excess[f"{name}.{output}"]) for output, fitted in row.items()}
+        for name, row in fit.outputs.items()
+    }
+    return replace(fit, outputs=outputs)
 
 
 def _conclude(fit: Fit) -> Fit:

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.problem.shapes import Vector
 from seaopt.records import record
 from seaopt.simulation import RobustLoss
 
@@ -25,7 +24,7 @@ class Squares:
         """Return the loss's derivative at each residual, in sigma."""
         return r
 
-    def curvature(self, r: Vector) -> Vector:
+    def curvature(self, r: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the loss's second derivative at each residual, in sigma."""
         return np.ones_like(r)
 
@@ -52,7 +51,7 @@ class Huber:
         """Return the loss's derivative at each residual, in sigma."""
         return np.clip(r, -self.threshold, self.threshold)
 
-    def curvature(self, r: Vector) -> Vector:
+    def curvature(self, r: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the loss's second derivative at each residual, in sigma."""
         return (np.abs(r) <= self.threshold).astype(float)
 
@@ -79,7 +78,7 @@ class SoftL1:
         """Return the loss's derivative at each residual, in sigma."""
         return r / np.sqrt(1.0 + (r / self.threshold) ** 2)
 
-    def curvature(self, r: Vector) -> Vector:
+    def curvature(self, r: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the loss's second derivative at each residual, in sigma."""
         return (1.0 + (r / self.threshold) ** 2) ** -1.5
 

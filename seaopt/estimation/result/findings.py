@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field
 from typing import Any, Literal
@@ -10,6 +11,7 @@ import numpy as np
 
 from seaopt.codec import OrInfinite, OrMinusInfinite, OrNaN
 from seaopt.estimation.problem.shapes import Signal
+from seaopt.parameters import QUANTILE
 from seaopt.records import PlotAccessor, Worded, record
 
 Severity = Literal["error", "warning", "note"]
@@ -92,6 +94,8 @@ class OutputFit:
     explainable : float or None
         The share that some model of the inputs could account for, by coherence and by a flexible predictor; None where
         the log is too short to tell.
+    excess : float or None
+        How many times the noise of its sensor the residual is: 1 where nothing is missing; None without diagnostics.
 
     """
 
@@ -105,22 +109,34 @@ class OutputFit:
     one_step_fit_percent: float | None = None
     explained: float | None = None
     explainable: float | None = None
+    excess: float | None = None
 
 
 @record
 class DerivedFigure:
-    """A figure that follows from the parameters, or is an experiment's own, with its std from the covariance."""
+    """A figure that follows from the parameters, or is an experiment's own, with its std from the covariances."""
 
-    json_keys = ("value", "unit", "std", "ci95")
+    json_keys = ("value", "unit", "std", "model_std", "ci95", "known")
 
     value: float
     unit: str
     std: OrInfinite
+    model_std: OrInfinite = 0.0
+
+    @property
+    def total_std(self) -> OrInfinite:
+        """The standard deviation of noise and model together."""
+        return math.hypot(self.std, self.model_std)
 
     @property
     def ci95(self) -> tuple[OrMinusInfinite, OrInfinite]:
-        """The 95 % interval."""
-        return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
+        """The 95 % interval, of noise and model together."""
+        return (self.value - QUANTILE * self.total_std, self.value + QUANTILE * self.total_std)
+
+    @property
+    def known(self) -> OrInfinite:
+        """Half the width of the 95 % interval over the value."""
+        return QUANTILE * self.total_std / abs(self.value) if self.value else math.inf
 
 
 @record
@@ -141,6 +157,7 @@ class Nuisance:
     drift: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
     noise: dict[str, float] = field(default_factory=dict[str, float])
     std: dict[str, OrInfinite] = field(default_factory=dict[str, float])
+    model_std: dict[str, OrInfinite] = field(default_factory=dict[str, float])
     plant: str = ""
     hold: Literal["zero", "first"] = "zero"
 
@@ -149,7 +166,12 @@ class Nuisance:
         """The estimated delay and gains, `delay_s` and `gain.F1`, with standard deviations."""
         values = {"delay_s": self.delay_s, **{f"gain.{name}": gain for name, gain in self.gain.items()}}
         return {
-            key: DerivedFigure(value=values[key], unit="s" if key == "delay_s" else "-", std=std)
+            key: DerivedFigure(
+                value=values[key],
+                unit="s" if key == "delay_s" else "-",
+                std=std,
+                model_std=self.model_std.get(key, 0.0),
+            )
             for key, std in self.std.items()
         }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -69,6 +69,8 @@ class Fit(Result, Worded):
         The covariance for white residuals; compared with the other it shows the effect of their colour.
     delay_covariance : Covariance or None
         Of the free parameters and of the delays that were fitted, `chirp.delay_s`; None where none was.
+    model_covariance : Covariance or None
+        Of the same: what the structure left in the residuals may move them by, besides noise; None without diagnostics.
     derived : mapping
         Figures that follow from the parameters.
     outputs : mapping of experiment to mapping of output to OutputFit
@@ -105,6 +107,7 @@ class Fit(Result, Worded):
     json_keys = (
         *("met", "findings", "status", "message", "cost", "iterations", "samples", "parameters", "derived"),
         *("covariance", "white_covariance", Key(field="delay_covariance", name="delay_covariance", omit_none=True)),
+        Key(field="model_covariance", name="model_covariance", omit_none=True),
         *("outputs", "identifiability", Key(field="nuisance", name="experiments"), "step_error_sigma"),
         *("step_error_parameter", "method", "log_likelihood", "unknowns", "aic", "bic", "notes", "provenance"),
     )
@@ -130,6 +133,7 @@ class Fit(Result, Worded):
     findings: tuple[FitFinding, ...] = ()
     notes: tuple[str, ...] = ()
     delay_covariance: Covariance | None = field(default=None, repr=False)
+    model_covariance: Covariance | None = field(default=None, repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
     minimum: Minimum | None = field(default=None, repr=False)
 
@@ -137,6 +141,23 @@ class Fit(Result, Worded):
     def wall_s(self) -> float:
         """Seconds from call to result."""
         return self.provenance.wall_s
+
+    @property
+    def total_covariance(self) -> Covariance:
+        """The covariance of the free parameters, of noise and model together."""
+        return self._add_model(self.covariance)
+
+    @property
+    def total_delay_covariance(self) -> Covariance | None:
+        """The same of the free parameters and the delays that were fitted; None where none was."""
+        return None if self.delay_covariance is None else self._add_model(self.delay_covariance)
+
+    def _add_model(self, noise: Covariance) -> Covariance:
+        model = self.model_covariance
+        if model is None:
+            return noise
+        rows = [model.names.index(name) for name in noise.names]
+        return replace(noise, matrix=noise.matrix + model.matrix[np.ix_(rows, rows)])
 
     @property
     def met(self) -> bool:

@@ -106,7 +106,7 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         covariance=Covariance(names=names, matrix=robust),
         white_covariance=Covariance(names=names, matrix=white),
         delay_covariance=Covariance(names=(*names, *delayed), matrix=joint) if delayed else None,
-        derived=_derive_figures(experiments, fitted, Covariance(names=names, matrix=seen_robust), identifiability),
+        derived=derive_figures(experiments, fitted, Covariance(names=names, matrix=seen_robust), identifiability),
         outputs=outputs,
         nuisance={
             experiment.name: describe_nuisance(experiment, z, statistics, variance)
@@ -263,7 +263,7 @@ def _compile_figures(plant: Plant) -> tuple[Any, dict[str, str]]:
     }
 
 
-def _derive_figures(
+def derive_figures(
     experiments: tuple[Experiment, ...], fitted: ParameterSet, seen: Covariance, identifiability: Identifiability
 ) -> dict[str, DerivedFigure]:
     """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g.

@@ -212,7 +212,7 @@ def combine_uncertainty(
     plants: Plants,
     drive: Drive | None = None,
 ) -> Uncertainty:
-    """Combine a fit's covariance (or a ParameterSet's prior_stds) and the declared ranges into one description.
+    """Combine a fit's covariance, of noise and model, (or prior_stds) and the declared ranges into one description.
 
     `others` has the values of parameters that `source` lacks; those with a prior_std are uncertain too. `drive` has the
     drive's delay, which is uncertain as the fit of one experiment left it, together with the parameters.
@@ -226,7 +226,7 @@ def combine_uncertainty(
     plant_names = {name for plant in plants.values() for name in plant.parameters}
     check_ranges(ranges, plants)
     if isinstance(source, Fit):
-        covariance = source.covariance if drive is None else drive.take_covariance(source)
+        covariance = source.total_covariance if drive is None else drive.take_covariance(source)
         nominal, names, matrix = source.parameters, covariance.names, covariance.matrix
         if source.status not in ("converged", "not_identifiable"):
             raise ControlError(f"the fit has not converged ({source.message}); nothing can be certified from it")

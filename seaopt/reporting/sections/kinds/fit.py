@@ -17,7 +17,7 @@ DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
 MOST_PLACES = 3  # that a reason names
 EXPLAINED = (
     "explained: share of the output's energy that the model accounts for; of at most: the share that any model of "
-    "these inputs could account for, estimated from the log alone"
+    "these inputs could account for, estimated from the log alone; over noise: the residual over its sensor's noise"
 )
 
 
@@ -79,7 +79,9 @@ def _tabulate_parameters(fit: Fit) -> Table:
             parameter.name,
             f"{parameter.value:.6g}",
             _spread(parameter.std),
+            _spread(parameter.model_std),
             _interval(parameter.ci95),
+            _known(parameter.known),
             _unit(parameter.unit),
             _remark(parameter),
             parameter.description,
@@ -91,16 +93,17 @@ def _tabulate_parameters(fit: Fit) -> Table:
         rows += [_tabulate_figure(name, figure, remark) for name, figure in figures.items()]
     return Table(
         label="Fitted parameters, and what follows from them",
-        head=("parameter", "value", "std", "95 % interval", "unit", "", "meaning"),
+        head=("parameter", "value", "std", "model std", "95 % interval", "known to", "unit", "", "meaning"),
         rows=tuple(rows),
-        align="<>>><<<",
+        align="<>>>>><<<",
         optional=("95 % interval", "meaning"),
     )
 
 
 def _tabulate_figure(name: str, figure: DerivedFigure, remark: str) -> tuple[str, ...]:
-    interval = _interval(figure.ci95) if figure.std else ""
-    return (name, f"{figure.value:.6g}", _spread(figure.std), interval, _unit(figure.unit), remark, "")
+    interval, known = (_interval(figure.ci95), _known(figure.known)) if figure.total_std else ("", "")
+    stds = (_spread(figure.std), _spread(figure.model_std))
+    return (name, f"{figure.value:.6g}", *stds, interval, known, _unit(figure.unit), remark, "")
 
 
 def _tabulate_outputs(fit: Fit) -> Table:
@@ -115,6 +118,7 @@ def _tabulate_outputs(fit: Fit) -> Table:
             _percent(figures.explainable),
             f"{figures.rms_residual:.4g}",
             _unit(figures.unit),
+            format_number(figures.excess, 2),
             format_number(figures.sigma),
             format_number(fit.nuisance[name].offset.get(output), 3) if name in fit.nuisance else MISSING,
             format_number(figures.whiteness_p, 2),
@@ -122,12 +126,12 @@ def _tabulate_outputs(fit: Fit) -> Table:
         for name, row in fit.outputs.items()
         for output, figures in row.items()
     ]
-    columns = ("fit %", "held out", "one step", "in the band", "explained", "of at most", "residual", "")
+    columns = ("fit %", "held out", "one step", "in the band", "explained", "of at most", "residual", "", "over noise")
     return Table(
         label="Fit of every output",
         head=("output", *columns, "sigma", "offset", "whiteness p"),
         rows=tuple(rows),
-        align="<>>>>>>><>>>",
+        align="<>>>>>>><>>>>",
         optional=("sigma", "offset", "whiteness p"),
     )
 
@@ -210,6 +214,11 @@ def _spread(std: float | None) -> str:
 def _interval(ends: tuple[float, float] | None) -> str:
     finite = ends is not None and all(map(math.isfinite, ends))
     return " to ".join(format_number(end, 6) for end in ends) if ends is not None and finite else MISSING
+
+
+def _known(share: float | None) -> str:
+    """Return to how many percent a value is known; nothing of what an interval does not tell from zero."""
+    return f"{100 * share:.2g} %" if share is not None and share < 1.0 else MISSING
 
 
 def _percent(share: float | None) -> str:

@@ -1,0 +1,292 @@
+r"""What the structure that is left in a fit's residuals may move its parameters by: their model covariance.
+
+A covariance of residuals tells how far noise moves the estimates. What a model lacks moves them too, and no formula on
+one log tells by how much; what a log can tell is put together here. All is linear in the minimum, over the parameters
+and delays alone: the other unknowns :math:`\nu` (offsets, initial states) are eliminated, so that with H the Hessian
+of all unknowns and E the columns of those that are wanted
+
+.. math:: S = (E^T H^{-1} E)^{-1}, \qquad \tilde J_t = J_t H^{-1} E S, \qquad S = \sum_t \tilde J_t^T \tilde J_t + P,
+          \qquad g_A = \sum_{t \in A} \tilde J_t^T r_t, \qquad H_A = \sum_{t \in A} \tilde J_t^T \tilde J_t .
+
+- b, the noise: the largest of the std for white residuals, of that for coloured ones (`covariance`), and of what the
+  scores :math:`\tilde J_t^T r_t` vary by within 0.1 s (Newey and West, Econometrica 55, 1987); at least 0.02 %.
+- j, parts of the log: without one of 8 contiguous parts the estimates move by :math:`d_k = -(S - H_k)^{-1} g_k`
+  (a jackknife of one step: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982);
+  :math:`v = \tfrac78 \sum (d_k - \bar d)^2` and :math:`j^2 = \max(0, v - b^2)`. Where few parts have all the
+  information, noise alone gives more than b^2 and scatters more: where the residual is noise, so much is taken off.
+- t, halves of the log, by time, by amplitude and by speed: :math:`d = (H_A^{-1} g_A - H_B^{-1} g_B)/2`, of the halves
+  that differ the most; where it is beyond 3 of its own standard deviations.
+- g, few values: an output's residual is in part a model's error, :math:`m_o = 1 - (\text{noise}/\text{rms})^2`, which
+  has some 80 independent values however long the log is (`noise_floor`):
+  :math:`G = \tfrac{N}{80} S^{-1} \big(\sum_o m_o \tilde J_o^T \tilde J_o\, \text{rms}_o^2\big) S^{-1}`.
+
+The count of 80, the halves and the limits are from fits of simulated actuators with 28 kinds of physics that the model
+lacked. Beyond an excess of 3 none of this suffices: see `seaopt.estimation.judgement`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.problem.noise_floor import NoiseFloor, list_excess, measure_floor
+from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
+from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
+from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence
+from seaopt.records import record
+
+PARTS = 8
+HALVES = 3  # by time, by amplitude, by speed
+WINDOW_S, WINDOWS = 0.1, 20  # over which scores correlate; and at least so many of them in a log
+ENVELOPE_S = 0.25
+APART = 3.0  # standard deviations from which halves differ
+INDEPENDENT = 80.0  # values of a model's error
+LEAST_SHARE = 2e-4  # of a value, below which no std is believed
+SCATTER = 3.0  # standard deviations by which the jackknife of a log whose information is in few parts may scatter
+CHANCE = 4.0  # over sqrt(N), the share of a residual's power by which its noise is misjudged: two std of that estimate
+LITTLE = 1.5  # excess up to which a residual is taken for noise
+FEWEST = 0.1  # share of the samples that a half has to have
+
+
+@record(eq=False)
+class ModelError:
+    """What the structure of residuals may move parameters and delays by, each part a covariance in SI."""
+
+    names: tuple[str, ...]  # the free parameters, then the delays that were fitted
+    excess: Mapping[str, float]  # of each output, EXPERIMENT.OUTPUT: its residual over its sensor's noise
+    # colour: what the noise's std lacks of b; parts: j; halves: t; few_values: g
+    colour: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
+    parts: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
+    halves: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
+    few_values: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def matrix(self) -> ParameterMatrix:
+        """The model covariance: the sum of all."""
+        return self.colour + self.parts + self.halves + self.few_values
+
+
+def estimate_model_error(
+    problem: FitProblem, z: Vector, residuals: ResidualsByExperiment, noise: ParameterMatrix
+) -> ModelError:
+    """Return what the residuals at a minimum may move its parameters and delays by, besides their noise.
+
+    `residuals`: at `z`; `noise`: the covariance of the parameters and the fitted delays, in their order.
+    """
+    unknowns = problem.unknowns
+    delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
+    stated = np.array([*range(unknowns.shared), *delays], dtype=int)
+    names = tuple(unknowns.names[i] for i in stated)
+    floors = {e.name: measure_floor(e, residuals[e.name]) for e in problem.experiments}
+    excess = list_excess(problem, floors)
+    bread = problem.evaluate(z).hessian if problem.loss.quadratic else compute_bread(problem, z)
+    if not stated.size or not np.all(np.isfinite(bread)):
+        zero = np.zeros((stated.size,) * 2)
+        return ModelError(names=names, excess=excess, colour=zero, parts=zero, halves=zero, few_values=zero)
+    columns = invert(bread)[0][:, stated]
+    inverse = columns[stated]
+    information = invert(inverse)[0]
+    sums = _sum_parts(problem, z, residuals, columns @ information, floors)
+    scores = inverse @ sums.windows @ inverse
+    variance = np.where(np.isfinite(np.diag(noise)), np.diag(noise), 0.0)
+    white = np.diag(inverse @ sums.power @ inverse)
+    noisy = np.maximum.reduce([variance, white, np.diag(scores)])
+    inflation = noisy / np.maximum(np.diag(inverse), 1e-300)
+    b2 = np.maximum(noisy, (LEAST_SHARE * z[stated]) ** 2)
+    return ModelError(
+        names=names,
+        excess=excess,
+        colour=_resize(scores, b2 - variance),
+        parts=_jackknife(information, sums, b2, inflation, noise_alone=max(excess.values()) <= LITTLE),
+        halves=_compare_halves(information, sums, inflation),
+        few_values=inverse @ sums.error_power @ inverse * (sums.count / INDEPENDENT),
+    )
+
+
+def _resize(matrix: ParameterMatrix, variances: ParameterVector) -> ParameterMatrix:
+    """Return a covariance of the same correlations with other variances, which count as zero where they are below."""
+    std = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    wanted = np.sqrt(np.maximum(variances, 0.0))
+    scale = np.where(std > 0.0, wanted / np.where(std > 0.0, std, 1.0), 0.0)
+    resized = matrix * scale[:, None] * scale
+    np.fill_diagonal(resized, wanted**2)
+    return resized
+
+
+@record(eq=False)
+class _Sums:
+    """Sums over the samples, over the parameters and delays alone: H_k and g_k of parts, and of a half of each split.
+
+    `share` is how many of the samples are in that half, `windows` the scores' products within a window, `power` and
+    `error_power` the information of the outputs weighted with the power of their residuals and of the model's error.
+    """
+
+    information: Float[np.ndarray, "parts q q"]
+    score: Float[np.ndarray, "parts q"]
+    half_information: Float[np.ndarray, "halves q q"]
+    half_score: Float[np.ndarray, "halves q"]
+    share: Float[np.ndarray, " halves"]
+    windows: ParameterMatrix
+    power: ParameterMatrix
+    error_power: ParameterMatrix
+    count: float
+
+
+def _jackknife(
+    information: ParameterMatrix, sums: _Sums, b2: ParameterVector, inflation: ParameterVector, *, noise_alone: bool
+) -> ParameterMatrix:
+    """Return what the estimates move by without one part of the log, beyond what noise moves them."""
+    q = len(information)
+    moved, by_noise = np.zeros((PARTS, q)), np.zeros((PARTS, q))
+    for k in range(PARTS):
+        without = invert(information - sums.information[k])[0]
+        moved[k] = -without @ sums.score[k]
+        by_noise[k] = np.diag(without @ sums.information[k] @ without) * inflation
+    apart = moved - np.mean(moved, axis=0)
+    share = (PARTS - 1.0) / PARTS
+    matrix = share * apart.T @ apart
+    chance = share * np.sum(by_noise, axis=0)
+    # Of one degree of freedom where one part has all the information, of 8 where they have as much.
+    freedom = np.sum(by_noise, axis=0) ** 2 / np.maximum(np.sum(by_noise**2, axis=0), 1e-300)
+    scatter = SCATTER * (np.sqrt(2.0 / np.maximum(freedom, 1.0)) - np.sqrt(2.0 / PARTS))
+    expected = np.maximum(np.where(scatter > 0.0, chance * (1.0 + scatter), b2), b2) if noise_alone else b2
+    return _resize(matrix, np.diag(matrix) - expected)
+
+
+def _compare_halves(information: ParameterMatrix, sums: _Sums, inflation: ParameterVector) -> ParameterMatrix:
+    """Return half of what the estimates of two halves differ by, of the splits that differ the most."""
+    q = len(information)
+    priors = information - np.sum(sums.information, axis=0)
+    whole_score, whole = np.sum(sums.score, axis=0), np.sum(sums.information, axis=0)
+    apart = np.zeros((HALVES, q))
+    for s in range(HALVES):
+        if not FEWEST < sums.share[s] < 1.0 - FEWEST:
+            continue
+        halves = (sums.half_information[s], whole - sums.half_information[s])
+        inverses = [invert(half + 0.5 * priors)[0] for half in halves]
+        scores = (sums.half_score[s] - 0.5 * whole_score, 0.5 * whole_score - sums.half_score[s])
+        shift = 0.5 * (inverses[0] @ scores[0] - inverses[1] @ scores[1])
+        std = 0.5 * np.sqrt(np.maximum(np.diag(inverses[0] + inverses[1]), 0.0) * inflation)
+        apart[s] = np.where(np.abs(shift) > APART * std, shift, 0.0)
+    largest = np.abs(apart) == np.max(np.abs(apart), axis=0)
+    chosen = np.where(largest, apart, 0.0)
+    return chosen.T @ chosen
+
+
+def _sum_parts(
+    problem: FitProblem,
+    z: Vector,
+    residuals: ResidualsByExperiment,
+    inverse: Float[np.ndarray, "n q"],
+    floors: Mapping[str, NoiseFloor],
+) -> _Sums:
+    """Sum over all samples, in one pass; `inverse` takes sensitivities to those of the parameters and delays alone."""
+    q, loss = inverse.shape[1], problem.loss
+    information, score = np.zeros((PARTS, q, q)), np.zeros((PARTS, q))
+    half_information, half_score, in_half = np.zeros((HALVES, q, q)), np.zeros((HALVES, q)), np.zeros(HALVES)
+    windows, power, error_power = (np.zeros((q, q)) for _ in range(3))
+    samples, before = sum(experiment.samples for experiment in problem.experiments), 0
+    for experiment in problem.experiments:
+        floor = floors[experiment.name]
+        rms2 = floor.rms**2
+        error = np.clip(1.0 - (1.0 + CHANCE / np.sqrt(np.maximum(floor.count, 1.0))) / floor.excess**2, 0.0, 1.0)
+        length = max(1, min(round(WINDOW_S / experiment.period), experiment.samples // WINDOWS))
+        split = _split(experiment, residuals[experiment.name])
+        for segment, high in zip(experiment.segments, split, strict=True):
+            into = map_to_influence(experiment, segment, inverse)
+            tail = np.zeros((q, length))
+            for rows, columns, used in stream_columns(experiment, segment, z):
+                along = compute_influence(columns, used, into)
+                r = (columns[:, :, 0] / experiment.sigma).T
+                weighted = along * loss.curvature(r)[:, None, :]
+                scores = np.sum(along * loss.slope(r)[:, None, :], axis=0)
+                part = (before + np.arange(rows.start, rows.stop)) * PARTS // samples
+                for k in range(int(part[0]), int(part[-1]) + 1):
+                    chosen = slice(*np.searchsorted(part, [k, k + 1]))
+                    information[k] += _gram(weighted[:, :, chosen], along[:, :, chosen])
+                    score[k] += np.sum(scores[:, chosen], axis=1)
+                for s, mask in enumerate(high[:, rows]):
+                    half_information[s] += _gram(weighted[:, :, mask], along[:, :, mask])
+                    half_score[s] += np.sum(scores[:, mask], axis=1)
+                in_half += np.count_nonzero(high[:, rows], axis=1)
+                grams = np.matmul(along, along.transpose(0, 2, 1))
+                power += np.tensordot(rms2, grams, 1)
+                error_power += np.tensordot(rms2 * error, grams, 1)
+                tail = _add_windows(windows, tail, scores)
+            _add_windows(windows, tail, np.zeros((q, length - 1)))
+            before += segment.samples.n
+    return _Sums(
+        information=information,
+        score=score,
+        half_information=half_information,
+        half_score=half_score,
+        share=in_half / max(samples, 1),
+        windows=windows,
+        power=power,
+        error_power=error_power,
+        count=float(sum(np.sum(floor.count) for floor in floors.values())),
+    )
+
+
+def _gram(a: Float[np.ndarray, "ny q m"], b: Float[np.ndarray, "ny q m"]) -> ParameterMatrix:
+    return np.sum(np.matmul(a, b.transpose(0, 2, 1)), axis=0)
+
+
+def _add_windows(
+    windows: ParameterMatrix, tail: Float[np.ndarray, "q l"], scores: Float[np.ndarray, "q m"]
+) -> Float[np.ndarray, "q l"]:
+    """Add the products of the scores' sums over every window that ends in these samples; return the new tail."""
+    length = tail.shape[1]
+    joined = np.concatenate([tail, scores], axis=1)
+    total = np.concatenate([np.zeros((len(joined), 1)), np.cumsum(joined, axis=1)], axis=1)
+    sums = total[:, length + 1 :] - total[:, 1:-length]
+    windows += sums @ sums.T / length
+    return joined[:, joined.shape[1] - length :]
+
+
+def _split(experiment: FitExperiment, residuals: ExperimentResiduals) -> list[Bool[np.ndarray, "halves n"]]:
+    """Return which samples of each segment are late in the log, large, and fast."""
+    effort, fast = [], []
+    for segment, left in zip(experiment.segments, residuals.segments, strict=True):
+        model = np.stack(segment.samples.y, axis=1) + left.raw
+        effort.append(_measure_envelope(model[:, _find_effort(experiment)], experiment.period))
+        fast.append(_measure_speed(experiment, model))
+    middles = [float(np.nanmedian(np.concatenate(parts))) for parts in (effort, fast)]
+    masks: list[Bool[np.ndarray, "halves n"]] = []
+    first, samples = 0, experiment.samples
+    for envelope, speed in zip(effort, fast, strict=True):
+        late = first + np.arange(envelope.size) >= 0.5 * samples
+        masks.append(np.array([late, envelope > middles[0], speed > middles[1]]))
+        first += envelope.size
+    return masks
+
+
+def _find_effort(experiment: FitExperiment) -> int:
+    """Return the output that is the spring's force or torque; the first where none is measured."""
+    sensing, outputs = experiment.data.plant.sensing, experiment.data.outputs
+    regulated = sensing.regulated if sensing is not None else ()
+    return next((outputs.index(name) for name in regulated if name in outputs), 0)
+
+
+def _measure_envelope(values: Signal, period: float) -> Signal:
+    """Return the largest distance from the median within 0.25 s; NaN where samples are missing."""
+    from scipy.ndimage import maximum_filter1d  # deferred: scipy is slow to load
+
+    away = np.abs(values - np.nanmedian(values)) if np.any(np.isfinite(values)) else np.zeros_like(values)
+    return maximum_filter1d(np.nan_to_num(away), max(1, round(ENVELOPE_S / period)))
+
+
+def _measure_speed(experiment: FitExperiment, model: Float[np.ndarray, "n ny"]) -> Signal:
+    """Return how fast the motor is, by its speed or position where one is measured, else by the spring's force."""
+    sensing, outputs = experiment.data.plant.sensing, experiment.data.outputs
+    if sensing is not None and sensing.motor_speed in outputs:
+        return np.abs(model[:, outputs.index(sensing.motor_speed)])
+    position = sensing.motor_position if sensing is not None else None
+    column = outputs.index(position) if position in outputs else _find_effort(experiment)
+    return np.abs(np.gradient(model[:, column])) if len(model) > 1 else np.zeros(len(model))
