@@ -96,7 +96,7 @@ def _tabulate_parameters(fit: Fit) -> Table:
         head=("parameter", "value", "std", "model std", "95 % interval", "known to", "unit", "", "meaning"),
         rows=tuple(rows),
         align="<>>>>><<<",
-        optional=("95 % interval", "meaning"),
+        optional=("model std", "95 % interval", "meaning"),
     )
 
 
