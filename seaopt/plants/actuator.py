@@ -72,6 +72,7 @@ from seaopt.plants.roles import (
     Friction,
     Mode,
     Port,
+    Recipe,
     Sensing,
     SeriesSpring,
     StateExpression,
@@ -280,11 +281,12 @@ def make_plant(
     second_order: tuple[str, str] | None = None,
     inputs: tuple[str, ...] = (),
     ports: tuple[Port, ...] = (),
+    recipe: Recipe | None = None,
 ) -> Plant:
     """Return the plant of an actuator: its equations and roles, then the parts that wrap any plant. `outputs`: what can
-    be measured. `derived`, `sensing`, `ports`: as in `Plant`. `second_order`: the derived figures that are mass and
-    damping of the second-order response with the links fixed. `inputs`: efforts of the world on the links, which a log
-    may leave out.
+    be measured. `derived`, `sensing`, `ports`, `recipe`: as in `Plant`. `second_order`: the derived figures that are
+    mass and damping of the second-order response with the links fixed. `inputs`: efforts of the world on the links,
+    which a log may leave out.
     """
     drive, parts = actuator.transmission, actuator.parts
     place, effort = drive.place_unit, drive.effort_unit
@@ -344,6 +346,7 @@ def make_plant(
         ),
         ports=ports,
         friction=frictions,
+        recipe=recipe,
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in parts else None,
     )
     return part_laws.wrapped(plant, [part for part in parts if part not in part_laws.INSIDE])

@@ -59,6 +59,8 @@ Around any plant, besides those of `seaopt.plants.drives`:
     Dead times T_c before the input and T_m behind the same outputs, as Padé approximants of order three: the phase is
     right to one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are
     for linearisation and continuous-time loops.
+``droop``, ``friction_drift``, ``friction_direction``
+    A motor that saturates, friction that changes over a log, or with the direction: `seaopt.plants.motor.effects`.
 ``deflection_sensor``
     One more output, what two encoders and a nominal stiffness make: `seaopt.plants.sensors.deflection`.
 """
@@ -72,13 +74,16 @@ from types import SimpleNamespace
 from typing import Any, Literal
 
 import casadi as ca
+import numpy as np
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter, declare
 from seaopt.plants import drives
+from seaopt.plants.friction import can_stick
+from seaopt.plants.motor import effects
 from seaopt.plants.motor.thermal import PARAMETERS, add_heat
 from seaopt.plants.plant import Plant
-from seaopt.plants.roles import change_ports, put_behind
+from seaopt.plants.roles import Recipe, change_ports, put_behind
 from seaopt.plants.sensors.deflection import PARTS as SENSOR_PARTS
 from seaopt.plants.sensors.deflection import keep_weights, read_deflection
 from seaopt.records import record
@@ -94,6 +99,9 @@ Part = Literal[
     "hardening",
     "spring_damping",
     "screw_mode",
+    "droop",
+    "friction_drift",
+    "friction_direction",
     "current_loop",
     "load_cell",
     "command_delay",
@@ -151,6 +159,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "command_delay": (declare("T_c", 1e-3, "s", 1e-9, "delay of the command"),),
     "measurement_delay": (declare("T_m", 1e-3, "s", 1e-9, "delay of the measurement"),),
     "servo_delay": (declare("T_v", 1e-3, "s", 1e-9, "delay of the servo's command"),),
+    **effects.PARTS,
     **drives.PARTS,
     **SENSOR_PARTS,
     "thermal": PARAMETERS,
@@ -308,6 +317,12 @@ _FILTERS = {
 
 _DEAD_TIMES = ("command_delay", "measurement_delay")  # from a command to what a log has of its effect
 
+# What is the motor's and the transmission's own, behind the drive.
+_EFFECTS: dict[str, Callable[[Plant], Plant]] = {
+    "droop": effects.let_droop,
+    "friction_drift": effects.let_friction_drift,
+    "friction_direction": effects.let_friction_differ,
+}
 _WRAPPERS: dict[str, Callable[[Plant, Sequence[str]], Plant]] = {
     "position_servo": drives.add_servo,
     "deflection_sensor": lambda plant, parts: read_deflection(plant),
@@ -355,6 +370,8 @@ def wrapped(
             )
     if "thermal" in parts:
         plant = add_heat(plant)
+    for part, change in _EFFECTS.items():
+        plant = change(plant) if part in parts else plant
     if "voltage_input" in parts or "duty_input" in parts:
         plant = drives.drive_electrically(plant, parts)
     for part in _ORDER:
@@ -377,6 +394,50 @@ def wrapped(
                 raise PlantError(f"plant {plant.name} has {reading} that {part} reads; name others")
         plant = _add_filter(plant, part, signals)
     return plant
+
+
+def add_part(plant: Plant, part: str) -> Plant:
+    """Return a plant with one more part, made again where it can be, so that the part is where it acts.
+
+    Raises PlantError: the part does not go with the plant; or sits inside an actuator, and nothing makes that again.
+
+    Examples
+    --------
+    >>> from seaopt.plants import high_impedance, let_stick
+    >>> stiffer = add_part(let_stick(high_impedance(parts=["load_cell"])), "hardening")
+    >>> stiffer.name, stiffer.sticks, "k_3" in stiffer.parameters
+    ('high_impedance(unlumped) with load_cell', True, True)
+
+    """
+    recipe = plant.recipe
+    if recipe is None or not _makes(recipe, plant):
+        made = wrapped(plant, [part])
+    else:
+        check_parts((*recipe.parts, part))
+        made = recipe.make((*recipe.parts, part))
+    return replace(made, sticks=plant.sticks and can_stick(made), drive_offset_s=plant.drive_offset_s)
+
+
+def _makes(recipe: Recipe, plant: Plant) -> bool:
+    """Tell whether a recipe makes a plant, at one point; states and outputs that a device adds are its own."""
+    made = recipe.make(recipe.parts)
+    if tuple(made.parameters) != tuple(plant.parameters) or tuple(made.inputs) != tuple(plant.inputs):
+        return False
+    if not (made.states.keys() <= plant.states.keys() and made.outputs.keys() <= plant.outputs.keys()):
+        return False
+    at = np.random.default_rng(0).uniform(0.5, 1.5, len(plant.states) + len(plant.inputs) + len(plant.parameters))
+    values: list[dict[str, float]] = []
+    for each in (made, plant):
+        x, u, p = np.split(at, np.cumsum([len(plant.states), len(plant.inputs)]))
+        x = x[[list(plant.states).index(name) for name in each.states]]
+        rows = ca.Function("rows", [each.t, each.x, each.u, each.p], [each.dynamics, each.output])(0.0, x, u, p)
+        named = zip((*each.states, *each.outputs), np.concatenate([np.array(row).ravel() for row in rows]), strict=True)
+        values.append({name: float(value) for name, value in named})
+    made_values, plant_values = values
+    return all(
+        math.isclose(value, plant_values[name], rel_tol=1e-9) or not math.isfinite(value)
+        for name, value in made_values.items()
+    )
 
 
 def list_dead_times(plant: Plant) -> tuple[str, ...]:

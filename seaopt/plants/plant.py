@@ -32,7 +32,18 @@ from seaopt.plants.equations.declaration import (
 )
 from seaopt.plants.equations.stored_equations import store_plant
 from seaopt.plants.memo import memo
-from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sampling, Sensing, SeriesSpring, Winding
+from seaopt.plants.roles import (
+    Actuation,
+    Expression,
+    Friction,
+    Mode,
+    Port,
+    Recipe,
+    Sampling,
+    Sensing,
+    SeriesSpring,
+    Winding,
+)
 from seaopt.records import record
 from seaopt.units import factor, unit_after
 
@@ -79,6 +90,10 @@ class Plant:
         smoothed curve.
     sampling : Sampling, optional
         States that hold what was sampled; f is zero for them.
+    clock : str, optional
+        The optional input that is the time since a log's beginning, s: counted where the log has no such channel.
+    recipe : Recipe, optional
+        How it is made with other parts.
     drive_offset_s : float
         Of one actuator whose drive was found as fast here and as slow there: what this one's delay is beyond that of
         the others, the parameters' ``drive_delay_s``, s.
@@ -126,6 +141,8 @@ class Plant:
     winding: Winding | None = field(default=None, repr=False)
     sticks: bool = False
     sampling: Sampling | None = field(default=None, repr=False)
+    clock: str | None = None
+    recipe: Recipe | None = field(default=None, repr=False)
     drive_offset_s: float = field(default=0.0, repr=False)
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)

@@ -311,6 +311,14 @@ class Winding:
 
 
 @record(eq=False)
+class Recipe:
+    """How a plant is made: its parts, and what makes it with others, ``parts -> Plant``."""
+
+    parts: tuple[str, ...]
+    make: Callable[[tuple[str, ...]], Any]
+
+
+@record(eq=False)
 class Sampling:
     """States that stand still between samples, and are set at each: memories of a device that samples."""
 

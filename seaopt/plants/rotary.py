@@ -27,10 +27,11 @@ from seaopt.plants.actuator import (
     check_choices,
     make_plant,
 )
+from seaopt.plants.motor import effects
 from seaopt.plants.parts import INSIDE, PARTS, Part, check_parts
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import GRAVITY
-from seaopt.plants.roles import Port, Sensing
+from seaopt.plants.roles import Port, Recipe, Sensing
 from seaopt.records import record
 
 RotaryLink = Literal["free", "locked", "pendulum"]
@@ -80,6 +81,7 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
     ),
     "hardening": (declare("k_3", 0.0, "N m/rad^3", 0.0, "cubic stiffness"),),
     "spring_damping": (),  # c_s is there without it
+    **effects.ROTARY_PARTS,
     "deflection_sensor": tuple(replace(parameter, unit="N m/rad") for parameter in PARTS["deflection_sensor"]),
 }
 
@@ -248,7 +250,12 @@ def _actuator(name: str, build: _Build) -> Plant:
         second_order=("reflected_inertia", "reflected_damping"),
         inputs=("tau_e",) if build.external else (),
         ports=(_port(name, build),),
+        recipe=Recipe(parts=build.parts, make=partial(_remake, name, build)),
     )
+
+
+def _remake(name: str, build: _Build, parts: tuple[Part, ...]) -> Plant:
+    return _actuator(name, replace(build, parts=parts))
 
 
 def _derive_figures(p: Any, build: _Build) -> dict[str, tuple[Any, str]]:

@@ -29,7 +29,7 @@ from seaopt.plants.actuator import (
 from seaopt.plants.parts import PARTS, Part
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import ACTUATOR, GRAVITY, link_mass, pendulum
-from seaopt.plants.roles import Port, Sensing
+from seaopt.plants.roles import Port, Recipe, Sensing
 from seaopt.records import record
 
 LinkKind = Literal["fixed", "mass", "pendulum"]
@@ -163,7 +163,12 @@ def _actuator(name: str, build: _Build) -> Plant:
         second_order=None if rides else ("m_k", "b_m"),
         inputs=("Fe1", "Fe2") if build.external else (),
         ports=_ports(name, build),
+        recipe=Recipe(parts=build.parts, make=partial(_remake, name, build)),
     )
+
+
+def _remake(name: str, build: _Build, parts: tuple[Part, ...]) -> Plant:
+    return _actuator(name, replace(build, parts=parts))
 
 
 def _list_outputs(build: _Build) -> dict[str, tuple[str, Any]]:

@@ -24,7 +24,8 @@ ROUNDING = 1e-6  # of an output: below it an error is not held against the outpu
 
 
 def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
-    """Return the plant's inputs from a log's channels of the same names, in the plant's order; zeros if it has none.
+    """Return the plant's inputs from a log's channels of the same names, in the plant's order; of an optional input
+    that it has none of zeros, or the time since it began.
     Raises LogError: an input is missing from the log, or has missing samples.
     """
     columns: list[Float[np.ndarray, " n"]] = []
@@ -32,7 +33,7 @@ def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]
     for name in plant.inputs:
         if name not in log.signals:
             if driven and name in plant.optional_inputs:
-                columns.append(np.zeros(len(log)))
+                columns.append(log.time - log.time[0] if name == plant.clock else np.zeros(len(log)))
                 continue
             raise LogError(
                 f'{log.source}: no channel "{name}" for the input of {plant.name}; {suggestion(name, log.signals)}'
