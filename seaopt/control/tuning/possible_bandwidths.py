@@ -26,7 +26,8 @@ FARTHEST_BELOW, FARTHEST_ABOVE = 4.0, 2.0  # of the bandwidth asked: where other
 USUAL_HZ = 60.0  # and as far as force loops usually go: above a resonance a law may need less than below it
 PROBE_RATIO = 1.2  # of a probe to the next
 STEP = 1.001 * math.log(PROBE_RATIO)
-RESOLUTION = 0.01  # to which the end of what is possible is found
+RESOLUTION = 0.01  # to which the end of what is possible is found, next to the bandwidth asked
+FAR_RESOLUTION = 0.05  # and far from it, of the distance, in logarithms: nobody moves an octave for 1 % more
 BISECTIONS = math.ceil(math.log2(math.log(PROBE_RATIO) / RESOLUTION))  # that find such an end
 MEMBERS, GENERATIONS = 30, 40  # of the evolution at every bandwidth
 STARTS_TRIED = 4
@@ -53,7 +54,9 @@ def list_steps(asked: float, end: float) -> list[float]:
     return [float(f) for f in np.geomspace(asked, end, count + 1)[1:]]
 
 
-def find_end(keeps: Callable[[float], bool], steps: Sequence[float], outside: float | None) -> float | None:
+def find_end(
+    keeps: Callable[[float], bool], steps: Sequence[float], asked: float, outside: float | None
+) -> float | None:
     """Return the first bandwidth that keeps the limits, moved towards the one before, which does not."""
     for inside in steps:
         if keeps(inside):
@@ -61,7 +64,8 @@ def find_end(keeps: Callable[[float], bool], steps: Sequence[float], outside: fl
         outside = inside
     else:
         return None
-    while outside is not None and abs(np.log(outside / inside)) > RESOLUTION:
+    resolution = max(RESOLUTION, FAR_RESOLUTION * abs(np.log(inside / asked)))
+    while outside is not None and abs(np.log(outside / inside)) > resolution:
         middle = float(np.sqrt(inside * outside))
         inside, outside = (middle, outside) if keeps(middle) else (inside, middle)
     return inside
@@ -85,8 +89,8 @@ class _Probes:
         highest = min(max(self.asked * FARTHEST_ABOVE, USUAL_HZ), HIGHEST_BANDWIDTH * spec.sample_rate_hz)
         down, up = (list_steps(self.asked, end) for end in (lowest, highest))
         self.expected = len(down) + len(up) + BISECTIONS
-        below, above = (find_end(self._keeps, steps, self.asked) for steps in (down, up))
-        largest = below if above is None else find_end(self._keeps, [*reversed(up), above], None)
+        below, above = (find_end(self._keeps, steps, self.asked, self.asked) for steps in (down, up))
+        largest = below if above is None else find_end(self._keeps, [*reversed(up), above], self.asked, None)
         nearest = tuple(f for f in (below, above) if f is not None)
         missed, closest = min((usage, f) for f, (usage, _) in self.tried.items())
         possible = PossibleBandwidths(nearest_hz=nearest, largest_hz=largest)
@@ -146,8 +150,7 @@ class _Probes:
         if not starts:
             return np.inf, x
         near, x = x, min(starts, key=lambda start: task.rank(grid, start))
-        usage, _ = task.rank(grid, x)
-        if usage > PROMISING_USAGE or (refined and np.allclose(x, near, rtol=1e-3)):
-            return usage, x
-        x = refine(task, grid, x, REFINEMENTS)
+        if task.rank(grid, x)[0] <= PROMISING_USAGE and not (refined and np.allclose(x, near, rtol=1e-3)):
+            x = refine(task, grid, x, REFINEMENTS)
+        x = min(near, x, key=lambda numbers: task.rank(grid, numbers)) if refined else x
         return task.rank(grid, x)[0], x

@@ -177,6 +177,8 @@ def retry(
             return _meet_friction_margin(task, *tried, ignore) if broken else tried
         if task.rank(grid, tried[0]) < rank:
             best, rank = tried, task.rank(grid, tried[0])
+        if keeping and rank[0] == 0.0:  # what is eased is kept as eased
+            break
     return best
 
 
@@ -315,8 +317,9 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
 
     It is lowered by a fifth at a time where none is asked and a limit is broken; where none keeps them, it is that
     which shows most of a friction margin that alone is missed, else zero, as nothing shows then which one misses least.
-    Where limits are missed clearly with all of it, little is looked for without any; and what lies between is solved
-    only where a law near the better of these two comes close to keeping them.
+    Where limits are missed clearly with all of it, little is looked for without any, and where they are missed far,
+    only near that law, as an evolution follows; and what lies between is solved only where a law near the better of
+    these two comes close to keeping them.
     """
     request, link = task.spec.link_feedforward, task.link
     broken = task.list_broken(loops)
@@ -327,7 +330,11 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
     missing, without = [(task, x, loops)] if broken == {FRICTION} else [], None
     miss = _measure_miss(task, x)
     if miss > CLEARLY:
-        without = solve(none, (x,), far_off=CLEARLY)
+        near = none.tidy(x)
+        scanned = miss <= FAR_OFF or not none.is_stable(near)
+        without = solve(none, (x,), far_off=CLEARLY) if scanned else _solve_from(none, near)
+        if none.list_broken(without[1]) == {FRICTION} and not scanned:
+            without = _meet_friction_margin(none, *without, ignore)
         least, start = min((miss, x), (_measure_miss(none, without[0]), without[0]), key=lambda pair: pair[0])
         close = float(np.clip(1.0 + CLOSER * (least - 1.0), CLEARLY, HOPELESS))
         lower = [] if least > FAR_OFF else [fed for fed in lower if _follow(fed, start) <= close]
