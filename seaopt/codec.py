@@ -98,9 +98,7 @@ def from_content(cls: type[T], content: Any, source: str, *, remedy: str) -> T:
 
 
 def read_fields(cls: type[Any], content: Any, source: str, *, remedy: str) -> dict[str, Any]:
-    """Return the fields of a record that a file holds. Raises FileError: a key is missing, a value is of the wrong
-    kind, or the file has a digest that is not that of its content.
-    """
+    """Return the fields of a record in a file. Raises FileError: missing or wrong keys, or another digest."""
     from seaopt.documents import check_table
 
     if isinstance(content, Mapping) and "made_from" in content:

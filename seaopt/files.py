@@ -67,9 +67,7 @@ def check_name(path: Path | str, remedy: str, error: type[SeaoptError] = FileErr
 
 
 def write_bytes(path: Path | str, content: bytes) -> Path:
-    """Write `content` to `path` in one step: a reader sees the old file or the new one, never a part. Raises FileError:
-    the folder cannot be made or written.
-    """
+    """Write `content` in one step: a reader sees the old file or the new. Raises FileError: it cannot be written."""
     target = Path(path)
     temporary = target.with_name(f".seaopt-{secrets.token_hex(8)}")
     made = False
@@ -94,9 +92,7 @@ def describe_os_error(error: OSError | ValueError) -> str:
 
 
 def write_text(path: Path | str, content: str) -> Path:
-    """Write text as UTF-8, as `write_bytes` does. Raises FileError: it holds half a character, as a name that is no
-    text does; or as of `write_bytes`.
-    """
+    """Write text as UTF-8, as `write_bytes` does. Raises FileError also: it holds half a character."""
     try:
         raw = content.encode()
     except UnicodeEncodeError as error:

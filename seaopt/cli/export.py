@@ -184,9 +184,7 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
 
 
 def _find_law(results: Path) -> tuple[Path, str, Path]:
-    """Return the file of the law or schedule in a folder, its schema, and its certificate's file. Raises ProblemError:
-    both are there.
-    """
+    """Return the law's or schedule's file, schema and certificate's file. Raises ProblemError: both are there."""
     law, scheduled = results / FILES["tune"], results / SCHEDULE_FILES["tune"]
     if not exists(scheduled):
         return law, SCHEMAS["tune"], results / FILES["certify"]

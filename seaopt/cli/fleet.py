@@ -41,9 +41,7 @@ def run_fleet(
     json: bool,
     amount: Amount,
 ) -> bool:
-    """Fit the logs, write tables and page, print verdict and spread; return whether all logs are met. `drift`: options
-    of `find_drift`.
-    """
+    """Fit the logs, write and print what they give; return whether all are met. `drift`: options of `find_drift`."""
     # Before workers start, who inherit it: threads of BLAS would fight over cores that all have a log.
     for name in THREADS:
         os.environ.setdefault(name, "1")

@@ -10,9 +10,7 @@ MAX_BANDWIDTHS = 200
 
 
 def parse_bandwidths(text: str) -> tuple[float, ...]:
-    """Return the bandwidths of LOW:HIGH:STEP, both ends included. Raises ControlError: it is not three numbers, or not
-    an ascending range of a reasonable length.
-    """
+    """Return the bandwidths of LOW:HIGH:STEP, both ends included; else refuse what no such range is (ControlError)."""
     try:
         low, high, step = (float(number) for number in text.split(":"))
     except ValueError as error:

@@ -93,9 +93,8 @@ def _add_options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, metavar=" ", help="Print the version.")
     ] = False,
 ) -> None:
-    """Series elastic actuators: from raw bench logs to a certified force controller.
-
-    Start with `seaopt demo`, or with `seaopt new LOG` on a log of your own.
+    """Series elastic actuators: from raw bench logs to a certified force controller. Start with `seaopt demo`, or with
+    `seaopt new LOG` on a log of your own.
     """
 
 
@@ -491,9 +490,8 @@ def schema(
 
 
 def main() -> None:
-    """Run the command line; a SeaoptError is one line on stderr, with the place in a text, and exit code 2.
-
-    An InternalError has another exit code, that of a defect, and the request to report it with.
+    """Run the command line; a SeaoptError is one line on stderr, with the place in a text, and exit code 2. An
+    InternalError has another exit code, that of a defect, and the request to report it with.
     """
     prepare_streams()
     try:

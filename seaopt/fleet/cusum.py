@@ -55,9 +55,7 @@ def _make_chain(threshold: float, allowance: float) -> Float[np.ndarray, "m m"]:
 
 
 def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
-    """Return after how many runs a one-sided chart raises an alarm on average, where nothing has changed. `threshold`,
-    `allowance`: h and k, in standard deviations.
-    """
+    """Return a one-sided chart's mean runs to a false alarm; `threshold`, `allowance`: h and k, in std."""
     chain = _make_chain(threshold, allowance)
     return float(np.linalg.solve(np.eye(STATES) - chain, np.ones(STATES))[0])
 

@@ -56,9 +56,7 @@ class Columns:
 
 
 def make_plan(problem: Problem, like: str | None, time_limit_s: float | None, client: str) -> Plan:
-    """Return the plan of a fleet. Raises ProblemError: no experiment says how to read a log, or it
-    reads several files.
-    """
+    """Return the plan of a fleet. Raises ProblemError: no experiment that reads a log, or one of several files."""
     template = problem.choose_template(like)
     if list_log_files(template) != [template.log]:
         raise ProblemError(

@@ -246,9 +246,7 @@ def _put(rows: pl.DataFrame, newer: pl.DataFrame) -> pl.DataFrame:
 
 
 def read_rows(folder: Path) -> pl.DataFrame:
-    """Return the rows of a table that nobody writes, in order of their logs. Raises FileError: there is none, or a file
-    of it is damaged.
-    """
+    """Return the rows of a table that nobody writes, ordered by log. Raises FileError: none, or a damaged one."""
     parts = [_read(path) for path in sorted((folder / "fleet").glob("part-*.parquet"))]
     if not parts:
         raise FileError(f"{folder / 'fleet'}: has no table; type the command of the fleet again")

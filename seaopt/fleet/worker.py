@@ -48,9 +48,7 @@ def name_process() -> str:
 
 
 def fit_batch(plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> list[Row]:
-    """Return a row for each log, with status "met", "not met", "failed" or "unchanged". `known`: the contents that are
-    fitted already; a log that still has it is not fitted again.
-    """
+    """Return a row for each log; one whose contents are those in `known` is "unchanged" and not fitted again."""
     return [_fit_log(plan, log, known.get(log.path)) for log in logs]
 
 

@@ -237,9 +237,7 @@ def _select(discs: Any, chosen: Any) -> Discs:  # whose lengths differ
 
 
 def _place_discs(estimate: FrequencyResponse, alpha: float, highest_hz: float) -> Discs:
-    """Return the band of an estimate in which discs are small, its centres, radii and averages. Each disc alone misses
-    the truth with probability `alpha`.
-    """
+    """Return band, centres, radii and averages of small discs, each of which misses the truth with `alpha`."""
     from scipy.ndimage import median_filter  # deferred: 0.2 s
 
     f, response = estimate.frequency_hz, estimate.response

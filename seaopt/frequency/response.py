@@ -114,9 +114,7 @@ def responses(
     stretch_s: float | None = None,
     rough: bool = False,
 ) -> list[FrequencyResponse]:
-    """Estimate the frequency responses from u to several outputs: `h1`, with the spectra of u made once. A rough
-    estimate is made in single precision, in half the time.
-    """
+    """Return `h1` from u to several outputs, the spectra of u made once; rough ones in single precision."""
     n = u.size
     if stretch_s is not None and not 0.0 < stretch_s < n * period:
         raise LogError(f"stretch_s = {stretch_s:g} is not within the log of {n * period:g} s; give a shorter one")

@@ -127,9 +127,7 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
 
 
 def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
-    """Return a plant whose input is the goal of a position that a firmware holds. Raises PlantError: the plant's
-    sensing names no position.
-    """
+    """Return a plant commanded by the goal of a position that firmware holds. Raises PlantError: no position."""
     sensing = plant.sensing
     position = sensing and (sensing.motor_position or sensing.link_position)
     if not sensing or not position:

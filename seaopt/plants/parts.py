@@ -179,9 +179,8 @@ LOADS = {"motor": 0.0, "output": 0.0}  # of friction that grows with them, as li
 
 
 def parameters(parts: Sequence[str], of_part: Mapping[str, tuple[Parameter, ...]]) -> list[Parameter]:
-    """Return the parameters of the parts that sit inside the actuator, from a screw's or a gear's table.
-
-    Bristles slip at the friction's own level, so that with them breakaway friction is above zero, as f_c is.
+    """Return the parameters of the parts that sit inside the actuator, from a screw's or a gear's table. Bristles slip
+    at the friction's own level, so that with them breakaway friction is above zero, as f_c is.
     """
     chosen = [parameter for part in parts if part in INSIDE for parameter in of_part[part]]
     sliding = next((parameter for parameter in chosen if parameter.name == "f_c"), None)
@@ -265,9 +264,8 @@ def friction_level(parts: Sequence[str], speed: Any, p: Any) -> Any:
 
 def bound_friction_slopes(parts: Sequence[str], p: Any) -> tuple[Any, Any]:
     """Return bounds of the slope of `dry_friction` over all speeds, N s/m (N m s/rad): the flattest and the steepest.
-
-    Without a load. The smoothing's slope is largest at rest, level/v_s, and never negative; that of
-    (f_s - f_c) exp(-(v/v_st)^2) is largest at v_st/sqrt(2), |f_s - f_c| sqrt(2/e)/v_st.
+    Without a load. The smoothing's slope is largest at rest, level/v_s, and never negative; that of (f_s - f_c)
+    exp(-(v/v_st)^2) is largest at v_st/sqrt(2), |f_s - f_c| sqrt(2/e)/v_st.
     """
     if "stribeck" not in parts:
         return 0.0, p.f_c / p.v_s
@@ -441,15 +439,7 @@ def _makes(recipe: Recipe, plant: Plant) -> bool:
 
 
 def list_dead_times(plant: Plant) -> tuple[str, ...]:
-    """Return the parameters of a plant that are delays of command and measurement.
-
-    Examples
-    --------
-    >>> from seaopt.plants import high_impedance
-    >>> list_dead_times(wrapped(high_impedance(), ["load_cell", "command_delay"]))
-    ('T_c',)
-
-    """
+    """Return the parameters of a plant that are delays of command and measurement."""
     delays = [parameter for part in _DEAD_TIMES for parameter in PARTS[part]]
     return tuple(parameter.name for parameter in delays if plant.parameters.get(parameter.name) == parameter)
 

@@ -368,9 +368,7 @@ def describe_parameters(expression: Expression, params: CompletedParameters) -> 
 
 
 def find_range(plant: Plant, params: ParameterSet) -> float | None:
-    """Return the largest magnitude of the first input that acts, by the plant's actuation; None where it states none.
-    Raises PlantError: it is not a positive number.
-    """
+    """Return the largest magnitude of the first input that acts; None if not stated, PlantError if not positive."""
     if plant.actuation is None or plant.actuation.largest is None:
         return None
     expression, values = plant.actuation.largest, plant.complete(params)
@@ -481,9 +479,7 @@ def state_space(
 
 
 def fill_vector(kind: str, names: Mapping[str, str], values: Mapping[str, float] | None) -> Float[np.ndarray, " n"]:
-    """Return the vector of `names` with the given values, zero elsewhere. Raises PlantError: a name is not one of
-    `names`.
-    """
+    """Return the vector of `names` with the given values, zero elsewhere. Raises PlantError: an unknown name."""
     if values is not None and not isinstance(values, Mapping):
         raise PlantError(f"{kind}s are given as a {type(values).__name__}; give a mapping of {kind} name to value")
     values = values or {}

@@ -13,10 +13,9 @@ SHARED = PLANNED & ControllerTable.model_fields.keys() - {"measured"}  # keys of
 
 
 def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
-    """Return what a file asks of predictive control; None where it asks for gains, or for no controller.
-
-    Raises ProblemError: [mpc] is there without the structure, or a key is given that is of gains. Raises ControlError:
-    a value is out of range.
+    """Return what a file asks of predictive control; None where it asks for gains, or for no controller. Raises
+    ProblemError: [mpc] is there without the structure, or a key is given that is of gains. Raises ControlError: a value
+    is out of range.
     """
     controller = table.controller
     if controller is None or controller.structure != MPC:

@@ -79,9 +79,7 @@ def _make(content: Mapping[str, Any], source: str) -> Problem:
 
 
 def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
-    """Make the objects that a validated problem file stands for. `folder`: where relative paths of logs start. Raises
-    SeaoptError: as `read_problem`.
-    """
+    """Make the objects of a validated problem file, its logs relative to `folder`. Raises as `read_problem`."""
     try:
         plants = _make_plants(table.plant)
         parameters = make_parameters(table, plants)

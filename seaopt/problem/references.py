@@ -30,9 +30,7 @@ RESPONSE = "frf:"  # before the name of an experiment whose frequency response i
 
 
 def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
-    """Refuse names of plants, inputs, outputs and ranges that the file's plants do not have, and ranges out of bounds.
-    Raises ProblemError: the message names the key.
-    """
+    """Refuse names and ranges that the file's plants do not have (ProblemError, with the key)."""
     places = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
     if table.controller:
         _check_responses(table, table.controller)

@@ -154,9 +154,7 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
 
 
 def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:
-    """Refuse a file that is not the controller.json of the predictive controller that a problem asks for. Raises
-    SeaoptError: the file cannot be read, or is of something else.
-    """
+    """Refuse a file other than the controller.json of a problem's predictive controller (SeaoptError)."""
     is_json = path.suffix.lower() == ".json"
     content = parse_file(path, json.loads, "JSON", remedy="give a controller.json") if is_json else None
     if not isinstance(content, dict) or "mpc" not in content:
@@ -266,9 +264,7 @@ def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> Plausibil
 def list_plants(
     problem: Problem, source: Fit | ParameterSet, spec: DelayedSpec | None = None
 ) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
-    """Return what the controller is designed on, and what it must be robust to, models and measured responses. `spec`:
-    whose delays count in place of the problem's.
-    """
+    """Return design and robust plants, models and measured responses; `spec`: its delays replace the problem's."""
     measured, plants = problem.measure_responses(source), problem.robust_to(source, spec)
     responses = {name: response for name, response in measured.items() if name in problem.controller_table.robust_to}
     design = measured[problem.controller_table.plant] if problem.designs_on_response else problem.design_plant

@@ -286,9 +286,7 @@ class Program:
     def double_sum(
         self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
     ) -> Float[np.ndarray, "2 p p"]:
-        """Return the sum over t and s of a(t)' R(t - s) a(s), and of it what t = s gives. The a are the influences into
-        v of the samples that count.
-        """
+        """Return the sum over t, s of a(t)' R(t - s) a(s), and its part t = s; a: influences that count into v."""
         ny, p, nc = into.shape
         width = _pad_to_vectors(p)
         padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")

@@ -291,9 +291,7 @@ def _call(future: Future[int], function: Any, address: int, count: int, owners: 
 
 
 def _join(futures: list[Future[int]], interrupt: BaseException | None) -> bool:
-    """Wait for all that have begun, and without an interrupt for all; the last interrupt is raised at the end. Returns
-    whether one failed.
-    """
+    """Wait for all that have begun, or all; raise the last interrupt at the end. Returns whether one failed."""
     waiting = True
     while waiting:
         try:

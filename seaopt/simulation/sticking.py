@@ -35,9 +35,7 @@ SWEEPS = 30  # over the forces of several joints that stop at once
 
 
 def separate_jumps(plant: Plant) -> tuple[Any, Any, Any]:
-    """Return f and h as the plant moves without its friction that jumps, and what holds each joint at rest. All are
-    expressions of the plant's own symbols.
-    """
+    """Return f and h without friction that jumps, and what holds each joint at rest, in the plant's symbols."""
     joints, arguments = _Joints(plant), [plant.t, plant.x, plant.u, plant.p]
     levels = joints.levels(*arguments[1:])
     return joints.rate(*arguments, 0.0 * levels), joints.read(*arguments, 0.0 * levels), levels

@@ -42,9 +42,7 @@ class MotorFriction:
 
 
 def find_motor_friction(plant: Plant, params: ParameterSet) -> MotorFriction:
-    """Return the friction of a plant that acts where the motor's effort does. Raises ControlError: there is none, or it
-    is nothing at these values.
-    """
+    """Return the friction where the motor's effort acts. Raises ControlError: none, or nothing at these values."""
     values = plant.complete(params)
     x, u = find_rest(plant, values)
     on_states = np.array(friction_matrices(plant)(x, u, values.vector)[0]) if plant.friction else np.zeros((1, 0))
@@ -146,9 +144,7 @@ def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
 
 
 def find_reading(plant: Plant, params: ParameterSet, output: str, friction: MotorFriction) -> float:
-    """Return the velocity at a friction per rate of an output that moves with it. Raises ControlError: the output moves
-    otherwise than the friction does.
-    """
+    """Return the velocity at a friction per rate of an output. Raises ControlError: the two move differently."""
     values = plant.complete(params)
     x, u = find_rest(plant, values)
     velocity = np.array(friction_matrices(plant)(x, u, values.vector)[2])[friction.index]

@@ -109,9 +109,7 @@ def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
 
 
 def find_critical(link: Link, velocity_filter_s: float, stiffness: float) -> Impedance:
-    """Return the critically damped impedance of a stiffness. Raises ControlError, with those that there are: it has
-    none.
-    """
+    """Return the critically damped impedance of a stiffness. Raises ControlError, with those that have one."""
     scan = scan_critical(link, velocity_filter_s)
     stiffnesses = scan.stiffness
     unit = mechanics_of(link.port.place_unit).stiffness

@@ -246,9 +246,7 @@ def add_impedance(
 
 
 def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
-    """Return F_e/v of the actuator under both loops at frequencies (Hz), without the link and without what sampling
-    folds.
-    """
+    """Return F_e/v of the actuator under both loops at frequencies (Hz), without the link and without aliases."""
     response = link.port.response(f)
     reference, feedback = link.law.reference_response(f), link.law.feedback_responses(f)
     s, z = 2j * np.pi * f, np.exp(2j * np.pi * f * link.sample_time_s)

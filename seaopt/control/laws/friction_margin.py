@@ -27,9 +27,7 @@ def find_friction_margin(controller: Controller, plant: Plant, params: Parameter
 def find_friction_margins(
     controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
 ) -> list[FrictionMargin | None]:
-    """Return `find_friction_margin` at several sets of parameters, all with the same conditions among them. `first` and
-    `least`: as in `friction_margin`.
-    """
+    """Return `find_friction_margin` at sets of parameters with the same conditions; see `friction_margin`."""
     return [
         None if loop is None else friction_margin(loop, first, least)
         for loop in take_friction_out(controller, plant, sets)

@@ -342,8 +342,8 @@ def choose_limit(command: Command, spec: ControllerSpec, requested: float | None
 
 
 def find_raised_limit(command: Command, spec: ControllerSpec, requested: float | None) -> str:
-    """Return the limit that a controller was designed with, where the one asked for is higher; else "". Its figures and
-    its certificate are of that one.
+    """Return the limit that a controller was designed and certified with, where the one asked for is
+    higher; else "".
     """
     designed, running = (choose_limit(command, spec, limit) for limit in (None, requested))
     return command.show(designed) if designed is not None and running is not None and running > designed else ""

@@ -269,9 +269,7 @@ def _check_reading(table: StoredController, law: Law) -> None:
 
 
 def check_achieved(stated: Any, figures: Mapping[str, Any]) -> None:
-    """Refuse figures, those of controller.json's `achieved`, that are not the ones that its law has. Raises FileError:
-    one of them is another, or missing.
-    """
+    """Refuse figures in controller.json's `achieved` that its law does not have, or lacks (FileError)."""
     if not isinstance(stated, Mapping):
         raise FileError(f"{FILE}: achieved is missing or not a table; {TUNE_AGAIN}")
     stated = {name: stated.get(name) for name in figures}

@@ -286,9 +286,7 @@ class InnerLoop:
         return math.isfinite(self.T_v)
 
     def close(self, law: Assembly, sample_time_s: float) -> Assembly:
-        """Return the law around which this loop is closed, of the inputs error, reference and what is read. `law` is
-        k_v v_ref, of error and reference.
-        """
+        """Return the law that this loop is closed around: `law` is k_v v_ref, of error and reference."""
         read = Assembly.of_gains(np.array([0.0, 0.0, -self.k_v]))
         if self.speed.differenced:
             read = read.through(TransferFunction(num=np.array([1.0, -1.0]) / sample_time_s, den=np.ones(1)))

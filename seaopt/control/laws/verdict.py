@@ -113,9 +113,7 @@ class PossibleBandwidths:
 
 
 def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
-    """Judge a loop by every limit of a scope that the specification imposes. With `stuck`, only by those that also hold
-    where the design plant is stuck by its friction.
-    """
+    """Judge a loop by a scope's imposed limits; with `stuck`, by those that also hold where friction sticks."""
     verdicts: list[Verdict] = []
     for limit in spec.limits:
         allowed = spec.allowed(limit)

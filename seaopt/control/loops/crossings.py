@@ -13,9 +13,7 @@ ROUNDING_DISTANCE = 1e-11  # of a frequency: nearer, values of a curve differ by
 def find_crossings(
     curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, " k"]:
-    """Return the zeros of a curve between grid points of opposite sign, ascending. Two zeros between the same two
-    points are not seen: the grid has to resolve the curve.
-    """
+    """Return the zeros of a curve, ascending; two between the same two points of the grid are not seen."""
     from scipy.optimize import elementwise
 
     values = curve(f)

@@ -223,9 +223,7 @@ def _prove(
     curves: Int[np.ndarray, " k"],
     edges: list[Float[np.ndarray, " _"]],
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return the peaks, raised until no arc of the level set just above them holds a larger value. Raises ControlError:
-    that does not come to an end.
-    """
+    """Return the peaks, raised until no arc of the level just above holds more. Raises ControlError: without end."""
     for _ in range(MAX_PROOF_ROUNDS):
         curve = np.repeat(curves, [row.size - 1 for row in edges])
         low, high = np.concatenate([row[:-1] for row in edges]), np.concatenate([row[1:] for row in edges])

@@ -225,9 +225,7 @@ def _list_given(params: ParameterSet) -> ParameterSet:
 
 
 def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
-    """Return the conditions that parameters hold, in SI units, by name. Raises ControlError: one is not finite, a delay
-    is negative, or a unit is of another dimension.
-    """
+    """Return the conditions among parameters, in SI units. Raises ControlError: one is not finite, or no such unit."""
     params = _list_given(params)
     values: dict[str, float] = {}
     for name, condition in conditions((plant,)).items():
@@ -296,9 +294,7 @@ def find_rows(plant: Plant, measured: Measured) -> list[int]:
 
 
 def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
-    """Return states and inputs at rest where the conditions among `params` are; zeros without any. Raises ControlError:
-    the plant cannot rest there.
-    """
+    """Return states and inputs at rest at the conditions among `params`. Raises ControlError: no rest there."""
     x, u = find_rests(plant, params, {}, 1)
     return x[:, 0], u[:, 0]
 

@@ -281,8 +281,8 @@ class ScheduledController(Result, Worded):
 
 
 def make_table(over: str, unit: str, points: Sequence[float], controllers: Sequence[Controller]) -> GainTable:
-    """Return the gains of controllers at points. Raises ControlError: their gains cannot be interpolated, they run at
-    different rates, or command an effort differently.
+    """Return the gains of controllers at points. Raises ControlError: they cannot be interpolated, or
+    differ in rate.
     """
     first = controllers[0]
     for point, controller in zip(points, controllers, strict=True):

@@ -40,9 +40,7 @@ class StoredSchedule:
 
 
 def read_schedule(content: Mapping[str, Any]) -> StoredSchedule:
-    """Return the fields of a schedule.json. Raises FileError: one is missing, malformed, or gains are not the
-    controllers'.
-    """
+    """Return the fields of a schedule.json. Raises FileError: one is missing or malformed, or gains disagree."""
     table = from_content(StoredSchedule, content, "schedule.json", remedy=TUNE_AGAIN)
     try:
         check_points(table.over, np.array(table.points))

@@ -307,9 +307,7 @@ def _compare_held_out(problem: FitProblem, other: ResidualsByExperiment, best: R
 
 
 def _compute_octaves(places: Sequence[FitOutput], residuals: Mapping[str, ResidualsByExperiment]) -> list[OctavePower]:
-    """Return the power of what each likelihood sees of an output's residual, in octaves below the Nyquist frequency.
-    `places` is the output in each fit's own problem.
-    """
+    """Return the power that each likelihood sees of an output's residual (`places`: in each fit), in octaves."""
     output, period, most = places[0], places[0].experiment.period, 1
     spectra: dict[str, tuple[Any, Any]] = {}
     for fitted, (name, residual) in zip(places, residuals.items(), strict=True):

@@ -132,9 +132,7 @@ class Measure:
 
 
 def make_measure(bench: Bench, criterion: str) -> Measure:
-    """Return the criterion of a name: "A", "D" or a free parameter's. Raises EstimationError: the name is unknown, or a
-    parameter whose relative variance counts is zero.
-    """
+    """Return the criterion "A", "D" or a free parameter's. Raises EstimationError: unknown, or relative to zero."""
     names = bench.model.free
     if criterion == "D":
         return Measure(weight=None, order=2.0 * len(names))
@@ -181,9 +179,7 @@ class ExcitationSearch:
         return float(np.max(shares)) if np.all(np.isfinite(shares)) else np.inf
 
     def scale_to_limits(self, excitation: Excitation) -> Candidate:
-        """Scale the excitation to be as large as the limits allow. Raises EstimationError: no size was found within
-        them.
-        """
+        """Scale the excitation to be as large as the limits allow. Raises EstimationError: no size is within."""
         u = self.bench.samples(excitation)
         low, high, factor = 0.0, np.inf, 1.0
         best: Candidate | None = None

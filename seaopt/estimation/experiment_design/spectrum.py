@@ -49,9 +49,7 @@ class Spectrum:
 
 
 def choose_harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Harmonics:
-    """Return at most `lines` log-spaced multiples of rate_hz/n in a band. Raises EstimationError: no multiple lies in
-    the band.
-    """
+    """Return at most `lines` log-spaced multiples of rate_hz/n in a band. Raises EstimationError: it has none."""
     low, high = band_hz
     first, last = max(int(np.ceil(low * n / rate_hz - 1e-9)), 1), min(int(high * n / rate_hz + 1e-9), (n - 1) // 2)
     if not 0.0 < low < high or first > last:

@@ -95,7 +95,6 @@ def list_candidates(
 
 def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTest]) -> Iterator[Candidate]:
     """Yield the fixed parameters that are at odds with the logs, and those that would make a linear plant nonlinear.
-
     One of each group that acts alike, such as a screw's lead and its gear, is tried before the second of any.
     """
     plain, bending = find_candidates(minimum.problem, fit)
@@ -374,10 +373,9 @@ def _clip_outputs(problem: FitProblem, residuals: ResidualsByExperiment, params:
 
 
 def find_clipping(model: Signal, measured: Signal) -> tuple[float, float, float, float] | None:
-    """Return the range inside which nothing is clipped, and the ends at which a model would have to be, if any.
-
-    The model's outermost samples are cut at each of some levels; the level that leaves the least is taken where it
-    takes a part of the residual's power away.
+    """Return the range inside which nothing is clipped, and the ends at which a model would have to be, if any. The
+    model's outermost samples are cut at each of some levels; the level that leaves the least is taken where it takes a
+    part of the residual's power away.
     """
     good = np.isfinite(model) & np.isfinite(measured)
     model, measured = model[good], measured[good]

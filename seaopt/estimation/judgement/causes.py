@@ -56,11 +56,10 @@ def find_causes(
     poor: bool,
     progress: Progress = ignore,
 ) -> list[Cause]:
-    """Return what explains the logs better than the fit, the best first.
-
-    `fit`: with its minimum; `residuals`: of the fit; `suspects`: what was fixed and is at odds with the logs;
-    `alternatives`: other plants that may have been on the bench; `poor`: whether the fit explains so little that
-    its estimates are no start: what searches does so from its own; `progress`: called before each that is tried.
+    """Return what explains the logs better than the fit, the best first. `fit`: with its minimum; `residuals`: of the
+    fit; `suspects`: what was fixed and is at odds with the logs; `alternatives`: other plants that may have been on the
+    bench; `poor`: whether the fit explains so little that its estimates are no start: what searches does so from its
+    own; `progress`: called before each that is tried.
     """
     minimum = fit.require_minimum("find_causes")
     whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)

@@ -74,9 +74,8 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
 def _gather(
     experiment: FitExperiment, residuals: ExperimentResiduals
 ) -> tuple[list[Float[np.ndarray, "n m"]], list[Float[np.ndarray, "n ny2"]]]:
-    """Return the inputs that move and [measured, residual] of each output, of each segment's samples that count.
-
-    A sample that does not count is replaced by the model's.
+    """Return the inputs that move and [measured, residual] of each output, of each segment's samples that count. A
+    sample that does not count is replaced by the model's.
     """
     moving: list[Float[np.ndarray, "n m"]] = []
     signals: list[Float[np.ndarray, "n ny2"]] = []
@@ -164,9 +163,8 @@ def _make_spectra(
     length: int,
     experiment: FitExperiment,
 ) -> _Spectra | None:
-    """Return the spectra over stretches of one length; None where there are too few of them.
-
-    Stretches are summed as they come, short ones several at a time: the memory is small, however long the logs are.
+    """Return the spectra over stretches of one length; None where there are too few of them. Stretches are summed as
+    they come, short ones several at a time: the memory is small, however long the logs are.
     """
     every = [(i, row) for i, rows in enumerate(inputs) for row in welch.list_starts([slice(0, len(rows))], length)]
     starts = welch.thin(every, MOST)
@@ -199,9 +197,8 @@ def _make_spectra(
 
 
 def _project(of_inputs: Complex[np.ndarray, "f m m"], across: Complex[np.ndarray, "f m s"]) -> Float[np.ndarray, "f s"]:
-    """Return the power of the projections of the outputs on the inputs, line by line, from U^H U and U^H Y.
-
-    An input that is silent at a line, or says there what others say, accounts for nothing more.
+    """Return the power of the projections of the outputs on the inputs, line by line, from U^H U and U^H Y. An input
+    that is silent at a line, or says there what others say, accounts for nothing more.
     """
     size = np.sqrt(np.einsum("fmm->fm", np.real(of_inputs)))
     size = np.where(size > SILENT * np.max(size, axis=0), size, np.inf)

@@ -55,10 +55,8 @@ FAR = 3.0  # times beyond a plausible range
 
 
 def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ignore) -> Fit:
-    """Return the fit with how much of its outputs is explained, and what is wrong with it.
-
-    `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
-    not explain the logs.
+    """Return the fit with how much of its outputs is explained, and what is wrong with it. `fit`: with its minimum;
+    `alternatives`: other plants that may have been on the bench, tried where this one does not explain the logs.
     """
     minimum = fit.require_minimum("judge")
     testing, trying = divide(progress, TESTS, CAUSES)
@@ -164,10 +162,9 @@ def _warn(kind: str, where: str, text: str, *, bad: bool = False) -> FitFinding:
 def _find_unexplained(
     fit: Fit, shares: Mapping[str, CoherentShare], excess: Mapping[str, float]
 ) -> Iterator[FitFinding]:
-    """Yield outputs that are explained less than they could be, and residuals that follow an input.
-
-    What follows the inputs is an error where it is more than noise: more than the rest of the residual, or far above
-    what neighbouring samples differ by; the rest may be what a nonlinearity leaves.
+    """Yield outputs that are explained less than they could be, and residuals that follow an input. What follows the
+    inputs is an error where it is more than noise: more than the rest of the residual, or far above what neighbouring
+    samples differ by; the rest may be what a nonlinearity leaves.
     """
     for where, fitted in _list_outputs(fit):
         share, explained, explainable = shares.get(where), fitted.explained, fitted.explainable

@@ -51,13 +51,11 @@ class ScoreTest:
 def run_score_tests(
     minimum: Minimum, fit: Fit, names: tuple[str, ...] | None = None, data: Mapping[str, Experiment] | None = None
 ) -> dict[str, ScoreTest]:
-    """Test each parameter that was fixed, that which would do most first; without those the free ones stand for.
-
-    A parameter that would make a linear plant nonlinear, such as friction fixed at zero, is not tested unless it is
-    named: the other plant is stepped and not discretised.
-
-    `minimum`, `fit`: where, and of what; `names`: the parameters to test; those that leave linear plants linear, if
-    left out; `data`: experiments with a free delay, which is then tested too, under the name EXPERIMENT.delay_s.
+    """Test each parameter that was fixed, that which would do most first; without those the free ones stand for. A
+    parameter that would make a linear plant nonlinear, such as friction fixed at zero, is not tested unless it is
+    named: the other plant is stepped and not discretised. `minimum`, `fit`: where, and of what; `names`: the parameters
+    to test; those that leave linear plants linear, if left out; `data`: experiments with a free delay, which is then
+    tested too, under the name EXPERIMENT.delay_s.
     """
     names, data = find_candidates(minimum.problem, fit)[0] if names is None else names, data or {}
     if not names and not data:

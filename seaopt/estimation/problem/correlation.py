@@ -110,9 +110,7 @@ def autocorrelation(r: Signal, lags: int) -> Float[np.ndarray, " lags1"]:
 
 
 def cross_correlation(residuals: Parts, inputs: Parts, lags: int = INPUT_LAGS) -> CrossCorrelation | None:
-    """Return the correlation of a residual with an input over some segments; None if either does not move. A residual
-    of exactly zero is one that does not count.
-    """
+    """Return the correlation of a residual with an input (zero residuals do not count); None if either is still."""
     from scipy.special import erfc  # deferred: scipy is slow to load
 
     used = [r != 0.0 for r in residuals]

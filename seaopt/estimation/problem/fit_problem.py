@@ -242,9 +242,7 @@ def pose_problem(
     holdout: float = 0.0,
     noise: bool = False,
 ) -> FitProblem:
-    """Return the problem of fitting the free parameters to experiments; with `noise`, their process noise too.
-    Parameters that are left out have their plants' defaults.
-    """
+    """Return the fit of the free parameters, others at the plants' defaults; with `noise`, of the process noise too."""
     names = [experiment.name for experiment in experiments]
     if len(set(names)) < len(names):
         raise EstimationError(f"experiments are named {', '.join(names)}; give each a name of its own")

@@ -78,10 +78,9 @@ class Covariance:
 
 
 def take_root(covariance: ParameterMatrix) -> ParameterMatrix:
-    """Return a factor of a covariance, R R^T, for draws: standard deviations times the correlation's root.
-
-    The root is taken of the correlation, whose entries are of one size: the eigenvalues of a covariance in m, N/m
-    and kg m^2 span so many decades that the small ones would be lost in rounding.
+    """Return a factor of a covariance, R R^T, for draws: standard deviations times the correlation's root. The root is
+    taken of the correlation, whose entries are of one size: the eigenvalues of a covariance in m, N/m and kg m^2 span
+    so many decades that the small ones would be lost in rounding.
     """
     std = np.sqrt(np.diag(covariance))
     scale = np.where(std > 0.0, std, 1.0)
@@ -231,9 +230,8 @@ class _Form:
 
 def estimate_correlations(statistics: ResidualStatistics) -> tuple[Float[np.ndarray, "lags1 ny ny"], int]:
     """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window, and the last lag.
-
-    The last lag is that at which correlation differs from chance. The window reaches three times as far (after
-    Politis, J. Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
+    The last lag is that at which correlation differs from chance. The window reaches three times as far (after Politis,
+    J. Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
     count = np.maximum(statistics.count, 1.0)
     r = statistics.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]

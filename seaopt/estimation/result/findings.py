@@ -34,14 +34,7 @@ class FitFinding:
 
 
 def state_guesses(guessed: Sequence[str]) -> str:
-    """Return the guesses that a result rests on, in words; "" where there are none.
-
-    Examples
-    --------
-    >>> state_guesses(["N_p", "l"]), state_guesses([])
-    ('on 2 guesses: N_p, l', '')
-
-    """
+    """Return the guesses that a result rests on, in words; "" where there are none."""
     count = "1 guess" if len(guessed) == 1 else f"{len(guessed)} guesses"
     return f"on {count}: {', '.join(guessed)}" if guessed else ""
 

@@ -80,9 +80,8 @@ class Identifiability:
 
 
 def assess_identifiability(hessian: Matrix, names: tuple[str, ...], values: ParameterVector) -> Identifiability:
-    """Return the identifiability of the first ``len(names)`` unknowns, the others eliminated from the Hessian.
-
-    `values` are those of the unknowns, to which changes along an unseen direction are relative.
+    """Return the identifiability of the first ``len(names)`` unknowns, the others eliminated from the Hessian. `values`
+    are those of the unknowns, to which changes along an unseen direction are relative.
     """
     p = len(names)
     if not p:
@@ -113,9 +112,8 @@ def assess_identifiability(hessian: Matrix, names: tuple[str, ...], values: Para
 
 
 def compute_structural_rank(problem: FitProblem, z: Vector) -> int:
-    """Return how many directions of the parameters a rich input would show on the outputs that were measured.
-
-    The input is white noise of the log's own size on every input that the log excites, from rest and without noise.
+    """Return how many directions of the parameters a rich input would show on the outputs that were measured. The input
+    is white noise of the log's own size on every input that the log excites, from rest and without noise.
     """
     p = problem.unknowns.shared
     information = np.diag(problem.unknowns.precision[:p])
@@ -138,10 +136,8 @@ def compute_structural_rank(problem: FitProblem, z: Vector) -> int:
 
 
 def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
-    """Return in words what cannot be identified.
-
-    `direction`: relative changes that have no effect; `alone_seen`: whether the outputs depend on the parameter, if
-    it is one alone.
+    """Return in words what cannot be identified. `direction`: relative changes that have no effect; `alone_seen`:
+    whether the outputs depend on the parameter, if it is one alone.
     """
     names = sorted(direction)
     if len(names) == 1:

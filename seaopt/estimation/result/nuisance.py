@@ -22,9 +22,8 @@ ITERATIONS = 40  # that initial states of a nonlinear plant may take
 def estimate_nuisance(
     experiment: Experiment, params: ParameterSet, band_hz: tuple[float, float] | None = None
 ) -> tuple[Nuisance, dict[str, float | None]]:
-    """Return a log's own initial state, offset and what else it leaves free, the plant's parameters being known.
-
-    The second result is the fit percent of each output in the band; None without one.
+    """Return a log's own initial state, offset and what else it leaves free, the plant's parameters being known. The
+    second result is the fit percent of each output in the band; None without one.
     """
     problem = pose_problem((experiment,), params.fix(), loss=Squares(), band_hz=band_hz)
     solved = settle(problem, problem.evaluate(problem.unknowns.start), ITERATIONS, None)

@@ -172,11 +172,10 @@ def _compute_covariances(
     ParameterVector,
     Vector,
 ]:
-    """Return the parameters' covariance for white residuals and for the actual ones, and how much is unseen.
-
-    Both are over what is seen alone, and so is the third, of parameters and delays together; the fourth is how much of
-    each parameter is not seen (0 to 1, squared). The last are the variances of all unknowns: of parameters, delays and
-    gains for the actual residuals, of others for white ones.
+    """Return the parameters' covariance for white residuals and for the actual ones, and how much is unseen. Both are
+    over what is seen alone, and so is the third, of parameters and delays together; the fourth is how much of each
+    parameter is not seen (0 to 1, squared). The last are the variances of all unknowns: of parameters, delays and gains
+    for the actual residuals, of others for white ones.
     """
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
     bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z)
@@ -209,9 +208,8 @@ def _compute_log_likelihood(problem: FitProblem, evaluation: Evaluation) -> floa
 
 
 def _find_vague(fitted: ParameterSet, params: ParameterSet, identifiability: Identifiability) -> dict[str, str]:
-    """Return the free parameters that are less certain than their size, in words: the log hardly shows them.
-
-    Of several that hardly have an effect but together, a std beyond the value is enough: another start ends elsewhere.
+    """Return the free parameters that are less certain than their size, in words: the log hardly shows them. Of several
+    that hardly have an effect but together, a std beyond the value is enough: another start ends elsewhere.
     """
     beyond = {name for name, p in fitted.items() if (p.std or 0.0) > abs(p.value)}
     weak = (beyond.intersection(direction) for direction in identifiability.weak)
@@ -266,11 +264,10 @@ def _compile_figures(plant: Plant) -> tuple[Any, dict[str, str]]:
 def derive_figures(
     experiments: tuple[Experiment, ...], fitted: ParameterSet, seen: Covariance, identifiability: Identifiability
 ) -> dict[str, DerivedFigure]:
-    """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g.
-
-    Sigma is over what is seen. A figure that is the same along every direction that is not has its variance from that,
-    whatever single parameters have (an estimable function: Searle, Linear Models, 1971, ch. 5); any other has none.
-    One that depends on parameters of one log alone is that log's, EXPERIMENT.NAME.
+    """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g. Sigma is over what is
+    seen. A figure that is the same along every direction that is not has its variance from that, whatever single
+    parameters have (an estimable function: Searle, Linear Models, 1971, ch. 5); any other has none. One that depends on
+    parameters of one log alone is that log's, EXPERIMENT.NAME.
     """
     out: dict[str, DerivedFigure] = {}
     sizes = {name: fitted[name].value for name in seen.names}

@@ -234,9 +234,7 @@ def estimate_block_length(residual: Float[np.ndarray, "n ny"]) -> int:
 
 
 def _make_pool(residuals: ExperimentResiduals, problem: FitProblem, raw: bool) -> Float[np.ndarray, "m ny"]:
-    """Return residuals to draw from: raw, or what the loss makes of the weighted ones. They are without their mean, and
-    without missing samples, which are made up for in size.
-    """
+    """Return residuals to draw from, raw or weighted by the loss: without mean, scaled up for missing samples."""
     used = _find_used_rows(residuals)
     whole = residuals.raw[used] if raw else problem.loss.slope(residuals.weighted[used])
     present = np.isfinite(whole) & (whole != 0.0)

@@ -118,9 +118,7 @@ def winding() -> Plant:
 
 
 def add_heat(plant: Plant) -> Plant:
-    """Return a plant whose motor warms up. Raises PlantError: the plant's actuation is no current, or it has one of the
-    names.
-    """
+    """Return a plant whose motor warms up. Raises PlantError: its actuation is no current, or a name is taken."""
     actuation = plant.actuation
     if actuation is None or plant.inputs[actuation.input] != "A":
         raise PlantError(

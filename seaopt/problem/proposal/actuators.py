@@ -160,9 +160,8 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
 
 
 def _add_drive(lines: _Lines, facts: Facts, *, effort: bool) -> None:
-    """Add K_tau and eta, of which a log tells the product at most, and what stands between command and current.
-
-    A commanded torque makes K_tau and eta one.
+    """Add K_tau and eta, of which a log tells the product at most, and what stands between command and current. A
+    commanded torque makes K_tau and eta one.
     """
     scaled = "Torque constant K_tau of the motor"
     if facts.input == "torque":
@@ -194,9 +193,8 @@ def _add_drive(lines: _Lines, facts: Facts, *, effort: bool) -> None:
 
 
 def _add_payload(lines: _Lines, places: list[str]) -> dict[str, tuple[float, float]]:
-    """Add the link that will hang from the joint, where no log had it, and return the range of its inertia.
-
-    A link without gravity is no plant to certify on: under a torque controller its angle drifts.
+    """Add the link that will hang from the joint, where no log had it, and return the range of its inertia. A link
+    without gravity is no plant to certify on: under a torque controller its angle drifts.
     """
     mass = lines.optional(
         "m",

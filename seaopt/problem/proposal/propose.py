@@ -100,11 +100,9 @@ class Proposal:
 def propose(
     logs: Sequence[Path], answers: Mapping[str, str], folder: Path, title: str = "", progress: Progress = ignore
 ) -> Proposal:
-    """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's.
-
-    `progress` is called before each log is read, and before each is looked at.
-
-    Raises SeaoptError: a log cannot be read or lies outside the folder, or an answer is not one.
+    """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's. `progress`
+    is called before each log is read, and before each is looked at. Raises SeaoptError: a log cannot be read or lies
+    outside the folder, or an answer is not one.
     """
     interview = Interview(answers)
     reading, looking = divide(progress, READING, LOOKING)

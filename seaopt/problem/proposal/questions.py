@@ -39,9 +39,8 @@ class Question:
         return name_entry(self.key)
 
     def read(self, answer: str) -> str:
-        """Return an answer as it counts: a choice or the beginning of one, or a number.
-
-        Raises ProblemError: it is none of the choices, or no positive number.
+        """Return an answer as it counts: a choice or the beginning of one, or a number. Raises ProblemError: it is none
+        of the choices, or no positive number.
         """
         text = answer.strip()
         if self.choices:
@@ -108,9 +107,8 @@ class Interview:
         return f"guessed: {'; '.join(reasons)}" if reasons else ""
 
     def list_guessed(self) -> list[str]:
-        """Return the guesses that results rest on: parameters, and other entries such as "unit of F1".
-
-        Unknown values that are fitted are not among them, nor is the bandwidth, which is a requirement.
+        """Return the guesses that results rest on: parameters, and other entries such as "unit of F1". Unknown values
+        that are fitted are not among them, nor is the bandwidth, which is a requirement.
         """
         open_keys = [
             question.key
@@ -121,12 +119,5 @@ class Interview:
 
 
 def name_entry(key: str) -> str:
-    """Return what a question's key is called in the file's `guessed`.
-
-    Examples
-    --------
-    >>> name_entry("unit:F1"), name_entry("N")
-    ('unit of F1', 'N')
-
-    """
+    """Return what a question's key is called in the file's `guessed`."""
     return key.replace(":", " of ", 1)

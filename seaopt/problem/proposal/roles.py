@@ -115,9 +115,8 @@ def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, Sur
 
 
 def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str, SurveyedColumn, str]:
-    """Return the input's role, its column, and why that is a guess, if it is one.
-
-    Raises LogError: no column drives a motor.
+    """Return the input's role, its column, and why that is a guess, if it is one. Raises LogError: no column drives a
+    motor.
     """
     for role, quantity in OF_INPUT.items():
         named = [column for column in columns if column.header.quantity == quantity]

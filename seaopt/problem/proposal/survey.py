@@ -84,19 +84,8 @@ class Survey:
 
 
 def survey_log(path: Path, clock: str | None = None) -> Survey:
-    r"""Read every column of a log; `clock` names the time where the file leaves that open.
-
-    Raises LogError: the file cannot be read, or holds no numbers that vary.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> file = Path(tempfile.mkdtemp()) / "a.csv"
-    >>> _ = file.write_text("t_ms,cur_mA,note\n0,100,a\n2,150,b\n4,120,c\n")
-    >>> survey = survey_log(file)
-    >>> survey.clock.name, [column.header.quantity for column in survey.columns], survey.left_out
-    ('t_ms', ['current'], {'note': 'text'})
-
+    r"""Read every column of a log; `clock` names the time where the file leaves that open. Raises LogError: the file
+    cannot be read, or holds no numbers that vary.
     """
     held = contents(path)
     numeric = [field for field in held.fields if field.numeric]
@@ -190,15 +179,7 @@ def _lead(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> fl
 
 
 def slow_sign(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"], rate_hz: float) -> int:
-    """Return 1 where two columns move alike below 1 Hz, -1 where one falls as the other rises, else 0.
-
-    Examples
-    --------
-    >>> t = np.arange(4000) / 400
-    >>> slow_sign(np.sin(t), -np.sin(t - 0.1), 400.0)
-    -1
-
-    """
+    """Return 1 where two columns move alike below 1 Hz, -1 where one falls as the other rises, else 0."""
     f = np.fft.rfftfreq(first.size, 1.0 / rate_hz)
     slow = (f > 0.0) & (f <= max(SLOW_HZ, 2.0 * rate_hz / first.size))
     a, b = (np.fft.rfft(np.nan_to_num(values - np.nanmean(values)))[slow] for values in (first, second))
@@ -208,15 +189,7 @@ def slow_sign(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"], r
 
 
 def regress(values: Float[np.ndarray, " n"], on: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the slope of a column on another, and the share of its variance that this explains.
-
-    Examples
-    --------
-    >>> t = np.linspace(0.0, 1.0, 50)
-    >>> regress(3.0 * t + 1.0, t)
-    (3.0, 1.0)
-
-    """
+    """Return the slope of a column on another, and the share of its variance that this explains."""
     good = np.isfinite(values) & np.isfinite(on)
     y, x = values[good] - np.mean(values[good]), on[good] - np.mean(on[good])
     power = float(x @ x)

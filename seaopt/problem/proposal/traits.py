@@ -37,10 +37,8 @@ class Traits:
 
 
 def find_traits(table: Table, source: str, outputs: Sequence[str], positions: Sequence[str], *, held: bool) -> Traits:
-    """Return the traits of a log.
-
-    `outputs`: what is fitted. `positions`: which of it are positions. `held`: whether the input holds each value until
-    the next sample; a measured one does not.
+    """Return the traits of a log. `outputs`: what is fitted. `positions`: which of it are positions. `held`: whether
+    the input holds each value until the next sample; a measured one does not.
     """
     quality = assess_quality(table, inputs=[source])
     excitation = quality.excitation.get(source)
@@ -66,20 +64,7 @@ def _find_delay(quality: Quality, source: str, outputs: Sequence[str], *, held: 
 
 
 def fit_delay(spectra: Spectra, source: str, output: str, *, held: bool) -> tuple[float, float] | None:
-    """Return the delay of an output and its standard deviation, s; None where too little is coherent.
-
-    Examples
-    --------
-    >>> from seaopt.logs.quality.spectra import compute_spectra
-    >>> rng = np.random.default_rng(0)
-    >>> u = rng.normal(size=8000)
-    >>> y = np.concatenate([np.zeros(5), u[:-5]]) + 0.01 * rng.normal(size=8000)
-    >>> spectra = compute_spectra({"u": u, "y": y}, [slice(0, 8000)], 0.001)
-    >>> delay, std = fit_delay(spectra, "u", "y", held=False)
-    >>> round(delay, 4), std < 1e-4
-    (0.005, True)
-
-    """
+    """Return the delay of an output and its standard deviation, s; None where too little is coherent."""
     f, coherence = spectra.frequency_hz[1:-1], spectra.coherence(source, output)[1:-1]
     good = np.flatnonzero(coherence > COHERENT)
     if not good.size:

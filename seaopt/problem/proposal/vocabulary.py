@@ -106,18 +106,8 @@ class Header:
 
 
 def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> Header:
-    """Return what a column's header says; `unit` is what the file itself states.
-
-    Without `metres` an m at the end of a name is the motor.
-
-    Examples
-    --------
-    >>> header = read_header("mot_pos_deg")
-    >>> header.quantity, header.side, header.unit
-    ('angle', 'motor', 'deg')
-    >>> read_header("Motorstrom [mA]").quantity, read_header("tau_s").unit
-    ('current', '')
-
+    """Return what a column's header says; `unit` is what the file itself states. Without `metres` an m at the end of a
+    name is the motor.
     """
     stated, bare = _clean_unit(unit), bare_name(name)
     suffix, stem = ("", bare) if stated else _split_suffix(bare)
@@ -148,26 +138,12 @@ def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> H
 
 
 def is_m_open(header: Header) -> bool:
-    """Tell whether the m at the end of a name is metres or the motor, which the name alone does not say.
-
-    Examples
-    --------
-    >>> is_m_open(read_header("pos_m")), is_m_open(read_header("weg_m")), is_m_open(read_header("pos [m]"))
-    (True, False, False)
-
-    """
+    """Tell whether the m at the end of a name is metres or the motor, which the name alone does not say."""
     return header.unit == "m" and read_header(header.name, metres=False).quantity == "angle"
 
 
 def split_words(name: str) -> list[str]:
-    """Return the words of a name in small letters.
-
-    Examples
-    --------
-    >>> split_words("motorPosition_F1"), split_words("/joint.tau_cmd")
-    (['motor', 'position', 'f1'], ['joint', 'tau', 'cmd'])
-
-    """
+    """Return the words of a name in small letters."""
     parts = re.findall(r"[A-Z]?[a-zäöüß]+\d*|[A-Z]+\d*(?![a-z])|[A-Z]\d*|\d+", name)
     return [part.lower() for part in parts]
 

@@ -128,9 +128,7 @@ def spectrum_panel(prediction: ModelledOutputs) -> Panel:
 def amplitude_density(
     values: Float[np.ndarray, " n"], period: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return frequencies above zero and the root of the power density there, of the longest run without a gap. Raises
-    EstimationError: it has too few samples.
-    """
+    """Return frequencies and root power density of the longest whole run. Raises EstimationError: too short."""
     from scipy.signal import welch  # deferred: 0.3 s
 
     run = _find_longest_run(values)

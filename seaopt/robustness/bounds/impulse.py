@@ -76,9 +76,7 @@ def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: B
 def _sample(
     a: Taylor, b: Taylor, read: Sequence[tuple[Taylor, Taylor]], period: float, delay: Entry
 ) -> ImpulseTransfer:
-    """Return the plant behind a zero-order hold and a delay, whose part of a sample splits the command in two. `read`
-    are c and d of each measured output.
-    """
+    """Return the plant behind a hold and a delay that splits the command; `read` are c and d of each output."""
     count, n = a.c.shape[0], a.c.shape[1]
     over = a.basis
     left, right = _compute_bases(a.c)

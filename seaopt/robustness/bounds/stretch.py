@@ -75,9 +75,7 @@ def bound_stretch(
     low: float,
     high: float,
 ) -> StretchBound:
-    """Bound Ms of a scheduled law on a stretch between two neighbouring points, on a plant without friction. `middle`
-    is the schedule at the middle of the stretch.
-    """
+    """Bound Ms of a schedule on a stretch between points, `middle` at its middle, on a plant without friction."""
     frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s
     change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
     moves = table.over in plant.parameters or table.over in plant.states

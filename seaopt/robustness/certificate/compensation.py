@@ -160,9 +160,7 @@ Measure = Callable[[Controller, Plant, ParameterSet, Draw], EigenvalueCase]
 def find_gravity_cases(
     loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
 ) -> dict[str, EigenvalueCase]:
-    """Return how fast each plant's link runs away at most with its weight compensated; nothing of
-    models that hold it.
-    """
+    """Return how fast each plant's link runs away at most with its weight compensated; none of held links."""
     compensation = loops.value.controller.compensation
     term = None if compensation is None else compensation.gravity
     if term is None:
@@ -224,9 +222,7 @@ def measure_gravity(controller: Controller, plant: Plant, nominal: ParameterSet,
 
 
 def measure_ripple(controller: Controller, plant: Plant, nominal: ParameterSet, draw: Draw) -> EigenvalueCase:
-    """Return the largest eigenvalue over the slopes at one draw. Raises ControlError: the plant has no output that is
-    read.
-    """
+    """Return the largest eigenvalue over the slopes at a draw. Raises ControlError: the plant lacks the output."""
     compensation = controller.compensation
     assert compensation is not None and compensation.ripple is not None
     ripple, gravity = compensation.ripple, compensation.gravity

@@ -32,9 +32,7 @@ Margin = TypeVar("Margin", FrictionMargin | None, CompensationMargin)
 
 @record
 class FrictionDraws:
-    """For how many draws stability is shown for all friction of their sector (without friction it is), and the least
-    margin.
-    """
+    """For how many draws stability is shown for all friction of their sector, and the least margin."""
 
     samples: int
     shown: int

@@ -31,10 +31,7 @@ IMPEDANCE_DRAWS = 100  # at most so many are looked at
 
 @record
 class ImpedanceDraws:
-    """For how many draws the link is stable by itself, and passive with its own damper.
-
-    A draw of a plant with friction counts where it is so sliding and stuck.
-    """
+    """For how many draws the link is stable, and passive with its own damper, friction sliding and stuck."""
 
     samples: int
     stable: int

@@ -482,9 +482,7 @@ def _certify_place(
     shared: Shared[tuple[ScheduledController, dict[str, Plant]]],
     part: tuple[float, Uncertainty, Points, np.random.Generator],
 ) -> tuple[PlaceCertificate, Bool[np.ndarray, "3 n"]]:
-    """Check the law at one value: the nominal parameters, draws and, at a point, a search for the worst case. Also
-    return which draws fail in which way.
-    """
+    """Check the law at one value: nominal, draws and, at a point, a search; also return how each draw fails."""
     (schedule, models), (value, unknown, points, rng) = shared.value, part
     controller, point, plants = schedule.at(value), value in schedule.points, split_states(models, unknown)
     figures = {name: controller.close(plant, unknown.nominal).figures() for name, plant in plants.items()}

@@ -85,11 +85,10 @@ def severity_slopes(
     points: Points,
     by: Levels | None = None,
 ) -> SeveritySlopes:
-    """Return the derivatives of the severity of `points` (n, k), coordinates of `unknown`, with respect to these.
-
-    They are of the spectral radius where the loop is unstable, else of the larger of Ms and Mt as fractions of their
-    limits or of `by`, as in `severities`; of Ms without a limit. They are zero where there is no derivative: at a plant
-    that is not finite, at a double pole.
+    """Return the derivatives of the severity of `points` (n, k), coordinates of `unknown`, with respect to these. They
+    are of the spectral radius where the loop is unstable, else of the larger of Ms and Mt as fractions of their limits
+    or of `by`, as in `severities`; of Ms without a limit. They are zero where there is no derivative: at a plant that
+    is not finite, at a double pole.
     """
     sampled, out = _sample_plants(controller, plant, unknown, points), np.zeros(points.shape)
     finite = np.flatnonzero(np.all(np.isfinite(sampled.a), axis=(1, 2)) & np.all(np.isfinite(sampled.b), axis=1))

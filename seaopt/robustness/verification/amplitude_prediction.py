@@ -38,9 +38,7 @@ def predict_gain(
     f: Float[np.ndarray, " f"],
     amplitude: Float[np.ndarray, " a"],
 ) -> Complex[np.ndarray, "a f"]:
-    """Return force over reference at amplitudes (N) and frequencies (Hz), the fundamental alone. Where several
-    frictions change with the velocity, each is taken for sliding.
-    """
+    """Return force over reference at amplitudes (N) and frequencies (Hz): fundamental, other frictions sliding."""
     values = plant.complete(params)
     loop = controller.close(take_sliding(plant, values), values)
     p, open_loop = loop.plant.response(f), loop.open_loop(f)

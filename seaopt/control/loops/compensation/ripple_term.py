@@ -153,9 +153,7 @@ class RippleTerm:
 
 
 def sum_ripple(cycles: Sequence[int], numbers: Sequence[Any], position: Any, operations: Any) -> Any:
-    """Return the series at a position, of floats or expressions. `operations`: what has fmin, fmax and floor for them:
-    the modules numpy or casadi.
-    """
+    """Return the series at a position, of floats or expressions; `operations`: the module numpy or casadi."""
     count = len(cycles)
     turns = operations.fmax(operations.fmin(numbers[0] * position, MOST_TURNS), -MOST_TURNS)
     quarter = 0.5 * math.pi * (turns - operations.floor(turns + 0.5))

@@ -48,9 +48,7 @@ SLOWEST_HZ = 1e-6
 
 
 def leave_positive(left: Any, least: Any = np.minimum, most: Any = np.maximum) -> Any:
-    """Return a number, or where it is less than `LEFT` a positive one that continues it smoothly. `least` and `most`
-    are those of arrays, or of a solver's expressions.
-    """
+    """Return a number, or below `LEFT` a positive one that continues it smoothly; of arrays or expressions."""
     return most(left, LEFT) - LEFT + LEFT * LEFT / (2.0 * LEFT - least(left, LEFT))
 
 
