@@ -26,7 +26,6 @@ class SeaoptError(Exception):
     Traceback (most recent call last):
     ...
     seaopt.errors.SeaoptError: bandwidth_hz = 80 is outside 15 to 60; choose one inside, or give bandwidth_range_hz
-
     """
 
 
@@ -126,7 +125,6 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     'did you mean "bandwidth_hz"?'
     >>> suggestion("zzz", ["J", "b_r"])
     'known: J, b_r'
-
     """
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
@@ -150,7 +148,6 @@ def require_type(
     Traceback (most recent call last):
     ...
     seaopt.errors.SeaoptError: log = 'x.csv' is a str; give a Log
-
     """
     if not isinstance(value, kind):
         raise error(f"{argument} = {' '.join(repr(value)[:60].split())} is a {type(value).__name__}; {remedy}")
@@ -167,7 +164,6 @@ def require_number(value: Any, argument: str, error: type[SeaoptError] = SeaoptE
     Traceback (most recent call last):
     ...
     seaopt.errors.SeaoptError: k = 1j is a complex; give a real number
-
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise error(f"{argument} = {repr(value)[:60]} is a {type(value).__name__}; give a real number")
@@ -186,7 +182,6 @@ def require_memory(numbers: float, argument: str, error: type[SeaoptError] = Sea
     Traceback (most recent call last):
     ...
     seaopt.errors.SeaoptError: duration_s = 1e+07 takes about 80 GB of memory, and 4 GB is the most; give less
-
     """
     size_GB = 8e-9 * numbers
     if not size_GB <= MOST_GB:
@@ -202,7 +197,6 @@ def require_seed(seed: Any, error: type[SeaoptError] = SeaoptError) -> int:
     Traceback (most recent call last):
     ...
     seaopt.errors.SeaoptError: seed = -1 is not a seed; give a whole number, 0 or more
-
     """
     if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or seed < 0:
         raise error(f"seed = {repr(seed)[:60]} is not a seed; give a whole number, 0 or more")

@@ -51,7 +51,6 @@ class Processes(Executor):
     >>> with Processes(workers=1) as executor:  # in a script below `if __name__ == "__main__":`
     ...     executor.submit(abs, -2).result()
     2
-
     """
 
     def __init__(self, workers: int | None = None) -> None:
@@ -197,7 +196,6 @@ def map_ordered(
     >>> with ThreadPoolExecutor(2) as threads:
     ...     list(map_ordered(abs, [-3, 2, -1], threads))
     [3, 2, 1]
-
     """
     check_executor(executor)
     if executor is None:
@@ -235,7 +233,6 @@ class Shared(Generic[Item]):
     ...     def __call__(self, x): return self.shared.value["factor"] * x
     >>> list(map_ordered(Scale(Shared({"factor": 3})), [1, 2]))
     [3, 6]
-
     """
 
     def __init__(self, value: Item) -> None:

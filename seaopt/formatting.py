@@ -61,7 +61,6 @@ def format_toml(value: Any) -> str:
     --------
     >>> print(format_toml({"rate_hz": 400.0, "rule": "restamp", "F1 [N]": [1, True]}))
     { rate_hz = 400, rule = "restamp", "F1 [N]" = [1, true] }
-
     """
     if isinstance(value, Mapping):
         return f"{{ {format_keys(value)} }}" if value else "{}"  # pyright: ignore[reportUnknownArgumentType]
@@ -79,7 +78,6 @@ def format_keys(keys: Mapping[str, Any]) -> str:
     --------
     >>> format_keys({"resample": {"rate_hz": 400}, "decimate": 2})
     'resample = { rate_hz = 400 }, decimate = 2'
-
     """
     return ", ".join(f"{_format_key(name)} = {format_toml(value)}" for name, value in keys.items())
 
@@ -95,7 +93,6 @@ def format_remedies(text: str, remedies: Sequence[Mapping[str, Any]]) -> str:
     --------
     >>> format_remedies("call log.restamp()", [{"resample": "restamp"}])
     'call log.restamp(); in a problem file: resample = "restamp"'
-
     """
     ways = [" and ".join(format_keys({name: value}) for name, value in keys.items()) for keys in remedies]
     return f"{text}; in a problem file: {', or '.join(ways)}" if ways else text

@@ -44,7 +44,6 @@ class Parameter:
         False where a fit gave the value and its data cannot identify it: other values fit as well.
     plausible : (low, high) or None
         What such actuators have, in `unit`: a fit that ends outside is warned of.
-
     """
 
     json_keys = (
@@ -139,7 +138,6 @@ class ParameterSet(Mapping[str, Parameter]):
     >>> params = params.update(J=2e-6).free("J")
     >>> params["J"].value, params.free_names
     (2e-06, ('J',))
-
     """
 
     __slots__ = ("_items",)
@@ -161,7 +159,6 @@ class ParameterSet(Mapping[str, Parameter]):
         --------
         >>> ParameterSet.of(k=(655e3, "N/m"), eta=0.95)["k"].unit
         'N/m'
-
         """
         pairs = {name: value if isinstance(value, tuple) else (value, "-") for name, value in values.items()}
         return cls(
@@ -222,7 +219,6 @@ class ParameterSet(Mapping[str, Parameter]):
             A name is unknown or a value outside its bounds.
         UnitError
             A unit is unknown or of another dimension.
-
         """
         changed: list[Parameter] = []
         for name, stated in values.items():

@@ -23,7 +23,6 @@ class Progress(Protocol):
         What is done just now; without a share, a remark that is worth keeping.
     share : float, optional
         Of the whole call that is done, from 0 to 1; never less than before.
-
     """
 
     def __call__(self, note: str, share: float | None = None, /) -> None:
@@ -52,7 +51,6 @@ def divide(progress: Progress, *weights: float) -> list[Progress]:
     half of the first 0.125
     the second begins 0.25
     a remark None
-
     """
     ends = [0.0, *accumulate(weights)]
     total = ends[-1] or 1.0
@@ -68,7 +66,6 @@ def count_off(items: Sequence[Item], what: str, progress: Progress) -> Iterator[
     ...     pass
     plant 1 of 2 0.0
     plant 2 of 2 0.5
-
     """
     for number, item in enumerate(items):
         progress(f"{what} {number + 1} of {len(items)}", number / len(items))

@@ -84,7 +84,6 @@ class Table:
         The file, or the files.
     notes : tuple of str
         What was done on reading, one sentence each.
-
     """
 
     time: Float[np.ndarray, " n"]

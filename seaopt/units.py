@@ -137,7 +137,6 @@ def header_unit(header: str) -> str | None:
     --------
     >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur")
     ('N', 'usec', None)
-
     """
     match = _HEADER.match(header)
     return match["unit"].strip() if match else None

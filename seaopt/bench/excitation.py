@@ -58,7 +58,6 @@ class Multisine:
     >>> sine = Multisine(amplitudes=(2.0,), frequencies_hz=(1.0,))
     >>> sine.samples(np.array([0.0, 0.25, 0.5]), np.random.default_rng(0)).round(6)
     array([0., 2., 0.])
-
     """
 
     amplitudes: tuple[float, ...] = option("In the input's unit.")
@@ -108,7 +107,6 @@ def scale(parts: Excitation, factor: float) -> Excitation:
     --------
     >>> scale(PAPER_STAND, 0.5)[1]
     Noise(std=0.5, band_hz=150.0)
-
     """
     out: list[Chirp | Noise | Multisine] = []
     for part in parts:
@@ -131,7 +129,6 @@ def excite(
     >>> time, current = excite(PAPER_STAND, duration_s=164, rate_hz=400, rng=np.random.default_rng(1))
     >>> time.size
     65600
-
     """
     require_memory(4.0 * duration_s * rate_hz, f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g}", SimulationError)
     n = round(duration_s * rate_hz)

@@ -138,7 +138,6 @@ def virtual_log(
     >>> log = virtual_log(so.plants.high_impedance(), so.plants.thor(), PAPER_STAND, duration_s=1, rate_hz=400, seed=1)
     >>> len(log), sorted(log.signals)
     (400, ['F1', 'F2', 'I', 'q'])
-
     """
     devices = sensors if sensors is not None else Sensors()
     for name in devices.names:

@@ -103,7 +103,6 @@ def fit(
     >>> result = so.fit([experiment], truth.update(J=1e-6, b_r=5e-4).free("J", "b_r"))
     >>> result.status, abs(result.parameters["J"].value / 3.31e-6 - 1) < 0.001
     ('converged', True)
-
     """
     started = time.perf_counter()
     chosen = method if method is not None else OutputError()

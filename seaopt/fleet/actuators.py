@@ -47,7 +47,6 @@ def tabulate_actuators(fleet: Fleet, drift: Drift, population: Population | None
     >>> fleet = Fleet(rows=rows, units={"J": "kg m^2"}, identity=("unit",), fitted=("J",))
     >>> tabulate_actuators(fleet, find_drift(fleet)).select("label", "met", "failed", "J").rows()
     [('b', 0, 1, None), ('a', 1, 0, 2e-06)]
-
     """
     names = fleet.fitted or tuple(fleet.units)
     statuses = {"met": MET, "not_met": NOT_MET, "failed": FAILED}
@@ -88,7 +87,6 @@ def write_actuators(table: pl.DataFrame, path: Path | str) -> Path:
     ------
     FileError
         The folder cannot be written.
-
     """
     import io
 

@@ -69,7 +69,6 @@ class Alarm:
         From `since` on.
     level : float
         The chart over its threshold, where it is largest; above 1.
-
     """
 
     json_keys = (
@@ -135,7 +134,6 @@ class Drift(Worded):
         Why there are no charts; "" where there are.
     doubt : str
         Why it is not known how many would have an alarm if all were healthy; "" where it is.
-
     """
 
     table: pl.DataFrame
@@ -256,7 +254,6 @@ def find_drift(
     >>> drift = find_drift(Fleet(rows=rows, units={"J": "kg m^2"}, identity=("joint", "run"), fitted=("J",)))
     >>> [(one.actuator, one.since_time, one.raised_time) for one in drift.alarms]
     [('knee', 'run 16', 'run 17')]
-
     """
     history = order_runs(fleet, actuator, time)
     names = fleet.fitted or tuple(fleet.units)

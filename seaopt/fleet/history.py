@@ -51,7 +51,6 @@ class History:
         Where the time is from, in words.
     warning : str
         What is doubtful about it; "" where nothing is.
-
     """
 
     rows: pl.DataFrame
@@ -98,7 +97,6 @@ def order_runs(fleet: Fleet, actuator: Sequence[str] | None = None, time: Sequen
     >>> history = order_runs(Fleet(rows=rows, units={}, identity=("unit", "run")))
     >>> history.rows["log"].to_list(), history.unit, history.source
     (['a/9.csv', 'a/10.csv', 'b/2.csv'], 'run', 'column "run"')
-
     """
     when = _choose_time(fleet.identity) if time is None else check_names(time, fleet.identity, "time", COLUMN)
     if actuator is None:

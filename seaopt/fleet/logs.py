@@ -37,7 +37,6 @@ class FleetLog:
         Absolute, or an address.
     identity : mapping of name to text
         Whose log it is, and of when.
-
     """
 
     path: str
@@ -70,7 +69,6 @@ def find_logs(names: Iterable[str | Path], identity: str | None = None) -> tuple
     ...     logs = find_logs([f"{folder}/*.csv"], identity="{robot}_{joint}.csv")
     >>> [dict(log.identity) for log in logs]
     [{'robot': 'r7', 'joint': 'hip'}, {'robot': 'r7', 'joint': 'knee'}]
-
     """
     names = [names] if isinstance(names, str | Path) else names
     paths = sorted({path for name in names for path in _expand(str(name))})
@@ -96,7 +94,6 @@ def read_manifest(path: Path | str, column: str = "log") -> tuple[FleetLog, ...]
         It cannot be read, or has no such column.
     LogError
         A log is listed twice, or is not named.
-
     """
     import polars as pl
 

@@ -167,7 +167,6 @@ def write_fleet_page(
     >>> fleet = Fleet(rows=rows, units={"J": "kg m^2"}, identity=("unit",), fitted=("J",))
     >>> write_fleet_page(fleet, find_drift(fleet), tempfile.mkdtemp() + "/fleet.html").name
     'fleet.html'
-
     """
     table = tabulate_actuators(fleet, drift, population)
     names, timed = fleet.fitted or tuple(fleet.units), not drift.missing

@@ -72,7 +72,6 @@ class Population(Worded):
         (95 %), and NAME_own with NAME_own_std from its own logs alone.
     left_out : mapping of reason to int
         Logs that are not used.
-
     """
 
     json_keys = ("names", "units", "logarithmic", "mean", "between", "within", "actuators", "left_out")
@@ -182,7 +181,6 @@ def estimate_population(
     >>> shrunk = estimate_population(fleet).table["J"].to_numpy()
     >>> [round(float(np.std(values / truth)), 2) for values in (J, shrunk)]
     [0.09, 0.05]
-
     """
     wanted = fleet.free if parameters is None else parameters
     names = check_names(wanted, fleet.free, "parameters", "free parameter of the fleet")

@@ -34,7 +34,6 @@ class Spread:
         Of the values: their median, and what a tenth of them lie below and above.
     std : float
         Median of the stated standard deviations.
-
     """
 
     json_keys = (
@@ -74,7 +73,6 @@ class Fleet(Result, Worded):
         The parameters among them, whose errors' correlations have columns, too.
     drift, population : mapping or None
         What fleet.json says of them, of `read_fleet`; the objects are those of `find_drift`, `estimate_population`.
-
     """
 
     rows: pl.DataFrame

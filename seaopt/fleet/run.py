@@ -100,7 +100,6 @@ def fit_fleet(
     ...                          identity="{joint}.csv")
     >>> fleet.counts, fleet.rows["joint"].to_list()
     ({'met': 2, 'not met': 0, 'failed': 0}, ['joint1', 'joint2'])
-
     """
     check_executor(executor)
     problem = problem if isinstance(problem, Problem) else read_problem(problem)
@@ -169,7 +168,6 @@ def read_fleet(folder: Path | str) -> Fleet:
     >>> read_fleet("no_such_folder")
     Traceback (most recent call last):
     seaopt.errors.FileError: no_such_folder/fleet.json: ...
-
     """
     place, remedy = Path(folder), "type the command of the fleet again"
     content = read_json(place / "fleet.json", FLEET_SCHEMA, remedy=remedy)

@@ -71,7 +71,6 @@ class Between:
         Degrees of freedom and scale of Student's t that standardised innovations follow; infinite and 1 of normal ones.
     shaped : bool
         Whether the runs are enough to tell correlation and tails.
-
     """
 
     json_keys = ("std", "pairs", "dof", "correlation", "tails", "scale")

@@ -79,7 +79,6 @@ class MeasuredResponse:
     >>> measured = measure_response(stand, log, "F1")
     >>> measured.confidence, bool(measured.frequency_hz[-1] > 100.0)
     (0.95, True)
-
     """
 
     name: str
@@ -163,7 +162,6 @@ def measure_response(
     LogError
         The log is too short, has gaps or missing samples, nothing is excited, other inputs are excited too, or too few
         frequencies are coherent.
-
     """
     require_number(confidence, "confidence", LogError)
     if not 0.0 < confidence < 1.0:

@@ -42,7 +42,6 @@ class FrequencyResponse:
         Between 0 and 1.
     averages : int
         Segments averaged.
-
     """
 
     frequency_hz: Lines
@@ -101,7 +100,6 @@ def h1(
     >>> estimate = h1(u, 3 * u, 1 / 400)
     >>> bool(np.allclose(estimate.response, 3.0)), bool(np.all(estimate.coherence > 0.999))
     (True, True)
-
     """
     return responses(u, (y,), period, stretch_s=stretch_s)[0]
 

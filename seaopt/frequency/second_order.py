@@ -68,7 +68,6 @@ class DriveEstimate:
         The paper's: k/m_k is the mean of K and b, which assumes a static gain of 1.
     K : Uncertain
         Of F1/F_m, as printed in (16).
-
     """
 
     m_k: Uncertain
@@ -99,7 +98,6 @@ class SecondOrder:
         Frequencies fitted.
     misfit : float
         Root mean square of the residual in standard deviations of the estimate: 1 where the form explains the log.
-
     """
 
     json_keys = (
@@ -175,7 +173,6 @@ class SecondOrder:
         >>> drive = printed.drive(655000, 1.0)
         >>> round(drive.m_k_averaged.value, 1), round(drive.b_m_averaged.value), round(drive.efficiency.value, 3)
         (294.7, 11650, 0.95)
-
         """
         whole = np.zeros((5, 5))
         whole[:4, :4], whole[4, 4] = self.covariance, k_std**2
@@ -246,7 +243,6 @@ def second_order(
     >>> form = second_order(so.h1(log["I"], log["F1"], log.period), Clock(period=log.period), unit="N/A")
     >>> abs(form.b.value - 655000 / 295.2) < 3 * form.b.std
     True
-
     """
     chosen = np.flatnonzero(coherent_lines(estimate) if use is None else use)
     if chosen.size < MIN_LINES:

@@ -68,7 +68,6 @@ class Pair:
         None where the response is largest at an end of the good band.
     second_order : SecondOrder or None
         None where too few frequencies are coherent.
-
     """
 
     source: str
@@ -119,7 +118,6 @@ class Survey:
         Input by input.
     adapt : callable ``params -> params``
         Puts parameters of this log alone in their places.
-
     """
 
     plant: Plant
@@ -212,7 +210,6 @@ def survey(
     >>> log = so.virtual_log(plant, so.plants.thor(), PAPER_STAND, duration_s=20, rate_hz=400, seed=1)
     >>> [pair.name for pair in survey(plant, log, outputs=("F1", "F2")).pairs]
     ['F1/I', 'F2/I']
-
     """
     names = tuple(outputs) or tuple(name for name in plant.outputs if name in log.signals)
     present = [name for name in plant.inputs if name in log.signals]

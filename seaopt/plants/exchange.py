@@ -82,7 +82,6 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     States start at zero. An output with the name of a state is called NAME_out. Friction is its smoothed curve: of a
     plant that sticks the model's description says so, for there the FMU creeps, and so it does of a drive's delay,
     which an FMU of a continuous plant cannot carry.
-
     """
     refuse_samples(plant)
     if ca.depends_on(ca.vertcat(plant.dynamics, plant.output), plant.t):

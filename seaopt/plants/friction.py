@@ -213,7 +213,6 @@ def let_stick(plant: Plant) -> Plant:
     True
     >>> round(float(so.simulate(plant, params, log)["F1"][-1]))  # smoothed, it creeps on towards 240 N
     237
-
     """
     if not can_stick(plant) and remembers(plant):
         raise PlantError(

@@ -36,7 +36,6 @@ def plant_of_kind(kind: str, *, sticks: Any = False, **options: Any) -> Plant:
     ------
     PlantError
         The kind or one of its options is unknown, or an installed package's entry point fails.
-
     """
     installed = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
     if kind not in KINDS and kind not in installed:

@@ -26,7 +26,6 @@ class Resonance:
         Negative where the mode grows.
     states : tuple of str
         The states that take part, the largest first, each scaled by its participation factor.
-
     """
 
     frequency_hz: float
@@ -48,7 +47,6 @@ class Modes:
         Finite zeros of each transfer function, rad/s.
     dc_gain : mapping of (output, input) to float
         In the output's unit over the input's; infinite where it integrates.
-
     """
 
     poles: Complex[np.ndarray, " nx"]
@@ -92,7 +90,6 @@ def modes(
     >>> swinging = modes(high_impedance(), thor())
     >>> round(swinging.resonances[0].frequency_hz, 2), round(swinging.dc_gain["F1", "I"], 1)
     (7.5, 240.3)
-
     """
     a, b, c, d = state_space(plant, params, x, u)
     eigen: Any = np.linalg.eig(a)

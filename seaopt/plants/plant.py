@@ -119,7 +119,6 @@ class Plant:
     >>> model = plant.linearize(so.ParameterSet.of(m=(2.0, "kg"), k=(50.0, "N/m"), c=(1.0, "N s/m")))
     >>> [round(float(abs(pole)), 6) for pole in model.poles()]
     [5.0, 5.0]
-
     """
 
     name: str
@@ -203,7 +202,6 @@ class Plant:
             A parameter has neither a value in `params` nor a default, or one that the plant cannot have.
         UnitError
             A value's unit has another dimension than the plant's.
-
         """
         require_type(params, ParameterSet, f"params of plant {self.name}", "give a ParameterSet", ParameterError)
         if isinstance(params, CompletedParameters):
@@ -242,7 +240,6 @@ class Plant:
         ------
         PlantError
             The plant declares none.
-
         """
         if self.energy is None:
             raise PlantError(f"plant {self.name} declares no energy; give energy=lambda x, p: ... when it is made")
@@ -268,7 +265,6 @@ class Plant:
         -------
         control.StateSpace
             From `inputs` to `outputs`, states named as the plant's.
-
         """
         import control  # deferred: it imports matplotlib
 
@@ -329,7 +325,6 @@ class CompletedParameters(ParameterSet):
         What was completed; it may hold conditions and other plants' parameters too.
     vector : array, shape (np,)
         The values.
-
     """
 
     __slots__ = ("given", "plant", "vector")
@@ -470,7 +465,6 @@ def state_space(
     ------
     PlantError
         The plant holds samples.
-
     """
     refuse_samples(plant)
     at = (fill_vector("state", plant.states, x), fill_vector("input", plant.inputs, u), plant.complete(params).vector)

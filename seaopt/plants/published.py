@@ -57,6 +57,5 @@ def thor() -> ParameterSet:
     >>> params = thor()
     >>> params["k"].value, params["J"].value
     (655000.0, 3.31e-06)
-
     """
     return ParameterSet((*ACTUATOR, *PENDULUM, GRAVITY))

@@ -46,7 +46,6 @@ class Actuation:
         What the effort moves: effort times speed is the power that the motor makes. It gives the back-EMF.
     largest : callable ``p -> expression``, optional
         The largest magnitude of the input that acts; more of it changes nothing, as of a duty above 1.
-
     """
 
     input: str
@@ -74,7 +73,6 @@ class Sensing:
         How much such an output moves with each encoder, where that is no longer its slope: behind a filter.
     still : tuple of str
         Outputs that stay at zero, as the motion of a link does that is held.
-
     """
 
     regulated: tuple[str, ...]
@@ -104,7 +102,6 @@ class SeriesSpring:
         The derived figures that (16) of Orekhov et al. 2015 reads from a second-order response with k known.
     play : str or None
         The parameter that is its play, where it has some; a fit that looks for it starts more than once.
-
     """
 
     deflection: StateExpression
@@ -175,7 +172,6 @@ class Friction:
     >>> p, x = SimpleNamespace(f_c=1.0, K_tau=0.5), SimpleNamespace(omega=3.0)
     >>> rub.force_at(x, SimpleNamespace(I=4.0), p)
     1.2
-
     """
 
     velocity: StateExpression
@@ -255,7 +251,6 @@ class Port:
     probe : callable ``() -> Plant``, optional
         Makes the same actuator with its other links held and a bare inertia on this one, for the impedance at the
         port. That plant's first port has motion and coordinate in one, the effort, and the inertia as its payload.
-
     """
 
     motion: str | None = None
@@ -301,7 +296,6 @@ class Winding:
         The effort at the spring that an ampere makes.
     unit : str
         Of the effort.
-
     """
 
     rises: tuple[str, str]
@@ -345,7 +339,6 @@ class Mode:
         That sets it; more of it lowers the frequency.
     state : str
         That takes most part in it.
-
     """
 
     name: str

@@ -206,7 +206,6 @@ def rotary(
     >>> model = plant.linearize(plant.defaults)
     >>> model.output_labels
     ['tau_s', 'theta_m', 'theta_l', 'tau_h', 'deflection']
-
     """
     check_choices(("link", link, LINKS), ("drive", drive, DRIVES), ("spring", spring, SPRINGS))
     if not isinstance(external, bool):

@@ -269,7 +269,6 @@ def two_link(
     >>> plant = two_link(link1="mass", link2="pendulum")
     >>> list(plant.states)
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
-
     """
     return _build_plant(f"two_link({link1}, {link2}, ", (link1, link2), drive, spring, parts, external=True)
 
@@ -303,7 +302,6 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: S
     >>> model = high_impedance().linearize(thor())
     >>> bool(abs(model.dcgain()[0, 0] - 240.33) < 0.01)  # N/A: K_tau / r
     True
-
     """
     return _build_plant("high_impedance(", ("fixed", "fixed"), drive, spring, parts)
 
@@ -330,6 +328,5 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Se
     --------
     >>> list(moving_output().outputs)
     ['F1', 'F2', 'q', 'phi', 'x_2']
-
     """
     return _build_plant("moving_output(", ("fixed", "pendulum"), drive, spring, parts, suffixes=("1", ""))

@@ -78,7 +78,6 @@ class Problem:
         What is asked of predictive control, with structure = "mpc".
     refused : str
         What is wrong in the tables of a design, where the file was read without them: `read_problem(design=False)`.
-
     """
 
     title: str

@@ -58,7 +58,6 @@ def read_problem(path: Path | str, *, design: bool = True) -> Problem:
     >>> problem = so.read_problem(so.demo_path())
     >>> problem.title, list(problem.plants)
     ('THOR linear SEA', ['stand', 'swing'])
-
     """
     require_type(path, (str, Path), "path", "give the path of a problem file", ProblemError)
     source = Path(path)

@@ -89,7 +89,6 @@ def fit_problem(
     ------
     ProblemError
         There is nothing to fit.
-
     """
     if not problem.table.experiment:
         raise ProblemError(f"{problem.source}: has no [[experiment]] to fit; {WRITE_ONE}")
@@ -182,7 +181,6 @@ def tune_problem(
         As in `seaopt.tune`.
     executor : concurrent.futures.Executor, optional
         For the certificates, with `retune`; as in `seaopt.certify`.
-
     """
     if problem.mpc is not None:
         return linear_controller(design_mpc(problem, source))
@@ -354,7 +352,6 @@ def certify_problem(
         The fit; or values, of a problem without experiments.
     progress, executor
         As in `seaopt.certify`.
-
     """
     table, plants, measured = problem.robustness, problem.certified_plants(), problem.measure_responses(source)
     if isinstance(controller, Controller) and problem.designs_on_response:
@@ -399,7 +396,6 @@ class Stages:
     >>> stages = Stages(so.read_problem(so.demo_path()))
     >>> stages.problem.title  # stages.fit, stages.controller and stages.certificate take their time
     'THOR linear SEA'
-
     """
 
     def __init__(self, problem: Problem, **made: Any) -> None:

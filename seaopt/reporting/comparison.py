@@ -42,7 +42,6 @@ def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s:
     ------
     LogError
         The log does not allow an estimate.
-
     """
     view = view_sensors(experiment, fit)
     estimate = survey(

@@ -48,7 +48,6 @@ def write_frequency_figure(
     ------
     FileError
         The folder cannot be written.
-
     """
     return write_figure(compose_sheet(survey_panels(surveys, given, fitted)), path)
 
@@ -67,7 +66,6 @@ def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
     -------
     list of Path
         Both files.
-
     """
     return write_figure(compose_sheet(frontier_panels(frontier), FRONTIER_COLUMNS), path)
 
@@ -93,6 +91,5 @@ def write_quality_figure(data: Log | Table, quality: Quality, path: Path | str) 
     ------
     FileError
         The folder cannot be written.
-
     """
     return write_figure(compose_sheet(log_panels(data, quality)), path)

@@ -40,7 +40,6 @@ class Clock:
         The plant gets the input this much later.
     delay_free : bool
         Whether derivatives with respect to the delay are wanted.
-
     """
 
     period: float
@@ -131,7 +130,6 @@ def transition(model: Model, theta: Float[np.ndarray, " np"], clock: Clock) -> F
     ------
     SimulationError
         The plant samples with another period.
-
     """
     check_period(model, clock)
     nx, nu = model.nx, model.nu

@@ -40,7 +40,6 @@ class Model:
     sticks : bool
         Whether friction that jumps is simulated as it is (`seaopt.simulation.sticking`). f and h are then those
         without it, as the plant moves at speed.
-
     """
 
     plant: Plant
@@ -126,7 +125,6 @@ class Model:
         -------
         G : array, shape (nx + ny, nx + nu + 1)
         dG : array, shape (np, nx + ny, nx + nu + 1)
-
         """
         rows, cols = self.nx + self.ny, self.nx + self.nu + 1
         p = np.append(self.parameters(theta), 0.0)  # room for a number, which an address needs
@@ -151,7 +149,6 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
         A parameter has no value.
     PlantError
         An output is unknown.
-
     """
     chosen = outputs or tuple(plant.outputs)
     for name in chosen:

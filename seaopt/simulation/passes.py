@@ -35,7 +35,6 @@ class Weights:
         knee^2 (sqrt(1 + (r / knee)^2) - 1).
     knee : array, shape (ny,)
         Where a robust loss leaves the square, in the output's unit.
-
     """
 
     sections: Float[np.ndarray, "m 5"]
@@ -71,7 +70,6 @@ class Segment:
         Time of the first sample, for plants that depend on time.
     drift_span : (float, float)
         Drift's coordinate, which runs from -1 to 1 over the whole log, at the first sample, and its step.
-
     """
 
     u: tuple[Float[np.ndarray, " m"], ...]
@@ -116,7 +114,6 @@ class Point:
     correction : array, shape (1 + ns, nx, ny), or None
         Gain by which the prediction error corrects the next state, and its derivatives with respect to theta, a free
         delay, and what else it depends on (ns in all). None: the plant is simulated.
-
     """
 
     theta: Float[np.ndarray, " np"]

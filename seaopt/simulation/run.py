@@ -53,7 +53,6 @@ def run_passes(
     -------
     Pass
         Numbers that are not finite where the simulation left what floats can hold.
-
     """
     check_period(model, point.clock)
     chosen = weights if weights is not None else Weights.plain(model.ny)
@@ -125,7 +124,6 @@ def double_sum(
         Takes the column v of an output to its influence a on p estimates; its first column is zero.
     r : array, shape (lags + 1, ny, ny)
         R(k)[a, b] of output a with output b so many samples before; R(-k) = R(k)'. Time grows with the lags.
-
     """
     program = Program.make(model, segment, point, weights)
     return None if program is None else program.double_sum(x0, into, r)

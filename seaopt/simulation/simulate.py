@@ -99,7 +99,6 @@ def simulate(
     >>> run = so.simulate(so.plants.high_impedance(), so.plants.thor(), so.Log.from_arrays(time=t, I=np.ones(400)))
     >>> round(float(run["F1"][-1]), 1)  # 240.33 N/A once it has settled
     240.3
-
     """
     require_type(plant, Plant, "plant", "give a Plant", SimulationError)
     require_type(log, Log, "log", "give a Log", SimulationError)

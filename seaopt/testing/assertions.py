@@ -43,7 +43,6 @@ def assert_recovered(
     >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
     >>> fit = so.fit([virtual_experiment(stand, thor)], thor.update(J=2e-6).free("J", "b_r"))
     >>> assert_recovered(fit, thor, sigmas=3, within=0.05)
-
     """
     require_type(fit, Fit, "fit", "give what seaopt.fit returned")
     require_type(truth, (ParameterSet, Mapping), "truth", 'give the true values: thor(), or {"J": 3.31e-6}')
@@ -98,7 +97,6 @@ def assert_predicts(fit: Fit, experiment: Experiment, fit_percent: float | Mappi
     >>> from seaopt.testing import virtual_experiment
     >>> bench, other = (virtual_experiment(so.plants.high_impedance(), so.plants.thor(), seed=n) for n in (1, 2))
     >>> assert_predicts(so.fit([bench], so.plants.thor().free("J", "b_r")), other, fit_percent=95)
-
     """
     require_type(fit, Fit, "fit", "give what seaopt.fit returned")
     require_type(experiment, Experiment, "experiment", "give an Experiment")
@@ -147,7 +145,6 @@ def assert_certified(certificate: Certificate, *, failure_probability: float | N
     >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     >>> certificate = so.certify(controller, {"stand": stand}, thor, ranges={"eta": (0.9, 1.0)}, samples=500)
     >>> assert_certified(certificate, failure_probability=0.03)
-
     """
     require_type(certificate, Certificate, "certificate", "give what seaopt.certify returned")
     if failure_probability is not None:

@@ -55,7 +55,6 @@ class Expectation:
         Whose result it is about.
     judge : callable
         Judges the results, of which that stage's is there.
-
     """
 
     name: str
@@ -69,7 +68,6 @@ class Expectation:
         ----------
         results : Stages
             The problem's.
-
         """
         if getattr(results, self.stage) is None:
             fit = results.fit
@@ -93,7 +91,6 @@ def list_expectations(problem: Problem) -> list[Expectation]:
     >>> import seaopt as so
     >>> list_expectations(so.read_problem(so.demo_path()))
     []
-
     """
     expect = problem.table.expect
     if expect is None:

@@ -57,7 +57,6 @@ def virtual_experiment(
     >>> bench = virtual_experiment(so.plants.high_impedance(), so.plants.thor(), duration_s=5)
     >>> bench.outputs, len(bench.log)
     (('F1', 'F2'), 2000)
-
     """
 
     def record_log(sensors: Sensors) -> Log:

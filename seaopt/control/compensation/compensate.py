@@ -68,7 +68,6 @@ def add_compensation(
     >>> controller = so.tune(stand, params, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
     >>> round(add_compensation(controller, friction=CompensateFriction(fraction=0.8)).compensation.friction.effort, 6)
     40.0
-
     """
     if controller.design is None:
         raise ControlError(

@@ -63,7 +63,6 @@ class RippleFit:
         Of what is left of the command.
     samples : int
         That were used.
-
     """
 
     cycles: tuple[int, ...]
@@ -169,7 +168,6 @@ def identify_ripple(
     >>> fit = identify_ripple(Log.from_arrays(time=t, I=I, theta_m=theta, units={"I": "A", "theta_m": "rad"}))
     >>> fit.cycles, round(fit.cos[0], 3), round(fit.coulomb, 2)
     ((6,), 0.05, 0.3)
-
     """
     period = _choose_period(log, angle, period)
     wanted = list(range(1, highest + 1)) if cycles is None else np.asarray(cycles).tolist()  # not of NumPy

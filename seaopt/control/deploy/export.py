@@ -118,7 +118,6 @@ def export(
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> [path.name for path in export(controller, tempfile.mkdtemp(), name="knee")]
     ['knee.h', 'knee.c', 'knee_gains.h', 'knee_gains.m']
-
     """
     if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')

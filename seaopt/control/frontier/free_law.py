@@ -88,7 +88,6 @@ class FreeLaw:
         Of which Q is a sum.
     frequencies : int
         Of the program.
-
     """
 
     status: Literal["optimal", "impossible", "unstable plant", "no answer"]
@@ -165,7 +164,6 @@ def bound_free_law(
     >>> free = bound_free_law(tuned.plant(stand, thor), spec, [tuned.law])
     >>> free.status
     'optimal'
-
     """
     if isinstance(functions, bool) or not isinstance(functions, int) or functions < 1:
         raise ControlError(f"functions = {functions!r} is not a number of functions; give 1 or more")

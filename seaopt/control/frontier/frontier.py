@@ -153,7 +153,6 @@ def sweep(
     >>> frontier = sweep(so.plants.high_impedance(), so.plants.thor(), spec, [20, 30])
     >>> [row.feasible for row in frontier.rows], frontier.rows[0].noise_gain <= 25
     ([True, True], True)
-
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     check_executor(executor, ControlError)

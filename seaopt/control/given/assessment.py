@@ -66,7 +66,6 @@ def assess(
     >>> controller = assess(law, so.plants.high_impedance(), so.plants.thor(), spec)
     >>> controller.structure, controller.achieved.stable
     ('custom', True)
-
     """
     if isinstance(law, Plant):
         raise ControlError("law = a Plant; the law comes first, as in certify: assess(law, plant, params, spec)")

@@ -62,7 +62,6 @@ class GivenLaw:
         Whether it gives the command (A, V, duty) itself.
     per_effort : float or None
         The command that it makes of one unit of effort; None where the file does not say.
-
     """
 
     law: Law
@@ -249,7 +248,6 @@ def read_law(path: Path | str) -> GivenLaw:
     >>> _ = path.write_text('sample_rate_hz = 1000.0\ncompute_delay_samples = 1\n[pid]\nk_p = 2.0\nk_i = 30.0\n')
     >>> read_law(path).law.integrators
     1
-
     """
     source = Path(path)
     parse, form = (json.loads, "JSON") if source.suffix.lower() == ".json" else (tomllib.loads, "TOML")

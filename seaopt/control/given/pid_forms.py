@@ -53,7 +53,6 @@ def parallel_pid(
     >>> law = parallel_pid(k_p=2.0, k_i=10.0, sample_time_s=1e-3, integral="backward")
     >>> law.integrators, law.d.round(6).tolist()
     (1, [2.01, -2.01])
-
     """
     _check_numbers(k_p=k_p, k_i=k_i, k_d=k_d, T_f=T_f, b=b, c=c, feedforward=feedforward, sample_time_s=sample_time_s)
     if integral not in get_args(Integral):
@@ -114,7 +113,6 @@ def cascade_pid(
     >>> law = cascade_pid(k_v=0.3, k_p=5.0, k_i=60.0, T_v=0.05, sample_time_s=1e-3)
     >>> law.integrators, law.d.size
     (2, 3)
-
     """
     require_number(T_v, "T_v", ControlError)
     if not T_v > 0.0 or not math.isfinite(k_v):
@@ -173,7 +171,6 @@ def ideal_pid(
     --------
     >>> ideal_pid(K=2.0, T_i=0.2, sample_time_s=1e-3).d.round(6).tolist()
     [2.005, -2.005]
-
     """
     if not (T_i > 0.0 and T_d >= 0.0 and N > 0.0):
         raise ControlError(f"T_i = {T_i:g}, T_d = {T_d:g}, N = {N:g}: give positive times and a positive N")
@@ -223,7 +220,6 @@ def drive_pid(
     --------
     >>> drive_pid(per_effort=0.004, k_p=0.008, sample_time_s=1e-3).d.round(6).tolist()
     [2.0, -2.0]
-
     """
     if not require_number(per_effort, "per_effort", ControlError) > 0.0:
         raise ControlError(f"per_effort = {per_effort:g} is not positive; give the command for one unit of effort")

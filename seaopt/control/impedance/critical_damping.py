@@ -84,7 +84,6 @@ def critical_impedance(
     >>> force = so.tune(so.plants.rotary("locked"), values, so.ControllerSpec(measured="tau_s", bandwidth_hz=20))
     >>> critical_impedance(force, knee, values, 3.0).damping > 0
     True
-
     """
     require_number(stiffness, "stiffness", ControlError)
     link = find_link(controller, plant, parameters)

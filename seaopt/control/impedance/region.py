@@ -59,7 +59,6 @@ class ImpedanceRegion:
         The critically damped ones.
     called : Mechanics
         Units and words.
-
     """
 
     plot = PlotAccessor()
@@ -174,7 +173,6 @@ def passive_region(
     >>> region = passive_region(so.tune(so.plants.rotary("locked"), values, spec), knee, values, points=20)
     >>> region.margin.shape, region.stiffest.stiffness > 0
     ((20, 20), True)
-
     """
     link = find_link(controller, plant, parameters, link_damping)
     if isinstance(points, bool) or not 2 <= points <= MOST_POINTS:

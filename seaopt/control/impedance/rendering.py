@@ -84,7 +84,6 @@ class Rendering:
         Of the link after a step of x_0, as a share of where it ends; infinite where it is not stable.
     called : Mechanics
         Units and words.
-
     """
 
     impedance: Impedance
@@ -182,7 +181,6 @@ def render(
     >>> rendering = render(force, knee, values, Impedance(stiffness=40.0, damping=2.0))
     >>> rendering.passive, rendering.stable
     (True, True)
-
     """
     require_type(impedance, Impedance, "impedance", "give an Impedance", ControlError)
     link = find_link(controller, plant, parameters, link_damping)
@@ -238,7 +236,6 @@ def add_impedance(
     >>> force = so.tune(so.plants.rotary("locked"), values, so.ControllerSpec(measured="tau_s", bandwidth_hz=20))
     >>> add_impedance(force, knee, values, Impedance(stiffness=40.0, damping=2.0)).outer.direction
     1.0
-
     """
     require_type(impedance, Impedance, "impedance", "give an Impedance", ControlError)
     outer = find_link(controller, plant, parameters).outer(impedance)

@@ -53,7 +53,6 @@ class Score:
         Root mean square of the effort over that of white noise on the regulated signal.
     unit : str
         Of impedance and damping.
-
     """
 
     bandwidth_hz: float | None
@@ -100,7 +99,6 @@ class Scorecard(Worded):
     Parameters
     ----------
     scores : mapping of name to Score
-
     """
 
     scores: Mapping[str, Score]
@@ -149,7 +147,6 @@ def scorecard(
     >>> card = scorecard({"pid": controller})
     >>> round(card["pid"].bandwidth_hz), card.unit
     (30, 'N s/m')
-
     """
     require_type(controllers, Mapping, "controllers", "give {name: controller}", ControlError)
     if not controllers:

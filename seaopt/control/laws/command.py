@@ -36,7 +36,6 @@ class Command:
         The largest command that acts, by the plant's actuation; None where it states none.
     measured_unit : str
         Of what is fed back, and of its reference, where it is no effort: rad of an angle.
-
     """
 
     input: str
@@ -120,7 +119,6 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     >>> command = command_of(so.plants.high_impedance(), so.plants.thor(), "F1")
     >>> print(f"{command.per_effort:.6f} {command.per_effort_unit}")  # r/(eta K_tau) of (2) and (3)
     0.004161 A/N
-
     """
     source, unit = next(iter(plant.inputs.items()))
     values = plant.complete(params)

@@ -107,7 +107,6 @@ class Controller(LoopDelays, Result, Worded):
         friction margin are those of the law without it.
     gate : PlausibilityGate or None
         Which readings the exported law believes.
-
     """
 
     plot = PlotAccessor()
@@ -411,7 +410,6 @@ class Controller(LoopDelays, Result, Worded):
         ------
         FileError
             A field is missing or malformed, or one contradicts the law: gains, reference, measurement, achieved.
-
         """
         # Deferred, as pydantic takes long to import.
         from seaopt.control.laws.stored import check_achieved, check_friction_margin, check_link, read_controller

@@ -86,7 +86,6 @@ class Passivity:
         From here the fed-back force and the force at the port oppose each other; None where they never do.
     unit : str
         Of the damping: N s/m, or N m s/rad at a port that turns.
-
     """
 
     low_hz: float
@@ -107,7 +106,6 @@ class Passivity:
         ------
         ControlError
             The band is not within the examined one.
-
         """
         low, high = band_hz
         if not self.low_hz <= low < high <= self.high_hz:
@@ -175,7 +173,6 @@ def passivity(
     >>> found = passivity(so.tune(plant, params, spec), plant, params)
     >>> round(found.limit_hz, 1)
     160.3
-
     """
     ts = controller.sample_time_s
     high = 0.5 / ts if high_hz is None else high_hz
@@ -253,7 +250,6 @@ def passivity_rows(
     ControlError
         The measured force does not determine the force at the port (an elastic screw between them), so that the
         condition is quadratic in the gains.
-
     """
     port = port_of(plant, params, spec.regulated, per_effort)
     condition = weigh_passivity(port, spec.sample_time_s, spec.loop_delay_samples, f)

@@ -120,7 +120,6 @@ class PlausibilityGate:
     20.0 held
     20.0 held
     20.0 fault
-
     """
 
     range_N: tuple[float, float]
@@ -152,7 +151,6 @@ class PlausibilityGate:
         ------
         ControlError
             It is not within the range itself.
-
         """
         low, high = self.range_N
         if not low <= measurement <= high:
@@ -201,7 +199,6 @@ class PlausibilityGate:
         >>> gate = PlausibilityGate.of_controller(controller, range_N=(-4000.0, 4000.0))
         >>> print(f"{gate.max_step_N:.0f} N, {gate.ramp_A_per_s:.0f} A/s")
         473 N, 90 A/s
-
 
         """
         if not hasattr(controller, "command_limit"):

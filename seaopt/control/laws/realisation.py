@@ -70,7 +70,6 @@ class LawState:
         Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
     memory : (float, float)
         What the compensation, where there is one, keeps of the last sample.
-
     """
 
     x: Vector
@@ -116,7 +115,6 @@ class RunnableLaw:
         What lowers the limit as the winding warms up.
     compensation : Compensation, optional
         What is added to reference and effort; it may read further outputs.
-
     """
 
     a: Float[np.ndarray, "n n"]
@@ -184,7 +182,6 @@ class RunnableLaw:
         ControlError
             An input is not finite or beyond 1e15, the measurement is outside the gate's range, or the current is above
             the limit.
-
         """
         for name, value in (("reference", reference), ("current_A", current_A)):
             require_number(value, name, ControlError)
@@ -320,7 +317,6 @@ def runnable(
     >>> current, state = law.step(law.reset(), reference=5000.0, measurement=0.0)
     >>> round(current, 6)
     9.0
-
     """
     return realise(
         controller.law,
@@ -385,7 +381,6 @@ def realise(
     ------
     ControlError
         A number is out of range, or the law by itself is unstable other than by integrators.
-
     """
     require_type(gate, (PlausibilityGate, NoneType), "gate", "give a PlausibilityGate", ControlError)
     require_type(heat, (HeatGuard, NoneType), "heat", "give a HeatGuard", ControlError)

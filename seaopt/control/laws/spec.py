@@ -54,7 +54,6 @@ class ControllerSpec:
     ------
     ControlError
         A value is out of range, or two contradict each other.
-
     """
 
     measured: Measured = option(

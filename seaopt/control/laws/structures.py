@@ -204,7 +204,6 @@ class DisturbanceObserver:
         Of the design plant.
     T_q : float
         Seconds: time constant of Q_0.
-
     """
 
     nominal: Nominal
@@ -324,7 +323,6 @@ class Gains:
         Of a cascade.
     link : LinkPath, optional
         What is fed forward of the link's motion, the last signal read.
-
     """
 
     k_p: float

@@ -80,7 +80,6 @@ class Law:
     ... )
     >>> pi.integrators, pi.b.tolist(), pi.d.tolist()
     (1, [[1.0, -1.0]], [2.5, -2.5])
-
     """
 
     a: Float[np.ndarray, "n n"]
@@ -211,7 +210,6 @@ class Law:
         ... )
         >>> pi.integrators, pi.b.tolist()
         (1, [[1.0, -1.0]])
-
         """
         a, b, c, d = (np.asarray(part, dtype=float) for part in (a, b, c, d))
         n, k = c.size, d.size
@@ -252,7 +250,6 @@ class Law:
         >>> import control
         >>> Law.from_control(control.tf([2.5, -1.5], [1.0, -1.0], 1e-3)).d.tolist()
         [2.5, -2.5]
-
         """
         import control  # deferred: slow to import
 
@@ -325,7 +322,6 @@ class Law:
         >>> lag = TransferFunction(num=np.array([0.5]), den=np.array([1.0, -0.5]))
         >>> Law.from_transfer_functions(lag, lag, sample_time_s=1e-3).c.size
         1
-
         """
         measurements = [measurement] if isinstance(measurement, TransferFunction) else list(measurement)
         paths_by_name = {"reference": reference} | {

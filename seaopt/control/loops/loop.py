@@ -77,7 +77,6 @@ class LoopFigures:
         Peak of abs(F_m / noise on F), N/N.
     other_noise_gains : tuple of float
         The same of the further signals that the law reads, effort per unit of each.
-
     """
 
     stable: bool
@@ -219,7 +218,6 @@ class Loop:
         >>> force, effort = loop.simulate(np.ones(1000))
         >>> print(f"{force[-1]:.2f} N of {effort[-1]:.2f} N")
         1.00 N of 1.00 N
-
         """
         system = self.system()
         rows = [int(system.table.outputs[TRACKING]), 1]  # what is measured, and the effort

@@ -50,7 +50,6 @@ class DiskMargin:
         Real factors inside the disk.
     phase_deg : float
         Pure phases inside the disk; 180 where every one is.
-
     """
 
     skew: float
@@ -79,7 +78,6 @@ class Margins:
         Every crossover, from -180 to 180 degrees.
     disks : mapping of kind to DiskMargin
         Symmetric, S-based and T-based.
-
     """
 
     gain_up_db: float | None
@@ -105,7 +103,6 @@ def margins(loop: Loop) -> Margins:
     >>> found = margins(controller.close(so.plants.high_impedance(), so.plants.thor()))
     >>> found.disks["S-based"].alpha >= 1 / 1.6
     True
-
     """
     system = loop.system()
     if not np.max(np.abs(system.poles), initial=0.0) < STABLE:
@@ -186,7 +183,6 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     ------
     ControlError
         The loops run at different sample times.
-
     """
     if first.plant.sample_time_s != second.plant.sample_time_s:
         raise ControlError(

@@ -35,7 +35,6 @@ class Impedance:
     --------
     >>> Impedance(stiffness=50.0, damping=2.0).stiffness
     50.0
-
     """
 
     stiffness: float = option("K_v, N/m or N m/rad.", least=0.0)
@@ -82,7 +81,6 @@ class OuterLoop:
     >>> reference, state = outer.step(outer.reset(0.0), 1.0, 0.2)
     >>> reference  # 10 (1 - 0.2) - (0.2 - 0)/0.1
     6.0
-
     """
 
     stiffness: Annotated[float, Limits(ge=0.0)]
@@ -129,7 +127,6 @@ class OuterLoop:
             Of `reset`, or of the last step.
         reference, position : float
             x_0 and x, m or rad.
-
         """
         speed = state + self.rate * position
         reference_effort = self.direction * (self.stiffness * (reference - position) - self.damping * speed)

@@ -68,7 +68,6 @@ class DigitalPlant:
         y/u at 0 Hz, from the continuous plant; infinite where it has an integrator.
     others : (c, d), optional
         The same of further outputs that a law reads, shapes (k, n) and (k,).
-
     """
 
     a: Float[np.ndarray, "n n"]
@@ -135,7 +134,6 @@ def sample(
     ------
     ControlError
         The plant has no such output, or cannot rest where it is to be linearised.
-
     """
     linear, delay_s = linearise_sets(plant, [plant.complete(params)], measured, gain)
     return sample_linear(linear, delay_s, sample_time_s, delay_samples)[0]

@@ -60,7 +60,6 @@ class EstimatorState:
         The inputs before this sample's, oldest first.
     innovation : array, shape (ny,)
         Measured less predicted, in the outputs' units; NaN where nothing was measured.
-
     """
 
     predicted: Float[np.ndarray, " n"]
@@ -87,7 +86,6 @@ class EstimatorRun:
         Ljung-Box p-values over 20 lags, the settling left out; small means coloured.
     settled : int
         First sample that the test counts.
-
     """
 
     time: Float[np.ndarray, " m"]
@@ -134,7 +132,6 @@ class Estimator:
         disturbance, as ``I_drift``.
     G, H : arrays, shapes (nz, n), (nz, nu)
         The estimates are G z + H u.
-
     """
 
     plant: Plant
@@ -223,7 +220,6 @@ class Estimator:
             The log's rate is not the filter's, or it has gaps or missing samples.
         LogError
             An input or a measured output is not in the log.
-
         """
         u, y = self._samples(log)
         settled = min(self._count_settling(), len(log) // 2)
@@ -320,7 +316,6 @@ def estimator(
     >>> kalman = estimator(so.plants.high_impedance(), so.plants.thor(), noise, sample_time_s=1 / 400)
     >>> kalman.std["F1"] < 2.0, kalman.units[kalman.names.index("spring_rate")]
     (True, 'm/s')
-
     """
     parameters = params.parameters if isinstance(params, Fit) else params
     values = plant.complete(parameters)

@@ -60,7 +60,6 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
     ------
     FileError
         The folder cannot be written.
-
     """
     return write_code(collect_code(mpc), folder, single_precision=single_precision)
 

@@ -59,7 +59,6 @@ def estimate_noise(
     ------
     ControlError
         As `estimator` and `Estimator.run`; or the log is too short.
-
     """
     if len(log) < MIN_NOISE_SAMPLES:
         raise ControlError(f"{log.source} has {len(log)} samples; noise takes at least {MIN_NOISE_SAMPLES}")

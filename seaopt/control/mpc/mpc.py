@@ -102,7 +102,6 @@ class ForceMPC(LoopDelays, Result, Worded):
         current goes to zero.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
-
     """
 
     spec: MPCSpec
@@ -265,7 +264,6 @@ class ForceMPC(LoopDelays, Result, Worded):
         ------
         ControlError
             A reference is not a finite number within +-1e15, or there are more of them than the specification says.
-
         """
         began = time.perf_counter()
         references = self._read_references(reference_N)
@@ -476,7 +474,6 @@ def force_mpc(
     >>> step = mpc.step(mpc.start, reference_N=2000.0, measurement_N=0.0)
     >>> mpc.feasible, step.solved, round(step.current_A, 3)
     (True, True, 7.99)
-
     """
     require_plant(plant, "plant", ControlError)
     require_type(params, (ParameterSet, Fit), "params", "give a ParameterSet or a Fit", ControlError)

@@ -28,7 +28,6 @@ class NoiseModel:
     ------
     ControlError
         A value is not a number, is negative, or a sensor's is zero.
-
     """
 
     sensor_std: Mapping[str, float] = option("White noise of the measured output, in its unit.", least=0.0)
@@ -88,7 +87,6 @@ class NoiseModel:
         ------
         ControlError
             The fit has no such experiment.
-
         """
         name = experiment or next(iter(fit.outputs), "")
         if name not in fit.outputs:

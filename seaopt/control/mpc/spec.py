@@ -52,7 +52,6 @@ class MPCSpec:
     ------
     ControlError
         A value is out of range, or two contradict each other.
-
     """
 
     current_limit_A: float | None = option(

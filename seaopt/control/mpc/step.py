@@ -27,7 +27,6 @@ class MPCState:
         Samples since a program was solved: so old is the plan. Of one that never was: the horizon.
     gate : GateState
         What the plausibility gate, where there is one, has seen; its `status` is "ok", "held" or "fault".
-
     """
 
     kalman: EstimatorState
@@ -63,7 +62,6 @@ class MPCStep:
         Rows that the solver took in or let go.
     step_time_s : float
         The whole step's, in Python.
-
     """
 
     current_A: float

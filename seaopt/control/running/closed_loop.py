@@ -160,7 +160,6 @@ def run_loop(
     >>> run = run_loop(loop, [thor], np.full(1000, 100.0))
     >>> round(float(run.outputs["F1"][0, -1]))
     100
-
     """
     if not params:
         raise SimulationError("run_loop got no parameters; give one ParameterSet per run")

@@ -53,7 +53,6 @@ class ForceRun:
         Integration steps per sample, at the end.
     unit : str
         Of reference and force: N, or N m of a torque.
-
     """
 
     time: Float[np.ndarray, " n"]
@@ -167,7 +166,6 @@ def close_loop(
         negative, that step is above the limit, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
-
     """
     values = plant.complete(params)
     extra_delay_s = _check(plant, values, measured, delay_samples)

@@ -56,7 +56,6 @@ class SampledLoop:
     ------
     SimulationError
         The plant has no such output, or no friction that sticks, a number is out of range, or the loop is algebraic.
-
     """
 
     plant: Plant

@@ -134,7 +134,6 @@ class GainTable:
         ------
         ControlError
             A point of the table lies between the two.
-
         """
         if np.any((self.points > low) & (self.points < high)):
             raise ControlError(f"a stretch from {low:g} to {high:g} has a point of the table in it; end it there")

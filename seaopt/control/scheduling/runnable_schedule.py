@@ -51,7 +51,6 @@ class ScheduleState:
         Samples in a row that were not used because a number in them was not finite.
     misplaced : int
         Samples in a row without a finite scheduling variable.
-
     """
 
     effort: float = 0.0
@@ -81,7 +80,6 @@ class RunnableSchedule:
         The command's largest magnitude, in its unit; infinite where there is no limit.
     command : (str, str)
         Name and unit of the input that is commanded.
-
     """
 
     table: GainTable
@@ -117,7 +115,6 @@ class RunnableSchedule:
         ------
         ControlError
             Reference, measurement or command is not finite or beyond 1e15, or the command is above the limit.
-
         """
         for name, value in (("reference", reference), ("measurement", measurement), ("command", command)):
             if not is_number(require_number(value, name, ControlError)):

@@ -65,7 +65,6 @@ class ScheduledController(Result, Worded):
         The point whose law counts until a finite value of the variable was read.
     between : tuple of PlaceFigures
         What was found between the points.
-
     """
 
     over: str
@@ -177,7 +176,6 @@ class ScheduledController(Result, Worded):
         ------
         ControlError
             The value is not finite, or outside the points.
-
         """
         low, high = self.points[0], self.points[-1]
         if not low <= value <= high:
@@ -222,7 +220,6 @@ class ScheduledController(Result, Worded):
             Of the command, in its unit; the specification's if left out.
         tracking_time_s : float, optional
             Of the anti-windup.
-
         """
         return make_runnable(
             self.table,
@@ -261,7 +258,6 @@ class ScheduledController(Result, Worded):
         ------
         FileError
             A field is missing or malformed, or contradicts another: the gains must be those of the controllers.
-
         """
         from seaopt.control.scheduling.stored import read_schedule  # deferred: pydantic
 

@@ -104,7 +104,6 @@ def tune_schedule(
     >>> stiffer = tune_schedule(so.plants.high_impedance(), so.plants.thor(), spec, "k", [5e5, 6e5])
     >>> stiffer.feasible, [round(one.achieved.bandwidth_hz) for one in stiffer.controllers]
     (True, [20, 20])
-
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     require_plant(plant, "plant", ControlError)

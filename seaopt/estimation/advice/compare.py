@@ -105,7 +105,6 @@ class Ranking(Worded):
         The verdict, and why.
     fits : mapping of name to Fit
         In the order of `rows`.
-
     """
 
     plot = PlotAccessor()
@@ -173,7 +172,6 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
     >>> ranking = so.compare(fits)
     >>> ranking.preferred, ranking.evidence
     ('unlumped', 'very strong')
-
     """
     named = _name_apart(fits)
     minima = {name: fit.require_minimum("compare") for name, fit in named.items()}

@@ -83,7 +83,6 @@ class Diagnostics(Worded):
         Faults with their remedies, the worst first; empty if no problem was found.
     residuals : mapping of experiment to ExperimentResiduals
         The residuals that were tested.
-
     """
 
     plot = PlotAccessor()
@@ -144,7 +143,6 @@ def diagnose(fit: Fit) -> Diagnostics:
     >>> value, std = cause.preferred["late.delay_s"]
     >>> abs(value - 0.005) < 3 * std
     True
-
     """
     minimum = fit.require_minimum("diagnose")
     problem = minimum.problem

@@ -52,7 +52,6 @@ class Comparison:
         Its standard deviation over the design's: above 1, the design is better.
     peaks : mapping of signal to float
         Its peaks; those of the limited signals and the input.
-
     """
 
     excitation: Excitation
@@ -86,7 +85,6 @@ class Design:
         Largest magnitude of the input and of each limited signal.
     limits : Limits
         As given, the input's peak within its range.
-
     """
 
     excitation: Excitation
@@ -112,7 +110,6 @@ class Design:
             Such as `seaopt.bench.PAPER_STAND`.
         seed : int
             Of its noise.
-
         """
         u = self.bench.samples(excitation, seed)
         factor = self.rms / float(np.sqrt(np.mean(u**2)))
@@ -213,7 +210,6 @@ def design_experiment(
     ...     sigma={"F1": 2.0, "F2": 2.0})
     >>> round(design.rms, 6), design.against(PAPER_STAND).ratio["J"] > 2
     (1.7, True)
-
     """
     limits = _keep_range(limits, plant, params, input_name)
     bench = make_bench(
@@ -276,7 +272,6 @@ def expected_covariance(
     ...     for s in (10, 40))
     >>> 1.8 < short / long < 2.2
     True
-
     """
     bench = make_bench(
         plant,

@@ -56,7 +56,6 @@ class Limits:
     ------
     EstimationError
         A limit is not positive, or none limits the size of the excitation.
-
     """
 
     duration_s: float
@@ -93,7 +92,6 @@ class Multisines:
     spread : float
         The part of the power that is spread evenly over all candidates, 0 to below 1: a log with
         power everywhere also shows what the model lacks, and depends less on the guess.
-
     """
 
     lines: int = 60
@@ -109,7 +107,6 @@ class Chirps:
     ----------
     band_hz : (low, high), optional
         As for `Multisines`.
-
     """
 
     band_hz: tuple[float, float] | None = None

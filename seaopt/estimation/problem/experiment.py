@@ -98,7 +98,6 @@ class Experiment:
         The log has no measured output or lacks an input, a unit has the wrong dimension, or a name is unknown.
     LogError
         The log is not uniformly sampled.
-
     """
 
     plant: Plant

@@ -37,7 +37,6 @@ class Huber:
     ----------
     threshold : float
         In sigma; 1.345 keeps 95 % of the efficiency on Gaussian noise.
-
     """
 
     kind: ClassVar[RobustLoss] = "huber"
@@ -64,7 +63,6 @@ class SoftL1:
     ----------
     threshold : float
         In sigma.
-
     """
 
     kind: ClassVar[RobustLoss] = "soft_l1"

@@ -57,7 +57,6 @@ class OutputError(Method):
         values are kept where they explain the logs better.
     seed : int
         Of that search.
-
     """
 
     key: ClassVar[str] = "output_error"
@@ -101,7 +100,6 @@ class MultipleShooting(Method):
         Start from the logs' frequency responses where they explain the logs better than the given values.
     seed : int
         Of that search.
-
     """
 
     key: ClassVar[str] = "multiple_shooting"
@@ -176,7 +174,6 @@ class PredictionError(Method):
         Start from the logs' frequency responses where they explain the logs better than the given values.
     seed : int
         Of that search.
-
     """
 
     key: ClassVar[str] = "prediction_error"

@@ -63,7 +63,6 @@ class Bootstrap:
         Whether each draw was a fit, or one step.
     reference : Covariance
         The fit's own, for comparison.
-
     """
 
     names: tuple[str, ...]
@@ -165,7 +164,6 @@ def bootstrap(
     >>> fit = so.fit([so.Experiment(plant=plant, log=log, outputs=("F1", "F2"))], truth.free("J", "b_r"))
     >>> 0.7 < bootstrap(fit).std("J") / fit.covariance.std("J") < 1.3
     True
-
     """
     minimum = fit.require_minimum("bootstrap")
     problem = minimum.problem

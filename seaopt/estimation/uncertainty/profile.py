@@ -67,7 +67,6 @@ class Profile:
         How many there were.
     message : str
         Remarks; empty if there are none.
-
     """
 
     name: str
@@ -143,7 +142,6 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
     >>> low, high = profile(fit, "J", points=0).interval
     >>> low < 3.31e-6 < high
     True
-
     """
     minimum = fit.require_minimum("profile")
     names = minimum.problem.shared_names

@@ -104,7 +104,6 @@ def winding() -> Plant:
     >>> import seaopt as so
     >>> list(so.plants.winding().outputs)
     ['T_winding', 'T_case']
-
     """
     return Plant(
         name="winding",
@@ -209,7 +208,6 @@ class MotorRating:
         The largest current that can be commanded, where that is known.
     largest_V : float or None
         The same of the voltage; of a duty, of what it makes. The motor stands still.
-
     """
 
     resistance: Positive
@@ -262,7 +260,6 @@ class MotorRating:
         ------
         PlantError
             The duration is not positive, or the winding is too hot already.
-
         """
         if not 0.0 < require_number(duration_s, "duration_s", PlantError) < math.inf:
             raise PlantError(f"duration_s = {duration_s:g} is not positive; give how long the peak lasts")
@@ -381,7 +378,6 @@ def rate_motor(plant: Plant, params: ParameterSet, largest: float | None = None)
     >>> rating = rate_motor(plant, plant.defaults)
     >>> print(f"{rating.continuous_A:.3f} A, {rating.peak_A(10.0):.3f} A for 10 s")
     3.789 A, 14.446 A for 10 s
-
     """
     winding = plant.winding
     if winding is None:

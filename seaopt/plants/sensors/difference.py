@@ -44,7 +44,6 @@ class Difference:
     >>> import numpy as np
     >>> Difference(of="theta_m").read(np.array([0.0, 0.1, 0.3]), 0.01)
     array([ 0., 10., 20.])
-
     """
 
     of: str = option("The position that the device differences: a state of the plant, or an output that is one.")

@@ -165,7 +165,6 @@ def write_report(
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), so.ControllerSpec(bandwidth_hz=30))
     >>> so.write_report([controller], tempfile.mkdtemp() + "/report.html").name
     'report.html'
-
     """
     require_type(results, Sequence, "results", "give a list of results")
     require_type(path, (str, Path), "path", "give the page to write")

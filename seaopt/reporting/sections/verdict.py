@@ -39,7 +39,6 @@ def judge_results(
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), so.ControllerSpec(bandwidth_hz=30))
     >>> [one.text for one in judge_results(controller=controller)]
     ['Controller: pid on F1, 30 Hz, every limit met']
-
     """
     designs = (controller, mpc, certificate, verification)
     judged = [verdict for design in designs if design is not None and (verdict := judge(design)) is not None]

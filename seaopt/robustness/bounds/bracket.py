@@ -81,7 +81,6 @@ class Bracket:
         Why there is no bound; empty if there is one.
     parameters : mapping of name to value
         Those of the worst plant measured meanwhile, if it is worse than the given worst case; else empty.
-
     """
 
     json_keys = ("ms_lower", "ms_upper", "mt_lower", "mt_upper", "bounded_stable", "boxes", "left_out")
@@ -169,7 +168,6 @@ def bracket(
     >>> bounds = bracket(controller, stand, unknown)
     >>> bounds.bounded_stable, bounds.ms_upper / bounds.ms_lower < 1.011
     (True, True)
-
     """
     budget = budget or Budget()
     end = time.perf_counter() + budget.seconds

@@ -50,7 +50,6 @@ class StretchBound:
         By which share of itself the law differs from that of the middle, at most.
     reason : str
         Why nothing is shown; empty where it is.
-
     """
 
     plant: str

@@ -117,7 +117,6 @@ class Certificate(Result, Worded):
         the bandwidth at amplitudes of use.
     drawn_ms : mapping of name to array, shape (n,)
         Ms of the draws, up to `DRAWS_KEPT` of them, infinite where unstable; empty where it was read from a file.
-
     """
 
     plot = PlotAccessor()
@@ -193,7 +192,6 @@ class Certificate(Result, Worded):
         >>> coarse = certificate.with_simulation(sensors=so.Sensors(quantisation={"F1": 0.5}))
         >>> coarse.passed, len(coarse.simulated.verification.rows)
         (True, 7)
-
         """
         if not self.models:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
@@ -307,7 +305,6 @@ class Certificate(Result, Worded):
         ------
         FileError
             A field is missing or malformed, it was edited or written by hand, or nothing is required in it.
-
         """
         from seaopt.robustness.certificate.stored import build_certificate  # deferred, as pydantic takes long to import
 

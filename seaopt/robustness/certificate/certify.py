@@ -189,7 +189,6 @@ def certify(
     (True, 0, ['design', 'swing'])
     >>> certificate.simulated.passed
     True
-
     """
     require_type(controller, Controller, "controller", "give a Controller; a ForceMPC to certify_mpc", ControlError)
     require_type(plants, Mapping, "plants", "give a mapping of name to plant", ControlError)

@@ -88,7 +88,6 @@ class ConstrainedRuns(Result):
         What stands in its way, found by playing it again at other parameters, and what to do about it.
     left_out : tuple of str
         Bounded signals that a plant does not have, and conditions that are not drawn.
-
     """
 
     json_names = STEP_IN_FILE

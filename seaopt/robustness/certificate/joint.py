@@ -56,7 +56,6 @@ class Round:
         None if the controller misses its limits on those plants already.
     added : tuple of str
         Witnesses that the next round keeps its limits on too.
-
     """
 
     number: int
@@ -83,7 +82,6 @@ class JointTuning(Result):
     rounds : tuple of Round
     robust_to : mapping of name to (plant, parameters)
         Every plant besides the design plant on which the last controller had to keep its limits.
-
     """
 
     status: Literal["certified", "infeasible", "stuck", "rounds"]
@@ -189,7 +187,6 @@ def tune_certified(
     >>> done = tune_certified(stand, thor, spec, {"swing": swing}, ranges={"I_p": (0.15, 0.6)}, samples=100)
     >>> done.status, done.certificate.passed
     ('certified', True)
-
     """
     require_type(plants, Mapping, "plants", "give a mapping of name to plant", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)

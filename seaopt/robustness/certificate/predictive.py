@@ -45,7 +45,6 @@ def linear_controller(mpc: ForceMPC) -> Controller:
     >>> controller = linear_controller(force_mpc(so.plants.high_impedance(), so.plants.thor(), spec))
     >>> controller.structure, controller.feasible
     ('custom', True)
-
     """
     law = mpc.law  # its integrator apart: rounding leaves that pole on either side of the unit circle
     split = Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
@@ -132,7 +131,6 @@ def certify_mpc(
     >>> certificate = certify_mpc(mpc, {"stand": stand}, thor, ranges={"J": (3.2e-6, 3.4e-6)}, samples=100, runs=2)
     >>> certificate.passed, certificate.constrained.failures
     (True, 0)
-
     """
     require_type(mpc, ForceMPC, "mpc", "give a ForceMPC", ControlError)
     check_numbers(runs=runs, bound_tolerance=bound_tolerance, command_step=command_step)

@@ -75,7 +75,6 @@ class Requirement(Result):
     >>> row = Requirement(name="max_sensitivity", limit=1.6, value=1.7, met=False, plant="swing", state="stuck")
     >>> row.where
     'swing stuck'
-
     """
 
     name: str

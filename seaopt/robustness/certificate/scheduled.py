@@ -110,7 +110,6 @@ class PlaceCertificate(Result):
         Of the nominal parameters, and of what was simulated.
     simulated : Certificate or None
         What `certify` found on the plants that hold the variable; None between the points, or where there is none.
-
     """
 
     value: float
@@ -185,7 +184,6 @@ class ScheduleCertificate(Result, Worded):
         Of each plant that moves the variable.
     requirements : tuple of Requirement
         All of them.
-
     """
 
     schedule: ScheduledController
@@ -285,7 +283,6 @@ class ScheduleCertificate(Result, Worded):
         ------
         FileError
             A field is missing or malformed, it was edited or written by hand, or nothing is required in it.
-
         """
         from seaopt.robustness.certificate.stored import build_schedule_certificate  # deferred: pydantic
 
@@ -349,7 +346,6 @@ def certify_schedule(
     >>> certificate = certify_schedule(schedule, {"stand": stand}, thor, simulations=False)
     >>> certificate.passed, all(one.shown for one in certificate.stretches)
     (True, True)
-
     """
     require_type(schedule, ScheduledController, "schedule", "give a ScheduledController", ControlError)
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)

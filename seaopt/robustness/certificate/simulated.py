@@ -60,7 +60,6 @@ class Simulated(Result):
     left_out : mapping of what to reason
     sensors, command_step, seed
         What the scenarios were played with.
-
     """
 
     verification: Verification | None
@@ -147,7 +146,6 @@ def run_simulations(
     ------
     ControlError
         There is no plant, the controller does not know its design plant, or `draws` names an unknown plant.
-
     """
     if controller.design is None:
         raise ControlError(

@@ -85,7 +85,6 @@ def batch_figures(
         Blocks of draws computed at once.
     peaks : bool
         Whether to compute Ms and Mt; if not, they are NaN where stable.
-
     """
     values, extra = expand_draws(plant, controller.delay(nominal), draws)
     count = values.shape[1]

@@ -93,7 +93,6 @@ class Uncertainty:
         For every range of a mode's frequency, which values of its parameter put it where.
     absent : mapping of name to Parameter
         What a range may name besides `nominal`: the plants' defaults, and conditions.
-
     """
 
     nominal: ParameterSet
@@ -131,7 +130,6 @@ class Uncertainty:
         ------
         ControlError
             The bounds leave almost nothing of the distribution.
-
         """
         width = len(self.names)
         kept, tries = np.empty((0 if width else count, width)), 0
@@ -221,7 +219,6 @@ def combine_uncertainty(
     ------
     ControlError
         The fit leaves a parameter undetermined, or a range is empty or names nothing.
-
     """
     plant_names = {name for plant in plants.values() for name in plant.parameters}
     check_ranges(ranges, plants)
@@ -300,7 +297,6 @@ def check_ranges(ranges: Ranges, plants: Plants) -> None:
     ------
     ControlError
         A range is empty or not finite, leaves a parameter's bounds, or names nothing that a plant has.
-
     """
     extra = conditions(tuple(plants.values()))
     parameters = {name: plant.defaults.get(name) for plant in plants.values() for name in plant.parameters}
@@ -348,7 +344,6 @@ def place_value(plant: Plant, params: ParameterSet, name: str, value: float, pla
     ------
     ControlError
         A mode cannot be there.
-
     """
     values, extra = plant.complete(params), conditions((plant,))
     modes = find_modes(plants)

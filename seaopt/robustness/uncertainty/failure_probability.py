@@ -59,7 +59,6 @@ def failure_bound(samples: int, failures: int, confidence: float) -> float:
     --------
     >>> round(failure_bound(1375, 0, 1 - 1e-6), 4)
     0.01
-
     """
     if failures >= samples:
         return 1.0

@@ -31,7 +31,6 @@ class PlantMargins:
         that long is beyond what the loop's model means.
     nu_gap, nu_gap_hz : float and float or None
         Vinnicombe's gap of this plant's loop gain to the design plant's. It says little here: docs/theory/margins.md.
-
     """
 
     margins: Margins

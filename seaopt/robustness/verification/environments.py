@@ -77,7 +77,6 @@ class StabilityMap:
         Whether the loop is stable with the link fixed.
     called : Mechanics
         Units and words of what is on the port.
-
     """
 
     plot = PlotAccessor()
@@ -221,7 +220,6 @@ def coupled_stability(
     >>> stability = coupled_stability(controller, stand, thor, dampings_N_s_per_m=(100.0,), points=5)
     >>> stability.spectral_radius.shape, stability.fixed_stable
     ((1, 5, 5), True)
-
     """
     coupled = attach_environment(take_sliding(plant, parameters))
     values, called = _take_bare(coupled, parameters), mechanics_of(coupled.states[str(coupled.ports[0].coordinate)])

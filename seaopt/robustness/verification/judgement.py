@@ -110,7 +110,6 @@ class Outcome(Result):
         A step overshoots further than is allowed, but would not without the current limit.
     contact_impulse, contact_loss_J : float or None
         Of the hardest contact: what stops the link along its coordinate, and the energy lost.
-
     """
 
     json_keys = (

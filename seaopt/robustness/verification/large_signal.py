@@ -86,7 +86,6 @@ class LargeSignal:
         The dry friction, as an effort at the spring; zero where there is none.
     unit : str
         Of the amplitudes: N, or N m.
-
     """
 
     plot = PlotAccessor()
@@ -184,7 +183,6 @@ def large_signal(
     >>> sweep = large_signal(so.tune(stand, thor, spec), stand, thor, amplitudes_N=(20.0, 800.0))
     >>> round(sweep.bandwidth_hz[0]), sweep.bandwidth_hz[1] < 25
     (30, True)
-
     """
     parameters = controller.delay(parameters)
     limit, period, band = controller.command_limit, controller.sample_time_s, controller.spec.bandwidth_hz

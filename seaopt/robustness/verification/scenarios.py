@@ -61,7 +61,6 @@ class Phase:
         payload arrives with the link's speed.
     held : bool
         The link is held where it is: the plant's partner without it takes over.
-
     """
 
     duration_s: float
@@ -113,7 +112,6 @@ class Scenario:
     friction : {"smooth", "sticking"}
         How dry friction is simulated: as its smoothed curve, or as one that jumps at rest, so that what sticks stands
         still (`seaopt.simulation.sticking`). Bristles are simulated as they are in either.
-
     """
 
     name: str
@@ -145,7 +143,6 @@ class Scenario:
         --------
         >>> Scenario(name="knock", phases=(Phase(duration_s=1.0, force_N=50.0), Phase(duration_s=1.0))).describe_size()
         '50 N'
-
         """
         forces = [abs(phase.force_N) for phase in self.phases if phase.force_N]
         waves = [wave.amplitude for phase in self.phases for wave in phase.excitation if isinstance(wave, Chirp)]
@@ -211,7 +208,6 @@ def default_scenarios(controller: Controller, plant: Plant, sets: Sequence[Param
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> [scenario.name for scenario in default_scenarios(controller, so.plants.high_impedance())]
     ['2 % step', '10 % step', '50 % step', 'unsaturated step', 'saturating doublet', 'saturating hold', 'chirp']
-
     """
     step, rest = find_step_limit(controller), controller.force_limit(0.0)
     band = controller.spec.bandwidth_hz

@@ -72,7 +72,6 @@ class Sweep:
         How far off it still was in the last quarter of a pulse or a pause, over their size.
     fault : str
         Why it does not keep the judgement; empty where it does.
-
     """
 
     plant: str
@@ -125,7 +124,6 @@ def sweep_schedule(
     ------
     ControlError
         The plant cannot rest at the first point.
-
     """
     if schedule.over not in plant.parameters and schedule.over not in plant.states:
         return ()

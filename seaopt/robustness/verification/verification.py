@@ -56,7 +56,6 @@ class Verification(Result, Worded):
     follows_hz : mapping of plant name to (lo, hi) or None
         Band in which the linear loop's force is within 3 dB of its reference, at nominal parameters, friction sliding.
         With a swinging link it does not begin at 0 Hz, and a step does not reach its reference.
-
     """
 
     plot = PlotAccessor()
@@ -193,7 +192,6 @@ class Verification(Result, Worded):
         ------
         FileError
             A key is missing or a value of the wrong kind.
-
         """
         stored = read_fields(cls, content, source, remedy=remedy)
         stored["rows"] = tuple(map(_restore_settling, stored["rows"]))
@@ -295,7 +293,6 @@ def verify(
     >>> verification = verify(controller, {"stand": stand, "swing": swing}, thor, sensors=cell)
     >>> verification.passed, len(verification.rows)
     (True, 17)
-
     """
     check_plants(plants, draws or {}, partners or {})
     check_sensors(sensors, controller, plants)

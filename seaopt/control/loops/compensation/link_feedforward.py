@@ -118,7 +118,6 @@ class LinkPath:
         Of the effort that the model says.
     corner_hz, high_pass_hz : float
         Of the low-pass and of the high-pass; a high-pass of zero is none.
-
     """
 
     measured: str
@@ -161,7 +160,6 @@ class LinkPath:
         ------
         ControlError
             The plant has it in another unit, or its link moves and it has no such output.
-
         """
         unit = plant.outputs.get(self.measured)
         if unit is None and plant.port is not None and plant.port.motion is not None:

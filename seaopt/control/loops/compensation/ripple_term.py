@@ -49,7 +49,6 @@ class CompensateRipple:
     --------
     >>> CompensateRipple(cycles=(6, 12), cos=(0.1, 0.0), sin=(0.0, 0.02)).fraction
     0.9
-
     """
 
     cycles: tuple[int, ...] = option("Harmonics, in cycles per revolution.", least=1, most=MOST_CYCLES)

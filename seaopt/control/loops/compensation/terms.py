@@ -55,7 +55,6 @@ class CompensateFriction:
     --------
     >>> CompensateFriction(fraction=0.9).source
     'reference'
-
     """
 
     fraction: float = option(
@@ -88,7 +87,6 @@ class CompensateGravity:
     ------
     ControlError
         The fraction is out of range.
-
     """
 
     fraction: float = option(
@@ -199,7 +197,6 @@ class Compensation:
     >>> _, _, memory = compensation.step((0.0, 0.0), 0.0, [0.2])
     >>> round(compensation.step(memory, 0.0, [0.200005])[1], 9)  # 5 mm/s of 10 mm/s
     20.0
-
     """
 
     json_keys = ("friction", "gravity", "ripple")
@@ -253,7 +250,6 @@ class Compensation:
         ------
         ControlError
             There are not as many readings as outputs.
-
         """
         if len(readings) != len(self.reads):
             raise ControlError(
