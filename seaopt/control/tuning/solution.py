@@ -44,6 +44,7 @@ QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
 NARROW = 1.01  # of a limit: what a law misses by less, it may miss between the frequencies alone
 TIGHTENINGS = 3
+LEAST_TIGHTENING = 1.0015  # less moves no law: a limit missed by a thousandth counts as kept on a grid
 NO_LEVEL_ABOVE = 10.0  # a frequency further off counts no more: |F/F_ref| along -3 dB falls below it anywhere
 LOWER_FRACTIONS = 4  # of a link's feedforward, by a fifth each
 CLOSER = 0.5  # of what is missed with all of it and without any: a fraction between that misses more is not solved
@@ -204,7 +205,7 @@ def tighten_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solu
         missed = measure_missed(task, best[1])
         if not missed or max(missed.values()) > NARROW or not all(map(can_ease, missed)):
             break
-        factors |= {name: factors.get(name, 1.0) / used**2 for name, used in missed.items()}
+        factors |= {name: factors.get(name, 1.0) / max(used**2, LEAST_TIGHTENING) for name, used in missed.items()}
         tight = replace(task, eased=factors)
         trial = refine(tight, make_grid(tight), best[0])
         best = (trial, task.measure(trial))
