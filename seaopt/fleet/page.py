@@ -20,7 +20,7 @@ from seaopt.fleet.scatter import BETWEEN_HEAD
 from seaopt.fleet.worker import FAILED, MET, NOT_MET
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.reporting.page.fleet import ActuatorTable, Cell, Row, draw_trend, write_page
-from seaopt.reporting.sections.data import Commands, Item, Mark, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Mark, Reason, Section, Table, Verdict, mark_met
 from seaopt.units import unit_after
 
 MOST_DRAWN = 300  # actuators with drawings: the worst
@@ -59,6 +59,27 @@ def describe(result: Fleet | Drift | Population) -> list[Section]:
         "Population": _describe_population,
     }
     return sections[type(result).__name__](result)
+
+
+def summarise(result: Fleet | Drift | Population) -> list[KeyFigure]:
+    """Return how many logs are met and failed, or how many actuators raise an alarm."""
+    if isinstance(result, Fleet):
+        counts = result.counts
+        return [
+            KeyFigure(name="logs", value=str(len(result.rows)), against=f"{counts[MET]} met"),
+            KeyFigure(name="not met", value=str(counts[NOT_MET]), against="fitted, and not to be used"),
+            KeyFigure(name="failed", value=str(counts[FAILED]), against="not fitted"),
+        ]
+    if isinstance(result, Population):
+        return []
+    by = f"by {join_words(result.history.actuator or ('all logs',))}"
+    figures = [KeyFigure(name="actuators", value=str(result.actuators), against=by)]
+    if not result.missing:
+        alarmed = len({alarm.actuator for alarm in result.alarms})
+        healthy = "not known" if result.expected is None else format_number(result.expected, 2)
+        against = f"{healthy} if all were healthy"
+        figures.append(KeyFigure(name="with an alarm", value=str(alarmed), against=against))
+    return figures
 
 
 def _describe_fleet(fleet: Fleet) -> list[Section]:
@@ -178,7 +199,7 @@ def write_fleet_page(
             (mark_met(fleet.met), f"Fleet: {fleet.verdict}"),
             (drift_mark if timed else Mark(text="no charts", style="note"), f"Drift: {drift.verdict}"),
         ),
-        glance=_glance(fleet, drift),
+        glance=[*summarise(fleet), *summarise(drift)],
         table=ActuatorTable(
             heads=(
                 *(["off siblings"] if population else []),
@@ -227,21 +248,6 @@ def _list_reasons(fleet: Fleet) -> list[Section]:
     )
     table = Table(head=("logs", "why", "one of them"), rows=rows, align="><<")
     return [Section(title="Reasons", part="reasons", tables=(table,), remarks=(remark,))] if rows else []
-
-
-def _glance(fleet: Fleet, drift: Drift) -> tuple[tuple[str, str, str], ...]:
-    counts = fleet.counts
-    figures = [
-        ("logs", str(len(fleet.rows)), f"{counts[MET]} met"),
-        ("not met", str(counts[NOT_MET]), "fitted, and not to be used"),
-        ("failed", str(counts[FAILED]), "not fitted"),
-        ("actuators", str(drift.actuators), "by " + join_words(drift.history.actuator or ("all logs",))),
-    ]
-    if not drift.missing:
-        alarmed = len({alarm.actuator for alarm in drift.alarms})
-        healthy = "not known" if drift.expected is None else format_number(drift.expected, 2)
-        figures.append(("with an alarm", str(alarmed), f"{healthy} if all were healthy"))
-    return tuple(figures)
 
 
 def _list_rows(table: pl.DataFrame, names: Sequence[str], drift: Drift, siblings: bool) -> tuple[Row, ...]:

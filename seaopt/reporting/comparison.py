@@ -9,13 +9,11 @@ from itertools import combinations
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.estimation import DerivedFigure, Experiment, Fit
-from seaopt.formatting import join_words
-from seaopt.frequency import DriveEstimate, Pair, Survey, Uncertain, h1, survey
+from seaopt.estimation import Experiment, Fit
+from seaopt.frequency import Pair, Survey, h1, survey
 from seaopt.frequency.survey import ResponseFunction
 from seaopt.logs import Log
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants.friction import has_friction
 from seaopt.reporting.figures.panel import Panel
 from seaopt.reporting.figures.response import Curve, response_panel
 from seaopt.simulation import Clock
@@ -23,7 +21,6 @@ from seaopt.units import divide_units
 
 GIVEN, FITTED, FORM = "#d55e00", "#0072b2", "#009e73"
 _LOOKS = ((FITTED, "-"), (GIVEN, "-."), ("#cc79a7", ":"), ("#e69f00", "--"))  # of models, one after the other
-FAR = 3.0  # standard deviations: what lies farther is said to differ
 
 
 def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s: float | None = None) -> Survey:
@@ -167,60 +164,3 @@ def survey_panels(
             curves += _list_forms(pair)
             panels.append(response_panel(f"{name}_{pair.name}", f"{name}: {pair.name}", pair, curves))
     return panels
-
-
-def describe_responses(measured: Survey, fit: Fit, experiment: str) -> str:
-    """Return how an experiment's frequency responses compare with the fit, in sentences."""
-    usable = [pair for pair in measured.pairs if pair.second_order is not None]
-    if not usable:
-        return "The log is not coherent enough for a comparison in frequency."
-    away = [pair.misfit(measured.model(pair, fit.parameters)) for pair in usable]
-    names = [pair.name for pair in usable]
-    parts = [f"The fitted model lies {_each(away, names)} standard deviations from H1 (rms over its coherent lines)"]
-    forms = [pair.second_order.misfit for pair in usable if pair.second_order is not None]
-    parts.append(f", the second-order fit {_each(forms, names)}. ")
-    if has_friction(measured.plant, measured.adapt(fit.parameters)):
-        parts.append("With dry friction a response depends on the amplitude: the model's is that of sliding. ")
-    elif max(away) > FAR:
-        parts.append("The model lacks something that the log shows. ")
-    odd = [name for name, form, model in zip(names, forms, away, strict=True) if form > FAR * max(model, 1.0)]
-    if odd:
-        parts.append(f"{join_words(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
-    spring = measured.plant.spring
-    if spring is not None and spring.mass is not None and spring.damping is not None:
-        figures = (spring.mass, spring.damping)
-        derived = {name: fit.derived.get(f"{experiment}.{name}") or fit.derived[name] for name in figures}
-        drives = ((pair, measured.drive(pair, fit.parameters)) for pair in measured.pairs)
-        parts += [_read_drive(pair, drive, derived) for pair, drive in drives if drive is not None][:1]
-    return "".join(parts).strip()
-
-
-def _read_drive(pair: Pair, drive: DriveEstimate, derived: Mapping[str, DerivedFigure]) -> str:
-    """Return the sprung mass and the damping by (16), and by the fit, which `derived` holds."""
-    (m_k, mass), (b_m, damping) = derived.items()
-    words = f"{_gap(m_k, drive.m_k, mass)} and {_gap(b_m, drive.b_m, damping)}"
-    averaged = ""
-    if abs(drive.efficiency.value - 1.0) > FAR * drive.efficiency.std:
-        averaged = (
-            f" The form's static gain is {drive.efficiency.value:.3f} of what the motor gives, not 1: the mean of its "
-            f"K and b in place of b alone would give {m_k} = {drive.m_k_averaged.value:.4g} "
-            f"{drive.m_k_averaged.unit} and {b_m} = {drive.b_m_averaged.value:.5g} {drive.b_m_averaged.unit}."
-        )
-    return (
-        f"From the second-order fit K/(s² + a s + b) of {pair.name}, with k known, follow {m_k} = {drive.m_k} and "
-        f"{b_m} = {drive.b_m}; the fit in time "
-        f"gives {mass.value:.5g} ± {mass.std:.2g} {mass.unit} and {damping.value:.5g} ± {damping.std:.2g} "
-        f"{damping.unit}. So the second-order fit has {words}.{averaged}"
-    )
-
-
-def _gap(name: str, form: Uncertain, fitted: DerivedFigure) -> str:
-    away, std = form.value - fitted.value, float(np.hypot(form.std, fitted.std))
-    side = "above" if away > 0.0 else "below"
-    return f"{name} {abs(away / fitted.value):.2%} {side} it ({abs(away) / max(std, 1e-300):.1f} combined std)"
-
-
-def _each(values: list[float], names: list[str]) -> str:
-    if len(values) == 1:
-        return f"{values[0]:.3g}"
-    return join_words([f"{value:.3g} ({name})" for value, name in zip(values, names, strict=True)])

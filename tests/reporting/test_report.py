@@ -40,8 +40,8 @@ def test_nothing_or_two_of_a_kind_is_refused(controller, tmp_path, without_drawi
 def test_the_page_says_how_the_papers_form_compares_with_the_fit(stand, stand_log, thor, tmp_path, without_drawing):
     fit = so.fit([so.Experiment(plant=stand, log=stand_log, name="chirp", outputs=("F1",))], thor.free("J", "b_r"))
     page = so.write_report([fit], tmp_path / "r.html").read_text(encoding="utf-8")
-    (said,) = [line for line in page.splitlines() if "of F1/I, with k known, follow" in line]
-    mass = float(said.split("follow m_k = ")[1].split()[0])
+    (said,) = [line for line in page.splitlines() if "of F1/I, with k known, has" in line]
+    mass = float(said.split("has m_k = ")[1].split()[0])
     assert mass == pytest.approx(0.646 + 3.31e-6 / (0.002 / (6 * 3.141592653589793)) ** 2, rel=5e-4)  # (1), (2)
     assert "not of second order" not in said
     assert (tmp_path / "figures" / "response_chirp.svg").exists()
@@ -230,6 +230,28 @@ def test_what_a_certificate_says_in_a_line(certificate, kind):
     )
     assert judged.met and f"{len(certificate.runs.rows)} simulated runs passed" in judged.text
     assert ("nothing was uncertain" in judged.text) == (kind == "nothing uncertain")
+
+
+def test_the_page_says_whose_draws_are_simulated_and_what_the_colours_of_runs_mean(
+    certificate, tmp_path, without_drawing
+):
+    page = so.write_report([certificate], tmp_path / "r.html").read_text(encoding="utf-8")
+    part = page.split('<section id="simulation"')[1].split("</section>")[0]
+    assert "the worst case that the certificate found on its plant: draw 1 on stand and draw 1 on swing." in part
+    on_stand, on_swing = part.split("<h3>Runs on stand</h3>")[1].split("<h3>Runs on swing</h3>")
+    assert "Grey: link 2 is held." in on_swing and "Grey" not in on_stand
+    failed = {row.plant for row in certificate.runs.failures}
+    assert [("in yellow" in text) for text in (on_stand, on_swing)] == ["stand" in failed, "swing" in failed]
+
+
+def test_figures_to_see_first_are_those_of_the_results(certificate, tmp_path, without_drawing):
+    page = so.write_report([certificate], tmp_path / "r.html").read_text(encoding="utf-8")
+    first = page.split('<dl class="glance">')[1].split("</dl>")[0]
+    shown = [re.sub(r"<[^>]+>", "|", entry) for entry in re.findall(r"<div>(.*?)</div>", first)]
+    draws, runs = certificate.monte_carlo, certificate.runs
+    assert len(shown) == 4 + 2 + 1
+    assert f"{draws.failures} of {draws.samples}" in shown[5]
+    assert f"{len(runs.failures)} of {len(runs.rows)}" in shown[6]
 
 
 def test_a_design_on_a_fit_that_is_not_met_is_not_met_on_the_page(fitted, controller, tmp_path, without_drawing):

@@ -70,4 +70,4 @@ def test_the_table_says_how_large_and_how_far_off(stand, swing, thor):
     line = next(line for line in repr(found).splitlines() if "step" in line and "passed" in line)
     assert "50 N" in line and f"{error:.3g}" in line.split()
     assert f"swing tracks references between {low:.3g} and " in repr(found)
-    assert "draw 1 on swing: I_p = 0.3" in repr(found)
+    assert "Draw 1 on swing: I_p = 0.3" in repr(found)

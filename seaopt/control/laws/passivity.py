@@ -52,8 +52,8 @@ from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
-from seaopt.records import record
-from seaopt.units import LINEAR, ROTARY, mechanics_of
+from seaopt.records import Worded, record
+from seaopt.units import LINEAR, mechanics_of
 
 Curve = Callable[[Frequencies], Any]
 LOWEST_PASSIVE_HZ = 0.01
@@ -62,8 +62,8 @@ COSINE_ROUNDING = 1e-9  # cosines of the impedance's angle nearer to zero than t
 TINY = float(np.finfo(float).tiny)
 
 
-@record
-class Passivity:
+@record(repr=False)
+class Passivity(Worded):
     """Where the actuator is passive at link 2.
 
     Parameters
@@ -118,21 +118,6 @@ class Passivity:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, for robustness.json."""
         return to_content(self)
-
-    def __repr__(self) -> str:
-        bands = ", ".join(f"{low:.4g} to {high:.4g} Hz" for low, high in self.bands_hz) or "nowhere"
-        lines = [f"Passive at link 2: {bands} (of {self.low_hz:g} to {self.high_hz:g} Hz)"]
-        if not self.held_stable:
-            return f"{lines[0]}\n  the loop is UNSTABLE with link 2 held"
-        if self.violated_hz is not None:
-            lines.append(
-                f"  violated from {self.violated_hz:.4g} Hz, most at {self.least_hz:.4g} Hz: Re Z = "
-                f"{self.least_damping_N_s_per_m:.4g} {self.unit}, {self.least_cosine:.3g} of |Z|"
-            )
-        if self.limit_hz is not None:
-            word = ROTARY.word if self.unit == ROTARY.damping else LINEAR.word
-            lines.append(f"  from {self.limit_hz:.4g} Hz the fed-back {word} opposes the {word} at the port")
-        return "\n".join(lines)
 
 
 def passivity(

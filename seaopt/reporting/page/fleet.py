@@ -15,7 +15,7 @@ from seaopt.formatting import format_number, printable
 from seaopt.records import record
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_parts, render_template
-from seaopt.reporting.sections.data import Mark, Section
+from seaopt.reporting.sections.data import KeyFigure, Mark, Section
 
 WIDTH, HEIGHT, EDGE = 132.0, 30.0, 3.0  # of a drawing, in its units
 MOST_POINTS = 40  # of a drawing; runs beyond are averaged, those that follow each other
@@ -68,15 +68,15 @@ def write_page(
     *,
     title: str,
     verdicts: Iterable[tuple[Mark, str]],
-    glance: Iterable[tuple[str, str, str]],
+    glance: Iterable[KeyFigure],
     table: ActuatorTable,
     sections: Sequence[Section],
     files: Sequence[Path | str] = (),
     command: str = "",
 ) -> Path:
-    """Write a page that needs no network and no other file; sections stand in their `PARTS`. `glance`: name, figure,
-    and what it is compared with. `files`, `command`: what it was made of, besides the logs, and what was typed to make
-    it. Raises FileError: the folder cannot be written.
+    """Write a page that needs no network and no other file; sections stand in their `PARTS`. `glance`: figures to see
+    first. `files`, `command`: what it was made of, besides the logs, and what was typed to make it. Raises FileError:
+    the folder cannot be written.
     """
     html = render_template(
         "fleet.html.jinja",

@@ -16,10 +16,10 @@ from seaopt.control.deploy.export import export
 from seaopt.errors import FileError, SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.files import read_json, write_json, write_text
-from seaopt.formatting import format_count, format_figure, format_number
+from seaopt.formatting import format_count
 from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
-from seaopt.reporting.comparison import describe_responses, fit_surveys, response_panels
+from seaopt.reporting.comparison import fit_surveys, response_panels
 from seaopt.reporting.drawing import write_figure
 from seaopt.reporting.figures import certificate as certificates
 from seaopt.reporting.figures import fit as fits
@@ -33,8 +33,10 @@ from seaopt.reporting.figures.schedule import schedule_panels
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_parts, render_template
-from seaopt.reporting.sections import describe
+from seaopt.reporting.sections import describe, summarise
 from seaopt.reporting.sections.data import Section
+from seaopt.reporting.sections.kinds.responses import compare_with_fit
+from seaopt.reporting.sections.kinds.verification import describe_drawings
 from seaopt.reporting.sections.verdict import UNMET, describe_expectations, judge_results
 from seaopt.robustness import Certificate, ScheduleCertificate
 from seaopt.robustness.verification.environments import StabilityMap
@@ -270,7 +272,7 @@ def _list_plates_of_fit(fit: Fit, ranking: Ranking | None, diagnostics: Diagnost
                 part="fit",
                 heading=f"{name} in frequency",
                 panels=response_panels(experiment, surveys[name], models),
-                text=describe_responses(surveys[name], fit, name),
+                text=" ".join(compare_with_fit(surveys[name], fit, name)),
             )
         panels = [
             replace(panel, name=f"log_{name}_{panel.name}", link=f"{name}, {panel.link}")
@@ -306,7 +308,9 @@ def _list_plates_of_simulation(material: Material) -> Iterator[Plate]:
             panel = simulations.simulation_panel(material.verification, row)
             by_plant.setdefault(row.plant, []).append(panel)
     for name, panels in by_plant.items():
-        yield Plate(name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=panels)
+        assert material.verification is not None
+        text = describe_drawings(material.verification, name)
+        yield Plate(name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=panels, text=text)
     if material.large:
         yield Plate(name="bandwidth", part="amplitude", panels=[simulations.bandwidth_panel(material.large)])
         makers = simulations.amplitude_panel, simulations.saturation_panel
@@ -349,6 +353,7 @@ def _render(
         verification=None if certificate is not None and runs is certificate.runs else runs,
         expectations=expectations,
     )
+    first = (fit, controller, certificate, runs)
     results = (
         controller,
         material.schedule,
@@ -378,7 +383,7 @@ def _render(
         title=title,
         parts=PARTS,
         verdicts=judged,
-        glance=list_figures(material),
+        glance=[figure for result in first if result is not None for figure in summarise(result)],
         described=described,
         plates=drawn,
         doubt="" if sound else UNMET,
@@ -394,47 +399,6 @@ def _score(controller: Controller | None) -> Scorecard | None:
     with suppress(SeaoptError):
         return scorecard({controller.structure: controller})
     return None
-
-
-def list_figures(material: Material) -> list[tuple[str, str, str]]:
-    """Return what to see at a glance: a name, a figure with its unit, and what it is compared with."""
-    figures: list[tuple[str, str, str]] = []
-    if material.fit is not None and material.fit.outputs:
-        percents = {
-            f"{name}.{output}": output_fit.fit_percent
-            for name, row in material.fit.outputs.items()
-            for output, output_fit in row.items()
-        }
-        least = min(percents, key=percents.__getitem__)
-        figures.append(("fit", f"{percents[least]:.2f} %", f"least of the outputs: {least}"))
-    controller, certificate = material.controller, material.certificate
-    if controller is not None:
-        a, spec = controller.achieved, controller.spec
-        ms = spec.level("max_sensitivity")
-        figures += [
-            ("bandwidth", format_figure(a.bandwidth_hz, "Hz", 3), f"asked {spec.bandwidth_hz:g} Hz"),
-            ("Ms", format_number(a.ms, 3), "" if ms is None else f"at most {ms:g}"),
-            ("phase margin", format_figure(a.phase_margin_deg, "deg", 3), "design plant"),
-            ("noise gain", format_figure(a.noise_gain, controller.command.gain_unit, 3), "design plant"),
-        ]
-    if certificate is not None and certificate.models:
-        worst = max(certificate.worst.values(), key=lambda worst: worst.ms)
-        level = certificate.controller.spec.level("max_sensitivity")
-        allowed = "" if level is None else f", at most {level:g}"
-        draws = certificate.monte_carlo
-        figures.append(
-            (
-                "worst Ms found",
-                format_number(worst.ms, 3),
-                f"on {format_count(len(certificate.plants), 'plant')}{allowed}",
-            )
-        )
-        if draws.samples:
-            figures.append(("draws failed", f"{draws.failures} of {draws.samples}", "all plants together"))
-    if material.verification is not None:
-        failed, count = len(material.verification.failures), len(material.verification.rows)
-        figures.append(("runs failed", f"{failed} of {count}", "simulated, nonlinear"))
-    return figures
 
 
 def write_header(controller: Controller, *, fit_met: bool = True) -> tuple[bool, str]:

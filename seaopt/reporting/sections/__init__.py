@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import Any
 
 from seaopt.reporting.sections import html, text
-from seaopt.reporting.sections.data import Commands, Section, Verdict
+from seaopt.reporting.sections.data import Commands, KeyFigure, Section, Verdict
 
 # The module of each kind: found by name, so that a text of one result loads nothing of the others.
 KINDS = {
@@ -25,12 +25,13 @@ KINDS = {
     "Certificate": "certificate",
     "ScheduleCertificate": "schedule_certificate",
     "Verification": "verification",
-    "Diagnostics": "diagnostics",
-    "Ranking": "ranking",
-    "Scorecard": "lines",
-    "LargeSignal": "lines",
-    "StabilityMap": "lines",
-    "Passivity": "lines",
+    "Diagnostics": "advice",
+    "Ranking": "advice",
+    "Simulated": "simulated",
+    "LargeSignal": "simulated",
+    "Passivity": "contact",
+    "StabilityMap": "contact",
+    "Scorecard": "contact",
     "Fleet": "seaopt.fleet.page",
     "Drift": "seaopt.fleet.page",
     "Population": "seaopt.fleet.page",
@@ -51,6 +52,12 @@ def judge(result: object, commands: Commands | None = None) -> Verdict | None:
     """Return the verdict on a result, with the commands to type next; None for results without a verdict."""
     judged = getattr(_find_module(result), "judge", None)
     return None if judged is None else judged(result, commands or Commands())
+
+
+def summarise(result: object) -> list[KeyFigure]:
+    """Return the figures of a result to see first; none of results without such."""
+    summarised = getattr(_find_module(result), "summarise", None)
+    return [] if summarised is None else summarised(result)
 
 
 def write_text(result: object) -> str:

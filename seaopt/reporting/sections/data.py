@@ -115,6 +115,15 @@ class Verdict:
 
 
 @record
+class KeyFigure:
+    """A number to see first, with its unit, and what it is compared with."""
+
+    name: str
+    value: str
+    against: str = ""
+
+
+@record
 class Commands:
     """Commands to type next, for a result of the command line; empty elsewhere."""
 

@@ -16,12 +16,12 @@ from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
 from seaopt.executors import map_ordered
-from seaopt.formatting import format_band, format_count, html_text
+from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
 from seaopt.progress import Progress, divide, ignore
-from seaopt.records import Result, record
+from seaopt.records import Result, Worded, record
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
@@ -45,8 +45,8 @@ NAMED_FAULTS = {
 }  # fmt: skip
 
 
-@record(eq=False)
-class Simulated(Result):
+@record(eq=False, repr=False)
+class Simulated(Result, Worded):
     """Scenarios and large signals on every plant; passivity and coupled stability on the design plant.
 
     Parameters
@@ -88,27 +88,6 @@ class Simulated(Result):
         if self.passivity is None or self.environments is None:
             return None
         return self.passivity.to_dict() | {"environments": self.environments.to_dict()}
-
-    def lines(self) -> list[str]:
-        """Return the findings in short, one line each; what failed or is left out is not among them."""
-        out: list[str] = []
-        if self.verification is not None:
-            failed, count = len(self.verification.failures), len(self.verification.rows)
-            out.append(f"simulation: {f'{failed} of {count} runs FAILED' if failed else f'{count} runs passed'}")
-            out += self.verification.describe_tracking()
-        out += [f"bandwidth on {sweep.plant} against amplitude: {_format_large(sweep)}" for sweep in self.large_signal]
-        if self.passivity is not None:
-            out.append(f"port at link 2: passive {_format_bands(self.passivity)}")
-        if self.environments is not None:
-            out.append(f"environments at link 2: {_format_environments(self.environments)}")
-        return out
-
-    def __repr__(self) -> str:
-        parts = (self.verification, *self.large_signal, self.passivity, self.environments)
-        left_out = [f"No {what}: {reason}" for what, reason in self.left_out.items()]
-        return "\n".join([*(repr(part) for part in parts if part is not None), *left_out])
-
-    _repr_html_ = html_text
 
 
 def run_simulations(
@@ -269,35 +248,3 @@ def _list_sweeps(
 
 def _sweep(controller: Controller, name: str, plant: Plant, parameters: ParameterSet) -> LargeSignal:
     return replace(large_signal(controller, plant, parameters), plant=name)
-
-
-def _format_large(sweep: LargeSignal) -> str:
-    pairs = list(zip(sweep.amplitude_N, sweep.bandwidth_hz, strict=True))
-    if sweep.friction_N:  # stuck, widest, saturated; the others are in the report
-        widest = max(pairs, key=lambda pair: pair[1] or 0.0)
-        pairs = [pair for pair in pairs if pair in (pairs[0], widest, pairs[-1])]
-    return ", ".join(
-        f"{'–' if hz is None else f'{hz:.3g} Hz'} at {amplitude:.4g} {sweep.unit}" for amplitude, hz in pairs
-    )
-
-
-def _format_bands(port: Passivity) -> str:
-    if not port.held_stable:
-        return "nowhere: the loop is UNSTABLE with link 2 held"
-    bands = ", ".join(format_band(band, "Hz") for band in port.bands_hz) or "nowhere"
-    if port.violated_hz is None:
-        return bands
-    return f"{bands}; everywhere with a damper of {-port.least_damping_N_s_per_m:.3g} {port.unit}"
-
-
-def _format_environments(environments: StabilityMap) -> str:
-    if environments.everywhere:
-        return f"stable against all of {environments.stable.size} {environments.called.inertias} on springs and dampers"
-    shares = ", ".join(
-        f"{np.count_nonzero(stable)} at {damping:g}"
-        for damping, stable in zip(environments.damping, environments.stable, strict=True)
-    )
-    called = environments.called
-    return (
-        f"of {environments.stable[0].size} {called.inertias} on springs, stable by damping ({called.damping}): {shares}"
-    )

@@ -27,11 +27,10 @@ from seaopt.control import Controller
 from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.port import bare_port, probe_of
 from seaopt.errors import ControlError
-from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import take_sliding
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Worded, record
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Column
 from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
@@ -59,8 +58,8 @@ class Environment:
     doubling_s: float | None  # time in which the oscillation doubles; None if it does not grow
 
 
-@record(eq=False)
-class StabilityMap:
+@record(eq=False, repr=False)
+class StabilityMap(Worded):
     """Where the loop is stable against an environment.
 
     Parameters
@@ -114,27 +113,6 @@ class StabilityMap:
             "stable_share": [float(np.mean(stable)) for stable in self.stable],
             "worst": to_content(self.worst),
         }
-
-    def __repr__(self) -> str:
-        verdict, called = "stable" if self.everywhere else "NOT STABLE everywhere", self.called
-        lines = [
-            f"Coupled stability at link 2: {verdict}, {called.inertias} of {self.mass[0]:.3g} to {self.mass[-1]:.3g} "
-            f"{called.inertia} on springs of {self.stiffness[0]:.3g} to {self.stiffness[-1]:.3g} {called.stiffness}"
-        ]
-        for damping, stable in zip(self.damping, self.stable, strict=True):
-            lines.append(
-                f"  damper {damping:g} {called.damping}: stable in {np.count_nonzero(stable)} of {stable.size}"
-            )
-        w = self.worst
-        growth = "which dies out" if w.doubling_s is None else f"which doubles in {w.doubling_s:.3g} s"
-        lines.append(
-            f"  worst: {w.m_2:.4g} {called.inertia}, {w.k_e:.4g} {called.stiffness}, {w.d_e:.4g} {called.damping}, "
-            f"at {w.frequency_hz:.4g} Hz, {growth}"
-        )
-        return "\n".join([*lines, f"  link 2 fixed: {'stable' if self.fixed_stable else 'NOT STABLE'}"])
-
-    def _repr_html_(self) -> str:
-        return html_text(self) + self.plot.to_html()
 
 
 def attach_environment(plant: Plant) -> Plant:

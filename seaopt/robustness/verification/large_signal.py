@@ -26,11 +26,10 @@ from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.running.closed_loop import run_loop
 from seaopt.errors import ControlError
-from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import find_dry_friction, take_sliding
-from seaopt.records import PlotAccessor, record
+from seaopt.records import PlotAccessor, Worded, record
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
 from seaopt.robustness.verification.scenarios import build_loop
 from seaopt.units import LINEAR
@@ -60,8 +59,8 @@ class _StoredSweep:
     saturated: tuple[tuple[bool, ...], ...]
 
 
-@record(eq=False)
-class LargeSignal:
+@record(eq=False, repr=False)
+class LargeSignal(Worded):
     """Gain and bandwidth against amplitude.
 
     Parameters
@@ -126,21 +125,6 @@ class LargeSignal:
             saturated=np.array(content["saturated"], dtype=bool),
             onset_N=np.array(saturation_map["amplitude_N"]),
         )
-
-    def __repr__(self) -> str:
-        dry = f", dry friction {self.friction_N:.4g} {self.unit}" if self.friction_N else ""
-        lines = [f"Bandwidth against amplitude on {self.plant}{dry}"]
-        for amplitude, band, predicted, hit in zip(
-            self.amplitude_N, self.bandwidth_hz, self.predicted_hz, self.saturated, strict=True
-        ):
-            bandwidth = "not within the sweep" if band is None else f"{band:.4g} Hz"
-            bandwidth += "" if predicted is None else f" (predicted {predicted:.4g} Hz)"
-            from_hz = f", saturates from {self.frequency_hz[np.argmax(hit)]:.4g} Hz" if np.any(hit) else ""
-            lines.append(f"  {amplitude:.4g} {self.unit}: {bandwidth}{from_hz}")
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return html_text(self) + self.plot.to_html()
 
 
 def large_signal(

@@ -15,7 +15,6 @@ from seaopt.control import Controller
 from seaopt.control.laws.command import Command
 from seaopt.errors import ControlError, StepSizeError, suggestion
 from seaopt.executors import Shared, map_ordered
-from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
@@ -126,46 +125,6 @@ class Verification(Result, Worded):
             if (not row.met, row.peak_force_N) > (not before.met, before.peak_force_N):
                 best[row.plant, row.scenario] = row
         return tuple(best.values())
-
-    def describe_draws(self) -> list[str]:
-        """Return a line per draw: where it differs from nominal."""
-        rows = {(row.plant, row.draw): row for row in self.rows if row.draw != NOMINAL}
-        return [f"draw {row.draw} on {row.plant}: {format_values(row.parameters, 6, NOMINAL)}" for row in rows.values()]
-
-    def describe_tracking(self) -> list[str]:
-        """Return a line per plant whose moving output keeps the force from following slow references."""
-        lines: list[str] = []
-        for name, band in self.follows_hz.items():
-            if not self.stages[name].plant.moves:
-                continue
-            if band is None:
-                lines.append(f"{name} tracks no reference within 3 dB: the swinging output prevents it")
-            elif band[0] > 0.0:
-                lines.append(
-                    f"{name} tracks references between {band[0]:.3g} and {band[1]:.3g} Hz (within 3 dB); below "
-                    "that the swinging output prevents it"
-                )
-        return lines
-
-    def describe_steps(self) -> list[str]:
-        """Return a line per plant on which steps are judged: the worst that its user sees of them."""
-        lines: list[str] = []
-        for plant in self.stages:
-            rows = [row for row in self.rows if row.plant == plant and row.settling_s is not None]
-            if not rows:
-                continue
-            over, more = (
-                max((row.overshoot or 0.0 for row in rows if row.overshoot_by_limit is by_limit), default=0.0)
-                for by_limit in (False, True)
-            )
-            limited = f" ({100 * more:.3g} % where the current limit makes it)" if more else ""
-            slowest = max(row.settling_s or 0.0 for row in rows)
-            sizes = [self.scenario(row).phases[-1].force_N for row in rows]
-            settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
-            ends = " to ".join(dict.fromkeys(f"{size:.4g}" for size in (min(sizes), max(sizes))))
-            unit = self.command.reference_unit
-            lines.append(f"steps on {plant}, {ends} {unit}: overshoot up to {100 * over:.3g} %{limited}, {settled}")
-        return lines
 
     @property
     def skipped_rows(self) -> tuple[Mapping[str, str], ...]:
@@ -435,8 +394,3 @@ def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
     if plant.port is None or plant.port.held is None:
         return None
     return share_drive(plant.port.held(), plant)
-
-
-def describe_witness(row: Outcome) -> str:
-    """Return where a row's draw differs from nominal, as text that follows its reason."""
-    return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())

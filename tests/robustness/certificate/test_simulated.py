@@ -63,6 +63,19 @@ def test_large_signals_are_swept_on_every_plant(certificate, controller, swing, 
     assert "bandwidth on swing" in flatten(repr(certificate))
 
 
+def test_simulations_print_every_part(certificate):
+    """Runs, sweeps of every plant, the port and its environments, each in a section; of a sweep a row per amplitude."""
+    text, simulated = repr(certificate.simulated), certificate.simulated
+    assert text.startswith("met      Simulation: 27 runs passed")
+    for title in ("Simulated runs", "Bandwidth against amplitude on swing", "Passivity at link 2", "Coupled stability"):
+        assert text.count(f"\n{title}") == 1
+    sweep = repr(simulated.large_signal[1])
+    assert sweep in text and all(f"  {amplitude:.4g}  " in sweep for amplitude in simulated.large_signal[1].amplitude_N)
+    assert f"{np.count_nonzero(simulated.environments.stable[0])}" in repr(simulated.environments)
+    missing = replace(simulated, passivity=None, left_out={"passivity": "there is no port"})
+    assert "note     no passivity: there is no port" in repr(missing)
+
+
 def test_the_certificate_without_is_as_it_was(linear):
     assert linear.simulated is None
     assert (linear.to_dict()["simulation"], linear.to_dict()["passivity"]) == (None, None)

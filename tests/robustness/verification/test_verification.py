@@ -14,6 +14,7 @@ from seaopt.bench import Chirp
 from seaopt.control import Gains
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError
+from seaopt.reporting.sections.kinds.verification import describe_tracking
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Stage, _build_reference, play
@@ -53,7 +54,7 @@ def test_the_tuned_controller_passes(verification):
 
 
 def test_a_swinging_output_is_blamed_only_where_there_is_one(verification):
-    lines = replace(verification, follows_hz={"stand": (2.0, 30.0), "swing": (2.0, 30.0)}).describe_tracking()
+    lines = list(describe_tracking(replace(verification, follows_hz={"stand": (2.0, 30.0), "swing": (2.0, 30.0)})))
     assert [line.split()[0] for line in lines] == ["swing"]
     assert "swinging" in lines[0]
 

@@ -5,10 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from seaopt.control.laws.limits import BY_REQUIREMENT
-from seaopt.formatting import MISSING, format_band, format_count, format_number, format_values
+from seaopt.formatting import MISSING, format_band, format_count, format_number, format_values, join_words
 from seaopt.reporting.figures.certificate import label_requirement
-from seaopt.reporting.sections.data import Cell, Commands, Mark, Reason, Section, Table, Verdict, list_notes, mark_met
+from seaopt.reporting.sections.data import (
+    Cell,
+    Commands,
+    KeyFigure,
+    Mark,
+    Reason,
+    Section,
+    Table,
+    Verdict,
+    list_notes,
+    mark_met,
+)
 from seaopt.reporting.sections.kinds.controller import show_costs
+from seaopt.reporting.sections.kinds.simulated import list_left_out, summarise_findings
+from seaopt.reporting.sections.kinds.verification import describe_steps
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.requirement import Failure, group_failures
@@ -99,9 +112,23 @@ def explain_failure(failure: Failure) -> Reason:
     return Reason(what=f"{row.name} {value}, limit {row.sense} {limit}", where=row.where, count=failure.count)
 
 
+def summarise(certificate: Certificate) -> list[KeyFigure]:
+    """Return the largest Ms found, and how many draws failed; nothing of measured points alone."""
+    if not certificate.models:
+        return []
+    level, draws = certificate.controller.spec.level("max_sensitivity"), certificate.monte_carlo
+    ms = max(worst.ms for worst in certificate.worst.values())
+    on = f"on {format_count(len(certificate.plants), 'plant')}" + ("" if level is None else f", at most {level:g}")
+    figures = [KeyFigure(name="worst Ms found", value=format_number(ms, 3), against=on)]
+    if draws.samples:
+        failed = f"{draws.failures} of {draws.samples}"
+        figures.append(KeyFigure(name="draws failed", value=failed, against="all plants together"))
+    return figures
+
+
 def describe(certificate: Certificate) -> list[Section]:
     """Return the margins of every plant, the requirements, the worst cases, the draws, and the findings."""
-    left_out = {} if certificate.simulated is None else certificate.simulated.left_out
+    left_out = [] if certificate.simulated is None else list_left_out(certificate.simulated)
     return [
         _list_requirements(certificate),
         Section(
@@ -117,7 +144,8 @@ def describe(certificate: Certificate) -> list[Section]:
             ),
         ),
         *(_describe_uncertainty(certificate) if certificate.models else ()),
-        *list_notes("the certificate", [*certificate.notes, *(f"no {what}: {why}" for what, why in left_out.items())]),
+        *_describe_draws(certificate),
+        *list_notes("the certificate", [*certificate.notes, *left_out]),
     ]
 
 
@@ -159,11 +187,24 @@ def _tabulate_margins(certificate: Certificate) -> Table:
 def _describe_simulation(certificate: Certificate) -> Iterator[str]:
     """Yield what was found in simulation, and at the link."""
     if certificate.runs is not None:
-        yield from certificate.runs.describe_steps()
+        yield from describe_steps(certificate.runs)
     if certificate.simulated is not None:
-        yield from certificate.simulated.lines()
+        yield from summarise_findings(certificate.simulated)
     if certificate.impedance is not None:
         yield from (f"impedance: {line}" for line in certificate.impedance.lines())
+
+
+def _describe_draws(certificate: Certificate) -> Iterator[Section]:
+    """Yield what the draws of the simulated runs are."""
+    drawn = {} if certificate.runs is None else certificate.list_draws()
+    runs = [f"draw {number} on {name}" for name, draws in drawn.items() for number in range(1, len(draws) + 1)]
+    if runs:
+        states = " (with friction sliding, and stuck)" if any(len(draws) > 1 for draws in drawn.values()) else ""
+        sentence = (
+            "Every scenario is simulated at the nominal parameters and at the worst case that the certificate found on "
+            f"its plant{states}: {join_words(runs)}."
+        )
+        yield Section(title="Parameters of the simulated runs", part="simulation", screen=False, sentences=(sentence,))
 
 
 def _list_requirements(certificate: Certificate) -> Section:

@@ -10,7 +10,7 @@ from seaopt.control.laws.command import describe_cascade, name_gain_units
 from seaopt.control.laws.verdict import join_labels, list_design_figures
 from seaopt.control.loops.law import describe_integrators
 from seaopt.formatting import MISSING, format_band, format_count, format_figure, format_number
-from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes
+from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, list_notes
 
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
@@ -56,6 +56,19 @@ def _choose_range(asked: float) -> str:
     low, high = (factor * asked for factor in SWEEP_SPREAD)
     step = max(float(f"{(high - low) / 6:.1g}"), 0.1)
     return f"{step * math.floor(low / step):.4g}:{step * math.ceil(high / step):.4g}:{step:.4g}"
+
+
+def summarise(controller: Controller) -> list[KeyFigure]:
+    """Return bandwidth and margins on the design plant."""
+    achieved, spec, on = controller.achieved, controller.spec, "design plant"
+    ms, gain_unit = spec.level("max_sensitivity"), controller.command.gain_unit
+    asked, allowed = f"asked {spec.bandwidth_hz:g} Hz", "" if ms is None else f"at most {ms:g}"
+    return [
+        KeyFigure(name="bandwidth", value=format_figure(achieved.bandwidth_hz, "Hz", 3), against=asked),
+        KeyFigure(name="Ms", value=format_number(achieved.ms, 3), against=allowed),
+        KeyFigure(name="phase margin", value=format_figure(achieved.phase_margin_deg, "deg", 3), against=on),
+        KeyFigure(name="noise gain", value=format_figure(achieved.noise_gain, gain_unit, 3), against=on),
+    ]
 
 
 def describe(controller: Controller) -> list[Section]:

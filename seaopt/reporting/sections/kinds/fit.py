@@ -9,7 +9,7 @@ from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import DerivedFigure, FitFinding
 from seaopt.formatting import MISSING, format_count, format_number
 from seaopt.parameters import Parameter
-from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict, list_notes
+from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
 from seaopt.units import unit_after
 
 RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be proposed
@@ -41,6 +41,19 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
         reasons=reasons,
         next=tuple(filter(None, (cures, again))),
     )
+
+
+def summarise(fit: Fit) -> list[KeyFigure]:
+    """Return the least percentage that an output is fitted to."""
+    percents = {
+        f"{name}.{output}": output_fit.fit_percent
+        for name, row in fit.outputs.items()
+        for output, output_fit in row.items()
+    }
+    if not percents:
+        return []
+    least = min(percents, key=percents.__getitem__)
+    return [KeyFigure(name="fit", value=f"{percents[least]:.2f} %", against=f"least of the outputs: {least}")]
 
 
 def describe(fit: Fit) -> list[Section]:

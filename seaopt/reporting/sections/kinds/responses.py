@@ -1,12 +1,19 @@
-"""Frequency responses of experiments in words: a row per response, and the actuator as the second order sees it."""
+"""Frequency responses of experiments in words: a row per response, its second-order form, and a fit beside them."""
 
 from __future__ import annotations
 
-from seaopt.formatting import MISSING, format_number
-from seaopt.frequency import DriveEstimate, Pair, Survey
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from seaopt.estimation import DerivedFigure, Fit
+from seaopt.formatting import MISSING, format_number, join_words
+from seaopt.frequency import DriveEstimate, Pair, Survey, Uncertain
+from seaopt.plants.friction import has_friction
 from seaopt.reporting.responses import Responses
 from seaopt.reporting.sections.data import Section, Table
 
+FAR = 3.0  # standard deviations: what lies farther is said to differ
 HEAD = ("response", "coherent", "peak", "gain", "f_n", "zeta", "form", "file", "fit")
 COLUMNS = (
     "coherent: band of coherence above 0.8; peak and natural frequency f_n in Hz; gain, f_n and damping ratio zeta are "
@@ -73,3 +80,68 @@ def _describe_drive(survey: Survey, pair: Pair, drive: DriveEstimate) -> tuple[s
         f"with k known: {m_k} = {drive.m_k}, {b_m} = {drive.b_m}, efficiency {drive.efficiency}",
         f"K and b averaged, as the paper does: {m_k} = {drive.m_k_averaged}, {b_m} = {drive.b_m_averaged}",
     )
+
+
+def compare_with_fit(measured: Survey, fit: Fit, experiment: str) -> Iterator[str]:
+    """Yield how an experiment's frequency responses compare with the fit, in sentences."""
+    forms = {pair: pair.second_order for pair in measured.pairs if pair.second_order is not None}
+    if not forms:
+        yield "The log is not coherent enough for a comparison in frequency."
+        return
+    names, away = [pair.name for pair in forms], [pair.misfit(measured.model(pair, fit.parameters)) for pair in forms]
+    of_form = [form.misfit for form in forms.values()]
+    yield (
+        f"The fitted model is {_list_each(away, names)} standard deviations from H1 (rms over its coherent lines), the "
+        f"second-order form {_list_each(of_form, names)}."
+    )
+    if has_friction(measured.plant, measured.adapt(fit.parameters)):
+        yield "With dry friction a response depends on the amplitude: the model's is that of sliding."
+    elif max(away) > FAR:
+        yield "The log shows dynamics that the model does not have."
+    odd = [name for name, form, model in zip(names, of_form, away, strict=True) if form > FAR * max(model, 1.0)]
+    if odd:
+        yield f"{join_words(odd)} {'is' if len(odd) == 1 else 'are'} not of second order."
+    yield from _compare_drive(measured, fit, experiment)
+
+
+def _compare_drive(measured: Survey, fit: Fit, experiment: str) -> Iterator[str]:
+    """Yield sprung mass and damping by the second-order form of the first response that tells them, and by the fit."""
+    spring = measured.plant.spring
+    if spring is None or spring.mass is None or spring.damping is None:
+        return
+    drives = ((pair, measured.drive(pair, fit.parameters)) for pair in measured.pairs)
+    for pair, drive in drives:
+        if drive is not None:
+            names = (spring.mass, spring.damping)
+            fitted = {name: fit.derived.get(f"{experiment}.{name}") or fit.derived[name] for name in names}
+            yield from _describe_gap(pair, drive, fitted)
+            return
+
+
+def _describe_gap(pair: Pair, drive: DriveEstimate, fitted: Mapping[str, DerivedFigure]) -> Iterator[str]:
+    by_form = dict(zip(fitted, (drive.m_k, drive.b_m), strict=True))
+    in_form = [f"{name} = {figure}" for name, figure in by_form.items()]
+    in_fit = [f"{name} = {figure.value:.5g} ± {figure.std:.2g} {figure.unit}" for name, figure in fitted.items()]
+    yield (
+        f"The second-order form K/(s² + a s + b) of {pair.name}, with k known, has {join_words(in_form)}; the fit in "
+        f"time has {join_words(in_fit)}."
+    )
+    yield f"The form differs by {join_words([_compare(name, by_form[name], fitted[name]) for name in fitted])}."
+    if abs(drive.efficiency.value - 1.0) > FAR * drive.efficiency.std:
+        averaged = dict(zip(fitted, (drive.m_k_averaged, drive.b_m_averaged), strict=True))
+        in_mean = [f"{name} = {figure.value:.5g} {figure.unit}" for name, figure in averaged.items()]
+        yield (
+            f"Its static gain is {drive.efficiency.value:.3f} of what the motor gives, not 1: the mean of its K "
+            f"and b in place of b alone would give {join_words(in_mean)}."
+        )
+
+
+def _compare(name: str, form: Uncertain, fitted: DerivedFigure) -> str:
+    away, std = form.value - fitted.value, float(np.hypot(form.std, fitted.std))
+    return f"{100 * away / fitted.value:+.2f} % of {name} ({abs(away) / max(std, 1e-300):.1f} combined std)"
+
+
+def _list_each(values: Sequence[float], names: Sequence[str]) -> str:
+    if len(values) == 1:
+        return f"{values[0]:.3g}"
+    return join_words([f"{value:.3g} ({name})" for value, name in zip(values, names, strict=True)])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
-from seaopt.formatting import format_count, format_number
-from seaopt.reporting.sections.data import Commands, Item, Reason, Section, Table, Verdict, mark_met
-from seaopt.robustness.verification.judgement import Outcome
-from seaopt.robustness.verification.verification import Verification, describe_witness
+from seaopt.formatting import format_count, format_number, format_values
+from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, mark_met
+from seaopt.robustness.verification.judgement import NOMINAL, Outcome
+from seaopt.robustness.verification.verification import Verification
 from seaopt.units import unit_after
 
 
@@ -25,6 +26,12 @@ def judge(verification: Verification, commands: Commands) -> Verdict:
     )
 
 
+def summarise(verification: Verification) -> list[KeyFigure]:
+    """Return how many runs failed."""
+    failed = f"{len(verification.failures)} of {len(verification.rows)}"
+    return [KeyFigure(name="runs failed", value=failed, against="simulated, nonlinear")]
+
+
 def describe(verification: Verification) -> list[Section]:
     """Return the worst run of each scenario on each plant, the failures, and what was not played."""
     word = verification.mechanics.word
@@ -40,8 +47,8 @@ def describe(verification: Verification) -> list[Section]:
             ),
             tables=(_tabulate_worst(verification),),
             remarks=(
-                *(f"{line}." for line in verification.describe_draws()),
-                *(f"{line}." for line in verification.describe_tracking()),
+                *_list_draws(verification),
+                *(f"{line}." for line in describe_tracking(verification)),
                 *([f"Simulated seconds per second: {speeds}."] if speeds else []),
             ),
             items=(
@@ -92,7 +99,59 @@ def _list_failures(verification: Verification) -> list[str]:
     for row in verification.failures:
         kinds.setdefault((row.plant, row.faults[0].kind if row.faults else row.reason), []).append(row)
     return [
-        f"{row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{describe_witness(row)}"
+        f"{row.plant}, {row.scenario}, draw {row.draw}: {row.reason}"
+        + "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
         + (f" (and {format_count(len(more), 'more such run')})" if more else "")
         for row, *more in kinds.values()
     ]
+
+
+def _list_draws(verification: Verification) -> Iterator[str]:
+    """Yield where each draw differs from nominal."""
+    rows = {(row.plant, row.draw): row for row in verification.rows if row.draw != NOMINAL}
+    for row in rows.values():
+        yield f"Draw {row.draw} on {row.plant}: {format_values(row.parameters, 6, NOMINAL)}."
+
+
+def describe_drawings(verification: Verification, plant: str) -> str:
+    """Return what the colours in the figures of a plant's runs mean, and which part of a run they show."""
+    rows = [row for row in verification.worst() if row.plant == plant]
+    meanings = {
+        "Grey: link 2 is held.": any(phase.held for row in rows for phase in verification.scenario(row).phases),
+        "Of a run that passed the end of the last phase is left out, as its title says.": any(row.met for row in rows),
+        "A run that failed is drawn whole, the judged window in yellow.": not all(row.met for row in rows),
+    }
+    return " ".join(text for text, applies in meanings.items() if applies)
+
+
+def describe_tracking(verification: Verification) -> Iterator[str]:
+    """Yield a line per plant whose moving output keeps the force from following slow references."""
+    for name, band in verification.follows_hz.items():
+        if not verification.stages[name].plant.moves:
+            continue
+        if band is None:
+            yield f"{name} tracks no reference within 3 dB: the swinging output prevents it"
+        elif band[0] > 0.0:
+            yield (
+                f"{name} tracks references between {band[0]:.3g} and {band[1]:.3g} Hz (within 3 dB); below that the "
+                "swinging output prevents it"
+            )
+
+
+def describe_steps(verification: Verification) -> Iterator[str]:
+    """Yield a line per plant on which steps are judged: the worst that its user sees of them."""
+    for plant in verification.stages:
+        rows = [row for row in verification.rows if row.plant == plant and row.settling_s is not None]
+        if not rows:
+            continue
+        over, more = (
+            max((row.overshoot or 0.0 for row in rows if row.overshoot_by_limit is by_limit), default=0.0)
+            for by_limit in (False, True)
+        )
+        limited = f" ({100 * more:.3g} % where the current limit makes it)" if more else ""
+        slowest = max(row.settling_s or 0.0 for row in rows)
+        sizes = [verification.scenario(row).phases[-1].force_N for row in rows]
+        settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
+        ends = " to ".join(dict.fromkeys(f"{size:.4g}" for size in (min(sizes), max(sizes))))
+        unit = verification.command.reference_unit
+        yield f"steps on {plant}, {ends} {unit}: overshoot up to {100 * over:.3g} %{limited}, {settled}"

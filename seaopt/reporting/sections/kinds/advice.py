@@ -1,8 +1,8 @@
-"""Diagnostics of a fit in words: what to look at, the tests of the residuals, where the information comes from."""
+"""Advice on fits in words: diagnostics, with the tests of the residuals, and which of several fits is preferred."""
 
 from __future__ import annotations
 
-from seaopt.estimation import Diagnostics
+from seaopt.estimation import Diagnostics, Ranking
 from seaopt.estimation.advice.diagnostics import SIGNIFICANCE
 from seaopt.estimation.advice.forecasts import Percent
 from seaopt.formatting import format_number
@@ -21,7 +21,12 @@ def format_percent(percent: Percent) -> str:
     return format_number(percent.used) + held_out
 
 
-def describe(diagnostics: Diagnostics) -> list[Section]:
+def describe(result: Diagnostics | Ranking) -> list[Section]:
+    """Return problems, tests and sources of information of a fit, or how several of them compare."""
+    return _describe_ranking(result) if isinstance(result, Ranking) else _describe_diagnostics(result)
+
+
+def _describe_diagnostics(diagnostics: Diagnostics) -> list[Section]:
     """Return the problems, a row for each output and input, and the share of information of each experiment."""
     rows: list[tuple[str, ...]] = []
     for name, outputs in diagnostics.outputs.items():
@@ -70,3 +75,43 @@ def describe(diagnostics: Diagnostics) -> list[Section]:
         table = Table(head=head, rows=shares, align="<".ljust(len(head), ">"))
         sections.append(Section(title="Information by experiment", part="diagnostics", tables=(table,)))
     return sections
+
+
+def _describe_ranking(ranking: Ranking) -> list[Section]:
+    """Return the verdict with its reasons, and a row per fit; criteria are counted from those of the best."""
+    best = ranking.rows[0]
+    rows = tuple(
+        (
+            row.name,
+            *(
+                f"{getattr(row, criterion) - getattr(best, criterion):+.6g}"
+                for criterion in ("effective_bic", "bic", "aic")
+            ),
+            str(row.unknowns),
+            ", ".join(
+                f"{name}.{output} {format_percent(percent)}"
+                for name, outputs in row.free_run.items()
+                for output, percent in outputs.items()
+            ),
+        )
+        for row in ranking.rows
+    )
+    return [
+        Section(
+            title="Ranking",
+            part="ranking",
+            sentences=ranking.sentences,
+            tables=(
+                Table(
+                    label="Fits compared",
+                    head=("fit", "effective BIC", "BIC", "AIC", "unknowns", "simulated (held out) %"),
+                    rows=rows,
+                    align="<>>>><",
+                ),
+            ),
+            remarks=(
+                f"The residuals are coloured: {format_number(ranking.effective_samples, 3)} of {ranking.samples} "
+                "samples count as independent. Differences of BIC beyond 10 are very strong evidence.",
+            ),
+        )
+    ]
