@@ -72,7 +72,7 @@ class Sensors:
         limit, step = self.saturation.get(name), self.quantisation.get(name)
         if limit is not None:
             out = np.clip(out, -limit, limit)
-        return step * np.round(out / step) if step else out
+        return step * np.floor(out / step + 0.5) if step else out
 
     def convert(self, name: str, value: float) -> float:
         """Return one reading of a value that has its noise: offset added, clipped, rounded to the nearest step."""

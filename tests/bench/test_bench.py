@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+from fractions import Fraction
+
+import casadi as ca
 import numpy as np
 import pytest
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Multisine, Noise, excite, scale
+from seaopt.control.running.loop_kernel import _describe_device
 from seaopt.control.tuning.corners import draw
 from seaopt.errors import ControlError, EstimationError, SimulationError
 from seaopt.estimation.experiment_design.excitation_search import Limits
@@ -118,3 +122,16 @@ def test_what_is_no_seed_is_refused_wherever_one_is_given(thor, stand, seed):
         so.virtual_log(stand, thor, PAPER_STAND, duration_s=1, rate_hz=400, seed=seed)
     with pytest.raises(ControlError, match="not a seed; give a whole number"):
         draw(thor.prior(k=3000.0), 2, seed)
+
+
+def test_a_value_between_two_steps_reads_as_the_upper_one_in_logs_as_in_loops():
+    """Halves are exact in binary; half to even, as NumPy rounds, reads 0.5 and 1.5 steps otherwise."""
+    sensors = so.Sensors(quantisation={"F1": 0.5}, offset={"F1": 0.25}, saturation={"F1": 1.25})
+    values = np.arange(-16, 17) / 8.0
+    step, limit = Fraction(1, 2), Fraction(5, 4)
+    clipped = [min(max(Fraction(value) + Fraction(1, 4), -limit), limit) for value in values]
+    nearest = [float(step * ((value / step + Fraction(1, 2)) // 1)) for value in clipped]
+    device, numbers = _describe_device(sensors, "F1")
+    in_loop = [float(device.read(ca.DM(value), ca.DM(numbers))) for value in values]
+    assert sensors.read("F1", values, np.random.default_rng(0)).tolist() == nearest
+    assert [sensors.convert("F1", value) for value in values] == nearest == in_loop
