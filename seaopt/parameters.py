@@ -211,14 +211,8 @@ class ParameterSet(Mapping[str, Parameter]):
         return ParameterSet({**self._items, **{parameter.name: parameter for parameter in parameters}}.values())
 
     def update(self, **values: float | tuple[float, str]) -> ParameterSet:
-        """Return a set with new values; a tuple (value, unit) is converted to the declared unit.
-
-        Raises
-        ------
-        ParameterError
-            A name is unknown or a value outside its bounds.
-        UnitError
-            A unit is unknown or of another dimension.
+        """Return a set with new values; a tuple (value, unit) is converted to the declared unit. Raises ParameterError:
+        a name is unknown or a value outside its bounds. Raises UnitError: a unit is unknown or of another dimension.
         """
         changed: list[Parameter] = []
         for name, stated in values.items():

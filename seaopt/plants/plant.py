@@ -194,14 +194,9 @@ class Plant:
     def complete(self, params: ParameterSet) -> CompletedParameters:
         """Return the plant's own parameters in its units and order: from `params`, else the defaults.
 
-        Public functions do this once; what is complete for this plant is returned as it is.
-
-        Raises
-        ------
-        ParameterError
-            A parameter has neither a value in `params` nor a default, or one that the plant cannot have.
-        UnitError
-            A value's unit has another dimension than the plant's.
+        Public functions do this once; what is complete for this plant is returned as it is. Raises ParameterError: a
+        parameter has neither a value in `params` nor a default, or one that the plant cannot have. Raises UnitError: a
+        value's unit has another dimension than the plant's.
         """
         require_type(params, ParameterSet, f"params of plant {self.name}", "give a ParameterSet", ParameterError)
         if isinstance(params, CompletedParameters):
@@ -234,13 +229,7 @@ class Plant:
         return dict(self.derived(name_parameters(self, self.p)))
 
     def stored_energy(self) -> Any:
-        """Return the energy (J) as an expression of x and p.
-
-        Raises
-        ------
-        PlantError
-            The plant declares none.
-        """
+        """Return the energy (J) as an expression of x and p. Raises PlantError: the plant declares none."""
         if self.energy is None:
             raise PlantError(f"plant {self.name} declares no energy; give energy=lambda x, p: ... when it is made")
         x, _, p = name_symbols(self, self.x, self.u, self.p)

@@ -405,11 +405,8 @@ class Controller(LoopDelays, Result, Worded):
         """Return the controller of a controller.json; what it achieves is computed again on the design plant.
 
         One that calls itself feasible and breaks a limit there, as it may with other parameters, is not feasible.
-
-        Raises
-        ------
-        FileError
-            A field is missing or malformed, or one contradicts the law: gains, reference, measurement, achieved.
+        Raises FileError: a field is missing or malformed, or one contradicts the law: gains, reference, measurement,
+        achieved.
         """
         # Deferred, as pydantic takes long to import.
         from seaopt.control.laws.stored import check_achieved, check_friction_margin, check_link, read_controller

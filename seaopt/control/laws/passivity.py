@@ -100,13 +100,7 @@ class Passivity(Worded):
     unit: str = LINEAR.damping
 
     def holds(self, band_hz: tuple[float, float]) -> bool:
-        """Tell whether Re Z >= 0 throughout a band.
-
-        Raises
-        ------
-        ControlError
-            The band is not within the examined one.
-        """
+        """Tell whether Re Z >= 0 throughout a band. Raises ControlError: the band is not within the examined one."""
         low, high = band_hz
         if not self.low_hz <= low < high <= self.high_hz:
             raise ControlError(

@@ -145,12 +145,8 @@ class PlausibilityGate:
             raise ControlError(f"max_held = {held!r} is not a number of samples; give 0, 1, ... up to {MOST_HELD}")
 
     def start(self, measurement: float) -> GateState:
-        """Return the state in which the first reading must be near a measurement at rest.
-
-        Raises
-        ------
-        ControlError
-            It is not within the range itself.
+        """Return the state in which the first reading must be near a measurement at rest. Raises ControlError: it is
+        not within the range itself.
         """
         low, high = self.range_N
         if not low <= measurement <= high:

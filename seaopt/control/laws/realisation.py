@@ -172,16 +172,11 @@ class RunnableLaw:
     ) -> LawState:
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
 
-        A law without an integrator cannot be set: its next command follows from the inputs alone. A measurement that
-        is left out is zero, and a gate judges the first reading by its range; one that is given, by its jump from it.
+        A law without an integrator cannot be set: its next command follows from the inputs alone. A measurement that is
+        left out is zero, and a gate judges the first reading by its range; one that is given, by its jump from it.
         `heat` is what is known of winding and case above the ambient (K); cold if left out. `readings` are of what the
-        compensation reads; zero if left out.
-
-        Raises
-        ------
-        ControlError
-            An input is not finite or beyond 1e15, the measurement is outside the gate's range, or the current is above
-            the limit.
+        compensation reads; zero if left out. Raises ControlError: an input is not finite or beyond 1e15, the
+        measurement is outside the gate's range, or the current is above the limit.
         """
         for name, value in (("reference", reference), ("current_A", current_A)):
             require_number(value, name, ControlError)

@@ -212,14 +212,8 @@ class Estimator:
         return dict(zip(self.names, estimates.tolist(), strict=True))
 
     def run(self, log: Log) -> EstimatorRun:
-        """Filter a log from rest; channels carry the plant's names.
-
-        Raises
-        ------
-        ControlError
-            The log's rate is not the filter's, or it has gaps or missing samples.
-        LogError
-            An input or a measured output is not in the log.
+        """Filter a log from rest; channels carry the plant's names. Raises ControlError: the log's rate is not the
+        filter's, or it has gaps or missing samples. Raises LogError: an input or a measured output is not in the log.
         """
         u, y = self._samples(log)
         settled = min(self._count_settling(), len(log) // 2)

@@ -129,11 +129,7 @@ class GainTable:
 
     def bound_change(self, low: float, high: float, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return what abs(C_y(s)/C_y(middle) - 1) stays below for every s from low to high, at frequencies in Hz.
-
-        Raises
-        ------
-        ControlError
-            A point of the table lies between the two.
+        Raises ControlError: a point of the table lies between the two.
         """
         if np.any((self.points > low) & (self.points < high)):
             raise ControlError(f"a stretch from {low:g} to {high:g} has a point of the table in it; end it there")

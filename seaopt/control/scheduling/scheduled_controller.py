@@ -170,12 +170,7 @@ class ScheduledController(Result, Worded):
         """Return the controller that the schedule is while the variable stands at a value.
 
         At a point it is the one that was tuned there. Elsewhere its specification asks for the bandwidth that it has:
-        what is asked there is judged by `between`.
-
-        Raises
-        ------
-        ControlError
-            The value is not finite, or outside the points.
+        what is asked there is judged by `between`. Raises ControlError: the value is not finite, or outside the points.
         """
         low, high = self.points[0], self.points[-1]
         if not low <= value <= high:
@@ -252,12 +247,8 @@ class ScheduledController(Result, Worded):
     def from_dict(
         cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet, others: Plants | None = None
     ) -> ScheduledController:
-        """Return the schedule of a schedule.json; what it achieves is computed again.
-
-        Raises
-        ------
-        FileError
-            A field is missing or malformed, or contradicts another: the gains must be those of the controllers.
+        """Return the schedule of a schedule.json; what it achieves is computed again. Raises FileError: a field is
+        missing or malformed, or contradicts another: the gains must be those of the controllers.
         """
         from seaopt.control.scheduling.stored import read_schedule  # deferred: pydantic
 

@@ -299,12 +299,8 @@ class Certificate(Result, Worded):
         models: Plants,
         parameters: ParameterSet,
     ) -> Certificate:
-        """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated.
-
-        Raises
-        ------
-        FileError
-            A field is missing or malformed, it was edited or written by hand, or nothing is required in it.
+        """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated. Raises
+        FileError: a field is missing or malformed, it was edited or written by hand, or nothing is required in it.
         """
         from seaopt.robustness.certificate.stored import build_certificate  # deferred, as pydantic takes long to import
 

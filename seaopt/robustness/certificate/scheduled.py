@@ -277,12 +277,8 @@ class ScheduleCertificate(Result, Worded):
     ) -> ScheduleCertificate:
         """Return the certificate of a schedule_robustness.json; nothing is simulated.
 
-        Linear figures are computed again. Arguments are those of `certify_schedule`.
-
-        Raises
-        ------
-        FileError
-            A field is missing or malformed, it was edited or written by hand, or nothing is required in it.
+        Linear figures are computed again. Arguments are those of `certify_schedule`. Raises FileError: a field is
+        missing or malformed, it was edited or written by hand, or nothing is required in it.
         """
         from seaopt.robustness.certificate.stored import build_schedule_certificate  # deferred: pydantic
 

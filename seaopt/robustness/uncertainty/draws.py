@@ -124,12 +124,7 @@ class Uncertainty:
         """Return `count` draws as coordinates; Gaussian draws outside a bound are drawn again.
 
         Coordinates of the Gaussian part are standard deviations along the principal axes of the correlation; those of
-        the ranges run from -1 to 1.
-
-        Raises
-        ------
-        ControlError
-            The bounds leave almost nothing of the distribution.
+        the ranges run from -1 to 1. Raises ControlError: the bounds leave almost nothing of the distribution.
         """
         width = len(self.names)
         kept, tries = np.empty((0 if width else count, width)), 0

@@ -145,12 +145,8 @@ class Verification(Result, Worded):
         source: str,
         remedy: str,
     ) -> Verification:
-        """Return what `to_dict` gave, of the same stages and draws; nothing is simulated.
-
-        Raises
-        ------
-        FileError
-            A key is missing or a value of the wrong kind.
+        """Return what `to_dict` gave, of the same stages and draws; nothing is simulated. Raises FileError: a key is
+        missing or a value of the wrong kind.
         """
         stored = read_fields(cls, content, source, remedy=remedy)
         stored["rows"] = tuple(map(_restore_settling, stored["rows"]))

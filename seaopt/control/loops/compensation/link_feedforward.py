@@ -154,12 +154,8 @@ class LinkPath:
         )
 
     def see(self, plant: Plant) -> Plant:
-        """Return a plant with the signal among its outputs: it is zero where the plant holds its link.
-
-        Raises
-        ------
-        ControlError
-            The plant has it in another unit, or its link moves and it has no such output.
+        """Return a plant with the signal among its outputs: it is zero where the plant holds its link. Raises
+        ControlError: the plant has it in another unit, or its link moves and it has no such output.
         """
         unit = plant.outputs.get(self.measured)
         if unit is None and plant.port is not None and plant.port.motion is not None:
