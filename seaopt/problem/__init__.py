@@ -6,12 +6,6 @@ from seaopt.problem.schema import json_schema
 from seaopt.problem.stages import Stages, certify_problem, fit_problem, tune_problem
 
 __all__ = [
-    "Problem",
-    "Stages",
-    "certify_problem",
-    "demo_path",
-    "fit_problem",
-    "json_schema",
-    "read_problem",
+    "Problem", "Stages", "certify_problem", "demo_path", "fit_problem", "json_schema", "read_problem",
     "tune_problem",
-]
+]  # fmt: skip

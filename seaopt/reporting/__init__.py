@@ -22,13 +22,9 @@ _HOME = {
     "write_report": "page.report",
 }
 __all__ = [
-    "experiment_survey",
-    "judge_results",
-    "write_frequency_figure",
-    "write_frontier_figure",
-    "write_quality_figure",
-    "write_report",
-]
+    "experiment_survey", "judge_results", "write_frequency_figure", "write_frontier_figure",
+    "write_quality_figure", "write_report",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,6 @@ from typing import Any
 
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
-from seaopt.estimation.result.fit_result import Nuisance
 from seaopt.frequency import Pair, SecondOrder, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
@@ -74,13 +73,10 @@ def estimate_responses(
         try:
             surveys[experiment.name] = experiment_survey(experiment, stretch_s=stretch_s)
             if fit is not None and experiment.name in fit.nuisance:
-                fitted[experiment.name] = (_adopt_fit(surveys[experiment.name], fit.nuisance[experiment.name]), fit)
+                survey, nuisance = surveys[experiment.name], fit.nuisance[experiment.name]
+                clock = replace(survey.clock, delay_s=nuisance.delay_s, delay_free=False)
+                fitted[experiment.name] = (replace(survey, clock=clock, gain=nuisance.gain), fit)
         except LogError as error:
             raise LogError(f"{problem.source}: experiment {experiment.name}: {error}") from error
     progress(", ".join(surveys), 1.0)
     return Responses(surveys=surveys, guess=problem.parameters, fitted=fitted)
-
-
-def _adopt_fit(survey: Survey, nuisance: Nuisance) -> Survey:
-    """Return a survey whose models have a fit's delay and gains."""
-    return replace(survey, clock=replace(survey.clock, delay_s=nuisance.delay_s, delay_free=False), gain=nuisance.gain)

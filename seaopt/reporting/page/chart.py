@@ -82,7 +82,8 @@ def _make_chart(panel: Panel) -> Chart:
         axis.set_gid(f"pane{number}")
         curves = _name_curves(axis, number)
         for label in label_lines(axis):
-            artists = [artist for artist in _artists(axis) if str(artist.get_label()) == label]
+            drawn_artists = (*axis.lines, *axis.collections, *axis.patches)
+            artists = [artist for artist in drawn_artists if str(artist.get_label()) == label]
             for index, artist in enumerate(artists):
                 if artist.get_gid() is None:
                     artist.set_gid(f"mark{number}-{len(key)}-{index}")
@@ -101,10 +102,6 @@ def _make_chart(panel: Panel) -> Chart:
         hover=panel.hover,
         key=entries if len(entries) > 1 else (),
     )
-
-
-def _artists(axis: Axes) -> list[Any]:
-    return [*axis.lines, *axis.collections, *axis.patches]
 
 
 def _name_curves(axis: Axes, number: int) -> list[dict[str, str]]:

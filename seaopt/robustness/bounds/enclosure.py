@@ -52,10 +52,6 @@ def _apply_operation(op: int, operands: list[Entry]) -> Entry:
     return enclosures[op](*operands)
 
 
-def _divide(a: Entry, b: Entry) -> Entry:
-    return a * b.reciprocal() if isinstance(b, Taylor) else a * (1.0 / b)
-
-
 def _raise_to_power(a: Entry, b: Entry) -> Entry:
     """Return a whole power by repeated products, any other of a positive number by its series."""
     if isinstance(b, Taylor):
@@ -138,7 +134,7 @@ BINARY: dict[int, Callable[[Any, Any], Entry]] = {
     ca.OP_ADD: lambda a, b: a + b,
     ca.OP_SUB: lambda a, b: a - b,
     ca.OP_MUL: lambda a, b: a * b,
-    ca.OP_DIV: _divide,
+    ca.OP_DIV: lambda a, b: a * (b.reciprocal() if isinstance(b, Taylor) else 1.0 / b),
     ca.OP_POW: _raise_to_power,
     ca.OP_CONSTPOW: _raise_to_power,
     ca.OP_FMAX: _larger,
