@@ -16,14 +16,15 @@ if TYPE_CHECKING:
     import pint
 
 DIMENSIONLESS = frozenset({"", "-", "1"})
-CELSIUS = frozenset({"degC", "°C", "celsius"})
+CELSIUS = frozenset({"degC", "°C", "celsius", "Celsius", "C"})  # a log has temperatures, and no charges in coulombs
 # What pint would read otherwise (Nm as a textile's length per mass, Grad as a gigaradian), or not at all.
 _SYNONYMS = {
     "usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC",
     "Nm": "(N*m)", "mNm": "(mN*m)", "kNm": "(kN*m)", "Nmm": "(N*mm)", "Ncm": "(N*cm)",
     "Grad": "deg", "dps": "(deg/s)", "rev": "turn", "Amp": "A", "Amps": "A", "amps": "A", "Volt": "V", "Volts": "V",
 }  # fmt: skip
-_HEADER = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+# A colon is an index's, as in x(:,2).
+_HEADER = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\]):]*)[\])]\s*$")
 # Python would work for years on 9^9^9^9.
 _POWER = re.compile(r"(?:\^|\*\*)[\s(+-]*(\d*)")
 _POWER_OF_POWER = re.compile(r"(?:\^|\*\*)\s*\(?\s*[-+]?\s*[\d.]+\s*\)?\s*(?:\^|\*\*)")
@@ -57,7 +58,7 @@ def _parse(unit: str) -> Any:
         raise UnitError(f'unit "{unit}" raises to a power that no unit has; write it like "N", "kg m^2" or "rad/s"')
     registry = _registry()
     try:
-        return registry.Unit(_pint_text(unit))
+        return registry.Unit("degC" if unit.strip() in CELSIUS else _pint_text(unit))
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
         raise UnitError(f'unit "{unit}" is not known; write it like "N", "mA", "kg m^2" or "rad/s"') from error
 
@@ -135,8 +136,8 @@ def header_unit(header: str) -> str | None:
 
     Examples
     --------
-    >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur")
-    ('N', 'usec', None)
+    >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur"), header_unit("x(:,2)")
+    ('N', 'usec', None, None)
     """
     match = _HEADER.match(header)
     return match["unit"].strip() if match else None

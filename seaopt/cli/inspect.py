@@ -14,7 +14,9 @@ from seaopt.cli.terminal import Amount, Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import check_folder, to_json, write_json
 from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, contents, read_table
+from seaopt.logs.formats import open_source
 from seaopt.logs.log.alignment import Rule
+from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
 from seaopt.logs.reading.selection import ClockError, is_time_name
 from seaopt.progress import divide
 from seaopt.reporting.sections import describe
@@ -48,7 +50,7 @@ def inspect_log(
     """
     if folder is not None:
         check_folder(folder)
-    headers, unit_of = _parse_pairs("--channel", channels), _parse_pairs("--unit", units)
+    headers, unit_of = parse_pairs("--channel", channels), parse_pairs("--unit", units)
     for name in unit_of:
         if name != "time" and name not in headers:
             unit = f"{name}={unit_of[name]}"
@@ -86,8 +88,9 @@ def inspect_log(
 
 
 def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:
-    """Read a table; where its clock is not clear the error is the command to type, and seconds may be assumed. Raises
-    LogError: no column, or more than one, is named like a time, or it has another unit.
+    """Read a table; where its clock is not clear the error is the command to type, and its unit may be assumed.
+
+    Raises LogError: no column, or more than one, is named like a time, or it has another unit.
     """
     if time is None and unit is not None:
         named = [field.name for field in contents(path).fields if field.numeric and is_time_name(field.name)]
@@ -99,22 +102,35 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
         return read(time=clock)
     except ClockError as error:
         if error.column is None or not is_time_name(error.column):
-            candidates = error.candidates if error.column is None else [error.column]
-            raise LogError(f"{error}; type {_spell_clock(path, *_choose_clock(path, candidates))}") from error
-        table = read(time=Column(column=error.column, unit="s"))
-        other = _spell_clock(path, error.column, "ms")
-        note = f'column "{error.column}" has no unit: seconds were assumed; for milliseconds type {other}'
+            named = (error.column, error.unit) if error.column is not None else _choose_clock(path, error.candidates)
+            raise LogError(f"{error}; type {_spell_clock(path, *named)}") from error
+        table = read(time=Column(column=error.column, unit=error.unit))
+        others = {"s": ("ms", "milliseconds")}.get(error.unit, ("s", "seconds"))
+        note = (
+            f'column "{error.column}" has no unit: {error.unit} was assumed, by the size of its steps; for {others[1]} '
+            f"type {_spell_clock(path, error.column, others[0])}"
+        )
         return replace(table, notes=(note, *table.notes))
 
 
 def _choose_clock(path: Path, candidates: Sequence[str]) -> tuple[str, str]:
-    """Return the first column whose header states a unit of time, with that unit; else the first one, in seconds."""
+    """Return the likely clock and its unit: the column whose header states a unit of time, or that runs on.
+
+    Of neither kind, the first.
+    """
     from seaopt.problem.proposal.vocabulary import read_header  # deferred: the problem file's classes take time
 
     stated = {field.name: field.unit for field in contents(path).fields}
     units = {name: read_header(name, stated.get(name)).unit for name in candidates}
-    timed = ((name, unit) for name, unit in units.items() if is_unit(unit) and same_dimension(unit, "s"))
-    return next(timed, (candidates[0] if candidates else "COLUMN", "s"))
+    for name, unit in units.items():
+        if is_unit(unit) and same_dimension(unit, "s"):
+            return name, unit
+    source = open_source(path)
+    for name in candidates:
+        values = source.read([name])[name]
+        if runs_on(values):
+            return name, guess_time_unit(values)
+    return candidates[0] if candidates else "COLUMN", "s"
 
 
 def _spell_clock(path: Path, column: str, unit: str) -> str:
@@ -128,13 +144,17 @@ def _spell_command(path: Path, options: str) -> str:
 def _parse_counter(option: str | None) -> Counter | None:
     if option is None:
         return None
-    ((column, count),) = _parse_pairs("--counter", [option]).items()
+    ((column, count),) = parse_pairs("--counter", [option]).items()
     if not count.isdecimal() or len(count) > MAX_DIGITS:
         raise SeaoptError(f'--counter "{option}": "{count}" is not how many samples a count stands for; give 1 or more')
     return Counter(column=column, samples_per_count=int(count))
 
 
-def _parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
+def parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
+    """Return the values of NAME=VALUE by name.
+
+    Raises SeaoptError: a text is none, or a name occurs twice.
+    """
     pairs: dict[str, str] = {}
     for text in texts:
         name, sign, value = (part.strip() for part in text.partition("="))

@@ -240,12 +240,20 @@ def new(
         bool, typer.Option("--yes", "-y", help="Ask nothing; take the best guesses and mark them as guesses.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    time: Annotated[str | None, typer.Option(metavar="COLUMN", help="The clock's column.")] = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ROLE=COLUMN", help="A column's role, such as I, tau_s, theta_m, F1. Repeatable."),
+    ] = None,
+    unit: Annotated[
+        list[str] | None, typer.Option(metavar="ROLE=UNIT", help="Unit of such a column, or of time. Repeatable.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Create a problem file from logs: inspect their columns, and ask for what cannot be inferred."""
     from seaopt.cli.new import write_problem
 
-    write_problem(logs, output, yes=yes, force=force, json=json)
+    write_problem(logs, output, yes=yes, force=force, json=json, time=time, channels=channel or (), units=unit or ())
 
 
 @app.command()

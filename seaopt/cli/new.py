@@ -5,10 +5,12 @@ from __future__ import annotations
 import secrets
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
+from seaopt.cli.inspect import parse_pairs
 from seaopt.cli.progress import show_progress
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import ProblemError, SeaoptError
@@ -20,17 +22,30 @@ COLUMN_HEAD = ("column", "role", "unit", "meaning")
 GUESS_HEAD = ("guess", "value", "why")
 
 
-def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force: bool, json: bool) -> Path:
-    """Write a problem file for logs and return its path; without `yes` what they leave open is asked. Raises
-    SeaoptError: a log cannot be read, a file is there already, or an answer is missing.
+def write_problem(
+    logs: Sequence[Path],
+    output: Path | None,
+    *,
+    yes: bool,
+    force: bool,
+    json: bool,
+    time: str | None = None,
+    channels: Sequence[str] = (),
+    units: Sequence[str] = (),
+) -> Path:
+    """Write a problem file for logs and return its path; without `yes` what they leave open is asked.
+
+    Raises SeaoptError: a log cannot be read, a file is there already, an option is malformed, or an answer is missing.
     """
+    columns = parse_pairs("--channel", channels) | ({"time": time} if time is not None else {})
+    look = partial(propose, columns=columns, units=parse_pairs("--unit", units))
     target = _choose_target(logs, output, force=force)
     folder, answers = target.parent, dict[str, str]()
     console, errors = Terminal(stderr=json), Terminal(stderr=True)
     with show_progress(errors, "looking at the logs", errors.say, brief=True) as tell:
-        proposal = propose(logs, answers, folder, target.stem, tell)
+        proposal = look(logs, answers, folder, target.stem, tell)
     if not yes and not json:
-        proposal = _interview(console, logs, answers, folder, proposal, target.stem)
+        proposal = _interview(console, answers, proposal, lambda: look(logs, answers, folder, target.stem))
     _write_checked(target, proposal.text)
     if json:
         content = {
@@ -86,7 +101,7 @@ def _write_checked(target: Path, text: str) -> None:
 
 
 def _interview(
-    console: Terminal, logs: Sequence[Path], answers: dict[str, str], folder: Path, proposal: Proposal, title: str
+    console: Terminal, answers: dict[str, str], proposal: Proposal, look: Callable[[], Proposal]
 ) -> Proposal:
     """Ask question by question; an empty answer takes the guess, which stays marked as one unless it was a choice."""
     done: set[str] = set()
@@ -97,7 +112,7 @@ def _interview(
         answer = _ask(console, question)
         if answer or question.choices:
             answers[question.key] = answer or question.guess
-            proposal = propose(logs, answers, folder, title)
+            proposal = look()
     return proposal
 
 

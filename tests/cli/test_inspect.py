@@ -132,15 +132,29 @@ def test_bad_options_are_refused(inspect, name, options, words):
 ROWS = "0,1\n1,2\n2,4\n3,1\n"
 
 
-def test_a_clock_called_time_without_unit_is_in_seconds_and_says_so(tmp_path):
+@pytest.mark.parametrize(("step", "unit", "other"), [(0.0025, "s", "ms"), (2.5, "ms", "s"), (2500.0, "us", "s")])
+def test_a_clock_called_time_without_unit_has_that_of_the_size_of_its_steps_and_says_so(tmp_path, step, unit, other):
     path = tmp_path / "bare.csv"
-    path.write_text("time,F1 [N]\n" + ROWS, encoding="utf-8")
+    rows = "".join(f"{step * at:.6g},{at % 3}\n" for at in range(40))
+    path.write_text("time,F1 [N]\n" + rows, encoding="utf-8")
     inspect_log(path, folder=tmp_path)
     report = json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))
-    assert report["rate_hz"] == 1.0
-    assert f"seaopt inspect {path} --time time --unit time=ms" in report["notes"][0]
-    inspect_log(path, units=["time=ms"], folder=tmp_path)
-    assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 1000.0
+    assert report["rate_hz"] == pytest.approx(400.0)
+    assert f"{unit} was assumed" in report["notes"][0]
+    assert f"seaopt inspect {path} --time time --unit time={other}" in report["notes"][0]
+    inspect_log(path, units=[f"time={unit}"], folder=tmp_path)
+    assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == pytest.approx(400.0)
+
+
+def test_a_column_that_runs_on_is_the_clock_to_type(tmp_path):
+    """Milliseconds in a column whose name says nothing, behind one that does not run on."""
+    path = tmp_path / "bare.csv"
+    rows = "".join(f"{at % 7},{2.5 * at}\n" for at in range(40))
+    path.write_text("b,a\n" + rows, encoding="utf-8")
+    with pytest.raises(SeaoptError, match="--time a --unit time=ms"):
+        inspect_log(path)
+    with pytest.raises(SeaoptError, match=r'column = "a", unit = "ms" \(--unit time=ms\)'):
+        inspect_log(path, time="a")
 
 
 def test_a_clock_that_is_not_clear_is_the_command_to_type(tmp_path):
@@ -148,10 +162,10 @@ def test_a_clock_that_is_not_clear_is_the_command_to_type(tmp_path):
     path.write_text("my stamp,F1 [N]\n" + ROWS, encoding="utf-8")
     with pytest.raises(SeaoptError) as raised:
         inspect_log(path)
-    command = f"seaopt inspect '{path}' --time 'my stamp' --unit time=s"
+    command = f"seaopt inspect '{path}' --time 'my stamp' --unit time=ms"
     assert command in str(raised.value) and "\n" not in str(raised.value)
     inspect_log(path, time="my stamp", units=["time=s"])
-    with pytest.raises(SeaoptError, match="--unit time=s"):
+    with pytest.raises(SeaoptError, match="--unit time=ms"):
         inspect_log(path, time="my stamp")
     inspect_log(path, rate_hz=10.0, folder=tmp_path)
     assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 10.0

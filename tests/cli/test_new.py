@@ -166,3 +166,17 @@ def test_commands_to_type_are_quoted(folder, seaopt, held):
     assert seaopt("new", "my log.csv", "-y").returncode == 0
     out = seaopt("new", "my log.csv", "-y")
     assert out.returncode == 2 and "seaopt new 'my log.csv' -o 'my log.toml' --force" in out.stderr
+
+
+def test_columns_and_their_units_can_be_named(folder, seaopt):
+    t, current = drive(3.0, 400.0, 2.0)
+    log = knee(current, 400.0, locked=True)
+    write_csv(folder / "bare.csv", {"n": 1e3 * t, "a": log["I"], "b": 1e3 * log["tau_s"]})
+    named = ("--time", "n", "--channel", "I=a", "--channel", "tau_s=b", "--unit", "tau_s=mN m", "--unit", "time=ms")
+    out = seaopt("new", "bare.csv", "--yes", *named)
+    assert out.returncode == 0, out.stderr
+    (experiment,) = so.read_problem(folder / "bare.toml").experiments()
+    assert experiment.log.rate_hz == pytest.approx(400.0)
+    assert abs(experiment.log["tau_s"] - log["tau_s"]).max() < 1e-6
+    wrong = seaopt("new", "bare.csv", "--yes", "--force", "--channel", "I")
+    assert wrong.returncode == 2 and "write --channel NAME=VALUE" in wrong.stderr

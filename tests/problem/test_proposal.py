@@ -456,7 +456,10 @@ def test_a_log_elsewhere_is_refused_with_the_command(tmp_path, logs):
 @pytest.mark.parametrize(
     ("names", "match"),
     [
-        (("t [s]", "F1 [N]", "F2 [N]"), r"no column drives a motor, of F1 \[N\] and F2 \[N\]; log its current"),
+        (
+            ("t [s]", "F1 [N]", "F2 [N]"),
+            r"no column drives a motor, of F1 \[N\] and F2 \[N\]; name it .*, or log its current",
+        ),
         (("time", "time2", "x"), "nothing is measured besides the input, x"),
     ],
 )

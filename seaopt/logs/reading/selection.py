@@ -14,6 +14,7 @@ from pathlib import Path
 from seaopt.errors import LogError, SeaoptError, UnitError, suggestion
 from seaopt.logs.formats import Field, Source, keep_rows
 from seaopt.logs.log.alignment import Rule
+from seaopt.logs.reading.clock_samples import guess_time_unit
 from seaopt.logs.reading.column import Column, spell_column
 from seaopt.logs.reading.counter import Counter
 from seaopt.records import record
@@ -27,11 +28,14 @@ ALIGNED = ({"align": {"hold": {}}}, {"align": {"linear": {}}})  # the same as ke
 
 
 class ClockError(LogError):
-    """The log's clock is not clear: its unit if `column` is named, else which of the `candidates` it is."""
+    """The log's clock is not clear: its unit if `column` is named, else which of the `candidates` it is.
 
-    def __init__(self, text: str, column: str | None = None, candidates: Sequence[str] = ()) -> None:
+    `unit` is the likely one of that column, by the size of its steps.
+    """
+
+    def __init__(self, text: str, column: str | None = None, unit: str = "s", candidates: Sequence[str] = ()) -> None:
         super().__init__(text)
-        self.column, self.candidates = column, tuple(candidates)
+        self.column, self.unit, self.candidates = column, unit, tuple(candidates)
 
 
 @record
@@ -250,10 +254,12 @@ def _list_paths(sources: Sequence[Source]) -> str:
 def _make_clock(file_column: FileColumn) -> ClockColumn:
     column, source, name = file_column.column, file_column.source, file_column.field.name
     if column.unit is None and file_column.field.unit is None:
+        unit = guess_time_unit(source.read([name])[name]) if file_column.field.numeric else "s"
         raise ClockError(
-            f'{source.path}: column "{name}" has no unit, and is the time; give it, in seconds if it is: '
-            f"time with {spell_column(column=column.column, unit='s')} (--unit time=s)",
+            f'{source.path}: column "{name}" has no unit, and is the time; give it, {unit} by the size of its steps: '
+            f"time with {spell_column(column=column.column, unit=unit)} (--unit time={unit})",
             column=name,
+            unit=unit,
         )
     if not same_dimension(file_column.unit, "s"):
         raise UnitError(

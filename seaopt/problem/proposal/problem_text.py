@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import json
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 
 import numpy as np
 
-from seaopt.formatting import printable
+from seaopt.formatting import format_toml, printable
 from seaopt.logs import assess_quality
 from seaopt.logs.quality.clock import JITTER_LIMIT
 from seaopt.problem.proposal.actuators import DESIGN, ParameterLine, Proposed, screw_travel
 from seaopt.problem.proposal.described_log import GEARED, SI_UNITS, DescribedLog, doubt_clock, make_table
 from seaopt.problem.proposal.questions import Interview
 from seaopt.problem.proposal.roles import DESCRIPTIONS, FOLLOWS
-from seaopt.problem.proposal.survey import regress
+from seaopt.problem.proposal.survey import SurveyedColumn, regress
 from seaopt.problem.proposal.traits import OUTLIERS
-from seaopt.units import factor, header_unit
+from seaopt.units import factor, header_unit, is_unit
 
 USUAL_BANDWIDTHS_HZ = (15.0, 60.0)  # of a problem file that gives no bandwidth_range_hz
 ABOVE_RESONANCE = 2.5  # bandwidth over resonance that is asked for first
@@ -37,7 +37,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
     head = [
         "# Written by seaopt new. Check every value marked as guessed before you run.",
         "schema = 1",
-        f"title = {_quote(title)}",
+        f"title = {format_toml(title)}",
     ]
     lines = [
         "",
@@ -48,11 +48,11 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
     if sticks:
         lines += _offer_stribeck(actuator.lines)
     for name, options in actuator.plants.items():
-        lines += ["", f"[plant.{name}]", *(f"{key} = {_value(value)}" for key, value in options.items())]
+        lines += ["", f"[plant.{name}]", *(f"{key} = {format_toml(value)}" for key, value in options.items())]
         if sticks:
             parts = options.get("parts", [])
             assert isinstance(parts, list)
-            lines += [f"# parts = {_value([*parts, 'stribeck'])}", "# sticks = true  # friction jumps at rest"]
+            lines += [f"# parts = {format_toml([*parts, 'stribeck'])}", "# sticks = true  # friction jumps at rest"]
     names: set[str] = set()
     for log in logs:
         name = next(name for name in _number_names(log.name) if name not in names)
@@ -73,7 +73,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
     if guessed := interview.list_guessed():
         head += [
             "# Guesses; every verdict lists them. Once you have measured one, correct it and remove it here.",
-            f"guessed = {_value(guessed)}",
+            f"guessed = {format_toml(guessed)}",
         ]
     return "\n".join([*head, *lines]) + "\n"
 
@@ -117,8 +117,11 @@ def _number_names(name: str) -> Iterator[str]:
 
 
 def _describe_experiment(log: DescribedLog, name: str, interview: Interview) -> list[tuple[str, str]]:
-    rows = [(f"name = {_quote(name)}", ""), (f"plant = {_quote(log.plant)}", interview.mark(f"link:{log.survey.name}"))]
-    rows.append((f"log = {_quote(log.file)}", "relative to this file"))
+    rows = [
+        (f"name = {format_toml(name)}", ""),
+        (f"plant = {format_toml(log.plant)}", interview.mark(f"link:{log.survey.name}")),
+        (f"log = {format_toml(log.file)}", "relative to this file"),
+    ]
     clock = log.survey.clock
     if clock is None:
         rows.append((f"rate_hz = {log.rate_hz:.10g}", interview.mark(f"rate:{log.survey.name}")))
@@ -128,6 +131,10 @@ def _describe_experiment(log: DescribedLog, name: str, interview: Interview) -> 
         rows.append((text, "; ".join(filter(None, marks))))
     if log.roles.columns[log.roles.input].header.measured:
         rows.append(('hold = "first"', "the input was measured: straight lines between its samples"))
+    if log.survey.overlap_s is not None:
+        low, high = log.survey.overlap_s
+        window = [math.ceil(1e6 * low) / 1e6, math.floor(1e6 * high) / 1e6]
+        rows.append((f"window_s = {format_toml(window)}", "the times that all clocks have"))
     return rows + _describe_clock(log)
 
 
@@ -149,7 +156,17 @@ def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, intervie
     if scale < 0.0:
         interview.assume(f"sign:{column.name}")
         guesses.append("guessed: sign reversed, as it falls when the effort rises")
-    return f"{name} = {_spell_column(column.name, unit, scale)}", "; ".join([*notes, *filter(None, guesses)])
+    keys = _spell_clock(column, log) if column.clock else {}
+    if keys and role == log.roles.input and not column.header.measured:
+        keys["align"] = {"hold": {}}
+    return f"{name} = {_spell_column(column.name, unit, scale, keys)}", "; ".join([*notes, *filter(None, guesses)])
+
+
+def _spell_clock(column: SurveyedColumn, log: DescribedLog) -> dict[str, object]:
+    """Return the keys of a column that has times of its own."""
+    stated = header_unit(column.clock)
+    unit = {} if stated and is_unit(stated) else {"unit": log.survey.clock_units[column.clock]}
+    return {"time": {"column": column.clock, **unit}, "align": {"linear": {}}}
 
 
 def _mark_role(column: str, doubt: str, interview: Interview) -> str:
@@ -199,8 +216,8 @@ def _describe_controller(
     guess = min(max(5.0 * round(ABOVE_RESONANCE * resonance / 5.0), low), high) if resonance else DEFAULT_BANDWIDTH_HZ
     band = interview.number("bandwidth_hz", "Bandwidth of the controller, in Hz", guess, why)
     rows = [
-        (f"plant = {_quote(DESIGN)}", ""),
-        (f"measured = {_quote(actuator.measured)}", "what is regulated"),
+        (f"plant = {format_toml(DESIGN)}", ""),
+        (f"measured = {format_toml(actuator.measured)}", "what is regulated"),
         ('structure = "pid"', ""),
         (f"bandwidth_hz = {band:.10g}", interview.mark("bandwidth_hz")),
     ]
@@ -221,7 +238,7 @@ def _describe_controller(
     example = f": {noise:.3g} {unit} make up to {gain * noise:.3g} {unit}" if noise else ""
     rows.append((f"max_noise_gain = {gain:.3g}", f"motor effort over sensor noise, at its peak{example}"))
     if actuator.robust_to:
-        rows.append((f"robust_to = {_value(list(actuator.robust_to))}", "Ms and Mt hold there too"))
+        rows.append((f"robust_to = {format_toml(list(actuator.robust_to))}", "Ms and Mt hold there too"))
     return rows
 
 
@@ -247,7 +264,7 @@ def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple
 
 
 def _describe_robustness(logs: Sequence[DescribedLog], actuator: Proposed) -> list[tuple[str, str]]:
-    plants = _value([DESIGN, *actuator.robust_to])
+    plants = format_toml([DESIGN, *actuator.robust_to])
     rows = [(f"plants = {plants}", "certified, over the uncertainty of the fit")]
     if actuator.ranges:
         ranges = ", ".join(f"{name} = [{low:.4g}, {high:.4g}]" for name, (low, high) in actuator.ranges.items())
@@ -277,22 +294,11 @@ def _find_resonance(logs: Sequence[DescribedLog]) -> tuple[float | None, str]:
     return None, "a typical value"
 
 
-def _spell_column(name: str, unit: str, scale: float) -> str:
+def _spell_column(name: str, unit: str, scale: float, keys: Mapping[str, object] | None = None) -> str:
     """Return a column as a problem file writes it: its header alone where that says its unit."""
-    if scale == 1.0 and header_unit(name) == unit:
-        return _quote(name)
-    more = f", scale = {scale:.10g}" if scale != 1.0 else ""
-    return f"{{ column = {_quote(name)}, unit = {_quote(unit)}{more} }}"
-
-
-def _quote(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
-
-
-def _value(value: object) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"  # pyright: ignore[reportUnknownArgumentType]
-    return _quote(str(value))
+    if scale == 1.0 and header_unit(name) == unit and not keys:
+        return format_toml(name)
+    return format_toml({"column": name, "unit": unit} | ({"scale": scale} if scale != 1.0 else {}) | dict(keys or {}))
 
 
 def _align(rows: Sequence[tuple[str, str]]) -> list[str]:

@@ -39,6 +39,8 @@ from seaopt.problem.proposal.roles import (
     FOLLOWS,
     INPUTS,
     LINEAR_OUTPUTS,
+    OF_INPUT,
+    OF_OUTPUT,
     ROTARY_OUTPUTS,
     Assignment,
     assign,
@@ -46,12 +48,14 @@ from seaopt.problem.proposal.roles import (
     is_held,
     is_rotary,
 )
+from seaopt.problem.proposal.stated import Stated
+from seaopt.problem.proposal.survey import ENOUGH as FEW
 from seaopt.problem.proposal.survey import Survey, SurveyedColumn, regress, slow_sign, survey_log
 from seaopt.problem.proposal.traits import OUTLIERS, find_traits
-from seaopt.problem.proposal.vocabulary import COUNTS, is_m_open, read_header
+from seaopt.problem.proposal.vocabulary import COUNTS, UNITS_OF, is_m_open, read_header
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
-from seaopt.units import factor
+from seaopt.units import factor, same_dimension
 
 READING, LOOKING = 1.0, 1.0  # shares of the time
 UNITS = {  # that a column of a role may be in; the others are angles
@@ -98,23 +102,35 @@ class Proposal:
 
 @np.errstate(over="ignore", invalid="ignore")  # of a column with numbers near the largest float
 def propose(
-    logs: Sequence[Path], answers: Mapping[str, str], folder: Path, title: str = "", progress: Progress = ignore
+    logs: Sequence[Path],
+    answers: Mapping[str, str],
+    folder: Path,
+    title: str = "",
+    progress: Progress = ignore,
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Proposal:
-    """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's. `progress`
-    is called before each log is read, and before each is looked at. Raises SeaoptError: a log cannot be read or lies
-    outside the folder, or an answer is not one.
+    """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's.
+
+    `columns` and `units` are those of roles that are known, "time" among them. `progress` is called before each log is
+    read, and before each is looked at.
+
+    Raises SeaoptError: a log cannot be read or lies outside the folder, or an answer is not one.
     """
-    interview = Interview(answers)
+    interview, stated = Interview(answers), Stated(columns=columns or {}, units=units or {})
     reading, looking = divide(progress, READING, LOOKING)
-    surveys = [_survey(path, interview) for path in count_off(logs, "reading log", reading)]
+    surveys = [_survey(path, interview, stated) for path in count_off(logs, "reading log", reading)]
     turns, doubt = is_rotary([column for survey in surveys for column in survey.columns])
-    if doubt:
+    if stated.rotary is not None:
+        turns = stated.rotary
+    elif doubt:
         text, guess = "Is the actuator rotary (a gear) or linear (a screw)?", "rotary" if turns else "linear"
         turns = interview.ask("actuator", text, guess, doubt, ("rotary", "linear")) == "rotary"
-    assignments = [_assign(survey, interview, turns) for survey in surveys]
+    assignments = [_assign(survey, interview, turns, stated) for survey in surveys]
     pairs = list(zip(surveys, assignments, strict=True))
     described = [
-        _describe_log(*pair, interview, folder, at)
+        _describe_log(*pair, interview, folder, at, stated)
         for at, pair in enumerate(count_off(pairs, "looking at log", looking))
     ]
     progress(format_count(len(logs), "log"), 1.0)
@@ -139,9 +155,12 @@ def propose(
     )
 
 
-def _survey(path: Path, interview: Interview) -> Survey:
+def _survey(path: Path, interview: Interview, stated: Stated) -> Survey:
     key = f"time:{path.name}"
-    survey = survey_log(path, interview.answers.get(key))
+    survey = survey_log(path, stated.clock or interview.answers.get(key), stated.unit_of)
+    stated.check(survey)
+    if stated.clock is not None:
+        survey = replace(survey, clocks=(stated.clock,))
     if len(survey.clocks) > 1 and survey.clock is not None:
         interview.ask(
             key, f"Which column of {path.name} is the time?", survey.clock.name, "the first of them", survey.clocks
@@ -169,16 +188,17 @@ def _settle_m(column: SurveyedColumn, survey: Survey, interview: Interview) -> S
     return replace(column, header=read_header(column.name, metres=False)) if meaning == "motor" else column
 
 
-def _assign(survey: Survey, interview: Interview, turns: bool) -> Assignment:
+def _assign(survey: Survey, interview: Interview, turns: bool, stated: Stated) -> Assignment:
     """Return the roles of a log's columns, which are asked for one by one where the guess is not right."""
-    roles = assign(survey, rotary=turns, given={})
+    roles = assign(survey, rotary=turns, given=stated.roles)
     whole = interview.ask("roles", "Are these the right columns?", "yes", "by names and samples", ("yes", "no"))
     if whole == "yes":
         return _check_outputs(roles, survey)
     known = {column.name: role for role, column in roles.columns.items()}
     choices = (*INPUTS, *(ROTARY_OUTPUTS if turns else LINEAR_OUTPUTS), "none")
     given = {
-        column.name: interview.ask(
+        column.name: stated.roles.get(column.name)
+        or interview.ask(
             f"role:{column.name}",
             f'What is column "{column.name}"?',
             known.get(column.name, "none"),
@@ -204,7 +224,9 @@ def _check_outputs(roles: Assignment, survey: Survey) -> Assignment:
     return roles
 
 
-def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folder: Path, at: int) -> DescribedLog:
+def _describe_log(
+    survey: Survey, roles: Assignment, interview: Interview, folder: Path, at: int, stated: Stated
+) -> DescribedLog:
     """Return a log with units, clock and plant."""
     unit, sure = survey.clock_unit()
     key = f"unit:{survey.clock.name}" if survey.clock is not None else ""
@@ -219,7 +241,7 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
     else:
         clock = assess_clock(survey.clock.values * factor(unit, "s"), str(survey.path))
         rate = clock.rate_hz
-    units, scales = _ask_units(roles, interview)
+    units, scales = _ask_units(roles, interview, stated)
     log = DescribedLog(
         survey=survey,
         roles=roles,
@@ -245,6 +267,9 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
 def _list_notes(log: DescribedLog) -> Iterator[str]:
     """Yield remarks on what a log shows."""
     name, traits = log.survey.name, log.traits
+    count = log.survey.columns[0].values.size
+    if count < FEW:
+        yield f"{name}: {count} samples are few to tell columns and units by, or to fit; check the roles"
     if traits.unexcited:
         yield f"{name}: {traits.unexcited}"
     if traits.delay_s is not None:
@@ -275,12 +300,13 @@ def _spell_name(stem: str, at: int) -> str:
     return text if text[:1].isalpha() else f"log{at + 1}_{text}".rstrip("_")
 
 
-def _ask_units(roles: Assignment, interview: Interview) -> tuple[dict[str, str], dict[str, float]]:
+def _ask_units(roles: Assignment, interview: Interview, stated: Stated) -> tuple[dict[str, str], dict[str, float]]:
     """Return each role's unit, and what its numbers are multiplied with besides."""
     units: dict[str, str] = {}
     scales: dict[str, float] = {}
     for role, column in roles.columns.items():
         unit, why = guess_unit(role, column)
+        _check_unit(role, unit, column.name, stated)
         if why:
             text = f'Unit of "{column.name}" ({DESCRIPTIONS[role]})?'
             unit = interview.ask(f"unit:{column.name}", text, unit, why, UNITS.get(role, ("rad", "deg", COUNTS)))
@@ -299,6 +325,14 @@ def _ask_units(roles: Assignment, interview: Interview) -> tuple[dict[str, str],
             scales[role], unit = factor(unit, "N m"), "A"
         units[role] = unit
     return units, scales
+
+
+def _check_unit(role: str, unit: str, column: str, stated: Stated) -> None:
+    """Refuse a unit that is not one of the role that the user gave a column."""
+    wanted = UNITS_OF.get(OF_INPUT.get(role) or OF_OUTPUT[role], "")
+    if column in stated.roles and wanted and unit != COUNTS and not same_dimension(unit, wanted):
+        option = f"--unit {role}={wanted.replace(' ', '')}"
+        raise LogError(f'column "{column}" is in {unit}, and {role} is in {wanted}; correct it: {option}')
 
 
 def _find_signs(log: DescribedLog) -> dict[str, float]:

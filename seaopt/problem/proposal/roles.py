@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from seaopt.errors import LogError
 from seaopt.formatting import join_words
 from seaopt.problem.proposal.survey import Survey, SurveyedColumn, find_leader, regress
@@ -28,7 +30,9 @@ DESCRIPTIONS = {
 }  # fmt: skip
 FOLLOWS = 0.9  # share of variance from which two channels are one but for a factor
 BY_SIZE, BY_DEFAULT = "by the size of its numbers", "the usual one"  # why a unit is guessed
+TURN, MOVES = 6.5, 0.5  # of an angle without a unit: more than a turn in radians, unless it moves less
 STILL = 0.02  # of the motor's motion: a link that moves less is held
+SUPPLIED = 0.5  # of its largest value: a voltage that never falls below is a supply's
 
 
 @record(eq=False)
@@ -98,6 +102,8 @@ def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignm
 def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, SurveyedColumn], *, rotary: bool) -> str:
     """Return why a column has no role; `source` is the input's."""
     header = column.header
+    if _is_supply(column):
+        return "a supply, which never comes near zero"
     if header.quantity in ("", "other", "time"):
         return "not a signal of the actuator" if header.quantity else "its name does not say what it is"
     if header.quantity == "speed":
@@ -114,12 +120,21 @@ def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, Sur
     return f"no output of an actuator with a {'gear' if rotary else 'screw'}"
 
 
+def _is_supply(column: SurveyedColumn) -> bool:
+    """Tell whether a voltage is that of a supply: one that drives a motor both ways goes through zero."""
+    if column.header.quantity != "voltage" or column.header.commanded:
+        return False
+    values = column.values[np.isfinite(column.values)]
+    least, largest = np.sort(np.abs(np.quantile(values, [0.01, 0.99])))
+    return bool(np.all(values > 0.0) or np.all(values < 0.0)) and bool(least > SUPPLIED * largest)
+
+
 def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str, SurveyedColumn, str]:
     """Return the input's role, its column, and why that is a guess, if it is one. Raises LogError: no column drives a
     motor.
     """
     for role, quantity in OF_INPUT.items():
-        named = [column for column in columns if column.header.quantity == quantity]
+        named = [column for column in columns if column.header.quantity == quantity and not _is_supply(column)]
         if role in ("torque", "goal"):  # which are measured as often
             named = [column for column in named if column.header.commanded]
         if role == "goal":
@@ -135,8 +150,8 @@ def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str,
     if not likely:
         names = join_words([column.name for column in survey.columns])
         raise LogError(
-            f"{survey.name}: no column drives a motor, of {names}; log its current as well, or the torque, voltage, "
-            "duty or goal that it is sent"
+            f"{survey.name}: no column drives a motor, of {names}; name it (--channel I=COLUMN), or log its current as "
+            "well, or the torque, voltage, duty or goal that it is sent"
         )
     leader = find_leader(likely)
     role = "torque" if leader.header.quantity == "torque" else "goal" if leader.header.quantity == "angle" else "I"
@@ -235,7 +250,7 @@ def _guess_unit(role: str, column: SurveyedColumn) -> tuple[str, str]:
             return "counts", "all its numbers are whole"
         if role in ("theta_m", "screw", "goal"):  # a motor turns many times, in radians as in degrees
             return "rad", BY_DEFAULT
-        return "deg" if large > 6.5 else "rad", BY_SIZE
+        return "deg" if large > TURN and column.swing > MOVES else "rad", BY_SIZE
     if quantity == "length":
         return "mm" if large > 0.5 else "m", BY_SIZE
     return UNITS_OF[quantity], BY_DEFAULT

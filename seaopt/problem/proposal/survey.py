@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError
-from seaopt.formatting import join_words
-from seaopt.logs import Column, contents, read_table
-from seaopt.problem.proposal.vocabulary import Header, read_header
+from seaopt.errors import LogError, suggestion
+from seaopt.logs import contents
+from seaopt.logs.formats import Field, open_source
+from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
+from seaopt.problem.proposal.vocabulary import Header, is_named_time, read_header
 from seaopt.records import record
+from seaopt.units import factor, is_unit
 
 SLOW_HZ = 1.0
 ALIKE = 0.5  # of the correlation below SLOW_HZ, from which its sign means something
 ENOUGH = 64  # samples for a correlation
+ESTIMATED = 0.9999  # share of variance from which a torque is a current times a constant
 SAME = 1.0 - 1e-6  # share of variance from which a column is another one, rounded
-TIME_STEPS = {"s": (2e-5, 0.2), "ms": (0.2, 200.0), "us": (200.0, 1e7)}  # of a clock without a unit, from and up to
 
 
 @record(eq=False)
@@ -28,6 +32,9 @@ class SurveyedColumn:
 
     header: Header
     values: Float[np.ndarray, " n"]
+    # the column of its own times, or the format's own clock, where they are not the log's: `values` are then
+    # interpolated to that
+    clock: str = ""
 
     @property
     def name(self) -> str:
@@ -67,6 +74,9 @@ class Survey:
     clocks: tuple[str, ...]
     columns: tuple[SurveyedColumn, ...]  # all others that hold numbers and vary
     left_out: Mapping[str, str]  # why other columns cannot be used: text, constants, and those without a number
+    # which part of the log's time, s, all clocks have; None where there is one clock
+    overlap_s: tuple[float, float] | None = None
+    clock_units: Mapping[str, str] = field(default_factory=dict[str, str])  # of other clocks
 
     @property
     def name(self) -> str:
@@ -79,31 +89,48 @@ class Survey:
             return "s", False
         if self.clock.header.unit:
             return self.clock.header.unit, True
-        step = float(np.nanmedian(np.abs(np.diff(self.clock.values))))
-        return next((unit for unit, (low, high) in TIME_STEPS.items() if low <= step < high), "s"), False
+        return guess_time_unit(self.clock.values), False
 
 
-def survey_log(path: Path, clock: str | None = None) -> Survey:
-    r"""Read every column of a log; `clock` names the time where the file leaves that open. Raises LogError: the file
-    cannot be read, or holds no numbers that vary.
+def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | None = None) -> Survey:
+    r"""Read every column of a log.
+
+    `clock` names the time where the file leaves that open, `units` are those of columns whose headers have none, or a
+    wrong one.
+
+    Raises LogError: the file cannot be read, or holds no numbers that vary.
     """
     held = contents(path)
-    numeric = [field for field in held.fields if field.numeric]
+    numeric = {field.name: field for field in held.fields if field.numeric}
     if not numeric:
         command = f"seaopt inspect {shlex.quote(str(path))} --list"
         raise LogError(f"{path}: holds no column of numbers; list what it holds with {command}")
-    headers = {field.name: read_header(field.name, field.unit) for field in numeric}
-    times = [name for name, header in headers.items() if header.quantity == "time"]
-    clocks = [field.clock for field in numeric if field.clock]
-    chosen = clock or (clocks[0] if clocks else times[0] if times else None)
-    values = _read_raw(path, list(headers), chosen)
-    if chosen is None:
-        chosen = next((name for name, samples in values.items() if _runs_on(samples)), None)
-    columns = {name: SurveyedColumn(header=header, values=values[name]) for name, header in headers.items()}
+    stated = {name: (units or {}).get(name, field.unit) for name, field in numeric.items()}
+    odd = any(unit and not is_unit(unit) and name.endswith(")") for name, unit in stated.items())
+    headers = {name: _read_header(name, unit, odd=odd) for name, unit in stated.items()}
+    raw = _read_raw(path, numeric)
+    times = [name for name, header in headers.items() if _is_time(header, raw[name])]
+    groups = _group_by_clock(list(numeric.values()), times, raw)
+    if clock is not None:
+        if clock not in numeric:
+            raise LogError(f'{path}: no column "{clock}" for time; {suggestion(clock, numeric)}')
+        groups = _lead_with(clock, groups)
+    chosen, members = next(iter(groups.items()))
+    if not chosen:
+        chosen = next((name for name in members if runs_on(raw[name])), None)
+    columns = {name: SurveyedColumn(header=headers[name], values=raw[name]) for name in members}
+    overlap = None
+    if chosen is not None:
+        others = {other: names for other, names in groups.items() if other and other != chosen}
+        moved, overlap = _move_to_clock(columns[chosen], others, headers, raw)
+        columns |= moved
+    size = raw[chosen or members[0]].size
+    wrong = {name: _describe_length(raw[name].size, size) for name in numeric if name not in {**columns, **groups}}
     moving = [column for name, column in columns.items() if name != chosen and name not in times and column.swing > 0.0]
     if not moving:
         raise LogError(f"{path}: no column varies; record a log in which the actuator moves")
     copies = _find_copies(moving)
+    copies |= _find_estimates([column for column in moving if column.name not in copies])
     moving = [column for column in moving if column.name not in copies]
     still = {
         name: "constant" if np.any(np.isfinite(column.values)) else "holds no number"
@@ -114,29 +141,113 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     return Survey(
         path=path,
         clock=columns[chosen] if chosen is not None else None,
-        clocks=tuple(times or clocks),
+        clocks=tuple(name for name in times if name in members) or ((chosen,) if chosen and chosen in groups else ()),
         columns=tuple(moving),
-        left_out=words | still | copies,
+        left_out=words | wrong | still | copies,
+        overlap_s=overlap,
+        clock_units={column.clock: _read_unit(column.clock, headers, raw) for column in moving if column.clock},
     )
 
 
-def _read_raw(path: Path, names: Sequence[str], clock: str | None) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the numbers of columns as they are, without their units."""
-    # Neither a channel's name nor its unit matters here, and a clock may not increase.
-    channels = {f"column {at}": Column(column=name, unit="-") for at, name in enumerate(names)}
-    time = Column(column=clock, unit="s") if clock is not None else None
-    table = read_table(path, time=time, channels=channels, rate_hz=1.0 if time is None else None, digest=False)
-    if any(signal.values.size != len(table) for signal in table.signals.values()):
-        raise LogError(f"{path}: {join_words(names)} are on several clocks; give each log a file of its own")
-    return {name: table.signals[f"column {at}"].values for at, name in enumerate(names)}
+def _read_header(name: str, unit: str | None, *, odd: bool) -> Header:
+    """Return a header, read; `odd`: round brackets in the file are names, not units."""
+    header = read_header(name, unit)
+    named = odd and name.endswith(")") and header.quantity != "time"
+    return read_header(name, brackets=False) if named else header
 
 
-def _runs_on(values: Float[np.ndarray, " n"]) -> bool:
-    """Tell whether a column is a clock by its samples: it only rises, by nearly the same each time."""
-    steps = np.diff(values)
-    return bool(
-        steps.size > 1 and np.all(steps > 0.0) and np.quantile(steps, 0.9) < 1.5 * np.median(steps) < 1e7 * steps[0]
-    )
+def _is_time(header: Header, values: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether a column is a time by its name, or the beginning of it and its samples: t_cell, not t_winding."""
+    rows = _count_rows(values)
+    return rows > 1 and (header.quantity == "time" or (is_named_time(header.name) and runs_on(values[:rows])))
+
+
+def _read_raw(path: Path, fields: Mapping[str, Field]) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return the numbers of columns as they are, without their units or clocks."""
+    source = open_source(path)
+    groups: dict[tuple[str | None, int | None], list[str]] = {}
+    for name, each in fields.items():
+        groups.setdefault((each.clock, each.length), []).append(name)
+    return {name: values for names in groups.values() for name, values in source.read(names).items()}
+
+
+def _group_by_clock(
+    fields: Sequence[Field], times: Sequence[str], raw: Mapping[str, Float[np.ndarray, " n"]]
+) -> dict[str | None, list[str]]:
+    """Return the columns of each clock, those of most samples first; of no clock those as long as most are.
+
+    A column without a clock of the format's belongs to the time that has as many samples; of several of one length, to
+    the first.
+    """
+    clocks = dict.fromkeys(each.clock for each in fields if each.clock)
+    if clocks:
+        groups: dict[str | None, list[str]] = {clock: [] for clock in clocks}
+        for each in fields:
+            if each.clock:
+                groups[each.clock].append(each.name)
+        return dict(sorted(groups.items(), key=lambda item: -raw[item[0] or ""].size if item[0] in raw else 0))
+    sizes = {each.name: _count_rows(raw[each.name]) for each in fields}
+    by_size = {sizes[name]: name for name in reversed(times) if sizes[name] > 1}
+    if not by_size:
+        counts = Counter(size for size in sizes.values() if size > 1)
+        usual = max(counts, key=lambda size: (counts[size] * size, size), default=1)
+        return {None: [name for name, size in sizes.items() if size == usual]}
+    groups = {by_size[size]: [] for size in sorted(by_size, reverse=True)}
+    last = next(iter(groups))
+    # A column that ends early, side by side with others, belongs to the time before it.
+    for name, size in sizes.items():
+        last = name if name in groups else last
+        early = size not in by_size and size > 1 and raw[name].size == raw[last or ""].size
+        if size in by_size or early:
+            groups[by_size.get(size, last)].append(name)
+    return groups
+
+
+def _count_rows(values: Float[np.ndarray, " n"]) -> int:
+    """Return how many samples a column has, without those missing at its end."""
+    return int(np.flatnonzero(np.isfinite(values))[-1]) + 1 if np.any(np.isfinite(values)) else values.size
+
+
+def _lead_with(clock: str, groups: Mapping[str | None, list[str]]) -> dict[str | None, list[str]]:
+    """Return the groups with the clock that was named in front."""
+    first = next((name for name, members in groups.items() if clock == name or clock in members), None)
+    members = groups.get(first, [])
+    return {clock: [*members], **{name: each for name, each in groups.items() if name != first}}
+
+
+def _read_unit(name: str, headers: Mapping[str, Header], raw: Mapping[str, Float[np.ndarray, " n"]]) -> str:
+    """Return a clock's unit, by its header or the size of its steps."""
+    header = headers[name]
+    return header.unit if header.unit and header.quantity == "time" else guess_time_unit(raw[name])
+
+
+def _move_to_clock(
+    clock: SurveyedColumn,
+    groups: Mapping[str, Sequence[str]],
+    headers: Mapping[str, Header],
+    raw: Mapping[str, Float[np.ndarray, " n"]],
+) -> tuple[dict[str, SurveyedColumn], tuple[float, float] | None]:
+    """Return columns of other clocks, interpolated to the log's, and which part of the log all clocks have, in s."""
+    if not groups:
+        return {}, None
+    time, moved = raw[clock.name] * factor(_read_unit(clock.name, headers, raw), "s"), dict[str, SurveyedColumn]()
+    low, high = float(np.nanmin(time)), float(np.nanmax(time))
+    for other, names in groups.items():
+        own = raw[other] * factor(_read_unit(other, headers, raw), "s")
+        there = np.isfinite(own)
+        if np.count_nonzero(there) < 2 or np.any(np.diff(own[there]) <= 0.0):
+            continue
+        low, high = max(low, float(own[there][0])), min(high, float(own[there][-1]))
+        for name in names:
+            if name != other:
+                good = there & np.isfinite(raw[name])
+                values = np.interp(time, own[good], raw[name][good], np.nan, np.nan) if np.any(good) else raw[name]
+                moved[name] = SurveyedColumn(header=headers[name], values=values, clock=other)
+    return moved, (low, high) if low < high else None
+
+
+def _describe_length(size: int, usual: int) -> str:
+    return "one number, beside the log" if size == 1 else f"{size} samples, where the log has {usual}"
 
 
 def _find_copies(columns: Sequence[SurveyedColumn]) -> dict[str, str]:
@@ -153,6 +264,21 @@ def _find_copies(columns: Sequence[SurveyedColumn]) -> dict[str, str]:
         else:
             kept.append(column)
     return copies
+
+
+def _find_estimates(columns: Sequence[SurveyedColumn]) -> dict[str, str]:
+    """Return the torques and forces that are a current times a constant: a drive's estimates, not a sensor's."""
+    estimates = dict[str, str]()
+    currents = [column for column in columns if column.header.quantity == "current"]
+    for column in columns:
+        if column.header.quantity not in ("torque", "force") or column.header.commanded or column.values.size < ENOUGH:
+            continue
+        for current in currents:
+            slope, share = regress(column.values, current.values)
+            if share > ESTIMATED:
+                estimates[column.name] = f"{slope:.4g} times {current.name}: the drive's estimate, not a sensor"
+                break
+    return estimates
 
 
 def find_leader(columns: Sequence[SurveyedColumn]) -> SurveyedColumn:
@@ -192,8 +318,8 @@ def regress(values: Float[np.ndarray, " n"], on: Float[np.ndarray, " n"]) -> tup
     """Return the slope of a column on another, and the share of its variance that this explains."""
     good = np.isfinite(values) & np.isfinite(on)
     y, x = values[good] - np.mean(values[good]), on[good] - np.mean(on[good])
-    power = float(x @ x)
-    if power <= 0.0 or not float(y @ y):
+    power, of_values = float(x @ x), float(y @ y)
+    if not (0.0 < power < np.inf and 0.0 < of_values < np.inf):
         return 0.0, 0.0
     slope = float(x @ y) / power
-    return float(f"{slope:.12g}"), float(f"{slope**2 * power / float(y @ y):.12g}")
+    return float(f"{slope:.12g}"), float(f"{(slope * np.sqrt(power / of_values)) ** 2:.12g}")

@@ -105,20 +105,21 @@ class Header:
     number: int | None = None  # of F1, F2
 
 
-def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> Header:
-    """Return what a column's header says; `unit` is what the file itself states. Without `metres` an m at the end of a
-    name is the motor.
+def read_header(name: str, unit: str | None = None, *, metres: bool = True, brackets: bool = True) -> Header:
+    """Return what a column's header says; `unit` is what the file itself states.
+
+    Without `metres` an m at the end of a name is the motor; without `brackets` what stands in them is part of the name.
     """
-    stated, bare = _clean_unit(unit), bare_name(name)
+    stated, bare = _clean_unit(unit), bare_name(name) if brackets else name
     suffix, stem = ("", bare) if stated else _split_suffix(bare)
     if suffix == "m" and not metres:
         suffix, stem = "", bare
     words = split_words(stem)
-    kinds = _list_quantities(words)
+    kinds = _list_quantities(words, stem)
     place = bool(_matches(words, PLACE_WORDS | DEFLECTION_WORDS))
     if suffix and not _fits(suffix, kinds, words, place=place):
         suffix, words = "", split_words(bare)
-        kinds = _list_quantities(words)
+        kinds = _list_quantities(words, bare)
     measures = _quantity_of_unit(stated or suffix)
     if "other" in kinds and measures in ("", "voltage", "current"):  # of the supply, say
         measures = "other"
@@ -140,6 +141,12 @@ def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> H
 def is_m_open(header: Header) -> bool:
     """Tell whether the m at the end of a name is metres or the motor, which the name alone does not say."""
     return header.unit == "m" and read_header(header.name, metres=False).quantity == "angle"
+
+
+def is_named_time(name: str) -> bool:
+    """Tell whether the first word of a name is a time's, whatever follows."""
+    words = split_words(re.split(r"[./]", name)[-1])
+    return bool(words) and words[0] in QUANTITY_WORDS["time"]
 
 
 def split_words(name: str) -> list[str]:
@@ -197,8 +204,10 @@ def _find_number(words: list[str]) -> int | None:
     return int(match[1]) if match else None
 
 
-def _list_quantities(words: list[str]) -> list[Quantity]:
+def _list_quantities(words: list[str], name: str) -> list[Quantity]:
     kinds: list[Quantity] = [quantity for quantity, known in QUANTITY_WORDS.items() if _matches(words, known)]
+    if "time" in kinds and set(_matches(words, QUANTITY_WORDS["time"])) == {"t"} and not is_named_time(name):
+        kinds.remove("time")  # as in pos_t
     # What is no signal is named in full, or else "states" would be a state.
     return [kind for kind in kinds if kind != "other" or any(word in QUANTITY_WORDS["other"] for word in words)]
 

@@ -1,0 +1,203 @@
+"""Problem files proposed for logs as devices and people write them: scalars beside the log, clocks, estimates."""
+
+from __future__ import annotations
+
+import math
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+import seaopt as so
+from seaopt.errors import SeaoptError
+from seaopt.problem.proposal import propose
+from tests.actuator_logs import drive, knee, write_csv
+
+RATE = 400.0
+
+
+@pytest.fixture(scope="module")
+def held():
+    """Return times and channels of a held knee."""
+    t, current = drive(6.0, RATE, 2.0)
+    return t, knee(current, RATE, locked=True)
+
+
+def roles_of(proposal):
+    return {row.role: row.column for row in proposal.columns if row.role}
+
+
+def unused_of(proposal):
+    return {row.column: row.description for row in proposal.columns if not row.role}
+
+
+def read_back(folder, proposal):
+    """Return the experiments of a proposal's file, read."""
+    path = folder / "problem.toml"
+    path.write_text(proposal.text, encoding="utf-8")
+    return so.read_problem(path).experiments()
+
+
+def write_v5(path, content):
+    scipy.io.savemat(path, {"log": content})
+
+
+def write_v73(path, content):
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in content.items():
+            file.create_dataset(f"log/{name}", data=np.atleast_2d(np.asarray(values, float)))
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, made by a test".ljust(124) + b"\x00\x02IM")
+
+
+@pytest.mark.parametrize("write", [write_v5, write_v73])
+@pytest.mark.parametrize("timed", [True, False])
+def test_numbers_beside_the_log_of_a_matlab_file_are_left_out(tmp_path, held, write, timed):
+    t, of = held
+    content = {"fs": RATE, "K_t": 0.037, "gains": [1.0, 2.0, 3.0], "current": of["I"], "torque_sensor": of["tau_s"]}
+    write(tmp_path / "run.mat", content | ({"time": t} if timed else {}))
+    answers = {} if timed else {"rate:run.mat": "400"}
+    proposal = propose([tmp_path / "run.mat"], answers, tmp_path)
+    expected = {"input": "log.current", "tau_s": "log.torque_sensor"} | ({"time": "log.time"} if timed else {})
+    assert roles_of(proposal) == expected
+    assert "one number" in unused_of(proposal)["log.K_t"] and "3 samples" in unused_of(proposal)["log.gains"]
+    (experiment,) = read_back(tmp_path, proposal)
+    assert len(experiment.log) == t.size and experiment.log.rate_hz == pytest.approx(RATE)
+
+
+def test_two_tables_side_by_side_are_brought_to_the_faster_clock(tmp_path, held):
+    """A drive at 400 Hz, and a cell at 150 Hz that began 0.1 s later."""
+    t, of = held
+    slow = np.arange(0.1, 5.9, 1 / 150.0)
+    torque = np.interp(slow, t, of["tau_s"])
+    fill = [""] * (t.size - slow.size)
+    rows = zip(t, of["I"], [*slow, *fill], [*torque, *fill], strict=True)
+    text = "t_drive [s],I [A],t_cell [ms],cell [N m]\n" + "".join(
+        f"{a:.6f},{b:.9g},{1e3 * c if c != '' else ''},{d}\n" for a, b, c, d in rows
+    )
+    (tmp_path / "two.csv").write_text(text, encoding="utf-8")
+    proposal = propose([tmp_path / "two.csv"], {}, tmp_path)
+    assert roles_of(proposal) == {"time": "t_drive [s]", "input": "I [A]", "tau_s": "cell [N m]"}
+    (experiment,) = read_back(tmp_path, proposal)
+    log = experiment.log
+    assert log.rate_hz == pytest.approx(RATE) and log.time[0] >= 0.1 and log.time[-1] <= slow[-1]
+    np.testing.assert_allclose(log["tau_s"], np.interp(log.time, slow, torque), rtol=1e-6, atol=1e-9)
+
+
+def test_two_clocks_of_a_matlab_file_are_brought_together(tmp_path, held):
+    t, of = held
+    slow = np.arange(0.1, 5.9, 1 / 150.0)
+    content = {"t_cell": slow, "cell_torque": np.interp(slow, t, of["tau_s"]), "t_drive": t, "iq": of["I"], "Kt": 0.03}
+    write_v5(tmp_path / "two.mat", content)
+    proposal = propose([tmp_path / "two.mat"], {}, tmp_path)
+    assert roles_of(proposal) == {"time": "log.t_drive", "input": "log.iq", "tau_s": "log.cell_torque"}
+    (experiment,) = read_back(tmp_path, proposal)
+    assert experiment.log.rate_hz == pytest.approx(RATE) and np.all(np.isfinite(experiment.log["tau_s"]))
+
+
+def test_a_torque_that_is_a_constant_times_the_current_is_no_sensor(tmp_path, held):
+    """A drive reports 0.1095 times its current, to four digits; the transducer's name says less."""
+    t, of = held
+    columns = {"t [s]": t, "iq [A]": of["I"], "joint_torque [N m]": np.round(0.1095 * of["I"], 4),
+               "transducer [N m]": of["tau_s"], "theta_m [rad]": of["theta_m"]}  # fmt: skip
+    proposal = propose([write_csv(tmp_path / "drive.csv", columns)], {}, tmp_path)
+    assert roles_of(proposal)["tau_s"] == "transducer [N m]"
+    assert "0.1095 times iq [A]" in unused_of(proposal)["joint_torque [N m]"]
+    del columns["transducer [N m]"]
+    alone = propose([write_csv(tmp_path / "alone.csv", columns)], {}, tmp_path)
+    assert "tau_s" not in roles_of(alone)
+
+
+def test_a_supply_is_no_input(tmp_path, held):
+    """A servo logs its supply in volts: it never comes near zero."""
+    t, of = held
+    columns = {"timestamp": t, "position": of["theta_m"], "input_volts": 7.4 + 0.05 * np.abs(of["I"]),
+               "goal_position": of["I"]}  # fmt: skip
+    proposal = propose([write_csv(tmp_path / "servo.csv", columns)], {}, tmp_path)
+    assert roles_of(proposal)["input"] == "goal_position"
+    assert "supply" in unused_of(proposal)["input_volts"]
+
+
+def test_a_temperature_in_degrees_is_no_charge(tmp_path, held):
+    t, of = held
+    path = write_csv(
+        tmp_path / "warm.csv", {"t [s]": t, "I [A]": of["I"], "tau [N m]": of["tau_s"], "case [C]": 30 + t}
+    )
+    assert unused_of(propose([path], {}, tmp_path))["case [C]"] == "not used: not a signal of the actuator"
+    assert so.logs.read_table(path).signals["case"].unit == "degC"
+
+
+def test_round_brackets_that_are_names_are_no_units(tmp_path, held):
+    """As an oscilloscope writes them: msr is a counter, and no milli-steradian."""
+    t, of = held
+    columns = {"Time[usec]": 1e6 * t, "CH1(msr)": np.arange(t.size) % 50, "CH2(iq_ad)": of["I"],
+               "CH3(torque_cell)": of["tau_s"], "CH4(vel_ta)": np.gradient(of["theta_m"])}  # fmt: skip
+    roles = roles_of(propose([write_csv(tmp_path / "scope.csv", columns)], {}, tmp_path))
+    assert roles == {"time": "Time[usec]", "input": "CH2(iq_ad)", "tau_s": "CH3(torque_cell)"}
+
+
+def test_columns_can_be_named_by_their_roles(tmp_path, held):
+    """Names that say nothing, and one that says the wrong thing."""
+    t, of = held
+    columns = {
+        "n": np.arange(t.size),
+        "stamp_b": 1e3 * t,
+        "a1": of["I"],
+        "force_x": 1e3 * of["tau_s"],
+        "a2": of["theta_m"],
+    }
+    path = write_csv(tmp_path / "bare.csv", columns)
+    named = {"time": "stamp_b", "I": "a1", "tau_s": "force_x", "theta_m": "a2"}
+    proposal = propose([path], {}, tmp_path, columns=named, units={"tau_s": "mN m", "time": "ms"})
+    assert roles_of(proposal) == {"time": "stamp_b", "input": "a1", "tau_s": "force_x", "theta_m": "a2"}
+    assert not {"roles", "unit of force_x", "unit of stamp_b", "role of a1"} & set(proposal.guessed)
+    (experiment,) = read_back(tmp_path, proposal)
+    np.testing.assert_allclose(experiment.log["tau_s"], of["tau_s"], rtol=1e-6, atol=1e-9)
+    assert experiment.log.rate_hz == pytest.approx(RATE)
+
+
+@pytest.mark.parametrize(
+    ("columns", "units", "words"),
+    [
+        ({"I": "a3"}, {}, 'no column "a3" for I'),
+        ({"tau": "a1"}, {}, 'did you mean "tau_s"'),
+        ({"time": "a3"}, {}, 'no column "a3" for time'),
+        ({"tau_s": "a1"}, {"tau_s": "N"}, "tau_s is in N m"),
+        ({"I": "a1"}, {"F1": "N"}, "--channel F1=COLUMN"),
+        ({"I": "a1", "tau_s": "a1"}, {}, "a1 is both I and tau_s"),
+        ({"I": "a1", "V": "a2"}, {}, "one input"),
+    ],
+)
+def test_a_column_that_is_named_wrong_is_refused(tmp_path, held, columns, units, words):
+    t, of = held
+    path = write_csv(tmp_path / "bare.csv", {"time [s]": t, "a1": of["I"], "a2": of["tau_s"]})
+    with pytest.raises(SeaoptError, match=words) as raised:
+        propose([path], {}, tmp_path, columns=columns, units=units)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_clock_of_two_steps_is_resampled_at_its_mean_rate(tmp_path):
+    """Steps of 2.7 and 10 ms in turn, without a word on the unit."""
+    step = np.tile([2.7e-3, 10e-3, 2.7e-3], 500)
+    t = np.cumsum(step)
+    columns = {"t": t, "I [A]": np.sin(9 * t) + np.sin(31 * t), "tau_s [N m]": np.cos(9 * t)}
+    proposal = propose([write_csv(tmp_path / "two.csv", columns)], {}, tmp_path)
+    assert f"resample = {{ rate_hz = {1 / np.mean(step):.3g}" in proposal.text
+    (experiment,) = read_back(tmp_path, proposal)
+    assert len(experiment.log.segments) == 1
+
+
+def test_a_log_of_few_samples_is_said_to_be_one(tmp_path):
+    t = np.arange(27) / 25e3
+    columns = {"t [s]": t, "I [A]": np.sin(2 * math.pi * 4e3 * t), "tau_s [N m]": np.cos(2 * math.pi * 4e3 * t)}
+    (note,) = propose([write_csv(tmp_path / "short.csv", columns)], {}, tmp_path).notes
+    assert "27 samples" in note
+
+
+def test_angles_without_units_are_judged_by_how_far_they_move(tmp_path, held):
+    """An encoder that began a turn away from zero, in radians."""
+    t, of = held
+    columns = {"t [s]": t, "iq [A]": of["I"], "theta_m": of["theta_m"], "theta_load": 0.03 * np.sin(t) - 7.5}
+    proposal = propose([write_csv(tmp_path / "turned.csv", columns)], {}, tmp_path)
+    assert {row.role: row.unit for row in proposal.columns}["theta_l"] == "rad"
