@@ -54,7 +54,7 @@ def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]
     out = {"problem": digest_plain(read(problem))}
     if stage in ("tune", "sweep"):
         out[ROBUSTNESS] = digest_plain(
-            _shape_by_robustness(problem, problem.robustness.retune if stage == "tune" else 0)
+            _shape_by_robustness(problem, (problem.robustness.retune or 0) if stage == "tune" else 0)
         )
     for before in earlier:
         path = folder / name_file(problem, before)

@@ -166,7 +166,13 @@ class RobustnessTable(StrictTable):
         "Draws; 1375 without failure mean below 1 % at a confidence of 1 - 1e-6.", default=1375, ge=1, le=10_000_000
     )
     seed: Whole = key("Seed of draws and simulations.", default=1, ge=0)
-    retune: Whole = key("Rounds of tuning for the worst case that was found.", default=0, ge=0, le=20)
+    retune: Whole | None = key(
+        "Rounds of tuning for the worst case that was found; left out, 3 where a first look at the draws finds one "
+        "that is over a limit.",
+        default=None,
+        ge=0,
+        le=20,
+    )
     bounds: Flag = key("Whether the worst case is enclosed, and not only searched for.", default=False)
     max_failure_probability: Number | None = key(
         "Bound on the probability of a failure that the draws must show.", default=None, gt=0, le=1

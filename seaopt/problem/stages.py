@@ -63,9 +63,12 @@ from seaopt.robustness import (
     linear_controller,
     tune_certified,
 )
+from seaopt.robustness.certificate.joint import breaks_at_draws
 from seaopt.robustness.verification.verification import list_readings
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
+
+ROUNDS = 3  # of tuning and certifying, where a first look at the draws finds one that is over a limit
 
 
 def fit_problem(
@@ -169,7 +172,9 @@ def tune_problem(
 ) -> Controller | JointTuning | ScheduledController:
     """Tune the problem's controller or schedule, as `seaopt tune` does; with `retune`, until it is certified.
 
-    With predictive control it is the law while no limit is active; `design_mpc` returns all of it.
+    Where [robustness] leaves `retune` out, so is a law that is over a limit at the draws that a certificate makes; a
+    look at some of them tells. With predictive control it is the law while no limit is active; `design_mpc` returns all
+    of it.
 
     Parameters
     ----------
@@ -200,12 +205,16 @@ def tune_problem(
             draws=draws,
             progress=progress,
         )
-    if not table.retune:
+    rounds = table.retune
+    if not rounds:
         tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
-        return complete_controller(problem, tuned, source)
+        tuned = complete_controller(problem, tuned, source)
+        if rounds == 0 or not _needs_reserve(problem, tuned, source):
+            return tuned
+        rounds = ROUNDS
     if problem.response_names:
         raise ProblemError(
-            f"{problem.source}: retune = {table.retune} in [robustness] tunes again on models, and "
+            f"{problem.source}: retune = {rounds} in [robustness] tunes again on models, and "
             f"{problem.response_names[0]} is a measured response; leave retune out"
         )
     return tune_certified(
@@ -219,11 +228,21 @@ def tune_problem(
         others=problem.parameters,
         samples=table.samples,
         seed=table.seed + 1,
-        rounds=table.retune,
+        rounds=rounds,
         complete=partial(complete_controller, problem, source=source),
         executor=executor,
         progress=progress,
     )
+
+
+def _needs_reserve(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> bool:
+    """Tell whether a controller that keeps its limits breaks one at the draws of its certificate."""
+    if not controller.met or problem.response_names:
+        return False
+    try:
+        return breaks_at_draws(controller, problem.certified_plants(), source, problem.ranges, problem.parameters)
+    except ControlError:  # of what nothing can be drawn: the certificate says so, and needs it
+        return False
 
 
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:

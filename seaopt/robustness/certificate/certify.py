@@ -214,21 +214,13 @@ def certify(
         raise ControlError("sensors and command_step are of the simulations, which are left out; give simulations=True")
     slopes = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
     min_friction_margin = max((slope for slope in slopes if slope is not None), default=None)
-    design, values = controller.design
-    seen = {name: controller.see(plant) for name, plant in plants.items()}
-    models, others = add_design(design, seen), others or ParameterSet()
-    if len(models) > len(seen):  # the design plant has its own values of what nobody else gives
-        missing = (values[name] for name in values if name in design.parameters and name not in others)
-        others = others.with_parameters(*missing)
-    models = split_delayed(controller.spec, design, models, parameters)
-    check_sensors(sensors, controller, models)
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
-    ranges = _add_warm_winding(ranges or {}, models, parameters, others)
-    unknown = combine_uncertainty(parameters, others, ranges, models, find_own_drive(controller, parameters))
-    _check_delay(controller, unknown.ranges)
+    loops = pose_loops(controller, plants, parameters, ranges or {}, others or ParameterSet(), bounds)
+    (design, values), models, unknown = controller.design, loops.models, loops.unknown
+    check_sensors(sensors, controller, models)
     nominal, varied = unknown.nominal, unknown.varied()
     names = [row.name for row in varied]
-    plants, spots = split_states(models, unknown), name_spots(models, unknown)
+    plants, spots = loops.plants, name_spots(models, unknown)
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
@@ -241,7 +233,7 @@ def certify(
         STEPS * len(models),
         SIMULATIONS * len(models) * simulations,
     )
-    loops = Shared(Loops(controller=controller, models=models, plants=plants, unknown=unknown, bounds=bounds))
+    loops = Shared(loops)
     failed, drawn, drawn_ms = measure_draws(loops, samples, rng, executor, drawing)
     worst, brackets = search_worst(loops, drawn, executor, searching)
     monte_carlo = count_failures(failed, seed, confidence)
@@ -298,6 +290,30 @@ def certify(
         )
     progress(f"{samples} draws, {format_count(monte_carlo.failures, 'failure')}", 1.0)
     return certificate
+
+
+def pose_loops(
+    controller: Controller,
+    plants: Plants,
+    parameters: Source,
+    ranges: Ranges,
+    others: ParameterSet,
+    bounds: Budget | None = None,
+) -> Loops:
+    """Return a controller on its plants, the design plant's among them, with what is uncertain of them."""
+    assert controller.design is not None
+    design, values = controller.design
+    seen = {name: controller.see(plant) for name, plant in plants.items()}
+    models = add_design(design, seen)
+    if len(models) > len(seen):  # the design plant has its own values of what nobody else gives
+        missing = (values[name] for name in values if name in design.parameters and name not in others)
+        others = others.with_parameters(*missing)
+    models = split_delayed(controller.spec, design, models, parameters)
+    ranges = _add_warm_winding(ranges, models, parameters, others)
+    unknown = combine_uncertainty(parameters, others, ranges, models, find_own_drive(controller, parameters))
+    _check_delay(controller, unknown.ranges)
+    states = split_states(models, unknown)
+    return Loops(controller=controller, models=models, plants=states, unknown=unknown, bounds=bounds)
 
 
 def _add_warm_winding(
