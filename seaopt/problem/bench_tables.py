@@ -83,10 +83,10 @@ class ActuationTable(StrictTable):
     """What a controller commands, and the effort that one unit of it makes, of the parameters."""
 
     input: str = key("The input that a controller commands.")
-    effort: Formula = key("Force or torque that one unit of it makes, of the parameters.")
+    effort: Formula = key("Force or torque that one unit of it makes, in terms of the parameters.")
     unit: str = key("N, or N m.", default="N")
     efficiency: str | None = key("Parameter that is the transmission's efficiency.", default=None)
-    speed: Formula | None = key("On which the effort works, of states and parameters.", default=None)
+    speed: Formula | None = key("Speed on which the effort works, in terms of states and parameters.", default=None)
     largest: Formula | None = key("End of the command's range: 1 for a duty.", default=None)
 
 
@@ -289,7 +289,7 @@ class VirtualTable(SensorsTable):
     rate_hz: Number = key("Samples per second.", gt=0, le=1e6)
     truth: dict[str, Number] = key("Parameters that differ from the file's.", default={})
     excitation: ExcitationTable = key("What drives it.")
-    outputs: list[str] = key("That are measured; those with noise where left out.", default=[])
+    outputs: list[str] = key("Outputs that are measured; those with noise where left out.", default=[])
 
 
 class ResampleTable(StrictTable):
@@ -317,7 +317,7 @@ class ExperimentTable(StrictTable):
         "The plant's outputs that were measured, and their columns.", default={}
     )
     differences: dict[str, DifferenceTable] = key("Speeds that a device computed from a position.", default={})
-    align: AlignTable | None = key("How columns of other clocks come to the log's.", default=None)
+    align: AlignTable | None = key("How columns of other clocks are aligned to the log's.", default=None)
     window_s: tuple[Number, Number] | None = key("Read only what lies between these times.", default=None)
     counter: CounterTable | None = key("A column that counts samples, which shows lost ones.", default=None)
     duplicates: Literal["first", "mean"] | None = key("Which of several samples at one time counts.", default=None)
@@ -331,14 +331,14 @@ class ExperimentTable(StrictTable):
     parameters: dict[str, Number | UnknownTable | ColumnTable] = key(
         "Values, or free ones, of this log alone.", default={}
     )
-    delay_s: Number | UnknownTable = key("From the input's column to its effect.", default=0.0)
+    delay_s: Number | UnknownTable = key("Delay from the input's column to its effect.", default=0.0)
     gain: dict[str, Number | UnknownTable] = key("Gain of each output's sensor.", default={})
     hold: Literal["zero", "first"] = key(
         '"first" for a measured input: straight lines between its samples.', default="zero"
     )
     drift: Whole = key("Order of a polynomial that each output may drift by.", default=0, ge=0, le=5)
     shots: Whole = key("Pieces with initial states of their own.", default=1, ge=1, le=100_000)
-    slice_s: tuple[Number, Number] | None = key("What is used, from the log's start.", default=None)
+    slice_s: tuple[Number, Number] | None = key("Stretch that is used, in seconds from the log's start.", default=None)
     resample: Literal["restamp"] | ResampleTable | None = key(
         '"restamp" for rounded timestamps; a rate for uneven ones.', default=None
     )

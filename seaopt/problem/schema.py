@@ -118,7 +118,7 @@ class ControllerTable(table_of(ControllerSpec, leave_out=("bandwidth_tolerance",
         'Plants on which stability, Ms and Mt hold too; "frf:NAME" for a measured frequency response.', default=[]
     )
     frf_confidence: Number = key(
-        "That the discs about measured frequency responses hold the truth, all of them.", default=0.95, gt=0.0, lt=1.0
+        "Probability that all discs about measured frequency responses hold the truth.", default=0.95, gt=0.0, lt=1.0
     )
     draws: Whole = key(
         "How many draws of the uncertain parameters must keep stability, Ms and Mt while it is tuned.",
@@ -316,9 +316,7 @@ class ProblemTable(StrictTable):
     mpc: MPCTable | None = key(
         'What only predictive control has, of a [controller] with structure = "mpc".', default=None
     )
-    robustness: RobustnessTable | None = key(
-        "What the certificate covers besides what the fit leaves open.", default=None
-    )
+    robustness: RobustnessTable | None = key("What the certificate covers besides the fit's uncertainty.", default=None)
     expect: ExpectTable | None = key("What `seaopt run` and pytest check of the results.", default=None)
 
 

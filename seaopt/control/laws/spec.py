@@ -62,7 +62,7 @@ class ControllerSpec:
     )
     bandwidth_hz: float = _limit("bandwidth_hz", unit="Hz", stated=True)
     bandwidth_range_hz: tuple[float, float] = option(
-        "Within which a bandwidth may be asked. It has no other effect.", default=(15.0, 60.0), unit="Hz"
+        "Range in which a bandwidth may be asked for; it has no other effect.", default=(15.0, 60.0), unit="Hz"
     )
     structure: Structure = option(
         "A pid_dob has a disturbance observer whose nominal plant is the design plant; a cascade closes a loop on the "
@@ -91,7 +91,7 @@ class ControllerSpec:
         "or the derivative of the measurement alone, c = 0, with k_r tuned.",
         default="tuned",
     )
-    sample_rate_hz: float = option("At which the controller runs.", default=1000.0, unit="Hz", above=0.0, most=1e6)
+    sample_rate_hz: float = option("Rate at which the controller runs.", default=1000.0, unit="Hz", above=0.0, most=1e6)
     compute_delay_samples: int | None = option(
         "Whole samples from a reading to the command being put out, besides the hold: the user's program. Left out: 0 "
         "where the log shows a delay behind a held command, else 1.",

@@ -73,7 +73,7 @@ class MPCSpec:
         unit="Hz",
         above=0.0,
     )
-    sample_rate_hz: float = option("At which the controller runs.", default=1000.0, unit="Hz", above=0.0)
+    sample_rate_hz: float = option("Rate at which the controller runs.", default=1000.0, unit="Hz", above=0.0)
     compute_delay_samples: int | None = _shared("compute_delay_samples")
     drive_delay_s: float | None = _shared("drive_delay_s")
     delay_samples: int | None = _shared("delay_samples")

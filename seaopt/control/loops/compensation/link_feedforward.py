@@ -88,7 +88,7 @@ class LinkFeedforward:
         unit="Hz",
     )
     high_pass_hz: float | None = option(
-        "Below which nothing is fed forward; a tenth of the bandwidth where left out, 0 for none.",
+        "Frequency below which nothing is fed forward; a tenth of the bandwidth where left out, 0 for none.",
         default=None,
         unit="Hz",
     )
