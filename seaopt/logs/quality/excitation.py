@@ -106,12 +106,13 @@ class InputExcitation:
 
     @property
     def sentence(self) -> str:
-        """The verdict: what can and cannot be identified with this input."""
+        """Which frequencies show a linear response, and what that means for a fit."""
         usable = self.usable_hz
         if usable is None:
             return (
-                f"{self.channel} excites nothing to which an output responds: no parameter can be identified; check "
-                "the channels, and drive harder"
+                f"no output follows {self.channel} linearly at {self.bands[0].low_hz:.2g} Hz or above: check the "
+                "channels, and drive harder. Of slower motion, friction and large swings this test says nothing: a fit may still "
+                "identify their parameters"
             )
         low, high = usable
         if self.bands[0].coherence is not None:
@@ -126,9 +127,9 @@ class InputExcitation:
         elif half is not None:
             sentence += f"; the response of {self.output} has fallen to half near {half:.2g} Hz, without a peak"
         elif self.bands[0].gain is not None:
-            sentence += "; no response falls to half in there: inertia and stiffness cannot be identified"
+            sentence += "; no response falls to half in there: inertia and stiffness have little effect on it"
         if low > 4.0 * self.bands[0].low_hz:
-            sentence += f"; nothing below {low:.3g} Hz: static gain and friction cannot be separated there"
+            sentence += f"; nothing linear below {low:.3g} Hz, where static gain and friction would be told apart"
         return sentence
 
 

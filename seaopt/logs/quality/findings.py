@@ -253,7 +253,7 @@ def find_pair_faults(pair: ChannelPair, period: float, driven: bool) -> Iterator
 
 
 def describe_excitation(excitation: InputExcitation) -> Finding:
-    """Return what can and cannot be identified with an input."""
+    """Return which linear responses to an input the log shows."""
     usable = excitation.usable_hz
     return Finding(
         kind="excitation",

@@ -270,8 +270,8 @@ def _list_notes(log: DescribedLog) -> Iterator[str]:
     count = log.survey.columns[0].values.size
     if count < FEW:
         yield f"{name}: {count} samples are few to tell columns and units by, or to fit; check the roles"
-    if traits.unexcited:
-        yield f"{name}: {traits.unexcited}"
+    if traits.unexcited is not None:
+        yield f"{name}: {replace(traits.unexcited, channel=log.roles.columns[log.roles.input].name).sentence}"
     if traits.delay_s is not None:
         yield f"{name}: the outputs respond about {1e3 * traits.delay_s:.2g} ms late: delay_s is fitted"
     if traits.outliers >= OUTLIERS:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from seaopt.logs import Quality, assess_quality
+from seaopt.logs.quality.excitation import InputExcitation
 from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
 from seaopt.signals import Table
@@ -33,7 +34,7 @@ class Traits:
     delay_s: float | None = None
     outliers: int = 0  # samples of outputs that stand far off
     standing: tuple[str, ...] = ()  # positions that stand still time and again while they are driven
-    unexcited: str = ""  # what to say where nothing can be identified; empty where something can
+    unexcited: InputExcitation | None = None  # of an input that no output follows linearly
 
 
 def find_traits(table: Table, source: str, outputs: Sequence[str], positions: Sequence[str], *, held: bool) -> Traits:
@@ -46,7 +47,7 @@ def find_traits(table: Table, source: str, outputs: Sequence[str], positions: Se
         delay_s=_find_delay(quality, source, outputs, held=held),
         outliers=sum(quality.channels[name].outliers.size for name in outputs),
         standing=tuple(name for name in positions if len(quality.channels[name].stuck) > 1),
-        unexcited=excitation.sentence if excitation is not None and excitation.usable_hz is None else "",
+        unexcited=excitation if excitation is not None and excitation.usable_hz is None else None,
     )
 
 

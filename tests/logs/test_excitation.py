@@ -1,0 +1,58 @@
+"""What a quality report says of excitation is true of logs of which more is known than the report can see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.logs import assess_quality
+
+J, B, MGL = 0.19, 0.1, 3.3
+
+
+def swing_up(seconds=6.0, rate_hz=500.0):
+    """Return times, torque, angle, speed and acceleration of a pendulum that is pumped up, by Runge-Kutta's steps."""
+    h, x, rows = 1.0 / rate_hz, np.array([0.02, 0.0]), []
+
+    def push(x):
+        return 1.5 * np.tanh(3.0 * x[1]) * np.exp(-0.3 * abs(x[0]))
+
+    def rate(x, u):
+        return np.array([x[1], (u - B * x[1] - MGL * np.sin(x[0])) / J])
+
+    for k in range(round(seconds * rate_hz)):
+        u = push(x)
+        rows.append((k * h, u, x[0], x[1], rate(x, u)[1]))
+        k1 = rate(x, u)
+        k2 = rate(x + 0.5 * h * k1, u)
+        k3 = rate(x + 0.5 * h * k2, u)
+        k4 = rate(x + h * k3, u)
+        x = x + h / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return np.array(rows).T
+
+
+def test_of_a_log_that_tells_the_inertia_nothing_else_is_said():
+    """A slow, large swing: nothing is coherent above the first line, and least squares find J within 2 %."""
+    t, u, angle, speed, rise = swing_up()
+    rng = np.random.default_rng(0)
+    inertia = np.linalg.lstsq(np.stack([rise, speed, np.sin(angle)], 1), u + 0.05 * rng.normal(size=u.size), rcond=None)
+    assert inertia[0][0] == pytest.approx(J, rel=0.02)
+    log = so.Log.from_arrays(time=t, torque=u + 0.05 * rng.normal(size=t.size), theta=np.round(angle / 3e-3) * 3e-3)
+    (finding,) = assess_quality(log, inputs=["torque"]).of("excitation")
+    assert "cannot" not in finding.sentence and "no parameter" not in finding.sentence
+    assert "slower motion" in finding.sentence and "a fit may" in finding.sentence
+
+
+def test_a_response_without_a_peak_is_not_said_to_hide_the_inertia():
+    """A stiff spring's force up to a third of its resonance: 1/(1 - r^2) rises by 12 %, which tells k/m to 1 %."""
+    rng = np.random.default_rng(1)
+    rate, n, f0 = 1000.0, 40_000, 60.0
+    lines = np.fft.rfft(rng.normal(size=n))
+    f = np.fft.rfftfreq(n, 1 / rate)
+    lines[(f > 20.0) | (f < 0.5)] = 0.0
+    response = 1.0 / (1.0 - (f / f0) ** 2 + 0.1j * f / f0)
+    u, y = np.fft.irfft(lines, n), np.fft.irfft(lines * response, n)
+    log = so.Log.from_arrays(time=np.arange(n) / rate, I=u, F1=y + 1e-4 * rng.normal(size=n))
+    (finding,) = log.quality.of("excitation")
+    assert "cannot" not in finding.sentence and "falls to half" in finding.sentence
