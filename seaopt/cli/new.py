@@ -121,6 +121,7 @@ def _ask(console: Terminal, question: Question) -> str:
     choices = f" ({', '.join(question.choices)})" if question.choices else ""
     console.say(f"{question.text}{choices}", style="bold")
     console.say(f"  Enter: {question.guess}" + (f", {question.why}" if question.why else ""), style="dim")
+    doubted = ""
     while True:
         console.say("  > ", end="")
         line = sys.stdin.readline()
@@ -129,7 +130,11 @@ def _ask(console: Terminal, question: Question) -> str:
         if not line.strip():
             return ""
         try:
-            return question.read(line)
+            answer = question.read(line)
+            if not (doubt := question.doubt(answer)) or answer == doubted:
+                return answer
+            doubted = answer
+            console.say(f"  {doubt}: type it again to keep it, or correct it", style="red")
         except ProblemError as error:
             console.say(f"  {error}", style="red")
 

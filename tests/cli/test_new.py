@@ -180,3 +180,18 @@ def test_columns_and_their_units_can_be_named(folder, seaopt):
     assert abs(experiment.log["tau_s"] - log["tau_s"]).max() < 1e-6
     wrong = seaopt("new", "bare.csv", "--yes", "--force", "--channel", "I")
     assert wrong.returncode == 2 and "write --channel NAME=VALUE" in wrong.stderr
+
+
+def test_a_value_that_is_unusual_is_asked_for_again(folder, seaopt, answer):
+    """A lever of 25, which is millimetres; then a mass of 900 kg that is meant."""
+    t, current = drive(3.0, 400.0, 2.0)
+    of = knee(current, 400.0)
+    write_csv(folder / "leg.csv", {"t [s]": t, "I [A]": of["I"], "F1 [N]": of["tau_s"], "phi [rad]": of["theta_l"]})
+    answer("", "", "", "", "", "25", "0.025", "900", "900", *[""] * 20)
+    out = seaopt("new", "leg.csv", "-o", "leg.toml")
+    assert out.returncode == 0, out.stderr
+    assert "25 is unusual, 0.002 to 1 are common: type it again to keep it" in out.stdout
+    problem = so.read_problem(folder / "leg.toml")
+    assert (problem.parameters["L_a"].value, problem.parameters["m"].value) == (0.025, 900.0)
+    assert "900 is unusual" in next(line for line in problem_lines(folder / "leg.toml") if line.startswith("m "))
+    assert "note: m: 900 is unusual" in out.stdout

@@ -201,3 +201,36 @@ def test_angles_without_units_are_judged_by_how_far_they_move(tmp_path, held):
     columns = {"t [s]": t, "iq [A]": of["I"], "theta_m": of["theta_m"], "theta_load": 0.03 * np.sin(t) - 7.5}
     proposal = propose([write_csv(tmp_path / "turned.csv", columns)], {}, tmp_path)
     assert {row.role: row.unit for row in proposal.columns}["theta_l"] == "rad"
+
+
+def test_noise_and_steps_of_the_sensor_are_written_and_limit_the_noise_gain(tmp_path, held):
+    """Noise of 0.3 N m ahead of a converter of 0.5 N m: noise moves the motor by a quarter of the largest effort."""
+    t, of = held
+    rng = np.random.default_rng(2)
+    read = np.round((of["tau_s"] + 0.3 * rng.normal(size=t.size)) / 0.5) * 0.5
+    path = write_csv(tmp_path / "coarse.csv", {"t [s]": t, "I [A]": of["I"], "tau_s [N m]": read})
+    proposal = propose([path], {"bandwidth_hz": "20"}, tmp_path)
+    (tmp_path / "problem.toml").write_text(proposal.text, encoding="utf-8")
+    problem = so.read_problem(tmp_path / "problem.toml")
+    sensors = problem.robustness.sensors
+    assert sensors.quantisation["tau_s"] == pytest.approx(0.5, rel=1e-3)
+    assert sensors.noise_std["tau_s"] == pytest.approx(0.3, rel=0.15)
+    total = math.hypot(0.3, 0.5 / math.sqrt(12.0))
+    low, high = np.quantile(read, [0.01, 0.99])
+    assert problem.spec.max_noise_gain == pytest.approx(0.25 * 0.5 * (high - low) / total, rel=0.1)
+    assert problem.spec.max_noise_gain < 50
+
+
+def test_steps_of_two_encoders_are_their_own(tmp_path):
+    t, current = drive(6.0, RATE, 2.0)
+    of = knee(current, RATE)
+    turn = 2 * math.pi
+    columns = {"t [s]": t, "I [A]": of["I"], "motor [rad]": np.round(of["theta_m"] / turn * 4096) / 4096 * turn,
+               "link [rad]": np.round(of["theta_l"] / turn * 65536) / 65536 * turn}  # fmt: skip
+    proposal = propose([write_csv(tmp_path / "two.csv", columns)], {"N": "100", "k_s": "300"}, tmp_path)
+    (tmp_path / "problem.toml").write_text(proposal.text, encoding="utf-8")
+    problem = so.read_problem(tmp_path / "problem.toml")
+    assert problem.controller_table.measured == "tau_d"
+    steps = problem.robustness.sensors.quantisation
+    assert steps["theta_m"] == pytest.approx(turn / 4096, rel=1e-3)
+    assert "theta_l" not in steps or steps["theta_l"] == pytest.approx(turn / 65536, rel=1e-2)

@@ -111,8 +111,8 @@ class InputExcitation:
         if usable is None:
             return (
                 f"no output follows {self.channel} linearly at {self.bands[0].low_hz:.2g} Hz or above: check the "
-                "channels, and drive harder. Of slower motion, friction and large swings this test says nothing: a fit may still "
-                "identify their parameters"
+                "channels, and drive harder. Of slower motion, friction and large swings this test says nothing: a fit "
+                "may still identify their parameters"
             )
         low, high = usable
         if self.bands[0].coherence is not None:

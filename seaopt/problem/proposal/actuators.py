@@ -19,6 +19,12 @@ from seaopt.problem.proposal.questions import Interview
 from seaopt.records import record
 from seaopt.units import unit_after
 
+# Of the actuators of robots, from a finger to an excavator, in SI: what lies outside is likely in another unit.
+USUAL = {
+    "N": (1.0, 2000.0), "N_p": (0.1, 20.0), "K_tau": (5e-4, 20.0), "R": (5e-3, 100.0), "V_s": (3.0, 1000.0),
+    "k_s": (0.02, 2e5), "k_n": (0.02, 2e5), "k": (1e3, 1e8), "l": (2e-4, 0.1), "L_a": (2e-3, 1.0), "L": (5e-3, 2.0),
+    "m": (5e-3, 500.0), "I_p": (1e-6, 500.0),
+}  # fmt: skip
 PRIOR = 0.05  # share that a data sheet's value may be off
 WIDE = (0.5, 2.0)  # of an inertia that somebody estimated: its range
 INERTIA_OVER_POINT = 4.0 / 3.0  # of a slender link about its end
@@ -84,7 +90,9 @@ class _Lines:
     def add(self, name: str, value: str, mark: str = "") -> None:
         parameter = self.defaults[name]
         about = ", ".join(text for text in (parameter.description, unit_after(parameter.unit).strip("- ")) if text)
-        comment = "; ".join(filter(None, (about, self.interview.mark(mark or name))))
+        comment = "; ".join(
+            filter(None, (about, self.interview.mark(mark or name), self.interview.list_doubts().get(name)))
+        )
         self.lines.append(ParameterLine(name=name, value=value, comment=comment))
 
     def free(self, name: str, start: float | None = None, **bounds: float) -> None:
@@ -95,7 +103,7 @@ class _Lines:
     def known(self, name: str, text: str, guess: float | None = None, why: str = "a typical value") -> float:
         """Ask for a value that no log can tell, and write it."""
         start = self.defaults[name].value if guess is None else guess
-        value = self.interview.number(name, self._add_unit(text, name), start, why)
+        value = self.interview.number(name, self._add_unit(text, name), start, why, USUAL.get(name))
         self.add(name, f"{value:.10g}")
         return value
 
@@ -112,7 +120,7 @@ class _Lines:
 
     def optional(self, name: str, text: str, why: str) -> float | None:
         """Ask for a value that may be unknown."""
-        return self.interview.optional(name, f"{self._add_unit(text, name)}, or unknown", why)
+        return self.interview.optional(name, f"{self._add_unit(text, name)}, or unknown", why, USUAL.get(name))
 
     def _add_unit(self, text: str, name: str) -> str:
         unit = unit_after(self.defaults[name].unit).strip()

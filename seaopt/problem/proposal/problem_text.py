@@ -16,6 +16,7 @@ from seaopt.problem.proposal.actuators import DESIGN, ParameterLine, Proposed, s
 from seaopt.problem.proposal.described_log import GEARED, SI_UNITS, DescribedLog, doubt_clock, make_table
 from seaopt.problem.proposal.questions import Interview
 from seaopt.problem.proposal.roles import DESCRIPTIONS, FOLLOWS
+from seaopt.problem.proposal.sensor_noise import combine_noise, limit_noise_gain, list_sensors
 from seaopt.problem.proposal.survey import SurveyedColumn, regress
 from seaopt.problem.proposal.traits import OUTLIERS
 from seaopt.units import factor, header_unit, is_unit
@@ -25,8 +26,6 @@ ABOVE_RESONANCE = 2.5  # bandwidth over resonance that is asked for first
 DEFAULT_BANDWIDTH_HZ = 20.0
 LEAST_RATE_HZ = 500.0  # of a controller; a slower log was not its clock
 HOLDOUT_S = 10.0  # a log from which a fifth can be kept back
-NOISE_GAIN = 50.0  # that is allowed up to WIDEST times the resonance, and by the square of the bandwidth above
-WIDEST = 4.0
 BRIDGE = 5.0  # periods that an irregular clock may skip
 RETUNE = 4
 COMMENT_AT = 56  # column of the comments
@@ -232,22 +231,14 @@ def _describe_controller(
     delay = f"from a reading to its command, besides the drive's fitted delay; {default} if left out"
     rows.append(("# compute_delay_samples = 1", delay))
     rows.append(_describe_limit(logs, interview))
-    gain = NOISE_GAIN * max(1.0, band / (WIDEST * resonance)) ** 2 if resonance else NOISE_GAIN
-    noise = _find_noise(logs, actuator.measured)
+    noise = combine_noise(list_sensors(logs, actuator), actuator)
+    gain = limit_noise_gain(logs, actuator.measured, noise, band, resonance)
     unit = SI_UNITS.get(actuator.measured, "N m")
     example = f": {noise:.3g} {unit} make up to {gain * noise:.3g} {unit}" if noise else ""
     rows.append((f"max_noise_gain = {gain:.3g}", f"motor effort over sensor noise, at its peak{example}"))
     if actuator.robust_to:
         rows.append((f"robust_to = {format_toml(list(actuator.robust_to))}", "Ms and Mt hold there too"))
     return rows
-
-
-def _find_noise(logs: Sequence[DescribedLog], output: str) -> float:
-    """Return the standard deviation of an output's noise from sample to sample, in SI; 0 where no log has it."""
-    levels = [
-        log.roles.columns[output].noise * abs(log.si_scale(output)) for log in logs if output in log.roles.columns
-    ]
-    return max(levels, default=0.0)
 
 
 def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple[str, str]:
@@ -271,10 +262,13 @@ def _describe_robustness(logs: Sequence[DescribedLog], actuator: Proposed) -> li
         rows.append((f"parameters = {{ {ranges} }}", "half to twice the value given"))
     if actuator.ranges or any("prior_std" in line.value for line in actuator.lines):
         rows.append((f"retune = {RETUNE}", "rounds of tuning for the worst case that the certificate finds"))
-    noise = _find_noise(logs, actuator.measured)
-    if noise > 0.0:
-        level = f"{{ {actuator.measured} = {noise:.3g} }}"
-        rows.append((f"sensors = {{ noise_std = {level} }}", "of the log, from sample to sample"))
+    if sensors := list_sensors(logs, actuator):
+        figures = {"noise_std": {}, "quantisation": {}}
+        for name, noise in sensors.items():
+            figures["noise_std"] |= {name: float(f"{noise.std:.3g}")} if noise.std else {}
+            figures["quantisation"] |= {name: float(f"{noise.step:.4g}")} if noise.step else {}
+        levels = {kind: levels for kind, levels in figures.items() if levels}
+        rows.append((f"sensors = {format_toml(levels)}", "as measured in the log, from sample to sample"))
     return rows
 
 

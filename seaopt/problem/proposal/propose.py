@@ -33,7 +33,7 @@ from seaopt.problem.proposal.actuators import (
 )
 from seaopt.problem.proposal.described_log import GEARED, DescribedLog, doubt_clock, make_table
 from seaopt.problem.proposal.problem_text import write_problem_text
-from seaopt.problem.proposal.questions import Interview, Question
+from seaopt.problem.proposal.questions import Interview, Question, name_entry
 from seaopt.problem.proposal.roles import (
     DESCRIPTIONS,
     FOLLOWS,
@@ -151,7 +151,10 @@ def propose(
         questions=tuple(interview.questions),
         guesses=tuple(question for question in interview.questions if question.key not in interview.answers),
         guessed=tuple(interview.list_guessed()),
-        notes=tuple(note for log in described for note in _list_notes(log)),
+        notes=(
+            *(note for log in described for note in _list_notes(log)),
+            *(f"{name_entry(key)}: {doubt}; check its unit" for key, doubt in interview.list_doubts().items()),
+        ),
     )
 
 

@@ -26,6 +26,7 @@ class Question:
     why: str  # where the guess is from
     choices: tuple[str, ...] = ()  # the answers that count; empty for a number
     open: bool = False  # whether "unknown" is an answer
+    usual: tuple[float, float] | None = None  # the numbers outside which an answer is doubted
 
     @property
     def label(self) -> str:
@@ -37,6 +38,12 @@ class Question:
     def entry(self) -> str:
         """What it is called in the file's `guessed`."""
         return name_entry(self.key)
+
+    def doubt(self, answer: str) -> str:
+        """Return why an answer that counts is doubted; "" where it is not."""
+        if self.usual is None or answer == UNKNOWN or self.usual[0] <= float(answer) <= self.usual[1]:
+            return ""
+        return f"{float(answer):.4g} is unusual, {self.usual[0]:g} to {self.usual[1]:g} are common"
 
     def read(self, answer: str) -> str:
         """Return an answer as it counts: a choice or the beginning of one, or a number. Raises ProblemError: it is none
@@ -74,21 +81,31 @@ class Interview:
         self.assumed: list[str] = []
 
     def ask(
-        self, key: str, text: str, guess: str, why: str = "", choices: Sequence[str] = (), *, open: bool = False
+        self,
+        key: str,
+        text: str,
+        guess: str,
+        why: str = "",
+        choices: Sequence[str] = (),
+        *,
+        open: bool = False,
+        usual: tuple[float, float] | None = None,
     ) -> str:
         """Return the answer to a question, or its guess."""
-        question = Question(key=key, text=text, guess=guess, why=why, choices=tuple(choices), open=open)
+        question = Question(key=key, text=text, guess=guess, why=why, choices=tuple(choices), open=open, usual=usual)
         if all(question.key != other.key for other in self.questions):
             self.questions.append(question)
         return question.read(self.answers[key]) if key in self.answers else guess
 
-    def number(self, key: str, text: str, guess: float, why: str = "") -> float:
+    def number(
+        self, key: str, text: str, guess: float, why: str = "", usual: tuple[float, float] | None = None
+    ) -> float:
         """Return a number that is always known, or guessed."""
-        return float(self.ask(key, text, f"{guess:.10g}", why))
+        return float(self.ask(key, text, f"{guess:.10g}", why, usual=usual))
 
-    def optional(self, key: str, text: str, why: str = "") -> float | None:
+    def optional(self, key: str, text: str, why: str = "", usual: tuple[float, float] | None = None) -> float | None:
         """Return a number, None where nobody knows it."""
-        answer = self.ask(key, text, UNKNOWN, why, open=True)
+        answer = self.ask(key, text, UNKNOWN, why, open=True, usual=usual)
         return None if answer == UNKNOWN else float(answer)
 
     def assume(self, key: str) -> None:
@@ -105,6 +122,12 @@ class Interview:
             and (question.key in self.assumed or (question.key not in self.answers and question.guess != UNKNOWN))
         ]
         return f"guessed: {'; '.join(reasons)}" if reasons else ""
+
+    def list_doubts(self) -> dict[str, str]:
+        """Return why answers are doubted, by the keys of their questions."""
+        given = {question.key: question for question in self.questions if question.key in self.answers}
+        doubts = {key: question.doubt(question.read(self.answers[key])) for key, question in given.items()}
+        return {key: doubt for key, doubt in doubts.items() if doubt}
 
     def list_guessed(self) -> list[str]:
         """Return the guesses that results rest on: parameters, and other entries such as "unit of F1". Unknown values

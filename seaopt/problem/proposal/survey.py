@@ -14,6 +14,7 @@ from jaxtyping import Float
 from seaopt.errors import LogError, suggestion
 from seaopt.logs import contents
 from seaopt.logs.formats import Field, open_source
+from seaopt.logs.quality.faults import find_quantisation
 from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
 from seaopt.problem.proposal.vocabulary import Header, is_named_time, read_header
 from seaopt.records import record
@@ -57,6 +58,11 @@ class SurveyedColumn:
         """Standard deviation of what changes from sample to sample: third differences remove what is smooth."""
         third = np.diff(self.values[np.isfinite(self.values)], 3)
         return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0)) if third.size else 0.0
+
+    @property
+    def quantum(self) -> float:
+        """The step whose multiples the samples are; 0 where there is none."""
+        return find_quantisation(self.values)
 
     @property
     def whole(self) -> bool:
