@@ -16,7 +16,9 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control import sweep
 from seaopt.errors import SeaoptError
-from seaopt.reporting.figures.panel import COLOURS
+from seaopt.reporting.figures.certificate import draws_panel, plants_of, requirements_panel, worst_panel
+from seaopt.reporting.figures.loop import LOOP_PANELS, MAIN
+from seaopt.reporting.figures.panel import COLOURS, compose_sheet
 
 PERIOD = 1e-3
 
@@ -102,10 +104,34 @@ def test_loops_are_drawn_as_the_papers_plant_and_the_law_make_them(controller, s
             np.testing.assert_allclose(drawn[1], 20 * np.log10(np.abs(expected)), atol=1e-6)
 
 
+def count_hidden(axis):
+    """The points behind the legend of a drawn figure, of 200 on every straight piece of a curve within the axes."""
+    box = axis.get_legend().get_window_extent()
+    hidden = 0
+    for line in axis.lines:
+        at = line.get_transform().transform(
+            np.column_stack([np.asarray(side, dtype=float) for side in line.get_data()])
+        )
+        pieces = np.linspace(at[:-1], at[1:], 200).reshape(-1, 2)
+        hidden += np.count_nonzero(((pieces > box.p0) & (pieces < box.p1)).all(axis=1))
+    return hidden
+
+
+def test_no_legend_hides_a_curve(certificate, controller):
+    panels = [LOOP_PANELS[name](controller, plants_of(certificate)) for name in MAIN]
+    figure = compose_sheet(
+        [*panels, worst_panel(certificate), draws_panel(certificate), requirements_panel(certificate)]
+    )
+    FigureCanvasAgg(figure).draw()
+    with_legend = [axis for axis in figure.axes if axis.get_legend() is not None]
+    assert {axis.get_title("left"): count_hidden(axis) for axis in with_legend if count_hidden(axis)} == {}
+    assert len(with_legend) == len(panels) + 3
+
+
 def test_limits_stand_where_they_were_asked(controller):
     sensitivity, tracking = controller.plot.sensitivity(), controller.plot.tracking()
     assert data(sensitivity, "Ms = 1.6")[1, 0] == pytest.approx(20 * np.log10(1.6))
-    assert data(tracking, "bandwidth asked")[0, 0] == 30.0
+    assert data(tracking, "asked: 30 Hz")[0, 0] == 30.0
     disk = data(controller.plot.nyquist(), "Ms = 1.6")
     np.testing.assert_allclose(np.hypot(disk[0] + 1.0, disk[1]), 1 / 1.6)
 
@@ -196,7 +222,7 @@ def test_draws_are_counted_as_the_certificate_counts_them(certificate):
 
 def test_a_certificate_draws_each_of_its_parts(certificate, thor):
     sensitivity = certificate.plot.sensitivity()
-    peak = max(data(sensitivity, "swing, worst case")[1])
+    peak = max(data(sensitivity, "swing, worst")[1])
     assert peak == pytest.approx(20 * np.log10(certificate.worst["swing"].ms), abs=1e-3)
     used = certificate.plot.requirements()
     shares = dict(zip((text.get_text() for text in used.get_yticklabels()), used.get_yticks(), strict=True))

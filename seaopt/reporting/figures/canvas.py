@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from numpy.lib.stride_tricks import sliding_window_view
 
 from seaopt.formatting import printable
 from seaopt.reporting.drawing import TEXT_AS_TEXT, render_figure
@@ -21,6 +26,13 @@ TOP, BARE_TOP, BOTTOM, RIGHT, BETWEEN = 0.34, 0.12, 0.48, 0.16, 0.12  # inches, 
 FEW_DECADES = 2.2  # over which 2 and 5 are ticks, too
 MANY_DECADES = 6.0  # over which there are no ticks between them
 FONT = 9.0  # points
+LEGEND: dict[str, Any] = {
+    "fontsize": "small", "frameon": True, "framealpha": 0.75, "edgecolor": "none", "borderpad": 0.2,
+    "columnspacing": 1.0, "handlelength": 1.7, "handletextpad": 0.6,
+}  # fmt: skip
+MOST_COLUMNS = 3  # of a legend
+CELL, CLEAR = 4.0, 1  # pixels in which a place for a legend is looked for; and cells between it and curves
+MOST_STEPS = 1000  # that a piece of a curve is looked at in: longer ones are mostly outside of the axes
 
 
 class PlainFigure(Figure):
@@ -115,17 +127,52 @@ def add_legend(axes: Sequence[Axes]) -> None:
     for axis in axes:
         handles = {label: line for label, line in label_lines(axis).items() if label not in shown}
         if handles:
-            axis.legend(
-                list(handles.values()),
-                list(handles),
-                fontsize="small",
-                frameon=True,
-                framealpha=0.75,
-                edgecolor="none",
-                borderpad=0.2,
-                loc="best",
-            )
+            draw = partial(axis.legend, list(handles.values()), list(handles), **LEGEND)
+            if isinstance(axis.get_figure(root=True), PlainFigure):
+                place_legend(axis, draw)
+            else:  # which may yet change its size
+                draw(loc="best")
         shown |= handles.keys()
+
+
+def place_legend(axis: Axes, draw: Callable[..., Legend]) -> None:
+    """Draw a legend near a corner, in as few columns as hide the least of the curves ("best" tries nine places)."""
+    curves, places = _find_curves(axis), list[tuple[int, int, tuple[float, float]]]()
+    for columns in range(1, MOST_COLUMNS + 1):
+        box = draw(ncols=columns, loc="upper right").get_window_extent()
+        tall, wide = (int(np.ceil(length / CELL)) + 2 * CLEAR for length in (box.height, box.width))
+        if tall > curves.shape[0] or wide > curves.shape[1]:
+            break
+        hidden = sliding_window_view(curves, (tall, wide)).sum(axis=(2, 3))
+        up, right = np.ogrid[: hidden.shape[0], : hidden.shape[1]]
+        down, left = up[::-1], right[:, ::-1]
+        away = np.minimum(down, up + 0.5) + np.minimum(left, right + 0.25)  # of a corner; upper right before others
+        row, column = np.unravel_index(np.lexsort((away.ravel(), hidden.ravel()))[0], hidden.shape)
+        x, y = (float(cell + CLEAR) * CELL for cell in (column, row))
+        places.append((int(hidden[row, column]), columns, (x / axis.bbox.width, y / axis.bbox.height)))
+    _, columns, place = min(places, default=(0, 1, "best"))
+    draw(ncols=columns, loc=place)
+
+
+def _find_curves(axis: Axes) -> Bool[np.ndarray, "rows columns"]:
+    """Return in which cells of the axes there are curves, the lowest row first."""
+    axis.apply_aspect()
+    axis.autoscale_view()
+    size = np.ceil(np.array(axis.bbox.size) / CELL).astype(int)
+    there = np.zeros(size[::-1], dtype=bool)
+    paths = [(line.get_path(), line.get_transform()) for line in axis.lines]
+    drawn = (each for each in axis.collections if not isinstance(each, QuadMesh))
+    paths += [(path, each.get_transform()) for each in drawn for path in each.get_paths()]
+    for path, transform in paths:
+        at = (transform.transform(np.asarray(path.vertices)) - axis.bbox.p0) / CELL
+        at = at[np.isfinite(at).all(axis=1)]
+        steps = np.diff(at, axis=0, append=at[-1:])
+        counts = np.clip(np.ceil(2.0 * np.abs(steps).max(axis=1, initial=0.0)), 1, MOST_STEPS).astype(int)
+        along = (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)) / np.repeat(counts, counts)
+        cells = np.floor(np.repeat(at, counts, axis=0) + along[:, np.newaxis] * np.repeat(steps, counts, axis=0))
+        column, row = cells[((cells >= 0) & (cells < size)).all(axis=1)].astype(int).T
+        there[row, column] = True
+    return there
 
 
 def take_literally(axes: Iterable[Axes]) -> None:

@@ -94,7 +94,7 @@ def worst_panel(certificate: Certificate) -> Panel:
         for (name, plant), colour in zip(certificate.linear_models.items(), COLOURS * 9, strict=False):
             cases = [("", (plant, certificate.parameters), "-")]
             if name in certificate.worst and certificate.worst[name].parameters:
-                cases.append((", worst case", (certificate.worst[name][0], certificate.worst[name][1]), "--"))
+                cases.append((", worst", (certificate.worst[name][0], certificate.worst[name][1]), "--"))
             for word, (model, values), style in cases:
                 loop = controller.close(model, values)
                 f = list_frequencies(loop)

@@ -243,7 +243,7 @@ def tracking_panel(controller: Controller, plants: Plants | None = None) -> Pane
 
     def draw_limits(axis: Axes) -> None:
         draw_level(axis, HALF_POWER_DB, "-3 dB", style=":")
-        draw_level(axis, spec.bandwidth_hz, "bandwidth asked", side="x")
+        draw_level(axis, spec.bandwidth_hz, "asked: {:g} Hz", side="x")
 
     return _magnitude_panel(
         controller,
