@@ -35,7 +35,7 @@ from seaopt.estimation import warn_unidentified
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
+from seaopt.plants.friction import find_dry_friction, name_slope_unit, split_friction, take_sliding
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
@@ -250,7 +250,7 @@ class Controller(LoopDelays, Result, Worded):
             notes.append("the design plant has no friction at these values: any min_friction_margin holds on it")
         notes += actuation_notes(plant, self.command)
         notes += limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
-        return (*notes, *self._noise_notes(), *self._slow_notes())
+        return (*notes, *self._noise_notes(), *self._rest_notes(), *self._slow_notes())
 
     def _noise_notes(self) -> list[str]:
         """Return what is fed forward of the link, and which noise is large because nothing was asked of it."""
@@ -272,6 +272,29 @@ class Controller(LoopDelays, Result, Worded):
                 f"{self.achieved.noise_gain:.3g} {called.unit} of motor {called.word}; give max_noise_gain"
             )
         return notes
+
+    def _rest_notes(self) -> tuple[str, ...]:
+        """Return how far from the reference dry friction may hold a law without an integral."""
+        error = self.rest_error
+        if not error:
+            return ()
+        return (
+            f"without an integral, friction may hold it {error:.3g} {self.command.reference_unit} from the reference; "
+            'structure = "pid" takes that away',
+        )
+
+    @property
+    def rest_error(self) -> float:
+        """How far from the reference dry friction may hold a "pd", in the unit of the reference; 0 with an integral.
+
+        At rest it takes f of the effort, so that y = P(0) (r/P(0) + k_p (r - y) - f).
+        """
+        if self.structure != "pd" or self.design is None:
+            return 0.0
+        plant, params = self.design
+        friction = sum(find_dry_friction(plant, plant.complete(params)).values())
+        static = abs(self.plant(plant, params).static_gain)
+        return friction * static / (1.0 + static * self.gains["k_p"])
 
     def _slow_notes(self) -> tuple[str, ...]:
         """Say that a step is long in arriving, which no limit forbids and friction makes longer."""

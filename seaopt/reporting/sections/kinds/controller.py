@@ -19,7 +19,7 @@ SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another on
 def judge(controller: Controller, commands: Commands) -> Verdict:
     """Return the verdict on a controller; `sweep` is the command that tunes at a range of bandwidths, if there is."""
     spec = controller.spec
-    name = f"Controller: {controller.structure} on {spec.regulated}, {spec.bandwidth_hz:g} Hz"
+    name = f"Controller: {controller.structure} on {spec.regulated}, {_name_bandwidths(controller)}"
     if controller.met:
         on = " on measured points" if controller.design is None else ""
         return Verdict(met=True, text=f"{name}, every limit met{on}")
@@ -31,6 +31,15 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
         reasons=tuple(reasons),
         next=_advise_bandwidth(controller, commands),
     )
+
+
+def _name_bandwidths(controller: Controller) -> str:
+    """Return the bandwidth asked, and where friction makes two of it the one that is left while it sticks."""
+    asked = f"{controller.spec.bandwidth_hz:g} Hz"
+    _, *stuck = {} if controller.design is None else controller.measure_states().values()
+    if not stuck:
+        return asked
+    return f"{asked} sliding and {format_number(stuck[0].bandwidth_hz, missing='none')} Hz stuck"
 
 
 def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[str, ...]:
