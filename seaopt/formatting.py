@@ -55,13 +55,7 @@ def format_count(count: int, noun: str) -> str:
 
 
 def format_toml(value: Any) -> str:
-    """Return a value as a problem file writes it.
-
-    Examples
-    --------
-    >>> print(format_toml({"rate_hz": 400.0, "rule": "restamp", "F1 [N]": [1, True]}))
-    { rate_hz = 400, rule = "restamp", "F1 [N]" = [1, true] }
-    """
+    """Return a value as a problem file writes it."""
     if isinstance(value, Mapping):
         return f"{{ {format_keys(value)} }}" if value else "{}"  # pyright: ignore[reportUnknownArgumentType]
     if isinstance(value, (list, tuple)):
@@ -72,13 +66,7 @@ def format_toml(value: Any) -> str:
 
 
 def format_keys(keys: Mapping[str, Any]) -> str:
-    """Return keys with their values as a problem file writes them, on one line.
-
-    Examples
-    --------
-    >>> format_keys({"resample": {"rate_hz": 400}, "decimate": 2})
-    'resample = { rate_hz = 400 }, decimate = 2'
-    """
+    """Return keys with their values as a problem file writes them, on one line."""
     return ", ".join(f"{_format_key(name)} = {format_toml(value)}" for name, value in keys.items())
 
 
@@ -87,13 +75,7 @@ def _format_key(name: str) -> str:
 
 
 def format_remedies(text: str, remedies: Sequence[Mapping[str, Any]]) -> str:
-    """Return a text with what to write in a problem file at its end: one remedy, or another.
-
-    Examples
-    --------
-    >>> format_remedies("call log.restamp()", [{"resample": "restamp"}])
-    'call log.restamp(); in a problem file: resample = "restamp"'
-    """
+    """Return a text with what to write in a problem file at its end: one remedy, or another."""
     ways = [" and ".join(format_keys({name: value}) for name, value in keys.items()) for keys in remedies]
     return f"{text}; in a problem file: {', or '.join(ways)}" if ways else text
 

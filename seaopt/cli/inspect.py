@@ -88,9 +88,8 @@ def inspect_log(
 
 
 def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:
-    """Read a table; where its clock is not clear the error is the command to type, and its unit may be assumed.
-
-    Raises LogError: no column, or more than one, is named like a time, or it has another unit.
+    """Read a table; where its clock is not clear the error is the command to type, and its unit may be assumed. Raises
+    LogError: no column, or more than one, is named like a time, or it has another unit.
     """
     if time is None and unit is not None:
         named = [field.name for field in contents(path).fields if field.numeric and is_time_name(field.name)]
@@ -114,9 +113,8 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
 
 
 def _choose_clock(path: Path, candidates: Sequence[str]) -> tuple[str, str]:
-    """Return the likely clock and its unit: the column whose header states a unit of time, or that runs on.
-
-    Of neither kind, the first.
+    """Return the likely clock and its unit: the column whose header states a unit of time, or that runs on. Of neither
+    kind, the first.
     """
     from seaopt.problem.proposal.vocabulary import read_header  # deferred: the problem file's classes take time
 
@@ -151,10 +149,7 @@ def _parse_counter(option: str | None) -> Counter | None:
 
 
 def parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """Return the values of NAME=VALUE by name.
-
-    Raises SeaoptError: a text is none, or a name occurs twice.
-    """
+    """Return the values of NAME=VALUE by name. Raises SeaoptError: a text is none, or a name occurs twice."""
     pairs: dict[str, str] = {}
     for text in texts:
         name, sign, value = (part.strip() for part in text.partition("="))

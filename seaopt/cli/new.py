@@ -33,9 +33,8 @@ def write_problem(
     channels: Sequence[str] = (),
     units: Sequence[str] = (),
 ) -> Path:
-    """Write a problem file for logs and return its path; without `yes` what they leave open is asked.
-
-    Raises SeaoptError: a log cannot be read, a file is there already, an option is malformed, or an answer is missing.
+    """Write a problem file for logs and return its path; without `yes` what they leave open is asked. Raises
+    SeaoptError: a log cannot be read, a file is there already, an option is malformed, or an answer is missing.
     """
     columns = parse_pairs("--channel", channels) | ({"time": time} if time is not None else {})
     look = partial(propose, columns=columns, units=parse_pairs("--unit", units))

@@ -28,9 +28,7 @@ class StrictTable(BaseModel):
 
 @cache
 def table_of(record: type[Any], name: str = "", leave_out: Collection[str] = ()) -> Any:
-    """Return the table of a record: a key per option, with its type, range, default and text. The table is named after
-    the record unless it has a `name`; options that no file states are left out.
-    """
+    """Return a record's table, a key per stated option with type, range, default and text; `name`: else its own."""
     keys: dict[str, Any] = {}
     for field in list_options(record):
         if field.name in leave_out:

@@ -275,9 +275,7 @@ def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
 def range_remarks(
     ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant], nominal: ParameterSet
 ) -> list[str]:
-    """Return a remark on each range that turns an angle past a right one, or leaves out a nominal mode. A nominal value
-    outside its range is among the notes of the certificate.
-    """
+    """Return a remark on each range that turns an angle past a right one, or leaves out a nominal mode."""
     remarks: list[str] = []
     modes = find_modes(plants)
     angles = {name for plant in plants.values() for name, unit in plant.states.items() if unit == "rad"}

@@ -174,8 +174,8 @@ def _draw_diagnostics(panel: Callable[[Diagnostics, str], Panel]) -> Make:
 
 
 def _draw_responses(fit: Fit, experiment: str | None = None, pair: str | None = None) -> list[Panel]:
-    """Draw measured frequency responses (H1) and the fitted model: magnitude, phase and coherence. `pair`: by its name,
-    such as F1/I; all if left out. `ax`: a sequence of three Axes, for one pair.
+    """Draw H1 and the fitted model: magnitude, phase, coherence; `pair` such as F1/I. `ax`: three Axes,
+    for one pair.
     """
     experiments = _choose_experiments(fit, experiment)
     surveys = {each.name: experiment_survey(each, fit) for each in experiments}

@@ -86,9 +86,7 @@ class Clock:
 def expm_with_derivatives(
     n: Float[np.ndarray, "m m"], dn: Float[np.ndarray, "np m m"]
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "np m m"]]:
-    """Return exp(n) and its derivatives along each dn: Taylor's polynomial by Horner's rule, scaled and squared.
-    Products of small matrices only: a linear solver's threads would cost more than the matrices themselves.
-    """
+    """Return exp(n) and its derivatives along each dn by a scaled Taylor polynomial: products of small matrices."""
     norm = float(np.max(np.sum(np.abs(n), axis=1), initial=0.0))
     if not np.isfinite(norm) or not np.all(np.isfinite(dn)):
         return np.full_like(n, np.nan), np.full_like(dn, np.nan)

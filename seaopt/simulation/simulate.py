@@ -25,8 +25,8 @@ ROUNDING = 1e-6  # of an output: below it an error is not held against the outpu
 
 def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
     """Return the plant's inputs from a log's channels of the same names, in the plant's order; of an optional input
-    that it has none of zeros, or the time since it began.
-    Raises LogError: an input is missing from the log, or has missing samples.
+    that it has none of zeros, or the time since it began. Raises LogError: an input is missing from the log, or has
+    missing samples.
     """
     columns: list[Float[np.ndarray, " n"]] = []
     driven = any(name in log.signals for name in plant.inputs)  # by one at least, though all may be optional

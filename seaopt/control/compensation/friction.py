@@ -131,9 +131,7 @@ def _choose_speed(friction: MotorFriction, effort: float, loop: FrictionLoop | N
 
 
 def find_motor_position(plant: Plant, wanted: str, otherwise: str = "") -> str:
-    """Return the output that is the motor's position. `wanted`: what would be compensated by it, for the message.
-    `otherwise`: what else there is to do, for the message. Raises ControlError: the plant has none.
-    """
+    """Return the output that is the motor's position; `wanted` and `otherwise` are for the ControlError without one."""
     position = plant.sensing.motor_position if plant.sensing is not None else None
     if position is None or position not in plant.outputs:
         raise ControlError(

@@ -43,9 +43,7 @@ def is_schedule(content: Mapping[str, Any]) -> bool:
 def read_runnable(
     content: Mapping[str, Any], limit: float | None = None, tracking_time_s: float | None = None
 ) -> tuple[RunnableSchedule, dict[str, Any]]:
-    """Return the law of a schedule.json ready to run, and the fields of its first controller. Raises ControlError: a
-    number is out of range. Raises FileError: the content is malformed or contradicts itself.
-    """
+    """Return a schedule.json's law ready to run, and its first controller's fields. Raises ControlError, FileError."""
     from seaopt.control.laws.stored import read_controller  # deferred: pydantic
     from seaopt.control.scheduling.stored import read_schedule
 

@@ -91,9 +91,7 @@ def critical_impedance(
 
 
 def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
-    """Return critically damped impedances up to the stiffest, beyond which something slower oscillates. A slow integral
-    of the force law leaves a real pole that is slower, of next to no weight.
-    """
+    """Return critically damped impedances up to the stiffest: beyond it something slower, of weight, oscillates."""
     p = np.geomspace(SLOWEST_POLE, FASTEST_POLE, POLES)
     loop = close_link(link, velocity_filter_s)
     k, d = _place(loop, p)

@@ -65,9 +65,7 @@ class MovingLoop:
 
 
 def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -> MovingLoop:
-    """Return the loop of a link, with an outer loop of any gains, against an environment. `load`: what is on the port,
-    the link's own inertia included; the link alone if left out.
-    """
+    """Return the loop of a link with an outer loop against `load`, which includes the link; the link alone if None."""
     load = link.load if load is None else load
     port, period = link.port, link.sample_time_s
     n = port.motor.size

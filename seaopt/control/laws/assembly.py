@@ -100,9 +100,7 @@ class Assembly:
         return replace(self, chain=np.vstack([static, self.chain]), c=-row @ self.a, d=-row @ self.b)
 
     def with_reference_behind(self, part: TransferFunction, difference: TransferFunction) -> Assembly:
-        """Return this, the inputs being error, reference and further signals, with the reference behind a filter.
-        `part`: the filter F, stable and of unit static gain. `difference`: (F - 1)/delta, over the same denominator.
-        """
+        """Return this with the reference behind a stable filter F = `part`, F(0) = 1; `difference`: (F - 1)/delta."""
         a, b, row, through = difference.state_space()
         n, chain, whole = self.c.size, self.chain.copy(), np.sum(self.chain[:, :2], axis=1)
         c, d, inner = np.zeros(b.size), 0.0, np.eye(b.size) - a

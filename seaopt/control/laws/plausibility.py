@@ -34,9 +34,7 @@ LARGEST, MOST_HELD = 1e15, 1_000_000  # what float and unsigned long of every ta
 
 
 def is_number(value: float) -> bool:
-    """Tell whether a running law takes a number: finite, and so small that nothing which follows overflows. A law that
-    took 1e308 once would have a state from which every later command overflows.
-    """
+    """Tell whether a running law takes a number: finite, and so small that no later command overflows."""
     return bool(-LARGEST <= value <= LARGEST)
 
 
@@ -195,7 +193,6 @@ class PlausibilityGate:
         >>> gate = PlausibilityGate.of_controller(controller, range_N=(-4000.0, 4000.0))
         >>> print(f"{gate.max_step_N:.0f} N, {gate.ramp_A_per_s:.0f} A/s")
         473 N, 90 A/s
-
         """
         if not hasattr(controller, "command_limit"):
             raise ControlError(f"controller = {controller!r:.80}: give a Controller, or a ForceMPC")

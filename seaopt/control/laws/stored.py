@@ -277,9 +277,7 @@ def check_achieved(stated: Any, figures: Mapping[str, Any]) -> None:
 
 
 def check_friction_margin(stated: Any, margin: FrictionMargin | None) -> None:
-    """Refuse a friction margin that the law does not have, but for the precision to which it is known. A file that
-    states none claims none; without friction any one holds.
-    """
+    """Refuse a stated friction margin that the law does not have, to its precision; without friction any holds."""
     if stated is not None and margin is not None:
         figures, rtol = {"friction_margin": margin.least_slope}, 2.0 * MARGIN_PRECISION
         check_agrees({"friction_margin": stated}, figures, FILE, remedy=TUNE_AGAIN, place="achieved", rtol=rtol)

@@ -195,9 +195,7 @@ def _climb(
     high: Float[np.ndarray, " m"],
     wanted: Bool[np.ndarray, " m"] | None = None,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in. Maxima that
-    are not `wanted` are followed for as long as others are.
-    """
+    """Return the peaks with the local maxima from `low` to `high` taken in; unwanted ones only beside wanted ones."""
     if not curve.size:
         return peaks, at
 

@@ -200,9 +200,7 @@ class ClosedLoop:
 
 
 def close(plant: StateSpace, law: Law) -> ClosedLoop:
-    """Return the loop of a plant (with its delay) and the law u = C_r r - C_y m. A plant that is not finite, of absurd
-    parameters, has every pole at infinity: its loop is not stable.
-    """
+    """Return the loop of a plant and u = C_r r - C_y m; of a plant that is not finite an unstable one."""
     from scipy.linalg import matrix_balance, schur
 
     ap, bp, cp, dp = plant
@@ -305,9 +303,7 @@ def _on_circle(m: Float[np.ndarray, "p k k"], k: Float[np.ndarray, "p k k"]) -> 
 
 
 def find_sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) -> list[Float[np.ndarray, " _"]]:
-    """Return, for each set of arcs, the angles at which its function changes sign. `function(theta, which)` is the
-    function number `which` of each angle; rounding about zero has no sign.
-    """
+    """Return where function(theta, which), of each set of arcs, changes sign; rounding about zero has none."""
     middles = [0.5 * (row[:-1] + row[1:]) for row in edges]
     which = np.repeat(np.arange(len(middles)), [row.size for row in middles])
     theta, end = np.concatenate(middles), np.concatenate([row[1:] for row in edges])

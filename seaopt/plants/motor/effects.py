@@ -62,10 +62,7 @@ ROTARY_PARTS: dict[str, tuple[Parameter, ...]] = {
 
 
 def let_droop(plant: Plant) -> Plant:
-    """Return a plant whose motor saturates.
-
-    Raises PlantError: its actuation is not a current.
-    """
+    """Return a plant whose motor saturates. Raises PlantError: its actuation is not a current."""
     actuation = plant.actuation
     if actuation is None or plant.inputs[actuation.input] != AMPERE:
         raise PlantError(
@@ -83,9 +80,8 @@ def let_droop(plant: Plant) -> Plant:
 
 
 def let_friction_drift(plant: Plant) -> Plant:
-    """Return a plant whose friction changes with the time since its log began.
-
-    Raises PlantError: it states no friction, or has such a part.
+    """Return a plant whose friction changes with the time since its log began. Raises PlantError: it states no
+    friction, or has such a part.
     """
     name, friction = _find_friction(plant, "friction_drift")
     force, jump, loads = friction.force, friction.jump, friction.loads
@@ -121,9 +117,8 @@ def let_friction_drift(plant: Plant) -> Plant:
 
 
 def let_friction_differ(plant: Plant) -> Plant:
-    """Return a plant whose friction differs between the directions of its motion.
-
-    Raises PlantError: it states no friction, or has such a part.
+    """Return a plant whose friction differs between the directions of its motion. Raises PlantError: it states no
+    friction, or has such a part.
     """
     name, friction = _find_friction(plant, "friction_direction")
 
@@ -163,9 +158,8 @@ def _change(
     change: Callable[[Plant], Plant],
     **fields: Any,
 ) -> Plant:
-    """Return a plant that sees other inputs and friction forces than it is given, a function of (x, u, p).
-
-    `change` makes the same of the plants of its ports; `fields` are what else is another.
+    """Return a plant that sees other inputs and friction forces than it is given, a function of (x, u, p). `change`
+    makes the same of the plants of its ports; `fields` are what else is another.
     """
     refuse_clash(plant, part, [parameter.name for parameter in parameters])
 

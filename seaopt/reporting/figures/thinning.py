@@ -16,9 +16,7 @@ METHOD = "least and largest sample of each of {} stretches (min-max)"
 def thin_series(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], stretches: int = STRETCHES
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return a series of at most two samples per stretch, and its ends; a short one as it is. `values`: NaN where a
-    sample is missing; a stretch without a sample gives NaN. `stretches`: of equally many samples.
-    """
+    """Return at most two samples per stretch of equal length, and the ends; NaN where a stretch has no sample."""
     n = values.size
     if n <= 2 * stretches:
         return time, values

@@ -118,10 +118,7 @@ def _round_up(value: float) -> str:
 
 @dataclass(slots=True, kw_only=True, eq=False)  # replaced field by field as the search goes on
 class _BranchAndBound:
-    """The state of one search: boxes and arcs still open, and what is known so far.
-
-    `lower` and `upper` are of S and T: the largest measured, and the largest bound of the arcs that are done.
-    """
+    """One search: boxes and arcs still open, and the largest of S and T measured (`lower`) and bounded (`upper`)."""
 
     controller: Controller
     plant: Plant

@@ -34,10 +34,7 @@ Coefficients = Float[np.ndarray, " m"]  # of a polynomial, ascending
 
 @record(eq=False)
 class Arcs:
-    """Pairs of a box, by its index, and an arc, by its middle and half its length in rad.
-
-    `s` and `t` bound abs(S) and abs(T) so far.
-    """
+    """Pairs of a box, by index, and an arc: middle and half length, rad; `s`, `t` bound abs(S) and abs(T) so far."""
 
     box: Int[np.ndarray, " p"]
     middle: PerArc
@@ -135,9 +132,7 @@ def _keeps_degree(controller: Controller, plant: ImpulseTransfer) -> Bool[np.nda
 
 
 def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
-    """Return every arc's coefficients to second order, and their remainders. Centre, slopes and half curvatures, as a
-    whole symmetric matrix, are along one axis.
-    """
+    """Return every arc's centre, slopes and half curvatures (a symmetric matrix) along an axis, and remainders."""
     over, k = model.basis, model.basis.size
     second = np.array([[over.index_of(i, j) for j in range(k)] for i in range(k)], dtype=int).reshape(k, k)
     half = np.where(np.eye(k) > 0.0, 1.0, 0.5)[:, :, None, None]

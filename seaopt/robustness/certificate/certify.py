@@ -441,9 +441,7 @@ def _check_delay(controller: Controller, ranges: Ranges) -> None:
 
 
 def _digest(controller: Controller) -> int:
-    """Return a number of the law's own, so that another law meets other draws at the same seed. To six digits: what two
-    machines tune from the same file is the same law.
-    """
+    """Return a law's number for other draws at the same seed; six digits, alike on two machines."""
     coefficients = (
         f"{value:.6g}" for part in (controller.reference, controller.measurement) for value in (*part.num, *part.den)
     )

@@ -66,9 +66,7 @@ def find_margins_at_draws(
     required: float | None = None,
     executor: Executor | None = None,
 ) -> dict[str, FrictionDraws]:
-    """Return margins at draws, of plants for which stability, or the slope required, is shown at nominal parameters.
-    Those that have friction at draws alone are among them.
-    """
+    """Return margins at draws, of plants whose nominal margin is shown or enough, or that rub at draws alone."""
     unknown, count = loops.value.unknown, min(samples, MARGIN_DRAWS)
     varied = [row.name for row in unknown.varied()]
     enough = {

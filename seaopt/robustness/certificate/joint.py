@@ -243,10 +243,7 @@ def tune_certified(
 def breaks_at_draws(
     controller: Controller, plants: Plants, parameters: Source, ranges: Ranges, others: ParameterSet
 ) -> bool:
-    """Tell whether a controller that keeps its limits breaks Ms, Mt or stability somewhere in what `certify` draws.
-
-    It is a first look: few draws, and the search for the worst case from them.
-    """
+    """Tell whether a law breaks Ms, Mt or stability at a few of `certify`'s draws, or in a search from them."""
     loops = Shared(pose_loops(controller, plants, parameters, ranges, others))
     if not loops.value.unknown.size:
         return False

@@ -153,9 +153,7 @@ def draw_requirements(
 def friction_requirements(
     margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None, unit: str
 ) -> list[Requirement]:
-    """Return that stability is shown for friction as steep as asked, at the nominal values and over draws. Without
-    friction there is nothing to show: the row says so, with an infinite value.
-    """
+    """Return that stability is shown for friction as steep as asked, nominal and drawn; infinite without friction."""
     if least is None:
         return []
 
@@ -235,9 +233,7 @@ def eigenvalue_requirements(
 
 
 def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
-    """Return what is required of an impedance: the link is stable by itself, and no environment changes that. Both hold
-    with friction sliding and stuck, and at the draws, and simulated steps come to rest.
-    """
+    """Return what is required of an impedance, friction sliding and stuck: a stable link in any environment."""
     if impedance is None:
         return []
     called, unit, plant = impedance.rendering.called, impedance.rendering.outer.place_unit, impedance.plant

@@ -51,9 +51,7 @@ class _SampledPlants:
 
 
 def severities(controller: Controller, figures: BatchFigures, by: Levels | None = None) -> Column:
-    """Return the severity of every draw: instability first, then the fraction of the limits that it uses. With `by`,
-    levels of Ms and Mt for all draws or for each, that is the fraction of these.
-    """
+    """Return the severity of every draw: instability, then the fraction of the limits, or of `by`, that it uses."""
     ms, mt = levels(controller).T if by is None else by.T
     with np.errstate(invalid="ignore"):  # infinite over infinite, of unstable draws, which are ranked apart
         used = np.maximum(figures.ms / ms, figures.mt / mt)

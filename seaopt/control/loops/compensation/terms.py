@@ -315,9 +315,7 @@ def compensate(
     readings: Sequence[Any],
     operations: Any,
 ) -> tuple[Any, Any, list[Any]]:
-    """Return the law's reference, the effort that is added, and the next memory, of floats or expressions.
-    `operations`: what has fmin, fmax and floor for them: the module casadi for expressions.
-    """
+    """Return the law's reference, added effort and next memory; `operations`: casadi for expressions, else numpy."""
     shaped, added, rubs = reference, 0.0, 0 if shape.friction is None else 2
     if shape.gravity:
         shaped = reference + _sum_series(numbers[rubs : rubs + shape.gravity], readings[shape.link], operations)
