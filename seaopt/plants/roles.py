@@ -116,8 +116,8 @@ class SeriesSpring:
 class Bristles:
     r"""Bristles, which give before a friction slides, so that at rest it is a spring: a friction that remembers.
 
-    The bristles' deflection z is a state of the plant, whose rate stands in `f`, and the force is :math:`\\sigma_0 z +
-    \\sigma_1 \\dot z`. While they hold, z follows the coordinate whose rate the velocity is.
+    The bristles' deflection z is a state of the plant, whose rate stands in `f`, and the force is
+    :math:`\sigma_0 z + \sigma_1 \dot z`. While they hold, z follows the coordinate whose rate the velocity is.
     """
 
     state: str  # the deflection z, the plant's own

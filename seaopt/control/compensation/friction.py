@@ -158,9 +158,9 @@ def find_reading(plant: Plant, params: ParameterSet, output: str, friction: Moto
 
 def find_velocity_per_rate(plant: Plant, params: ParameterSet, regulated: str, name: str) -> float:
     r"""Return the velocity at a friction per rate of the regulated output, slowly and with the link held. With the
-    plant :math:`\dot x = A x + b u`, y = c x and the velocity v x, slowly :math:`v x / \dot y = v A^{-2} b / (c A^{-1}
-    b)`: of a spring k between motor and link it is 1/k and the gear. Raises ControlError: the plant with its link held
-    has no stiffness, or its friction does not move.
+    plant :math:`\dot x = A x + b u`, y = c x and the velocity v x, slowly
+    :math:`v x / \dot y = v A^{-2} b / (c A^{-1} b)`: of a spring k between motor and link it is 1/k and the gear.
+    Raises ControlError: the plant with its link held has no stiffness, or its friction does not move.
     """
     locked = plant
     while locked.port is not None and locked.port.held is not None:

@@ -170,9 +170,9 @@ def _expand_law(law: Law) -> tuple[list[Coefficients], Coefficients]:
 def _expand_powers(law: Coefficients, delay: Int[np.ndarray, " p"], arcs: Arcs, count: int) -> Powers:
     r"""Return law(1 - 1/z) z^-delay w^j for every j: value, first and second order, bounds on the remainder and on all.
     Each is a product of functions of the angle, whose derivatives up to the third are bounded over the arc: of
-    :math:`p(\delta) q^D`, :math:`q = 1/z`, :math:`\delta = 1 - q`, with :math:`\delta' = iq`, these are :math:`i q^D (q
-    p' - D p)`, :math:`q^D (-q^2 p'' + (2D + 1) q p' - D^2 p)`, and at most :math:`|p^{(3)}| + 3(D + 1)|p''| + (3D^2 +
-    3D + 1)|p'| + D^3 |p|`.
+    :math:`p(\delta) q^D`, :math:`q = 1/z`, :math:`\delta = 1 - q`, with :math:`\delta' = iq`, these are
+    :math:`i q^D (q p' - D p)`, :math:`q^D (-q^2 p'' + (2D + 1) q p' - D^2 p)`, and at most
+    :math:`|p^{(3)}| + 3(D + 1)|p''| + (3D^2 + 3D + 1)|p'| + D^3 |p|`.
     """
     z, half = np.exp(1j * arcs.middle), arcs.half
     w, turn = np.expm1(1j * arcs.middle), z[:, None]

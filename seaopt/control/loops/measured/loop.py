@@ -101,8 +101,8 @@ class DiscLoop:
         r"""Return the worst figures of all responses in the discs; of a loop that is not shown to be stable, none. The
         bandwidth is that asked for where the discs cannot tell it from their own: it lies between their least and their
         largest, and the least is above 0.97 of it. Else it is the least. The crossover is that of the centres. Gain and
-        phase margins are those that Ms and Mt leave at least, and the delay margin that of :math:`|1 -
-        e^{-j\omega\tau}| < 1/|T|` at every frequency.
+        phase margins are those that Ms and Mt leave at least, and the delay margin that of
+        :math:`|1 - e^{-j\omega\tau}| < 1/|T|` at every frequency.
         """
         if not self.is_stable():
             return make_unstable_figures(np.inf)
