@@ -15,6 +15,9 @@ import pytest
 
 from seaopt.errors import LogError
 from seaopt.logs import Column, Hold, contents, read_log, read_table
+from seaopt.logs.formats.messages import build_wanted_tree
+from seaopt.logs.formats.simulink import assign_clocks
+from seaopt.logs.formats.source import Field, spread
 
 N = 200
 T = np.arange(N) / 100
@@ -426,3 +429,19 @@ def test_an_mcap_topic_of_two_types_is_refused(tmp_path):
         writer.finish()
     with pytest.raises(LogError, match="/a carries std_msgs/msg/Float64 and std_msgs/msg/Int64"):
         contents(path)
+
+
+def test_columns_of_arrays_are_named_by_their_place():
+    assert [field.name for field, _ in spread("x", (100, 2), "float64")] == ["x[:,0]", "x[:,1]"]
+    assert [field.name for field, _ in spread("x", (2, 9), "int8")] == ["x[0,:]", "x[1,:]"]
+    assert [field.name for field, _ in spread("x", (100, 2), "float64", matlab=True)] == ["x(:,1)", "x(:,2)"]
+
+
+def test_the_time_of_a_structure_is_the_clock_of_its_signals():
+    names = ("out.time", "out.signals.values")
+    fields = assign_clocks([Field(name=name, kind="float64", length=9) for name in names])
+    assert [(field.clock, field.unit) for field in fields] == [("out.time", "s"), ("out.time", None)]
+
+
+def test_wanted_paths_are_nested():
+    assert build_wanted_tree({"a.b[2]": "x", "a.c": "y"}) == {"a": {"b": {2: "x"}, "c": "y"}}

@@ -16,6 +16,12 @@ from seaopt.bench import PAPER_STAND, PAPER_SWING, Multisine, Noise
 from seaopt.errors import LogError
 from seaopt.files import to_json
 from seaopt.logs import Table, assess_quality
+from seaopt.logs.log.saturation import mask_saturated
+from seaopt.logs.quality.channel import assess_channel
+from seaopt.logs.quality.clock import advise_clock, measure_steps, timestamp_resolution
+from seaopt.logs.quality.faults import count_repeats, find_quantisation, find_runs
+from seaopt.logs.quality.lags import correlate_channels
+from seaopt.logs.quality.spectra import compute_spectra
 from seaopt.signals import Signal
 
 GRAVE = ("error", "warning")
@@ -393,3 +399,40 @@ def test_numbers_beyond_any_sensor_are_an_error_and_in_no_figure():
     assert (finding.severity, finding.count, finding.where_s[0][0]) == ("error", 2, t[50])
     assert not quality.of("missing") and quality.channels["F1"].std == plain.channels["F1"].std
     assert not any("inf" in one.sentence or "nan" in one.sentence or "∞" in one.sentence for one in quality.findings)
+
+
+def test_samples_at_the_ends_of_a_declared_range_are_masked():
+    log = so.Log.from_arrays(time=np.arange(5) / 10, F1=[0.0, 8.0, 9.0, 9.0, 3.0], units={"F1": "N"})
+    masked = mask_saturated(log, ["F1"], ranges={"F1": (-9.0, 9.0)}, search=True)
+    np.testing.assert_array_equal(masked["F1"], [0.0, 8.0, np.nan, np.nan, 3.0])
+    assert masked.notes == ("F1: 2 samples (40 %) at or beyond its declared range of -9 to 9 N masked",)
+
+
+def test_a_clipped_sine_has_one_rail_and_is_never_stuck():
+    channel = assess_channel(Signal(name="F1", values=np.clip(np.sin(np.arange(999.0)), -2, 0.8)))
+    assert [(rail.side, rail.value) for rail in channel.rails] == [("high", 0.8)]
+    assert channel.stuck.samples == 0
+
+
+def test_steps_of_a_clock_their_rounding_and_what_to_do():
+    rounded = np.round(np.arange(400) / 400, 3)
+    assert timestamp_resolution(rounded) == pytest.approx(1e-3)
+    assert timestamp_resolution(np.arange(400) / 400) == 0.0
+    period, gap_s = measure_steps(np.tile([2.7e-3, 2.7e-3, 10e-3], 100))
+    assert (1.0 / period, gap_s) == pytest.approx((3.0 / 15.4e-3, 0.02), abs=1e-3)
+    assert advise_clock(0.0025, rounded=True) == ("call log.restamp()", [{"resample": "restamp"}])
+    assert advise_clock(0.0025)[0].startswith("call log.resample(rate_hz=400), or log.restamp(rate_hz=400) where a PC")
+
+
+def test_runs_steps_and_repeats_of_values():
+    x = np.sin(np.arange(1000.0))
+    assert find_runs(np.array([True, True, False, True])).stop.tolist() == [2, 4]
+    assert find_quantisation(0.01 * np.round(x / 0.01)) == pytest.approx(0.01) and find_quantisation(x) == 0.0
+    assert count_repeats(np.repeat(np.sin(np.arange(50.0)), 4)) == 4
+
+
+def test_the_lag_of_one_channel_behind_another():
+    x = np.random.default_rng(1).normal(size=4000)
+    both = compute_spectra({"a": x[5:], "b": -x[:-5]}, [slice(0, 3995)], 0.01)
+    pair = correlate_channels(both, "a", "b")
+    assert pair.lag_s == pytest.approx(0.05, abs=1e-3) and pair.correlation < -0.9

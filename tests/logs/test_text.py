@@ -7,6 +7,9 @@ import pytest
 
 from seaopt.errors import LogError, UnitError
 from seaopt.logs import Column, contents, read_log, read_table
+from seaopt.logs.formats.text_layout import _join_quoted_lines, _number_header
+from seaopt.logs.reading.column import spell_column, suspect_wrap
+from seaopt.logs.reading.selection import is_time_name
 
 TIME, CURRENT, FORCE = [0.0, 0.0025, 0.005], [0.1, -0.15, 0.2], [10.5, 20.25, -3e-3]
 ROWS = "0;100;10,5\n2,5;-150;20,25\n5;200;-3e-3\n"
@@ -205,3 +208,14 @@ def test_an_unknown_unit_is_refused_where_others_are_known(file):
 def test_an_index_in_brackets_is_no_unit(file):
     table = read_table(file(b"time [s],q[0],q[1],T [\xc2\xb0C]\n0,1,2,20\n1,2,3,21\n"))
     assert list(table.signals)[:2] == ["q[0]", "q[1]"]
+
+
+def test_headers_that_repeat_are_numbered_and_those_over_two_lines_joined():
+    assert _number_header("X [s]", 3) == "X#3 [s]"
+    assert _join_quoted_lines(['t,"I', '[A]",F1', "x"]) == ['t,"I [A]",F1', "", "x"]
+
+
+def test_columns_named_like_a_time_and_columns_that_wrap():
+    assert [is_time_name(name) for name in ("Zeit [ms]", "imu.t", "F1 [N]")] == [True, True, False]
+    assert suspect_wrap(np.array([0.0, 3.0, 65530.0, 65535.0, 1.0]), 0.0, 65535.0) == 16
+    assert spell_column(column="cur", unit="A") == 'column = "cur", unit = "A"'

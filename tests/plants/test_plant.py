@@ -9,6 +9,7 @@ import pytest
 import seaopt as so
 from seaopt.errors import ParameterError, PlantError
 from seaopt.plants.memo import memo
+from seaopt.plants.parts import list_dead_times, wrapped
 
 GOOD = {
     "name": "cart",
@@ -116,3 +117,8 @@ def test_a_result_is_computed_once_for_each_plant():
     plants = so.plants.high_impedance(), so.plants.moving_output()
     assert [count_states(plant) for plant in (*plants, *plants)] == [2, 4, 2, 4]
     assert counted == [*plants]
+
+
+def test_dead_times_are_those_of_the_parts():
+    plant = so.plants.high_impedance()
+    assert list_dead_times(wrapped(plant, ["load_cell", "command_delay"])) == ("T_c",)

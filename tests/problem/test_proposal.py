@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.logs.quality.spectra import compute_spectra
 from seaopt.problem import json_schema
 from seaopt.problem.proposal import propose
-from seaopt.problem.proposal.vocabulary import read_header
+from seaopt.problem.proposal.questions import name_entry
+from seaopt.problem.proposal.survey import regress, slow_sign, survey_log
+from seaopt.problem.proposal.traits import fit_delay
+from seaopt.problem.proposal.vocabulary import is_m_open, read_header, split_words
 from tests.actuator_logs import KNEE, SCREW, drive, knee, screw, write_csv
 
 RATE = 400.0
@@ -550,3 +554,31 @@ def test_a_motor_that_stands_still_time_and_again_is_offered_friction_that_stick
     path.write_text("\n".join(taken), encoding="utf-8")
     problem = so.read_problem(path)
     assert problem.plants["held"].sticks and problem.parameters["f_s"].value > problem.parameters["f_c"].value > 0
+
+
+def test_names_are_split_and_an_m_may_be_metres_or_the_motor():
+    assert split_words("motorPosition_F1") == ["motor", "position", "f1"]
+    assert split_words("/joint.tau_cmd") == ["joint", "tau", "cmd"]
+    assert [is_m_open(read_header(name)) for name in ("pos_m", "weg_m", "pos [m]")] == [True, False, False]
+    assert (name_entry("unit:F1"), name_entry("N")) == ("unit of F1", "N")
+
+
+def test_a_survey_leaves_texts_out(tmp_path):
+    (tmp_path / "a.csv").write_text("t_ms,cur_mA,note\n0,100,a\n2,150,b\n4,120,c\n")
+    survey = survey_log(tmp_path / "a.csv")
+    assert survey.clock.name == "t_ms" and survey.left_out == {"note": "text"}
+    assert [column.header.quantity for column in survey.columns] == ["current"]
+
+
+def test_columns_are_compared_by_slope_and_by_slow_motion():
+    t = np.arange(4000) / 400
+    assert slow_sign(np.sin(t), -np.sin(t - 0.1), 400.0) == -1
+    assert regress(3.0 * t + 1.0, t) == pytest.approx((3.0, 1.0))
+
+
+def test_the_delay_of_an_output_is_that_of_its_samples():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=8000)
+    y = np.concatenate([np.zeros(5), u[:-5]]) + 0.01 * rng.normal(size=8000)
+    delay_s, std = fit_delay(compute_spectra({"u": u, "y": y}, [slice(0, 8000)], 0.001), "u", "y", held=False)
+    assert std < 1e-4 and delay_s == pytest.approx(0.005, abs=3 * std)

@@ -18,6 +18,7 @@ from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation import Squares, profile
 from seaopt.estimation.judgement import judge
+from seaopt.estimation.result.findings import state_guesses
 from seaopt.files import to_json
 
 FREE = ("J", "b_r", "eta")
@@ -510,3 +511,8 @@ def test_it_is_quick(stand, stand_log, thor):
     started = time.perf_counter()
     so.fit([experiment(stand, stand_log)], thor.free(*FREE))
     assert time.perf_counter() - started < 10
+
+
+def test_guesses_are_counted_and_named():
+    assert state_guesses(["N_p", "l"]) == "on 2 guesses: N_p, l"
+    assert state_guesses([]) == ""
