@@ -7,13 +7,12 @@ JSON has no infinity, so that null stands for one where a type here says so.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationError, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Strict, ValidationError
 
 from seaopt.errors import FileError, SeaoptError, suggestion
 
@@ -34,8 +33,6 @@ UNION_BRANCH = re.compile(
 Number = Annotated[float, Strict()]
 Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
-_OR_NULL = WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "null"}]})
-NullIsInfinite = Annotated[Number, BeforeValidator(lambda value: math.inf if value is None else value), _OR_NULL]
 
 
 class ResultTable(BaseModel):
