@@ -45,12 +45,7 @@ Document = TypeVar("Document", bound=BaseModel)
 
 
 def check_table(
-    model: type[Document],
-    content: Any,
-    source: str,
-    *,
-    remedy: str = "",
-    error: type[SeaoptError] = FileError,
+    model: type[Document], content: Any, source: str, *, remedy: str = "", error: type[SeaoptError] = FileError
 ) -> Document:
     """Return a table as a model. `model`: what the table may hold. `content`: as read from the file. `source`: the
     file, for messages. `remedy`: what to do about any mistake; left out where the place is the user's own, to be

@@ -118,12 +118,7 @@ class Parameter:
 
 
 def declare(
-    name: str,
-    value: float,
-    unit: str,
-    least: float,
-    description: str,
-    plausible: tuple[float, float] | None = None,
+    name: str, value: float, unit: str, least: float, description: str, plausible: tuple[float, float] | None = None
 ) -> Parameter:
     """Return a parameter from a row of a plant's table: its default, the least value, and what such actuators have."""
     return Parameter(name=name, value=value, unit=unit, min=least, description=description, plausible=plausible)

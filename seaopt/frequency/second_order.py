@@ -204,11 +204,7 @@ class SecondOrder:
 
 
 def second_order(
-    estimate: FrequencyResponse,
-    clock: Clock,
-    *,
-    unit: str = "-",
-    use: Bool[np.ndarray, " m"] | None = None,
+    estimate: FrequencyResponse, clock: Clock, *, unit: str = "-", use: Bool[np.ndarray, " m"] | None = None
 ) -> SecondOrder:
     """Fit K/(s^2 + a s + b) to an H1 estimate, without a guess.
 
@@ -304,10 +300,7 @@ def _start(f: Lines, measured: ComplexLines, sigma: Lines, clock: Clock) -> Floa
 
 
 def _fit_linear(
-    s: ComplexLines,
-    measured: ComplexLines,
-    sigma: Lines,
-    hold: ComplexLines,
+    s: ComplexLines, measured: ComplexLines, sigma: Lines, hold: ComplexLines
 ) -> tuple[float, Float[np.ndarray, "3"]]:
     """Return the cost and K, a, b of the best step of K - a s G - b G = s^2 G, weighted by the step before it."""
     g, scatter = measured / hold, sigma / np.abs(hold)

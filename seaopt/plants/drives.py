@@ -43,10 +43,7 @@ from seaopt.records import record
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "voltage_input": (RESISTANCE,),
-    "duty_input": (
-        RESISTANCE,
-        declare("V_s", 24.0, "V", 1e-9, "supply voltage", (1.0, 1e3)),
-    ),
+    "duty_input": (RESISTANCE, declare("V_s", 24.0, "V", 1e-9, "supply voltage", (1.0, 1e3))),
     "inductance": (declare("L_m", 1e-3, "H", 1e-12, "winding inductance", (1e-7, 1)),),
     "position_servo": (
         declare("k_p", 1.0, "-", 0.0, "gain of the servo, in the units that g_s, 1 unless given, converts"),

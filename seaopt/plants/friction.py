@@ -25,14 +25,7 @@ from jaxtyping import Float
 from seaopt.errors import PlantError
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import (
-    CompletedParameters,
-    Plant,
-    jacobians,
-    name_parameters,
-    name_symbols,
-    state_space,
-)
+from seaopt.plants.plant import CompletedParameters, Plant, jacobians, name_parameters, name_symbols, state_space
 from seaopt.plants.roles import Bristles, Friction, change_ports, with_values
 from seaopt.records import record
 

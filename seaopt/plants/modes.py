@@ -70,10 +70,7 @@ class Modes:
 
 
 def modes(
-    plant: Plant,
-    params: ParameterSet,
-    x: Mapping[str, float] | None = None,
-    u: Mapping[str, float] | None = None,
+    plant: Plant, params: ParameterSet, x: Mapping[str, float] | None = None, u: Mapping[str, float] | None = None
 ) -> Modes:
     """Return poles, zeros, static gains and resonances of a plant linearised at an operating point.
 

@@ -52,10 +52,7 @@ Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
 Energy = Callable[[Any, Any], Any]
 DRIVE_DELAY = "drive_delay_s"  # among parameters: seconds from a command to its effect
 Matrices = tuple[
-    Float[np.ndarray, "nx nx"],
-    Float[np.ndarray, "nx nu"],
-    Float[np.ndarray, "ny nx"],
-    Float[np.ndarray, "ny nu"],
+    Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"], Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nu"]
 ]
 
 
@@ -236,10 +233,7 @@ class Plant:
         return ca.SX(self.energy(x, p))
 
     def linearize(
-        self,
-        params: ParameterSet,
-        x: Mapping[str, float] | None = None,
-        u: Mapping[str, float] | None = None,
+        self, params: ParameterSet, x: Mapping[str, float] | None = None, u: Mapping[str, float] | None = None
     ) -> Any:
         """Return the continuous-time `control.StateSpace` at an operating point, signals named.
 
@@ -259,14 +253,7 @@ class Plant:
 
         a, b, c, d = state_space(self, params, x, u)
         return control.ss(
-            a,
-            b,
-            c,
-            d,
-            states=list(self.states),
-            inputs=list(self.inputs),
-            outputs=list(self.outputs),
-            name=self.name,
+            a, b, c, d, states=list(self.states), inputs=list(self.inputs), outputs=list(self.outputs), name=self.name
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -443,10 +430,7 @@ def refuse_samples(plant: Plant) -> None:
 
 
 def state_space(
-    plant: Plant,
-    params: ParameterSet,
-    x: Mapping[str, float] | None = None,
-    u: Mapping[str, float] | None = None,
+    plant: Plant, params: ParameterSet, x: Mapping[str, float] | None = None, u: Mapping[str, float] | None = None
 ) -> Matrices:
     """Return (A, B, C, D) of a plant at an operating point, as `Plant.linearize` but plain arrays.
 

@@ -119,9 +119,7 @@ _LINK_OF = {
     "locked": Link(effort="tau_e"),
     "free": _FREE,
     "pendulum": replace(
-        _FREE,
-        potential=lambda x, p: p.m * p.g * p.L * (1 - ca.cos(x.theta_l)),
-        parameters=(*_LINK, *_PENDULUM),
+        _FREE, potential=lambda x, p: p.m * p.g * p.L * (1 - ca.cos(x.theta_l)), parameters=(*_LINK, *_PENDULUM)
     ),
     "bare": _TURNING,  # of the probe, whose only parameter is its inertia
 }

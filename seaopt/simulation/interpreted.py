@@ -256,11 +256,7 @@ def _fold(
 
 
 def _folded_trajectory(
-    model: Model,
-    segment: Segment,
-    point: Point,
-    forcing: Float[np.ndarray, "n w"],
-    x0: Float[np.ndarray, " nx"],
+    model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]
 ) -> Trajectory:
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
     layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(point)

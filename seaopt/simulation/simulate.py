@@ -131,11 +131,7 @@ def simulate(
 def _run_to_tolerance(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clock: Clock, rtol: float) -> Pass:
     def run(substeps: int, model: Model = model) -> Pass:
         point = Point(
-            theta=np.zeros(0),
-            offset=np.zeros(model.ny),
-            gain=np.ones(model.ny),
-            clock=clock,
-            substeps=substeps,
+            theta=np.zeros(0), offset=np.zeros(model.ny), gain=np.ones(model.ny), clock=clock, substeps=substeps
         )
         return run_passes(model, segment, point, x0, sums=False, outputs=True, states=True)
 

@@ -14,14 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from seaopt.control.deploy.c_text import (
-    LARGEST_NUMBER,
-    Precision,
-    describe_timing,
-    identifier,
-    literal,
-    strip_markup,
-)
+from seaopt.control.deploy.c_text import LARGEST_NUMBER, Precision, describe_timing, identifier, literal, strip_markup
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.realisation import choose_limit

@@ -88,14 +88,7 @@ def assess(
     law = replace(law, sample_time_s=spec.sample_time_s)
     robust_to = take_own_delays(spec, plant, robust_to or {}, params)
     spec, values = settle_delays(spec, plant, params)
-    spec = replace(
-        spec,
-        structure=CUSTOM,
-        notch=None,
-        prefilter=None,
-        link_feedforward=None,
-        reference_weights="tuned",
-    )
+    spec = replace(spec, structure=CUSTOM, notch=None, prefilter=None, link_feedforward=None, reference_weights="tuned")
     task = make_task(plant, plant.complete(values), spec, robust_to, draws)
     loops = task.measure_law(law, filter_samples=count_filter_samples(law), integral_rad_s=find_integral_rate(law))
     return describe_law(task, law, loops, (plant, values), gains={})

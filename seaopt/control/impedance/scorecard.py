@@ -117,9 +117,7 @@ class Scorecard(Worded):
 
 
 def scorecard(
-    controllers: Mapping[str, Controller],
-    plant: Plant | None = None,
-    parameters: ParameterSet | None = None,
+    controllers: Mapping[str, Controller], plant: Plant | None = None, parameters: ParameterSet | None = None
 ) -> Scorecard:
     """Score controllers on four axes: tracking, apparent impedance, its passivity, noise.
 

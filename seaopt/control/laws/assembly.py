@@ -63,11 +63,7 @@ class Assembly:
         a = np.zeros((n + more, n + more))  # `block_diag` would take longer than all the rest of a law
         a[:n, :n], a[n:, n:] = self.a, other.a
         return Assembly(
-            chain=chain,
-            a=a,
-            b=np.vstack([self.b, other.b]),
-            c=np.concatenate([self.c, other.c]),
-            d=self.d + other.d,
+            chain=chain, a=a, b=np.vstack([self.b, other.b]), c=np.concatenate([self.c, other.c]), d=self.d + other.d
         )
 
     def scaled(self, factor: float) -> Assembly:

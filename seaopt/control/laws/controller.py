@@ -15,11 +15,7 @@ from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Prefilter, SpeedLoop
-from seaopt.control.laws.verdict import (
-    PossibleBandwidths,
-    list_broken_figures,
-    shorten_blocked,
-)
+from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath, multiply_out
 from seaopt.control.loops.compensation.terms import Compensation

@@ -25,13 +25,7 @@ from seaopt.control.loops.sampled_plant import (
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import (
-    SLIDING,
-    find_bristle_stiffness,
-    friction_matrices,
-    friction_slopes,
-    friction_states,
-)
+from seaopt.plants.friction import SLIDING, find_bristle_stiffness, friction_matrices, friction_slopes, friction_states
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record

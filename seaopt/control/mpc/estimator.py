@@ -192,10 +192,7 @@ class Estimator:
         return self.go_on(line, *self.correct(state, y, self.list_acting(line)))
 
     def go_on(
-        self,
-        line: Float[np.ndarray, "m nu"],
-        corrected: Float[np.ndarray, " n"],
-        innovation: Float[np.ndarray, " ny"],
+        self, line: Float[np.ndarray, "m nu"], corrected: Float[np.ndarray, " n"], innovation: Float[np.ndarray, " ny"]
     ) -> EstimatorState:
         """Return the state after a sample: the inputs before it and its own, and what `correct` gave."""
         return EstimatorState(

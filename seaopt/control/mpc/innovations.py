@@ -33,12 +33,7 @@ UNSEEN_OFFSET = 1e-6  # of what sensors show of their offsets; a part as small a
 
 
 def estimate_noise(
-    plant: Plant,
-    params: ParameterSet | Fit,
-    log: Log,
-    *,
-    outputs: tuple[str, ...] = ("F1",),
-    delay_samples: int = 0,
+    plant: Plant, params: ParameterSet | Fit, log: Log, *, outputs: tuple[str, ...] = ("F1",), delay_samples: int = 0
 ) -> NoiseModel:
     """Return the sensors' noise and offsets, and a white noise on the plant's first input, that explain a log best.
 

@@ -65,10 +65,7 @@ class OutputBounds:
         k = len(self.names)
         base = np.repeat(self.static * at_rest - self.middle / self.half, self.samples) + self.free @ start
         none = np.full(base.size, wide)
-        return (
-            np.concatenate([-none, -1.0 - base, np.zeros(k)]),
-            np.concatenate([1.0 - base, none, np.full(k, wide)]),
-        )
+        return (np.concatenate([-none, -1.0 - base, np.zeros(k)]), np.concatenate([1.0 - base, none, np.full(k, wide)]))
 
     def admissible_rest(self, drift: float, limit: float) -> tuple[float, float]:
         """Return the commands at rest, least and largest, that keep the bounds; within the limit of the command. Where

@@ -31,13 +31,7 @@ import numpy as np
 
 from seaopt.codec import Key, to_content
 from seaopt.errors import EstimationError
-from seaopt.estimation.advice.forecasts import (
-    Percent,
-    compute_percent,
-    filter_to_band,
-    simulate_freely,
-    split_samples,
-)
+from seaopt.estimation.advice.forecasts import Percent, compute_percent, filter_to_band, simulate_freely, split_samples
 from seaopt.estimation.problem.correlation import autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.fit_problem import FitProblem

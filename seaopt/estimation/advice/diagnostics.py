@@ -15,12 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.codec import to_content
-from seaopt.estimation.advice.forecasts import (
-    Percent,
-    compute_percent,
-    predict_one_step,
-    simulate_freely,
-)
+from seaopt.estimation.advice.forecasts import Percent, compute_percent, predict_one_step, simulate_freely
 from seaopt.estimation.judgement.judge import judge
 from seaopt.estimation.judgement.score_test import ScoreTest, run_score_tests
 from seaopt.estimation.problem.correlation import (
@@ -31,11 +26,7 @@ from seaopt.estimation.problem.correlation import (
     cross_correlation,
 )
 from seaopt.estimation.problem.fit_experiment import FitOutput
-from seaopt.estimation.problem.residual_statistics import (
-    ExperimentResiduals,
-    ResidualsByExperiment,
-    compute_statistics,
-)
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, compute_statistics
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import describe_outputs

@@ -101,10 +101,7 @@ def _map_derivatives(model: Model, count: int) -> ca.Function:
 
 
 def kalman_gain(
-    a: Float[np.ndarray, "t nx nx"],
-    c: Float[np.ndarray, "t ny nx"],
-    q: Float[np.ndarray, "t nx"],
-    r: PerOutput,
+    a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"], q: Float[np.ndarray, "t nx"], r: PerOutput
 ) -> Float[np.ndarray, "t nx ny"]:
     """Return the predictor's steady-state gain of each plant; not finite where there is none. What no output shows, as
     the place of a free body under force sensors, would drift without bound: it is left out of the filter and not
@@ -151,10 +148,7 @@ def _decompose_observability(
 
 
 def _solve_riccati(
-    a: Float[np.ndarray, "t m m"],
-    c: Float[np.ndarray, "t ny m"],
-    q: Float[np.ndarray, "t m m"],
-    r: PerOutput,
+    a: Float[np.ndarray, "t m m"], c: Float[np.ndarray, "t ny m"], q: Float[np.ndarray, "t m m"], r: PerOutput
 ) -> Float[np.ndarray, "t m ny"]:
     identity = np.eye(a.shape[1])
     x, g, h = (1.0 - LEAK) * a.transpose(0, 2, 1), c.transpose(0, 2, 1) @ (c / r[:, None]), q

@@ -46,10 +46,7 @@ def take_sensors(experiment: Experiment, fitted: Nuisance | None) -> Experiment:
 
 
 def describe_nuisance(
-    experiment: FitExperiment,
-    z: Vector,
-    statistics: StatisticsByExperiment | None,
-    variance: Vector,
+    experiment: FitExperiment, z: Vector, statistics: StatisticsByExperiment | None, variance: Vector
 ) -> Nuisance:
     """Return an experiment's own unknowns; offsets that the fit did not see are what is left over on average."""
     data, slots, point = experiment.data, experiment.slots, experiment.point(z)

@@ -87,12 +87,7 @@ class Log:
 
     @classmethod
     def from_arrays(
-        cls,
-        *,
-        time: Any,
-        units: Mapping[str, str] | None = None,
-        source: str = "arrays",
-        **channels: Any,
+        cls, *, time: Any, units: Mapping[str, str] | None = None, source: str = "arrays", **channels: Any
     ) -> Log:
         """Build a log from arrays.
 

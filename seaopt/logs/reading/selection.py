@@ -270,10 +270,7 @@ def _make_clock(file_column: FileColumn) -> ClockColumn:
 
 
 def _find_log_clock(
-    sources: Sequence[Source],
-    time: str | int | Column | None,
-    channels: list[FileColumn] | None,
-    rate_hz: float | None,
+    sources: Sequence[Source], time: str | int | Column | None, channels: list[FileColumn] | None, rate_hz: float | None
 ) -> ClockColumn:
     """Return the log's clock: as given, else the one that all channels share."""
     if rate_hz is not None:

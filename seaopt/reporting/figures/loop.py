@@ -14,15 +14,7 @@ from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.reporting.figures.fit import label_channel
-from seaopt.reporting.figures.panel import (
-    COLOURS,
-    LIMIT,
-    MEASURED,
-    Panel,
-    draw_level,
-    frequency_panel,
-    to_decibel,
-)
+from seaopt.reporting.figures.panel import COLOURS, LIMIT, MEASURED, Panel, draw_level, frequency_panel, to_decibel
 from seaopt.units import unit_after
 
 if TYPE_CHECKING:

@@ -66,13 +66,7 @@ class StretchBound:
 
 
 def bound_stretch(
-    name: str,
-    middle: Controller,
-    table: GainTable,
-    plant: Plant,
-    params: ParameterSet,
-    low: float,
-    high: float,
+    name: str, middle: Controller, table: GainTable, plant: Plant, params: ParameterSet, low: float, high: float
 ) -> StretchBound:
     """Bound Ms of a schedule on a stretch between points, `middle` at its middle, on a plant without friction."""
     frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s

@@ -272,11 +272,7 @@ def _bound_magnitude(model: ArcModel, at: BallCoordinates, width: BallCoordinate
 
 
 def _bound_quadratic(
-    top: PerArc,
-    a: Slopes,
-    b: Float[np.ndarray, "p k k"],
-    at: BallCoordinates,
-    width: BallCoordinates,
+    top: PerArc, a: Slopes, b: Float[np.ndarray, "p k k"], at: BallCoordinates, width: BallCoordinates
 ) -> PerArc:
     """Return a bound on top + a e + e b e over the cube, where at + width e is in the unit ball. A coordinate outside
     the ball along which it cannot but rise or fall is put at its end. What is left is split into parabolas of one

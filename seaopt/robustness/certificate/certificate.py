@@ -29,11 +29,7 @@ from seaopt.plants.friction import friction_slopes, remembers, split_friction
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.bounds.bracket import Bracket
-from seaopt.robustness.certificate.compensation import (
-    CompensationDraws,
-    describe_compensation,
-    list_compensation,
-)
+from seaopt.robustness.certificate.compensation import CompensationDraws, describe_compensation, list_compensation
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
@@ -293,11 +289,7 @@ class Certificate(Result, Worded):
 
     @classmethod
     def from_dict(
-        cls,
-        content: Mapping[str, Any],
-        controller: Controller,
-        models: Plants,
-        parameters: ParameterSet,
+        cls, content: Mapping[str, Any], controller: Controller, models: Plants, parameters: ParameterSet
     ) -> Certificate:
         """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated. Raises
         FileError: a field is missing or malformed, it was edited or written by hand, or nothing is required in it.

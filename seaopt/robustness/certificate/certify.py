@@ -35,11 +35,7 @@ from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Budget
-from seaopt.robustness.certificate.certificate import (
-    DESIGN_NAMES,
-    NO_MODEL,
-    Certificate,
-)
+from seaopt.robustness.certificate.certificate import DESIGN_NAMES, NO_MODEL, Certificate
 from seaopt.robustness.certificate.compensation import (
     find_compensation_at_draws,
     find_gravity_cases,
@@ -317,10 +313,7 @@ def pose_loops(
 
 
 def _add_warm_winding(
-    ranges: Ranges,
-    models: Plants,
-    parameters: Source,
-    others: ParameterSet,
+    ranges: Ranges, models: Plants, parameters: Source, others: ParameterSet
 ) -> dict[str, tuple[float, float]]:
     """Return the ranges with the temperatures of every winding that changes its loop, and those given for the air."""
     fitted = parameters.parameters if isinstance(parameters, Fit) else parameters

@@ -147,10 +147,7 @@ def draw_impedance(
         stable += rests
         passive += margin > 0.0
         if margin < least:
-            least, worst = (
-                margin,
-                {key: value for key, value in draw.items() if key in at.models[name].parameters},
-            )
+            least, worst = (margin, {key: value for key, value in draw.items() if key in at.models[name].parameters})
     return ImpedanceDraws(samples=count, stable=stable, passive=passive, margin=float(least), parameters=worst)
 
 

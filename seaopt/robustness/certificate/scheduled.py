@@ -55,11 +55,7 @@ from seaopt.robustness.certificate.certify import (
 )
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.measured_draws import Loops
-from seaopt.robustness.certificate.requirement import (
-    MIN_FRICTION_MARGIN,
-    Requirement,
-    Spot,
-)
+from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, Requirement, Spot
 from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
@@ -442,11 +438,7 @@ class Standing:
 
 
 def find_standing(
-    schedule: ScheduledController,
-    plants: Plants,
-    parameters: Source,
-    ranges: Ranges,
-    others: ParameterSet,
+    schedule: ScheduledController, plants: Plants, parameters: Source, ranges: Ranges, others: ParameterSet
 ) -> Standing:
     """Return what a schedule is certified at: its points and the values between them, with the design plant."""
     design, _ = schedule.design

@@ -27,12 +27,7 @@ from seaopt.robustness.verification.environments import StabilityMap, coupled_st
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
 from seaopt.robustness.verification.playback import STEP_IN_FILE
-from seaopt.robustness.verification.verification import (
-    Verification,
-    check_plants,
-    check_sensors,
-    verify,
-)
+from seaopt.robustness.verification.verification import Verification, check_plants, check_sensors, verify
 
 Played = TypeVar("Played")
 SIMULATION_FAILURES = "simulation_failures"

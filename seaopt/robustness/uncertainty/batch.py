@@ -20,14 +20,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.response import LARGEST_ENTRY
-from seaopt.control.loops.sampled_plant import (
-    LinearPlants,
-    conditions,
-    find_delay,
-    hold,
-    linearise,
-    read_conditions,
-)
+from seaopt.control.loops.sampled_plant import LinearPlants, conditions, find_delay, hold, linearise, read_conditions
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
@@ -253,13 +246,7 @@ def _find_neighbours(theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n
     return low, np.where(point < last, high, centre)
 
 
-def _refine_peaks(
-    loop: Products,
-    low: Column,
-    x: Column,
-    high: Column,
-    complement: bool,
-) -> Peaks:
+def _refine_peaks(loop: Products, low: Column, x: Column, high: Column, complement: bool) -> Peaks:
     """Return the curve's value at its maximum between `low` and `high`, and the angle."""
     best, where = np.zeros(x.size), x.copy()
     live = np.arange(x.size)

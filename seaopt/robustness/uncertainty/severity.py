@@ -77,11 +77,7 @@ def levels(controller: Controller) -> Levels:
 
 
 def severity_slopes(
-    controller: Controller,
-    plant: Plant,
-    unknown: Uncertainty,
-    points: Points,
-    by: Levels | None = None,
+    controller: Controller, plant: Plant, unknown: Uncertainty, points: Points, by: Levels | None = None
 ) -> SeveritySlopes:
     """Return the derivatives of the severity of `points` (n, k), coordinates of `unknown`, with respect to these. They
     are of the spectral radius where the loop is unstable, else of the larger of Ms and Mt as fractions of their limits

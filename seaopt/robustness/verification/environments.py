@@ -271,12 +271,7 @@ def _name_values(coupled: Plant, mass: Value, stiffness: Value, damping: Value) 
 
 
 def _compute_radii(
-    controller: Controller,
-    coupled: Plant,
-    parameters: CompletedParameters,
-    m: Column,
-    k: Column,
-    d: Column,
+    controller: Controller, coupled: Plant, parameters: CompletedParameters, m: Column, k: Column, d: Column
 ) -> Column:
     """Return the spectral radii against n environments."""
     draws = _name_values(coupled, m, k, d)

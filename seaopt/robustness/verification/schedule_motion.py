@@ -135,10 +135,7 @@ def move_schedule(
     pushing = _make_pushing(schedule, plant, params, rate)
     push = pushing.find_push(rate, FIRST_SHARE * find_least_effort(schedule))
     if push is None:
-        middle, lost = (
-            dict.fromkeys(("low", "high"), pushing.middle),
-            dict.fromkeys(("left", "ringing"), math.inf),
-        )
+        middle, lost = (dict.fromkeys(("low", "high"), pushing.middle), dict.fromkeys(("left", "ringing"), math.inf))
         fault = "is lost under any push, small ones too"
         return Motion(plant=name, asked=rate, rate=0.0, size=0.0, fault=fault, **middle, **lost)
     if push.rate < rate:

@@ -161,11 +161,7 @@ def _restore_settling(row: Outcome) -> Outcome:
 
 
 def make_stages(
-    controller: Controller,
-    plants: Plants,
-    sensors: Sensors | None,
-    command_step: float,
-    partners: Plants | None = None,
+    controller: Controller, plants: Plants, sensors: Sensors | None, command_step: float, partners: Plants | None = None
 ) -> dict[str, Stage]:
     """Return where a controller is played: on plants as it sees them, with what holds their links."""
     seen = {name: controller.see(plant) for name, plant in plants.items()}
