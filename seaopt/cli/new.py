@@ -174,3 +174,8 @@ def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
         console.wrap(f"note: {note}")
     out = shlex.quote(str(target.with_suffix("")))
     console.say(f"next: seaopt run {shlex.quote(str(target))} -o {out}", soft_wrap=True)
+    if len({column.log for column in proposal.columns}) == 1:
+        console.wrap(
+            "then: record the test once more at half the amplitude, and uncomment that log in the file; one log alone "
+            "hides what the model lacks"
+        )

@@ -234,3 +234,25 @@ def test_steps_of_two_encoders_are_their_own(tmp_path):
     steps = problem.robustness.sensors.quantisation
     assert steps["theta_m"] == pytest.approx(turn / 4096, rel=1e-3)
     assert "theta_l" not in steps or steps["theta_l"] == pytest.approx(turn / 65536, rel=1e-2)
+
+
+def test_a_second_log_at_half_the_amplitude_is_offered(tmp_path):
+    """Uncommented, the lines read a log of that name, which the fit is scored on."""
+    t, current = drive(10.0, RATE, 2.0)
+    for name, amplitude in (("run.csv", 1.0), ("run_half.csv", 0.5)):
+        of = knee(np.concatenate([np.zeros(8), amplitude * current[:-8]]), RATE, locked=True)
+        write_csv(tmp_path / name, {"t [s]": t, "cmd [A]": amplitude * current, "theta_m [rad]": of["theta_m"],
+                                    "tau_s [N m]": of["tau_s"]})  # fmt: skip
+    text = propose([tmp_path / "run.csv"], {"N": "100", "K_tau": "0.037"}, tmp_path).text
+    assert "half the amplitude" in text and "delay_s = {" in text
+    head, first, second = text.partition("# [[experiment]]")
+    block, blank, rest = (first + second).partition("\n\n")
+    assert all(line.startswith("# ") for line in block.splitlines())
+    lines = "\n".join(line.removeprefix("# ") for line in block.splitlines())
+    (tmp_path / "problem.toml").write_text(head + lines + blank + rest, encoding="utf-8")
+    problem = so.read_problem(tmp_path / "problem.toml")
+    fitted, scored = problem.experiments()
+    assert (scored.name, problem.choose_fitted((fitted, scored))) == ("run_half", (fitted,))
+    assert np.std(scored.log["I"]) == pytest.approx(0.5 * np.std(fitted.log["I"]))
+    several = propose([tmp_path / "run.csv", tmp_path / "run_half.csv"], {}, tmp_path).text
+    assert "half the amplitude" not in several

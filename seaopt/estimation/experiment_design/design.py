@@ -101,6 +101,14 @@ class Design:
         """The expected standard deviation of each free parameter."""
         return {name: self.covariance.std(name) for name in self.covariance.names}
 
+    @property
+    def half(self) -> Excitation:
+        """The excitation at half its amplitude, for a second log on which the fit of the first is validated.
+
+        A model that lacks friction, play or a motor that saturates fits one amplitude and misses the other.
+        """
+        return scale(self.excitation, 0.5)
+
     def against(self, excitation: Excitation, *, seed: int = 0) -> Comparison:
         """Compare with another excitation of equal rms, whatever its peaks.
 
@@ -132,6 +140,8 @@ class Design:
         allowed = {self.bench.input_name: limits.peak, **limits.peaks}
         lines.append(f"  {self.bench.input_name}: rms {self.rms:.4g}{_format_limit(limits.rms)} {unit}")
         lines += [f"  {name}: peak {value:.4g}{_format_limit(allowed[name])}" for name, value in self.peaks.items()]
+        lines.append("  then a second log at half the amplitude (design.half), on which to validate the fit: a model")
+        lines.append("  that lacks friction, play or a motor that saturates fits one amplitude and misses the other")
         return "\n".join(lines)
 
     _repr_html_ = html_text

@@ -29,6 +29,9 @@ HOLDOUT_S = 10.0  # a log from which a fifth can be kept back
 BRIDGE = 5.0  # periods that an irregular clock may skip
 RETUNE = 4
 COMMENT_AT = 56  # column of the comments
+HALF = "_half"  # at the end of the name of a log at half the amplitude
+
+Row = tuple[str, str]  # a line, and its comment
 
 
 def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview) -> str:
@@ -56,13 +59,13 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
     for log in logs:
         name = next(name for name in _number_names(log.name) if name not in names)
         names.add(name)
-        lines += ["", "[[experiment]]", *_align(_describe_experiment(log, name, interview))]
-        lines.append(_describe_delay(log))
+        keys = [_describe_delay(log)]
         if log is not logs[0]:
-            lines.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
-        for table, roles in (("inputs", (log.roles.input,)), ("outputs", log.outputs)):
-            channels = [_describe_channel(log, role, actuator, interview) for role in roles]
-            lines += [f"[experiment.{table}]", *_align(channels)]
+            keys.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
+        head_rows, channels = _describe_experiment(log, name, interview), _describe_channels(log, actuator, interview)
+        lines += ["", *_write_experiment(head_rows, keys, channels)]
+        if len(logs) == 1:
+            lines += _offer_second_log(log, name, head_rows, channels)
     lines += _describe_fit(logs)
     if actuator.measured:
         lines += ["", "[controller]", *_align(_describe_controller(logs, actuator, interview))]
@@ -75,6 +78,39 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
             f"guessed = {format_toml(guessed)}",
         ]
     return "\n".join([*head, *lines]) + "\n"
+
+
+def _write_experiment(rows: Sequence[Row], keys: Sequence[str], channels: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Return the lines of an experiment; `keys` are lines that stand behind the first rows."""
+    tables = [line for table, each in channels.items() for line in (f"[experiment.{table}]", *_align(each))]
+    return ["[[experiment]]", *_align(rows), *keys, *tables]
+
+
+def _describe_channels(log: DescribedLog, actuator: Proposed, interview: Interview) -> dict[str, list[Row]]:
+    """Return the entries of a log's channels by table."""
+    tables = {"inputs": (log.roles.input,), "outputs": log.outputs}
+    return {
+        table: [_describe_channel(log, role, actuator, interview) for role in roles] for table, roles in tables.items()
+    }
+
+
+def _offer_second_log(
+    log: DescribedLog, name: str, rows: Sequence[Row], channels: Mapping[str, Sequence[Row]]
+) -> list[str]:
+    """Return lines, to be taken in by hand, of a second log that shows what the model lacks."""
+    stem, dot, suffix = log.file.rpartition(".")
+    second = {"name": f"{name}{HALF}", "log": f"{stem}{HALF}{dot}{suffix}" if dot else f"{log.file}{HALF}"}
+    texts = {text.split(" = ", 1)[0]: text for text, _ in rows}
+    texts |= {key: f"{key} = {format_toml(value)}" for key, value in second.items()} | {"use": 'use = "validate"'}
+    keys = [_describe_delay(log)] if log.traits.delay_s is not None else []
+    bare = {table: [(text, "") for text, _ in each] for table, each in channels.items()}
+    return [
+        "",
+        "# Record the same test once more at half the amplitude, and uncomment these lines. Where the model lacks",
+        "# friction, play or a motor that saturates, its parameters fit one amplitude and miss the other: a single",
+        "# log hides that.",
+        *(f"# {line}" for line in _write_experiment([(text, "") for text in texts.values()], keys, bare)),
+    ]
 
 
 def _offer_stribeck(lines: Sequence[ParameterLine]) -> list[str]:

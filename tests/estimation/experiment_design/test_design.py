@@ -344,3 +344,11 @@ def test_what_cannot_be_told_is_said():
 def test_a_zero_has_no_relative_variance(swing, thor):
     with pytest.raises(EstimationError, match="d = 0 has no relative variance"):
         design_experiment(swing, thor.free("d"), Limits(duration_s=10, rate_hz=400, rms=1.0), sigma=NOISE)
+
+
+def test_a_second_log_at_half_the_amplitude_is_proposed(stand_design):
+    def samples(excitation):
+        return so.bench.excite(excitation, duration_s=2.0, rate_hz=400.0, rng=np.random.default_rng(0))[1]
+
+    np.testing.assert_allclose(samples(stand_design.half), 0.5 * samples(stand_design.excitation))
+    assert "half the amplitude" in repr(stand_design)
