@@ -74,10 +74,9 @@ def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANC
 
 @lru_cache(maxsize=64)
 def choose_threshold(probability: float, runs: int, charts: int, allowance: float = ALLOWANCE) -> float:
-    """Return the threshold h with which an actuator raises a false alarm with at most this probability. `probability`:
-    of an alarm of any of its charts within `runs` runs. `runs`, `charts`: how many runs; how many parameters of an
-    actuator have a chart. `allowance`: k, in standard deviations. Raises SeaoptError: the probability is not between 0
-    and 1, or smaller than 1e-6.
+    """Return the threshold h with which an actuator of so many `charts`, a parameter each, raises a false alarm within
+    `runs` runs with at most this probability. `allowance`: k, in standard deviations. Raises SeaoptError: the
+    probability is not between 1e-6 and 1.
     """
     if not 0.0 < probability < 1.0:
         raise SeaoptError(f"false_alarms = {probability:g} is no probability above 0 and below 1; give 0.01")

@@ -53,11 +53,9 @@ def strike(plant: Plant, params: CompletedParameters, state: State, output: str,
 
 
 def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -> tuple[HeldState, float, float]:
-    """Return the state of the plant with a port held after its link is stopped where it is. `plant`: with the moving
-    link; it declares its energy. `state`: before the contact. `port`: of the link that is caught. Returned: the state
-    of the plant with the port held, the drive's coordinate counted from where the link is held; what stops the link,
-    along its coordinate (N m s of a pendulum, N s of a mass); the kinetic energy (J) that is lost. Raises PlantError:
-    the port does not move, or the plant declares no energy.
+    """Return the state of the plant with a port held after its moving link is stopped there, the drive's coordinate
+    counted from where it is held; what stops the link along its coordinate (N m s of a pendulum, N s of a mass); and
+    the kinetic energy (J) lost. Raises PlantError: the port does not move, or the plant declares no energy.
     """
     motion, coordinate, rate = _read_motion(plant, port)
     inertia = np.array(_inertia(plant, motion)(state, params.vector)[0])
@@ -78,10 +76,9 @@ def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -
 
 
 def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldState, link: Mapping[str, float]) -> State:
-    """Return the state of a plant after the link at a port is let go at the position `link`, as the reverse of `catch`.
-    `plant`: with the link free. `port`: of the link that is let go. `held`: the state of the plant with the port held.
-    `link`: the link's coordinate when it is let go, such as {"phi": 0.3}; zero where left out, as its rate is. Raises
-    PlantError: the port does not move, or `link` names no state of its link.
+    """Return the state of a plant after the link at a port, `held` so far, is let go at the position `link`, such as
+    {"phi": 0.3}; zero where left out, as its rate is: the reverse of `catch`. Raises PlantError: the port does not
+    move, or `link` names no state of its link.
     """
     _, *link_states = _read_motion(plant, port)
     for name in link:

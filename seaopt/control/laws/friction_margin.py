@@ -12,14 +12,11 @@ from seaopt.plants import Plant
 
 
 def find_friction_margin(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
-    """Return how much steeper friction may be with stability shown, between the samples too; None without friction.
-
-    The linear plant of the test is the sliding one; what a curve's slope is above its flattest is in the sector.
-
-    `controller`: its measurement path closes the loop; the reference stands still. `plant`, `params`: the plant with
-    its friction, and parameters, conditions among them. Returned: with a factor of zero where the sliding loop is not
-    stable itself, where the loop has an `seaopt.control.loops.friction_loop.FrictionLoop.obstacle`, or where nothing
-    was shown: that does not show an oscillation.
+    """Return how much steeper friction may be with stability shown, between the samples too; None without friction. The
+    linear plant is the sliding one; what a curve's slope is above its flattest is in the sector. The controller's
+    measurement path closes the loop; the reference stands still; `params` may hold conditions. The factor is zero where
+    the sliding loop is unstable, has an `obstacle` (`FrictionLoop`), or nothing was shown, which does not show an
+    oscillation.
     """
     return find_friction_margins(controller, plant, [params])[0]
 

@@ -62,9 +62,8 @@ def describe_friction(
 
 
 def predict_limit_cycles(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[LimitCycle, ...]:
-    """Return the limit cycles that the describing function of a plant's friction predicts, the fastest last.
-    `controller`: its measurement path closes the loop; the reference stands still. `plant`, `params`: the plant with
-    its friction. Where several of its frictions change with velocity nothing is predicted, nor where one has bristles:
+    """Return the limit cycles that the describing function of a plant's friction predicts, the fastest last; the
+    reference stands still. None are predicted where several frictions change with velocity, nor where one has bristles:
     before they slip they are a spring, which the curve of steady sliding knows nothing of.
     """
     if remembers(plant):

@@ -450,10 +450,9 @@ def evaluate_terms(
     speed_rate: Any = 0.0,
     prefilter: tuple[Any, Any | None] | None = None,
 ) -> LawTerms:
-    """Return the terms of a law at q, for numbers that may be arrays or symbols. `observer`: the time constant, and the
-    two parts of the nominal plant at q. `notch`: w = tan(pi f T_s) of its frequency. `speed_rate`: 1/T_v of a speed
-    loop, rad/s; 0 where it does not integrate. `prefilter`: the same w of its corner; the damping is None in one of
-    first order.
+    """Return the terms of a law at q, of numbers, arrays or symbols. `observer`: time constant, and the nominal plant's
+    two parts at q. `notch`, `prefilter`: w = tan(pi f T_s) of its frequency; damping None of first order. `speed_rate`:
+    1/T_v of a speed loop, rad/s; 0 where it does not integrate.
     """
     series: Any = 1.0
     more: Any = 0.0

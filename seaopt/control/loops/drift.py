@@ -41,10 +41,8 @@ Slopes = list[tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "y n"], Any]]
 
 @memo
 def leave_out_drift(plant: Plant, measured: str | tuple[str, ...]) -> Plant:
-    """Return the plant without the motion that neither it nor a fed-back output depends on; often the plant itself.
-    `plant`: friction that remembers where it bent holds a link: such a plant is returned as it is. `measured`: the
-    output that is fed back, or all that are. Returned: in the coordinates relative to what drifts; outputs that tell
-    where that is are left out.
+    """Return the plant, relative to what drifts, without the motion that neither it nor the outputs `measured` depend
+    on, nor outputs that tell where that is; often the plant itself, as where friction that remembers holds a link.
     """
     names = {measured} if isinstance(measured, str) else {*measured}
     if remembers(plant) or not names <= plant.outputs.keys():

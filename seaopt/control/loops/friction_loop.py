@@ -130,10 +130,9 @@ def transfer(
 def make_friction_loops(
     plant: Plant, sets: Sequence[ParameterSet], measured: Measured, per_effort: float, delay_samples: int, law: Law
 ) -> list[FrictionLoop | None]:
-    """Return, per set of parameters, the sliding loop with what friction has above its flattest slope taken out.
-    `sets`: all with the same conditions among them. `measured`: the outputs that are fed back, the regulated one first.
-    `per_effort`: the command that the law's effort becomes, per unit. `delay_samples`: whole samples from measurement
-    to output, besides the hold. `law`: its sample time is the loop's. Returned: None where there is no friction.
+    """Return, per set of parameters with the same conditions, the sliding loop of `measured` (the regulated output
+    first) with what friction has above its flattest slope taken out; None without friction. `per_effort`: the command
+    for one unit of the law's effort. `delay_samples`: whole samples from measurement to output, besides the hold.
     """
     plant = leave_out_drift(freeze_heat(plant), measured)
     values = [plant.complete(params) for params in sets]

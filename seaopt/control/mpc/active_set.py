@@ -117,10 +117,9 @@ def find_nearest(
     sides: Int[np.ndarray, " m"],
     max_iterations: int,
 ) -> Solution:
-    """Return the point nearest to `start` within bounds. `low`, `high`: their bounds, low <= high: of a row that is
-    held at one end the other is not looked at. `sides`: where rows are held to begin with, as `Solution.sides`; the
-    held ones are linearly independent. `max_iterations`: changes of the held rows at most, besides the rows that are
-    let go at the start.
+    """Return the point nearest to `start` within low <= normals x <= high; of a row held at one end the other is not
+    looked at. `sides`: where rows are held to begin with, linearly independent, as `Solution.sides`. `max_iterations`:
+    changes of these at most, besides the rows that are let go at the start.
     """
     bounds = _Bounds(start=start, normals=normals, low=low, high=high)
     state = bounds.hold({row: side for row, side in enumerate(sides.tolist()) if side})

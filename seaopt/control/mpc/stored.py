@@ -24,10 +24,8 @@ def describe_mpc(mpc: ForceMPC) -> dict[str, Any]:
 
 
 def check_described(content: Any, mpc: ForceMPC, *, source: str, problem: str, remedy: str) -> None:
-    """Refuse what a controller.json says of a plan (`describe_mpc`) where it is not that of a controller. `content`:
-    the file's `mpc`. `source`, `problem`, `remedy`: the file, the problem's file, and what to do, for messages. Raises
-    FileError: the specification is another; or the C code's numbers are, which other parameters make; or they are
-    malformed.
+    """Refuse (FileError) a controller.json's `mpc` that does not describe (`describe_mpc`) the controller: another
+    specification, numbers of the C code that other parameters make, or malformed ones.
     """
     stored, expected = plain(content), plain(describe_mpc(mpc))
     spec = stored.get("spec") if isinstance(stored, dict) else None

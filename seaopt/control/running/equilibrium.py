@@ -48,9 +48,8 @@ class Equilibrium:
 
 
 def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equilibrium:
-    """Return where a loop rests at the conditions among each run's parameters; at zero without any. `loop`: plant and
-    law; the current's limit is not looked at. `params`: one per run, given with a state of the plant (phi) where it is
-    to rest elsewhere. Raises ControlError: the plant cannot rest there, or no reference makes the law command what it
+    """Return where a loop, its current unlimited, rests at the conditions (such as phi) among each run's parameters; at
+    zero without any. Raises ControlError: the plant cannot rest there, or no reference makes the law command what it
     takes.
     """
     law, plant = loop.law, loop.plant

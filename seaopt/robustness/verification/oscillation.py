@@ -36,10 +36,10 @@ class Oscillation:
 
 
 def find_oscillation(signal: Signal, sample_time_s: float, *, floor: float, lowest_hz: float) -> Oscillation | None:
-    """Return the oscillation that stands out in a window, or None. It stands out if its amplitude is above `floor`, in
-    both halves or only in the second, and if it explains at least half of the power above `lowest_hz`; noise filtered
-    by a loop does not. `floor` is the amplitude that noise and quantisation alone make. Movement slower than
-    `lowest_hz` is removed; at least two periods of it should fit into half of the window.
+    """Return the oscillation that stands out in a window, or None: its amplitude is above `floor` (what noise and
+    quantisation make), in both halves or only in the second, and it explains at least half of the power above
+    `lowest_hz`; noise filtered by a loop does not. Slower movement is removed; half a window should hold two of its
+    periods.
     """
     size = float(np.max(np.abs(signal)))
     spread = float(np.std(signal / size)) if size else 0.0

@@ -131,9 +131,8 @@ def compensation_margin(
     loop: FrictionLoop, reading: SpeedReading, asked: float, first: str = "", enough: float = np.inf
 ) -> CompensationMargin:
     """Return the steepest compensation for which the test of stability holds, the best over all multipliers. `loop`:
-    the loop with its friction taken out and without compensation, which must be stable. `asked`: the compensation's own
-    slope, N s/m (N m s/rad). `first`: the name of a multiplier that is tried first. `enough`: a multiplier that shows a
-    slope of so many times the one asked ends the search.
+    stable, with its friction taken out and without compensation. `asked`: the compensation's slope, N s/m (N m s/rad).
+    `first`: a multiplier that is tried first. `enough`: a slope of so many times `asked` ends the search.
     """
     if obstacle := find_obstacle(loop):
         return CompensationMargin(slope=0.0, asked=asked, frequency_hz=0.0, multiplier=obstacle)
