@@ -16,7 +16,8 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
+from seaopt.control.tuning.law_numbers import LawNumbers
+from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import feed_link, lower_fraction, search, solve
 from seaopt.control.tuning.tuner import (
     RobustTo,

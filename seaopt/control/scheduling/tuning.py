@@ -36,7 +36,8 @@ from seaopt.control.scheduling.scheduled_controller import (
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
+from seaopt.control.tuning.law_numbers import LawNumbers
+from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import Solution, recheck, solve
 from seaopt.control.tuning.tuner import make_controller, make_task, tune
 from seaopt.errors import ControlError, require_type

@@ -36,18 +36,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.tuning.frequencies import choose_prominent
-from seaopt.control.tuning.grid import Curve, Grid, Indices, LawResponse, Path, Usage, Values, use_disc
-from seaopt.control.tuning.optimisation_problem import (
-    CURVES,
-    FRICTION,
-    K_D,
-    K_P,
-    K_V,
-    NEXT_TO_NO_NOISE,
-    PASSIVE,
-    LawNumbers,
-    Task,
-)
+from seaopt.control.tuning.grid import FRICTION, Curve, Grid, Indices, LawResponse, Path, Usage, Values, use_disc
+from seaopt.control.tuning.law_numbers import K_D, K_P, K_V, LawNumbers
+from seaopt.control.tuning.optimisation_problem import CURVES, NEXT_TO_NO_NOISE, PASSIVE, Task
 from seaopt.records import record
 
 PerGain = Float[np.ndarray, " g"]

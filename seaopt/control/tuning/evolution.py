@@ -33,7 +33,7 @@ from jaxtyping import Float, Int
 
 from seaopt.control.laws.limits import INTEGRAL_RAD_S
 from seaopt.control.tuning.grid import Grid, Values
-from seaopt.control.tuning.optimisation_problem import (
+from seaopt.control.tuning.law_numbers import (
     DAMPING,
     K_D,
     K_I,
@@ -41,17 +41,15 @@ from seaopt.control.tuning.optimisation_problem import (
     K_V,
     NOTCH_DEPTH,
     PREFILTER_W,
-    SCOPES,
     SLOWEST_SPEED_RATE,
     SPEED_RATE,
-    STEADY,
     T_F,
     W_C,
     W_R,
     LawNumbers,
-    Task,
     least_integral_rate,
 )
+from seaopt.control.tuning.optimisation_problem import SCOPES, STEADY, Task
 from seaopt.control.tuning.starts import (
     SCANNED_PLANTS,
     judge_loops,

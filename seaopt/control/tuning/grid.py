@@ -24,6 +24,7 @@ ComplexArray = Complex[np.ndarray, "..."]
 Values = Float[np.ndarray, " n"]
 Indices = Int[np.ndarray, " c"]
 
+FRICTION = "min_friction_margin"
 LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 
 
@@ -111,6 +112,15 @@ def use_disc(
     """Return the usage of a limit by the worst of the responses in discs."""
     least, most = bound_disc(curve.of, p, discs, c_y, c_r, rest)
     return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level
+
+
+def use_friction(grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
+    """Return the usage of the friction margins aimed at, of each law one row per plant, where there are any."""
+    if not grid.friction.y.size:
+        return {}
+    c_y, c_v = law.c_y[..., None, :], law.c_v[..., None, :]
+    size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], c_v[..., None, :]), axis=-2)
+    return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, c_v)), 1e-300)}
 
 
 def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Frequencies) -> Curve:

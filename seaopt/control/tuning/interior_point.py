@@ -27,21 +27,16 @@ from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
 from seaopt.control.loops.measured.loop import leave_positive
 from seaopt.control.tuning.frequencies import choose_prominent
-from seaopt.control.tuning.grid import Grid, LawResponse, Path, Values
-from seaopt.control.tuning.optimisation_problem import (
-    CURVES,
+from seaopt.control.tuning.grid import FRICTION, Grid, LawResponse, Path, Values
+from seaopt.control.tuning.law_numbers import (
     DAMPING,
-    FRICTION,
     K_D,
     K_I,
     K_P,
     K_V,
-    LINEAR_LIMITS,
-    NOISE,
     NOTCH_DEPTH,
     NOTCH_W,
     NOTCH_WIDTH,
-    PASSIVE,
     PREFILTER_W,
     SPEED_RATE,
     T_F,
@@ -49,8 +44,8 @@ from seaopt.control.tuning.optimisation_problem import (
     W_C,
     W_R,
     LawNumbers,
-    Task,
 )
+from seaopt.control.tuning.optimisation_problem import CURVES, LINEAR_LIMITS, NOISE, PASSIVE, Task
 from seaopt.executors import solve_ipopt
 
 POINTS_PER_LIMIT = 24  # of each kind of limit

@@ -47,7 +47,6 @@ from jaxtyping import Complex, Float
 
 from seaopt.control.laws.limits import (
     BY_NAME,
-    INTEGRAL_RAD_S,
     LIMITS,
     STEADY,
     STEADY_PERIODS,
@@ -76,7 +75,6 @@ from seaopt.control.loops.absolute_stability import (
     limit_feedback,
 )
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
-from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.loop import DiscLoop
@@ -85,6 +83,7 @@ from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.grid import (
+    FRICTION,
     Curve,
     Frequencies,
     Grid,
@@ -94,9 +93,30 @@ from seaopt.control.tuning.grid import (
     Usage,
     measured_discs,
     use_disc,
+    use_friction,
 )
-from seaopt.plants import Plant
-from seaopt.plants.roles import Friction
+from seaopt.control.tuning.law_numbers import (
+    DAMPING,
+    K_D,
+    K_I,
+    K_P,
+    K_V,
+    NOTCH_DEPTH,
+    NOTCH_W,
+    NOTCH_WIDTH,
+    PREFILTER_W,
+    SLOWEST_SPEED_RATE,
+    SPEED_RATE,
+    T_F,
+    T_Q,
+    W_C,
+    W_R,
+    LawNumbers,
+    LawsNumbers,
+    least_integral_rate,
+    warp_frequency,
+)
+from seaopt.control.tuning.plant_with_friction import PlantWithFriction
 from seaopt.records import record
 
 OBJECTIVE_HZ = 0.1  # disturbances count from here
@@ -106,7 +126,6 @@ NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist f
 NEARLY_KEPT = 1.001
 NEXT_TO_NO_NOISE = 1e-9  # N/N, of a law without feedback: the objective's logarithm is taken
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
-SLOWEST_SPEED_RATE = 4.0 * INTEGRAL_RAD_S  # 1/T_v, rad/s, of a speed loop that integrates
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
 LOWEST_PREFILTER = 0.3  # of the bandwidth
 PREFILTER_DAMPING = (0.4, 2.0)
@@ -115,30 +134,9 @@ SCOPES: dict[Scope, tuple[str, ...]] = {
     scope: tuple(name for name in CURVES if BY_NAME[name].scope == scope) for scope in ("every plant", "design plant")
 }
 TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r")  # limits on the reference's path
-NOISE, PASSIVE, FRICTION = "max_noise_gain", "passive_band_hz", "min_friction_margin"
+NOISE, PASSIVE = "max_noise_gain", "passive_band_hz"
 LINEAR_LIMITS = 4
 MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
-
-# k_p, k_i, k_d, w_r, w_c, k_v, T_f, T_q, 1/T_v, notch_w, notch_width, notch_depth, prefilter_w, prefilter_damping
-LawNumbers = Float[np.ndarray, " 14"]
-LawsNumbers = Float[np.ndarray, "14 *n"]  # of one law, or of n: then of the shape (14, n, 1)
-K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH, PREFILTER_W, DAMPING = range(14)
-
-
-@record(eq=False)
-class PlantWithFriction:
-    """A plant with friction of which a margin is asked, or that grows as it slides."""
-
-    plant: int  # which of the task's plants slides as it does
-    model: Plant  # with its friction
-    loop: FrictionLoop  # with its friction taken out; its own law does not matter
-    flattest: Float[np.ndarray, " p"]  # slope of each friction, N s/m (N m s/rad), which the loop has in it
-    multiplier: str = ""  # of the margin aimed at; empty while none is chosen, and then nothing is asked
-
-    def find_fall(self) -> tuple[Friction, float]:
-        """Return the friction that falls most with speed, and how steeply."""
-        steepest = int(np.argmin(self.flattest))
-        return list(self.model.friction.values())[steepest], -float(self.flattest[steepest])
 
 
 @record(eq=False)
@@ -152,7 +150,7 @@ class Task:
     What it reads besides the regulated one has an entry each in `further`: the filter C that feeds it back, which is
     given, or the `SpeedLoop` that is tuned. `link` is what the last of them is made of, where that feeds the motion of
     the link forward. `eased` are factors by which more of a limit may be used while a law is looked for, by its name
-    (`seaopt.control.tuning.easing`); and unless it `settles`, any part of a step may be left to the integral.
+    (`seaopt.control.tuning.solution`); and unless it `settles`, any part of a step may be left to the integral.
     """
 
     spec: ControllerSpec
@@ -456,7 +454,7 @@ class Task:
             curves |= self.port_usage(grid, law) if row == 0 else {}
             for name, curve in curves.items():
                 rows.setdefault(name, []).append(curve)
-        everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | self.friction_usage(grid, law)
+        everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | use_friction(grid, law)
         return everywhere | {name: np.array(usage) for name, usage in rows.items()}
 
     def curves(self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse) -> dict[str, np.ndarray]:
@@ -498,14 +496,6 @@ class Task:
         turned = grid.force.add_up(law.c_y, law.c_v) * np.conj(grid.port.add_up(law.c_y, law.c_v))
         cosine = np.real(grid.unit * turned) / np.maximum(np.abs(turned), 1e-300)
         return {PASSIVE: np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)}
-
-    def friction_usage(self, grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
-        """Return the usage of the friction margins aimed at, of each law one row per plant, where there are any."""
-        if not grid.friction.y.size:
-            return {}
-        c_y, c_v = law.c_y[..., None, :], law.c_v[..., None, :]
-        size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], c_v[..., None, :]), axis=-2)
-        return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, c_v)), 1e-300)}
 
     def aim_multipliers(self, x: LawNumbers, multiplier: str = "") -> Task:
         """Return the task with one multiplier per plant with friction: that named, or the one that shows most of x."""
@@ -599,20 +589,6 @@ class Task:
         if self.spec.objective == "noise":
             return max(float(np.max(np.abs(law.c_y) / distance[: self.design_states])), NEXT_TO_NO_NOISE)
         return float(np.max((1.0 / distance) @ self.weights(grid.f)))
-
-
-def least_integral_rate(x: LawNumbers) -> float:
-    r"""Return the least k_i/(1 + k_p) of numbers, rad/s.
-
-    Behind a speed loop that integrates, two integrals act at the rate :math:`(T_v + k_p/k_i)^{-1}`; with this k_i it is
-    at least the least rate of one for every T_v allowed.
-    """
-    return INTEGRAL_RAD_S / (1.0 - INTEGRAL_RAD_S / SLOWEST_SPEED_RATE) if x[SPEED_RATE] > 0.0 else INTEGRAL_RAD_S
-
-
-def warp_frequency(f: float, ts: float) -> float:
-    """Return a corner as the bilinear transform has it, tan(pi f T_s)."""
-    return float(np.tan(np.pi * f * ts))
 
 
 def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:

@@ -1,9 +1,18 @@
-"""Find the bandwidths that keep the limits where the one asked does not, for the tuner's answer.
+r"""Find the bandwidths that keep the limits where the one asked does not, for the tuner's answer.
 
 What is possible is not always an interval that begins at the lowest: below a resonance a law may need more feedback
 than above it. So bandwidths are probed outwards from the one asked, in steps of a fifth, down to a quarter and up to
 twice it, or 60 Hz, at each a short evolution; the ends of what is possible next to it are found by bisection, and the
 largest of all from the top down.
+
+Where a sliding plant grows, how steeply friction may fall with speed is told too. Of Stribeck's friction
+:math:`\sigma < 0` is the flattest slope, and a plant that slides has the damping :math:`b + \sigma`, which may be
+negative: it then needs its controller to be stable. With a share of the fall it is
+
+.. math:: A_\lambda = A + (1 - \lambda)\, B_f\, \sigma\, C_v,
+
+from Coulomb's friction at 0 to the plant's own at 1. The largest share at which the limits are kept is found by
+bisection, each law from the one before: a continuation, whose end is a start for the plant itself.
 """
 
 from __future__ import annotations
@@ -15,11 +24,15 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.control.laws.verdict import PossibleBandwidths
+from seaopt.control.loops.sampled_plant import sample_linear
+from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import ENCIRCLES, Evolution
-from seaopt.control.tuning.frequencies import make_grid
+from seaopt.control.tuning.frequencies import count_growing, make_grid, place_frequencies
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task
-from seaopt.control.tuning.solution import recheck, tighten_limits
+from seaopt.control.tuning.law_numbers import LawNumbers
+from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, Task
+from seaopt.control.tuning.plant_with_friction import PlantWithFriction
+from seaopt.control.tuning.solution import recheck, solve, tighten_limits
 from seaopt.progress import Progress, ignore
 
 FARTHEST_BELOW, FARTHEST_ABOVE = 4.0, 2.0  # of the bandwidth asked: where others are looked for
@@ -35,6 +48,8 @@ PROMISING_USAGE = 1.5  # of the evolution; what misses by more is not refined
 REFINEMENTS = 3  # solutions of the interior-point method
 HIGHEST_BANDWIDTH = 0.249  # of the sample rate
 FAR = 1e3  # how much further away a law counts that does not keep the limits
+FALL_RESOLUTION = 1.03  # ratio to which the largest share of a fall is found
+SMALLEST_SHARE = 1e-3
 HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more is not looked for elsewhere
 
 
@@ -154,3 +169,50 @@ class _Probes:
             x = refine(task, grid, x, REFINEMENTS)
         x = min(near, x, key=lambda numbers: task.rank(grid, numbers)) if refined else x
         return task.rank(grid, x)[0], x
+
+
+def find_largest_fall(task: Task) -> tuple[PlantWithFriction, float, LawNumbers] | None:
+    """Return the plant whose friction falls most, the largest share of it with which the limits are kept, and the law.
+
+    It is one of the plants that grow as they slide; None where no friction falls, or the limits are not kept without a
+    fall either. That a law keeps them is measured, as it is of the answer itself.
+    """
+    falling = [
+        sliding
+        for sliding in task.frictions
+        if count_growing(task.plants[sliding.plant]) and sliding.find_fall()[1] > 0.0
+    ]
+    if not falling:
+        return None
+
+    def ease(share: float) -> Task:
+        eased = {sliding.plant: _ease_fall(sliding, share) for sliding in falling}
+        plants = tuple(eased[k].loop.plant if k in eased else plant for k, plant in enumerate(task.plants))
+        frictions = tuple(eased.get(sliding.plant, sliding) for sliding in task.frictions)
+        return replace(task, plants=plants, frictions=frictions)
+
+    x, loops = solve(ease(0.0))
+    if task.list_broken(loops):
+        return None
+    low, high, f = 0.0, 1.0, place_frequencies(task)
+    while high > max(FALL_RESOLUTION * low, SMALLEST_SHARE):
+        middle = float(np.sqrt(low * high)) if low else 0.25 * high
+        eased = ease(middle)
+        trial = refine(eased, eased.grid(f), improve(eased, eased.grid(f), x)[1]) if eased.is_stable(x) else x
+        if eased.is_stable(trial) and not eased.list_broken(eased.measure(trial)):
+            x, low = trial, middle
+        else:
+            high = middle
+    return max(falling, key=lambda sliding: sliding.find_fall()[1]), low, x
+
+
+def _ease_fall(sliding: PlantWithFriction, share: float) -> PlantWithFriction:
+    """Return a sliding plant with a share of the fall of its friction."""
+    loop, left = sliding.loop, (1.0 - share) * np.minimum(sliding.flattest, 0.0)
+    a = loop.a + (loop.friction * left) @ loop.velocity
+    c = loop.sensed + (loop.through * left) @ loop.velocity
+    linear = (a[None], loop.motor[None], c[None], loop.plant.sensed[1][None])
+    delay_s = np.array([loop.delay_s])
+    (plant,) = sample_linear(linear, delay_s, loop.plant.sample_time_s, loop.plant.delay_samples)
+    eased = replace(loop, a=a, sensed=c, slopes=loop.slopes + left, plant=plant)
+    return replace(sliding, loop=eased, flattest=sliding.flattest - left)

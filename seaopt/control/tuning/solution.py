@@ -11,12 +11,16 @@
 Where no law keeps the limits, an evolution looks for one (`search`), from which steps 2 to 5 are repeated.
 A friction margin is asked for afterwards, of the law that is best without, and everything repeated with it as a limit;
 and less of a link's motion is fed forward where no law keeps the limits with all of it (`lower_fraction`).
+
+The minimax leaves every limit as much room as the worst one uses: beside a noise gain that no law keeps, say, a
+bandwidth far from the one asked costs nothing. So where no law keeps all limits, those that are missed most are eased
+to what is used of them, and the law is looked for again, which then keeps the others as well as may be (`ease_limits`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,9 +33,10 @@ from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import make_grid, place_frequencies
-from seaopt.control.tuning.grid import Grid
+from seaopt.control.tuning.grid import FRICTION, Grid
 from seaopt.control.tuning.interior_point import CLEARLY, HOPELESS, refine
-from seaopt.control.tuning.optimisation_problem import FRICTION, K_I, W_R, LawNumbers, Task
+from seaopt.control.tuning.law_numbers import K_I, W_R, LawNumbers
+from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.starts import find_starts
 from seaopt.progress import Progress, count_off, divide, ignore
 
@@ -48,6 +53,9 @@ LEAST_TIGHTENING = 1.0015  # less moves no law: a limit missed by a thousandth c
 NO_LEVEL_ABOVE = 10.0  # a frequency further off counts no more: |F/F_ref| along -3 dB falls below it anywhere
 LOWER_FRACTIONS = 4  # of a link's feedforward, by a fifth each
 CLOSER = 0.5  # of what is missed with all of it and without any: a fraction between that misses more is not solved
+EASINGS = 3
+ALIKE = 1.1  # limits missed by as much as the worst within this factor are eased with it
+ROOM = 1.02  # beyond what is used of an eased limit
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: of a law without any, less is not looked for
 SCAN, IMPROVEMENT, REFINEMENT, RECHECK = 1.0, 1.0, 3.0, 0.5  # of the time of a solution
@@ -362,3 +370,25 @@ def _follow(task: Task, x: LawNumbers) -> float:
         return math.inf
     grid = make_grid(task)
     return task.rank(grid, refine(task, grid, x, 2))[0]
+
+
+def ease_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop], progress: Progress = ignore) -> Solution:
+    """Return the law that keeps what can be kept beside the limits missed most, from the one whose worst is least."""
+    best, factors = (x, loops), dict(task.eased)
+    for number in range(EASINGS):
+        missed = measure_missed(task, best[1])
+        left = {name: used for name, used in missed.items() if can_ease(name) and name not in factors}
+        if not left or not math.isfinite(max(missed.values())):
+            break
+        progress("keeping what can be kept", number / EASINGS)
+        worst = max(left.values())
+        factors |= {name: ROOM * used for name, used in left.items() if used * ALIKE >= worst}
+        tried = search(replace(task, eased=factors), *best, again=False)
+        if _total(measure_missed(task, tried[1])) < _total(missed):
+            best = tried
+    return best
+
+
+def _total(missed: Mapping[str, float]) -> float:
+    """Return by how much limits are missed in all, in logarithms."""
+    return sum(map(math.log, missed.values()))

@@ -36,27 +36,29 @@ from seaopt.control.laws.limits import INTEGRAL_RAD_S
 from seaopt.control.laws.spec import HIGHEST_CORNER
 from seaopt.control.laws.structures import CASCADE, LawTerms
 from seaopt.control.tuning.frequencies import count_growing, find_light_modes
-from seaopt.control.tuning.grid import Grid, LawResponse, Response, Responses, Values
-from seaopt.control.tuning.optimisation_problem import (
+from seaopt.control.tuning.grid import Grid, LawResponse, Response, Responses, Values, use_friction
+from seaopt.control.tuning.law_numbers import (
     K_D,
     K_I,
     K_P,
     K_V,
-    LOWEST_NOTCH,
-    NEXT_TO_NO_NOISE,
     NOTCH_W,
-    OBJECTIVE_HZ,
     PREFILTER_W,
-    SCOPES,
     SPEED_RATE,
     T_F,
     T_Q,
-    TRACKING,
     W_C,
     W_R,
     LawNumbers,
-    Task,
     warp_frequency,
+)
+from seaopt.control.tuning.optimisation_problem import (
+    LOWEST_NOTCH,
+    NEXT_TO_NO_NOISE,
+    OBJECTIVE_HZ,
+    SCOPES,
+    TRACKING,
+    Task,
 )
 from seaopt.records import record
 
@@ -372,7 +374,7 @@ def judge_loops(task: Task, grid: Grid, laws: LawResponse) -> tuple[Values, Valu
     """Return the objective of n laws, their worst usage of a limit on the loop, and whether 1 + L encircles zero."""
     count = laws.c_y.shape[0]
     weights, worst, value, turned = task.weights(grid.f), np.zeros(count), np.zeros(count), np.zeros(count)
-    for margins in task.friction_usage(grid, laws).values():
+    for margins in use_friction(grid, laws).values():
         worst = np.max(margins, axis=(1, 2))
     for row in range(len(grid.rows)):
         names = tuple(name for name in task.design_limits(grid.rows[row]) if name not in TRACKING)

@@ -56,21 +56,14 @@ from seaopt.control.loops.sampled_plant import (
     sample,
 )
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.control.tuning.easing import ROOM, ease_limits
-from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.frequencies import count_growing
-from seaopt.control.tuning.grid import Response
-from seaopt.control.tuning.optimisation_problem import (
-    FRICTION,
-    OBJECTIVE_HZ,
-    LawNumbers,
-    PlantWithFriction,
-    Task,
-    close_plant,
-)
-from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
-from seaopt.control.tuning.solution import feed_link, lower_fraction, retry, search, solve
+from seaopt.control.tuning.grid import FRICTION, Response
+from seaopt.control.tuning.law_numbers import LawNumbers
+from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Task, close_plant
+from seaopt.control.tuning.plant_with_friction import PlantWithFriction
+from seaopt.control.tuning.possible_bandwidths import find_largest_fall, find_possible_bandwidths
+from seaopt.control.tuning.solution import ROOM, ease_limits, feed_link, lower_fraction, retry, search, solve
 from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values

@@ -14,7 +14,8 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.convex_concave import linearise_law
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.grid import Grid
-from seaopt.control.tuning.optimisation_problem import K_V, SPEED_RATE, LawNumbers, Task
+from seaopt.control.tuning.law_numbers import K_V, SPEED_RATE, LawNumbers
+from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.tuner import make_task
 
 KNEE = so.plants.rotary(link="pendulum")

@@ -15,7 +15,7 @@ from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.tuning import interior_point
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import place_frequencies
-from seaopt.control.tuning.optimisation_problem import K_P
+from seaopt.control.tuning.law_numbers import K_P
 from seaopt.control.tuning.solution import solve, tighten_limits
 from seaopt.control.tuning.tuner import make_task
 from tests.control.tuning.drawn_requests import draw_request

@@ -11,7 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.control import Controller, Notch, Prefilter
 from seaopt.control.tuning.convex_concave import solve_qp
-from seaopt.control.tuning.optimisation_problem import T_F
+from seaopt.control.tuning.law_numbers import T_F
 from seaopt.control.tuning.starts import make_rest_start
 from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, FileError
