@@ -69,7 +69,8 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
         "NJP": _pad_to_vectors(layout.states),
         "NCP": _pad_to_vectors(layout.columns),
         "LINEAR": int(model.linear),
-        "STEPPED": int(model.sticks),
+        "STEPPED": int(model.sticks and not model.by_events),
+        "JOINT": int(model.by_events),
         "CORRECT": int(layout.corrected),
         "DELAYED": delayed,
         "MEASURED": int(measured),
@@ -79,7 +80,7 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
     else:
         constants["NQ"] = model.np
-    if model.sticks:
+    if constants["STEPPED"]:
         step, output = step_function(model), output_function(model)
         plain = [_drop_derivatives(step, "seaopt_plain_step"), _drop_derivatives(output, "seaopt_plain_output")]
         generated += generate_code(step, output, *plain)
@@ -87,7 +88,7 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
         rates = rate_functions(model, moving=delayed == 2)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
         constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
-        generated += generate_code(rates.rate, rates.output)
+        generated += generate_code(rates.rate, rates.output, *([rates.joint] if model.by_events else []))
         generated += _chain_code("rate", rates.rate_pattern, model.nx)
         generated += _chain_code("output", rates.output_pattern, model.ny)
     headers = map(_text, ("sums.h", "stack.h", "layout.h"))
@@ -182,7 +183,7 @@ def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     clock = point.clock
     foh = float(clock.hold == "first")
     constants = model.parameters(point.theta)
-    if not model.sticks:
+    if model.by_events or not model.sticks:
         rates = rate_functions(model, moving=_count_delayed(model, point) == 2)
         constants = np.array(rates.prepare(constants)).ravel()
     return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])

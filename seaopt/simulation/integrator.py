@@ -23,7 +23,8 @@ from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.simulation.model import Model, fill_parameters, linearise
 from seaopt.simulation.runge_kutta import runge_kutta_step
-from seaopt.simulation.sticking import sticking_line_step, sticking_output
+from seaopt.simulation.events import EventStep
+from seaopt.simulation.sticking import joint_equations, sticking_line_step, sticking_output
 
 STABLE = 2.5  # of a rate times the step: order four is stable up to 2.78 along the real axis, 2.83 along the imaginary
 
@@ -34,14 +35,38 @@ def step_function(model: Model) -> ca.Function:
     t, h = ca.SX.sym("t"), ca.SX.sym("h")
     x, p = ca.SX.sym("x", model.nx), ca.SX.sym("p", model.p.numel())
     u0, u1 = ca.SX.sym("u0", model.nu), ca.SX.sym("u1", model.nu)
-    if model.sticks:
+    arguments = [t, x, u0, u1, p, h]
+    if model.sticks and not model.by_events:
         x1 = sticking_line_step(model.plant)(t, x, u0, u1, fill_parameters(model, p), h)
     else:
-        rate = ca.Function("rate", [model.t, model.x, model.u, model.p], [model.f])
-        x1 = runge_kutta_step(lambda s, x: h * rate(t + s * h, x, u0 + s * (u1 - u0), p), 0.0, x, 1.0)
+        mode, f = _find_moving(model)[:2]
+        rate = ca.Function("rate", [model.t, model.x, model.u, model.p, mode], [f])
+        x1 = runge_kutta_step(lambda s, x: h * rate(t + s * h, x, u0 + s * (u1 - u0), p, mode), 0.0, x, 1.0)
+        arguments += [mode] if model.by_events else []
     moved = ca.vertcat(p[: model.np], h, u0, u1)
     results = [x1, ca.densify(ca.jacobian(x1, x)), ca.densify(ca.jacobian(x1, moved))]
-    return ca.Function("seaopt_step", [t, x, u0, u1, p, h], results, {"cse": True})
+    step = ca.Function("seaopt_step", arguments, results, {"cse": True})
+    if not model.by_events:
+        return step
+    mode, f, _, joint = _find_moving(model)
+    where = [model.t, model.x, model.u, model.p]
+    return EventStep(step, ca.Function("rate", [*where, mode], [f]), ca.Function("joint", where, joint), model.np)
+
+
+def _find_moving(model: Model) -> tuple[Any, Any, Any, list[Any]]:
+    """Return mode, f, h, and of a joint that sticks its figures, their speed's derivatives, and a force's effect.
+
+    Without such a joint the mode is nothing.
+    """
+    if not model.by_events:
+        return ca.SX(0, 1), model.f, model.h, []
+    mode, f, figures, effect = joint_equations(model.plant)
+    rows = [list(model.plant.outputs).index(name) for name in model.outputs]
+    h = sticking_output(model.plant)(model.t, model.x, model.u, model.plant.p)[rows]
+    filled = fill_parameters(model, model.p)
+    f, h, figures, effect = ca.substitute([f, h, figures, effect], [model.plant.p], [filled])
+    by = [ca.densify(ca.jacobian(figures[0], each)) for each in (model.x, model.theta)]
+    return mode, f, h, [ca.densify(figures), *by, effect]
 
 
 def count_stable_steps(model: Model, theta: Float[np.ndarray, " np"], period: float) -> float:
@@ -79,9 +104,10 @@ class Rates:
 
     prepare: Any  # p -> c, once per pass
     # rate, output: (t, x, u, du, c) -> f or h, and the nonzeros of its derivatives by x and by theta; where inputs move
-    # with the delay, by du each second, then by the delay too
+    # with the delay, by du each second, then by the delay too. The rate of a joint that sticks takes its mode besides
     rate: Any
     output: Any
+    joint: Any  # (t, x, u, c) -> [speed, holding force, F(0)], d speed/dx, d speed/d theta, what a force adds to f
     # rate_pattern, output_pattern: where those nonzeros stand
     rate_pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]]
     output_pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]]
@@ -91,11 +117,12 @@ class Rates:
 def rate_functions(model: Model, *, moving: bool = False) -> Rates:
     """Return the functions of compiled passes; of inputs that move with a free delay, or not."""
     du, parts = ca.SX.sym("du", model.nu), list[Any]()
-    for e in (model.f, model.h):
+    mode, f, h, joint = _find_moving(model)
+    for e in (f, h):
         by_theta = ca.jacobian(e, model.theta)
         along = ca.jtimes(e, model.u, du) if moving else ca.SX(e.numel(), 0)
         parts += [e, ca.jacobian(e, model.x), ca.sparsify(ca.horzcat(by_theta, along))]
-    dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)]
+    dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)] + joint
     sizes = [part.nnz() for part in dense]
     flat = ca.cse(ca.vertcat(*(entry for part in dense for entry in part.nonzeros())))
     flat, symbols, values = ca.extract_parametric(flat, model.p, {"extract_trivial": True})
@@ -103,14 +130,17 @@ def rate_functions(model: Model, *, moving: bool = False) -> Rates:
     for size in sizes:
         columns.append(flat[:size])
         flat = flat[size:]
-    arguments, names = [model.t, model.x, model.u, du, c], ["seaopt_rate", "seaopt_output"]
-    rate, output = (ca.Function(names[i], arguments, columns[3 * i : 3 * i + 3]) for i in range(2))
+    where = [model.t, model.x, model.u]
+    modes = [mode] if joint else []
+    rate = ca.Function("seaopt_rate", [*where, du, c, *modes], columns[:3])
+    output = ca.Function("seaopt_output", [*where, du, c], columns[3:6])
     prepare = ca.Function("seaopt_prepare", [model.p], [ca.vertcat(*values)])
     pattern = [list(zip(*part.sparsity().get_triplet(), strict=True)) for part in dense]
     return Rates(
         prepare=prepare,
         rate=rate,
         output=output,
+        joint=ca.Function("seaopt_joint", [*where, c], columns[6:]) if joint else None,
         rate_pattern=(pattern[1], pattern[2]),
         output_pattern=(pattern[4], pattern[5]),
     )

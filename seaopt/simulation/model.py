@@ -17,7 +17,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick
 from seaopt.plants.memo import memo
 from seaopt.records import record
-from seaopt.simulation.sticking import separate_jumps
+from seaopt.simulation.sticking import has_one_joint, separate_jumps
 
 
 @record(eq=False)
@@ -70,9 +70,14 @@ class Model:
         return self.p[: self.np]
 
     @property
+    def by_events(self) -> bool:
+        """Whether passes step from one stop or start of a joint to the next: where one joint sticks."""
+        return self.sticks and has_one_joint(self.plant)
+
+    @property
     def order(self) -> int:
-        """Order of the error of its steps: where a joint stops within one, that is found to order two."""
-        return 2 if self.sticks else 4
+        """Order of the error of its steps: where one of several joints stops within one, that is found to order two."""
+        return 2 if self.sticks and not self.by_events else 4
 
     @property
     def nx(self) -> int:

@@ -4,12 +4,19 @@ A friction whose role declares its `jump` F is here the set-valued
 
 .. math:: \lambda \in F(|v|)\,\mathrm{Sgn}(v), \qquad \mathrm{Sgn}(0) = [-1, 1],
 
-in place of its smoothed curve. A step first slides on, with the sign that the velocity has, by Runge's and Kutta's
-method of order four. If the velocity changes its sign in it, the step goes to where a straight line between both
-velocities passes zero, and for the rest of it the force is the constant that leaves no velocity at its end: the joint
-sticks. Where that takes more than F(0), the force is F(0), and the joint slides in the other direction. To step with
-such a constant is Moreau's and Jean's method (Acary and Brogliato, Numerical Methods for Nonsmooth Dynamical Systems,
-2008); here it is used for no more than the rest of a step in which a joint stops.
+in place of its smoothed curve.
+
+Of a plant with one such joint, log passes step from event to event (`seaopt.simulation.events`, `pass.c`), between
+which the plant is smooth: the joint slides in the direction m = 1 or -1, or is held, m = 0, by the force that leaves it
+no acceleration. `joint_equations` are its equations.
+
+Closed loops, and plants with several such joints, have a step of fixed structure. It first slides on, with the sign
+that the velocity has, by Runge's and Kutta's method of order four. If the velocity changes its sign in it, the step
+goes to where a straight line between both velocities passes zero, and for the rest of it the force is the constant that
+leaves no velocity at its end: the joint sticks. Where that takes more than F(0), the force is F(0), and the joint
+slides in the other direction. To step with such a constant is Moreau's and Jean's method (Acary and Brogliato,
+Numerical Methods for Nonsmooth Dynamical Systems, 2008); here it is used for no more than the rest of a step in which a
+joint stops.
 
 An output that contains accelerations contains the friction: at a joint that stands still the force that keeps it so.
 """
@@ -106,6 +113,29 @@ def sticking_output(plant: Plant) -> ca.Function:
     holding = _find_holding(free, effects, still, limits) * ca.if_else(levels > 0.0, levels, 1.0)
     y = joints.read(t, x, u, p, ca.if_else(still, holding, slide))
     return ca.Function("output", [t, x, u, p], [ca.densify(y)])
+
+
+def has_one_joint(plant: Plant) -> bool:
+    """Tell whether one friction of a plant sticks, so that passes go from event to event."""
+    return sum(friction.jumps for friction in plant.friction.values()) == 1
+
+
+@memo
+def joint_equations(plant: Plant) -> tuple[Any, Any, Any, Any]:
+    """Return the mode m of a plant's one joint, f with it, [v, holding force, F(0)], and what a force adds to f.
+
+    All are expressions of the plant's own symbols, and of m: 1 or -1 where the joint slides that way, 0 where it is
+    held.
+    """
+    joints, mode, force = _Joints(plant), ca.SX.sym("mode"), ca.SX.sym("force")
+    t, x, u, p = plant.t, plant.x, plant.u, plant.p
+    level = joints.levels(x, u, p)
+    free = joints.accelerate(t, x, u, p, 0.0)
+    holding = free / (free - joints.accelerate(t, x, u, p, 1.0))
+    sliding = joints.slide(x, u, p, mode)
+    f = joints.rate(t, x, u, p, ca.if_else(mode == 0.0, holding, sliding))
+    effect = ca.jacobian(joints.rate(t, x, u, p, force), force)
+    return mode, f, ca.vertcat(joints.speeds(x, p), holding, level), ca.densify(effect)
 
 
 class _Joints:

@@ -39,6 +39,8 @@ FIRST_RADIUS = 0.3  # over the size of the first point
 ROUNDING_DECREMENT = 1e-4  # squared standard deviations that rounding may leave of residuals that are rounding
 UNSEEN = 1e-14  # of the largest eigenvalue; directions below it are left where they are
 ROUNDING_RADIUS = 1e-15  # of the size of the point
+FLAT_STEPS = 6  # in a row that leave the cost as it is
+NEAR_ENOUGH = 1e-2  # squared standard deviations to the minimum, where the cost is flat
 STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a few times that over the step to come
 
 
@@ -75,6 +77,7 @@ def minimise(
     callback: Callback | None = None,
     follow: Callable[[M, Vector], M] | None = None,
     before: float = 0.0,
+    flat: float = 0.0,
 ) -> Solution[M]:
     """Minimise a sum of squares from `start`, inside the bounds.
 
@@ -83,7 +86,8 @@ def minimise(
     standard deviations to the minimum at which to stop; `max_iterations`: evaluations after the first; `callback`:
     called with the iteration and the cost; `follow`: (model, z) -> what it says of a z nearby if residuals are straight
     from there: then a last step needs no evaluation of its own once the whole steps before it have shown how straight
-    they are; `before`: of the search that this one goes on from.
+    they are; `before`: of the search that this one goes on from; `flat`: share of the cost that is no change: a few
+    steps in a row that make none end a search among kinks, whose gradient does not die out.
     """
     current = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
     if not np.isfinite(current.cost):
@@ -91,6 +95,7 @@ def minimise(
         return Solution(z=current.z, evaluation=current, status="stalled", message=message, iterations=0)
     scale = _column_norms(current)
     radius = first_radius * max(float(np.linalg.norm(scale * current.z)), 1.0)
+    unchanged = 0
     for iteration in range(1, max_iterations + 2):  # after the last step convergence is tested once more
         blocked = find_blocked(current, low, high)
         distance = current.distance_squared(~blocked)
@@ -106,6 +111,14 @@ def minimise(
             )
         if iteration > max_iterations:
             break
+        if unchanged >= FLAT_STEPS:
+            return Solution(
+                z=current.z,
+                evaluation=current,
+                status="converged" if distance <= NEAR_ENOUGH else "stalled",
+                iterations=iteration - 1,
+                message=f"the cost is flat, and {np.sqrt(distance):.1g} standard deviations are left by its slope",
+            )
         change, damping = _step(current, blocked, scale, radius)
         end = np.clip(current.z + change, low, high)
         moved = end - current.z
@@ -138,6 +151,7 @@ def minimise(
         predicted = -float(current.gradient @ moved + 0.5 * moved @ current.hessian @ moved)
         trial = objective.evaluate(end)
         ratio = (current.cost - trial.cost) / predicted if predicted > 0.0 and np.isfinite(trial.cost) else -1.0
+        unchanged = unchanged + 1 if 0.0 < flat and abs(trial.cost - current.cost) <= flat * current.cost else 0
         if ratio < 0.25:
             radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius
         elif ratio > 0.75 or damping == 0.0:

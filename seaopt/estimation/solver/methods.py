@@ -16,6 +16,7 @@ from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback
+from seaopt.estimation.solver.loosening import loosen_start
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
 from seaopt.estimation.solver.settle import Solved, explains_little, settle, settle_roughly
 from seaopt.estimation.solver.shots import cut_problem, find_start_on_shots, grow_shots
@@ -218,14 +219,14 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
     off is out of phase after some periods. On short shots, or held to the log, such a guess finds the mode.
     """
     if not method.search or not problem.unknowns.shared:
-        return problem.evaluate(problem.unknowns.start), []
+        return loosen_start(problem, problem.evaluate(problem.unknowns.start)), []
     rng = np.random.default_rng(require_seed(method.seed, EstimationError))
     guesses, matched = guess_from_responses(problem, rng)
     guessed = problem.evaluate(guesses[0]) if guesses else None
     if guessed is not None and matched and not explains_little(problem, guessed.power):
         return guessed, guesses
     first = problem.evaluate(problem.unknowns.start)
-    best = first if guessed is None or guessed.cost > first.cost else guessed
+    best = loosen_start(problem, first if guessed is None or guessed.cost > first.cost else guessed)
     if guesses and (matched or problem.all_linear) and explains_little(problem, best.power):
         # Of a linear plant the best initial states of shots follow from one evaluation.
         z = (

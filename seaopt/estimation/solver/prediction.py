@@ -17,7 +17,7 @@ from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.solver.least_squares import minimise
-from seaopt.estimation.solver.settle import estimate_sigma
+from seaopt.estimation.solver.settle import estimate_sigma, measure_flatness
 from seaopt.estimation.solver.step_size import EXACT
 from seaopt.simulation import Point, Segment, run_passes
 
@@ -37,7 +37,10 @@ def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -
         if predicting is None:
             return None
         low, high = problem.unknowns.low, problem.unknowns.high
-        solution = minimise(predicting, z, low, high, first_radius=PREDICTION_RADIUS, max_iterations=iterations)
+        flat = measure_flatness(predicting)
+        solution = minimise(
+            predicting, z, low, high, first_radius=PREDICTION_RADIUS, max_iterations=iterations, flat=flat
+        )
         if not np.isfinite(solution.evaluation.cost):
             return None
         last, z = z, solution.z

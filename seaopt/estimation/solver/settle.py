@@ -30,6 +30,7 @@ NEAR = 1e-2  # squared standard deviations that may be left to it
 FALL = 4.0  # of a smoothing speed of friction, in a stage
 TOLD = 2.0  # of the misfit, which is twice a log-likelihood: what sharper friction has to gain
 HALF = 0.5  # of the finest steps, which leaves room to check their error
+FLAT = 1e-6  # of a cost where joints stick: far less than its noise
 JUMPY_DECREMENT = 1e-2  # where joints stick, residuals jump a little as a stop moves to another integration step
 FLAT_DECREMENT = 1e-3  # process noise that is hardly there, or sharp friction, is a flat direction: slow to search
 
@@ -125,7 +126,8 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
     problem, evaluation = choose_first_steps(problem, start)
     decrement = FLAT_DECREMENT if problem.predicts or problem.find_smoothing() else DECREMENT
-    if any(experiment.model.sticks for experiment in problem.experiments):
+    flat = measure_flatness(problem)
+    if flat:
         decrement = JUMPY_DECREMENT
     checks: Checks = {}
     rough, before = problem.straight and not explains_little(problem, evaluation.power), 0.0
@@ -143,6 +145,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
             callback=callback,
             follow=problem.follow if problem.straight and attempt else None,
             before=before,  # in true sigmas
+            flat=flat,
         )
         evaluation, iterations = solution.evaluation, iterations + solution.iterations
         if not np.isfinite(evaluation.cost):
@@ -170,6 +173,11 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
     raise AssertionError  # the last attempt returns
 
 
+def measure_flatness(problem: FitProblem) -> float:
+    """Return the share of the cost that is no change: nothing where no joint sticks, and the cost is smooth."""
+    return FLAT if any(experiment.model.sticks for experiment in problem.experiments) else 0.0
+
+
 def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
     """Return a minimum near enough to be compared with others: sigma is estimated twice, the step chosen once."""
     problem, evaluation = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
@@ -184,6 +192,7 @@ def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
             unknowns.high,
             decrement=NEAR,
             max_iterations=ROUGH_ITERATIONS,
+            flat=measure_flatness(problem),
         )
         evaluation = solution.evaluation
         if not np.isfinite(evaluation.cost):
