@@ -21,7 +21,6 @@ the same, and nothing is left.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -62,8 +61,8 @@ class _Joint:
 class EventStep(ca.Callback):
     """The CasADi function (t, x, u0, u1, p, h) -> (x1, dx1/dx, dx1/d[theta, h, u0, u1]), u a line from u0 to u1.
 
-    `phase`: (t, x, u0, u1, p, h, mode) -> the same of a stretch in a mode; `rate`: (t, x, u, p, mode) -> f; `joint`: (t,
-    x, u, p) -> [v, holding force, F(0)], dv/dx, dv/dtheta, what a force adds to f.
+    `phase`: (t, x, u0, u1, p, h, mode) -> the same of a stretch in a mode; `rate`: (t, x, u, p, mode) -> f; `joint`:
+    (t, x, u, p) -> [v, holding force, F(0)], dv/dx, dv/dtheta, what a force adds to f.
     """
 
     def __init__(self, phase: ca.Function, rate: ca.Function, joint: ca.Function, thetas: int) -> None:
@@ -74,21 +73,34 @@ class EventStep(ca.Callback):
         self.construct("seaopt_step", {})
 
     def get_n_in(self) -> int:
+        """Return how many arguments there are."""
         return 6
 
     def get_n_out(self) -> int:
+        """Return how many results there are."""
         return 3
 
     def get_sparsity_in(self, i: int) -> Any:
+        """Return the shape of an argument."""
         return self.sizes[0][i]
 
     def get_sparsity_out(self, i: int) -> Any:
+        """Return the shape of a result."""
         return self.sizes[1][i]
 
+    def has_eval_buffer(self) -> bool:
+        """Tell that arguments and results come as memory, which is quicker."""
+        return True
+
     @np.errstate(all="ignore")
-    def eval(self, arg: list[Any]) -> list[Any]:
-        t, x, u0, u1, p, h = (np.array(each, dtype=float).ravel() for each in arg)
-        return list(_Steps(self, float(t[0]), u0, u1, p, float(h[0])).run(x))
+    def eval_buffer(self, arg: Any, res: Any) -> int:
+        """Step from the arguments to the results."""
+        t, x, u0, u1, p, h = (np.frombuffer(each) for each in arg)
+        results = _Steps(self, float(t[0]), u0, u1, p, float(h[0])).run(x)
+        for room, result in zip(res, results, strict=True):
+            if room is not None:
+                np.frombuffer(room)[:] = result.ravel(order="F")
+        return 0
 
 
 class _Steps:
@@ -214,6 +226,6 @@ def find_turn(w0: float, d0: float, w1: float, d1: float) -> float:
         else:
             high = r
         r = r - w / d if d else np.inf
-        if not low < r < high:
+        if not low <= r <= high:
             r = 0.5 * (low + high)
     return float(r)

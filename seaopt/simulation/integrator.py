@@ -21,9 +21,9 @@ from jaxtyping import Float
 
 from seaopt.plants.memo import memo
 from seaopt.records import record
+from seaopt.simulation.events import EventStep
 from seaopt.simulation.model import Model, fill_parameters, linearise
 from seaopt.simulation.runge_kutta import runge_kutta_step
-from seaopt.simulation.events import EventStep
 from seaopt.simulation.sticking import joint_equations, sticking_line_step, sticking_output
 
 STABLE = 2.5  # of a rate times the step: order four is stable up to 2.78 along the real axis, 2.83 along the imaginary

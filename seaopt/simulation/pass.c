@@ -307,7 +307,7 @@ static double find_turn(double w0, double d0, double w1, double d1) {
         if (w > 0.0) low = r;
         else high = r;
         r -= w / d;
-        if (!(r > low && r < high)) r = 0.5 * (low + high);
+        if (!(r >= low && r <= high)) r = 0.5 * (low + high);
     }
     return r;
 }

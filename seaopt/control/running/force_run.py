@@ -30,6 +30,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.plant import name_input, output_function
 from seaopt.plants.sensors.deflection import evaluate_weights
 from seaopt.records import record
+from seaopt.simulation.direct_call import DirectCall
 from seaopt.units import LINEAR, mechanics_of, name_command, unit_after
 
 State = TypeVar("State")
@@ -173,7 +174,7 @@ def close_loop(
     if isinstance(preview_samples, bool) or not isinstance(preview_samples, int) or preview_samples < 0:
         raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, values.vector
-    output, integrator = _DirectCall(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
+    output, integrator = DirectCall(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
     idle = [0.0] * (len(plant.inputs) - 1)
     devices, row = sensors or Sensors(), list(plant.outputs).index(measured)
     read = _place_sensor(devices, plant, values, measured)
@@ -272,27 +273,6 @@ def _check(plant: Plant, params: CompletedParameters, measured: str, delay_sampl
     return extra_delay_s
 
 
-class _DirectCall:
-    """A CasADi function of dense results, called in memory of its own: in a tenth of the time of CasADi's matrices."""
-
-    def __init__(self, function: Any) -> None:
-        self._buffer, self._run = function.buffer()  # `_run` alone does not keep the memory that it works in
-        self._arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
-        results = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
-        for set_pointer, arrays in ((self._buffer.set_arg, self._arguments), (self._buffer.set_res, results)):
-            for i, numbers in enumerate(arrays):
-                if numbers.size:  # an empty array has no address
-                    set_pointer(i, numbers.data)
-        self._results = [r.reshape(function.size_out(i), order="F") for i, r in enumerate(results)]
-
-    def __call__(self, *arguments: Any) -> list[Float[np.ndarray, "_ _"]]:
-        """Return the results as matrices. An argument is a number or a vector."""
-        for numbers, argument in zip(self._arguments, arguments, strict=True):
-            numbers[:] = argument
-        self._run()
-        return [result.copy() for result in self._results]
-
-
 @dataclass(slots=True, kw_only=True)  # remembers the steps and errors of the run so far
 class _Integrator:
     """A plant integrated while its inputs are held, in as many steps as it has needed so far."""
@@ -302,14 +282,14 @@ class _Integrator:
     substeps: int = FIRST_SUBSTEPS
     error: float = 0.0
     size: Any = 0.0
-    ends: _DirectCall | None = None
+    ends: DirectCall | None = None
 
     def advance(
         self, t: float, x: Float[np.ndarray, " nx"], u: list[float], p: Float[np.ndarray, " np"], lasting: float
     ) -> Any:
         """Return the state after a time `lasting`, the inputs held."""
         while True:
-            self.ends = self.ends or _DirectCall(_ends(self.plant, self.substeps))
+            self.ends = self.ends or DirectCall(_ends(self.plant, self.substeps))
             coarse, fine = (end[:, 0] for end in self.ends(t, x, u, p, lasting))
             size = np.maximum(self.size, np.maximum(np.abs(x), np.abs(fine)))
             scale = np.maximum(size, RESTS * np.max(size))

@@ -40,7 +40,7 @@ ROUNDING_DECREMENT = 1e-4  # squared standard deviations that rounding may leave
 UNSEEN = 1e-14  # of the largest eigenvalue; directions below it are left where they are
 ROUNDING_RADIUS = 1e-15  # of the size of the point
 FLAT_STEPS = 6  # in a row that leave the cost as it is
-NEAR_ENOUGH = 1e-2  # squared standard deviations to the minimum, where the cost is flat
+NEAR_ENOUGH = 0.25  # squared standard deviations that the slope leaves where the cost is flat
 STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a few times that over the step to come
 
 
@@ -151,7 +151,7 @@ def minimise(
         predicted = -float(current.gradient @ moved + 0.5 * moved @ current.hessian @ moved)
         trial = objective.evaluate(end)
         ratio = (current.cost - trial.cost) / predicted if predicted > 0.0 and np.isfinite(trial.cost) else -1.0
-        unchanged = unchanged + 1 if 0.0 < flat and abs(trial.cost - current.cost) <= flat * current.cost else 0
+        unchanged = unchanged + 1 if flat > 0.0 and abs(trial.cost - current.cost) <= flat * current.cost else 0
         if ratio < 0.25:
             radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius
         elif ratio > 0.75 or damping == 0.0:

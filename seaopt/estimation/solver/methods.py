@@ -66,6 +66,8 @@ class OutputError(Method):
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle from the best start that can be found."""
         best, guesses = find_start(problem, self)
+        if self.search and any(e.model.sticks for e in problem.experiments) and explains_little(problem, best.power):
+            best = _compare_predicting(problem, best, self)
         solved = settle(problem, best, self.max_iterations, callback)
         if not self.search:
             return solved
@@ -236,6 +238,23 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
         )
         best = best if z is None else min(best, problem.evaluate(z), key=lambda each: each.cost)
     return best, guesses
+
+
+def _compare_predicting(problem: FitProblem, start: Evaluation, method: Method) -> Evaluation:
+    """Return the better of two rough minima, from a start and from where the plant predicts: a search would creep.
+
+    Where joints move at other times than in the log the cost has many minima, and none of them explains it.
+    """
+    rough = settle_roughly(problem, start) if np.isfinite(start.cost) else None
+    if rough is not None and not explains_little(rough.problem, rough.solution.evaluation.power):
+        return problem.evaluate(rough.solution.z)
+    predicting = find_predicting_start(problem, start.z, method.max_iterations)
+    found = None if predicting is None else problem.evaluate(predicting)
+    if found is None or not np.isfinite(found.cost):
+        return start if rough is None else problem.evaluate(rough.solution.z)
+    other = settle_roughly(problem, found)
+    best = other if rough is None else min(other, rough, key=lambda each: each.misfit)
+    return problem.evaluate(best.solution.z)
 
 
 def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> Solved:

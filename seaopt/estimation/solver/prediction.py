@@ -18,7 +18,7 @@ from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.solver.settle import estimate_sigma, measure_flatness
-from seaopt.estimation.solver.step_size import EXACT
+from seaopt.estimation.solver.step_size import EXACT, bound_steps
 from seaopt.simulation import Point, Segment, run_passes
 
 PREDICTION_RADIUS = 100.0  # a plant that is held to the log may be moved far at once
@@ -37,9 +37,15 @@ def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -
         if predicting is None:
             return None
         low, high = problem.unknowns.low, problem.unknowns.high
-        flat = measure_flatness(predicting)
+        first = predicting.evaluate(np.clip(z, low, high))
         solution = minimise(
-            predicting, z, low, high, first_radius=PREDICTION_RADIUS, max_iterations=iterations, flat=flat
+            bound_steps(predicting, first),
+            first,
+            low,
+            high,
+            first_radius=PREDICTION_RADIUS,
+            max_iterations=iterations,
+            flat=measure_flatness(predicting),
         )
         if not np.isfinite(solution.evaluation.cost):
             return None

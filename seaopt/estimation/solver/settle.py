@@ -11,10 +11,11 @@ from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, ResidualPower
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from seaopt.estimation.problem.shapes import PerOutput, Vector
-from seaopt.estimation.solver.least_squares import DECREMENT, STILL_MOVING, Callback, Solution, minimise
+from seaopt.estimation.solver.least_squares import DECREMENT, STILL_MOVING, Callback, Solution, find_blocked, minimise
 from seaopt.estimation.solver.step_size import (
     Checks,
     StepError,
+    bound_steps,
     check_steps,
     choose_first_steps,
     find_worst,
@@ -30,6 +31,7 @@ NEAR = 1e-2  # squared standard deviations that may be left to it
 FALL = 4.0  # of a smoothing speed of friction, in a stage
 TOLD = 2.0  # of the misfit, which is twice a log-likelihood: what sharper friction has to gain
 HALF = 0.5  # of the finest steps, which leaves room to check their error
+THROWS = (-0.3, -0.03, 0.03, 0.3)  # of the speed that its input could give a joint
 FLAT = 1e-6  # of a cost where joints stick: far less than its noise
 JUMPY_DECREMENT = 1e-2  # where joints stick, residuals jump a little as a stop moves to another integration step
 FLAT_DECREMENT = 1e-3  # process noise that is hardly there, or sharp friction, is a flat direction: slow to search
@@ -73,9 +75,30 @@ def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback
     if not places or np.any(start.z[places] != 0.0):
         return sharpen(problem, start, solve)
     resting = sharpen(replace(problem, unknowns=unknowns.bound(places, 0.0, 0.0)), start, solve)
-    solved = sharpen(replace(resting.problem, unknowns=unknowns), resting.solution.evaluation, solve)
+    freed = replace(resting.problem, unknowns=unknowns)
+    solved = sharpen(freed, resting.solution.evaluation, solve)
     iterations = resting.solution.iterations + solved.solution.iterations
+    thrown = _throw(solved.problem, solved.solution.evaluation)
+    if thrown is not None:
+        moving = sharpen(solved.problem, thrown, solve)
+        iterations += moving.solution.iterations
+        solved = min(solved, moving, key=lambda each: each.misfit)
     return replace(solved, solution=replace(solved.solution, iterations=iterations))
+
+
+def _throw(problem: FitProblem, resting: Evaluation) -> Evaluation | None:
+    """Return where a joint at rest is thrown, and a step from there gains: at rest no slope tells of its speed."""
+    best, least = None, resting.cost - TOLD
+    for place in problem.find_stopped():
+        for share in THROWS if np.isfinite(resting.cost) else ():
+            z = resting.z.copy()
+            z[place] = share * problem.unknowns.prior_std[place]
+            thrown = problem.evaluate(z)
+            free = ~find_blocked(thrown, problem.unknowns.low, problem.unknowns.high)
+            reached = thrown.cost - 0.5 * thrown.distance_squared(free) if np.isfinite(thrown.cost) else np.inf
+            if reached < least:
+                best, least = thrown, reached
+    return best
 
 
 def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem, Evaluation], Solved]) -> Solved:
@@ -136,7 +159,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
         evaluation = problem.assemble(evaluation.passes)
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
-            problem,
+            bound_steps(problem, evaluation),
             evaluation,
             unknowns.low,
             unknowns.high,
@@ -185,9 +208,10 @@ def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
     unknowns, solution = problem.unknowns, None
     for _ in range(ROUGH_ROUNDS):
         problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
+        evaluation = problem.evaluate(evaluation.z)
         solution = minimise(
-            problem,
-            problem.evaluate(evaluation.z),
+            bound_steps(problem, evaluation),
+            evaluation,
             unknowns.low,
             unknowns.high,
             decrement=NEAR,

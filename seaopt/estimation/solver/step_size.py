@@ -23,6 +23,7 @@ MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trus
 NEARBY = 10.0  # standard deviations, over which a step error does not change
 # Of an order: where a joint that sticks stops, residuals jump, and finer steps make that no better for ever.
 MOST_STEPS = {4: MAX_SUBSTEPS, 2: 32}
+STIFF, STIFFER = 8.0, 4.0  # stable steps per sample that a search may always take, and times those at its start
 SAME_COST = 1e-2  # relative change of a cost, with steps of half the length, that bristles at the start may make
 EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
 
@@ -144,6 +145,32 @@ def find_worst(checks: Checks) -> StepError:
     """Return the largest of all experiments' errors."""
     errors = [check.error for check in checks.values()]
     return StepError(output=max(error.output for error in errors), parameter=max(error.parameter for error in errors))
+
+
+@record(eq=False)
+class BoundedSteps:
+    """A problem whose cost is infinite where a plant is far stiffer than at a start: nothing is simulated there."""
+
+    problem: FitProblem
+    start: Evaluation
+    most: float  # stable steps per sample
+
+    def evaluate(self, z: Vector) -> Evaluation:
+        """Return the evaluation at z."""
+        if _find_stiffest(self.problem, z) > self.most:
+            return replace(self.start, z=z, cost=np.inf)
+        return self.problem.evaluate(z)
+
+
+def bound_steps(problem: FitProblem, start: Evaluation) -> BoundedSteps:
+    """Return the problem with a bound on steps where joints stick: one that is thrown far off takes ever more."""
+    sticks = any(experiment.model.sticks for experiment in problem.experiments)
+    most = max(STIFF, STIFFER * _find_stiffest(problem, start.z)) if sticks else np.inf
+    return BoundedSteps(problem=problem, start=start, most=most)
+
+
+def _find_stiffest(problem: FitProblem, z: Vector) -> float:
+    return max(experiment.count_stable_steps(z) for experiment in problem.experiments)
 
 
 def _with_substeps(problem: FitProblem, substeps: Sequence[int]) -> FitProblem:

@@ -28,7 +28,7 @@ def simulate_rotor(current, speed):
     return out
 
 
-def fit_start(seed, output, speed, quiet_s):
+def fit_start(seed, output, speed, quiet_s, friction=0.01):
     rng, t = np.random.default_rng(seed), np.arange(N) * PERIOD
     lines = (0.7, 1.9, 4.1, 7.3, 12.1, 20.0)
     current = (t > quiet_s) * sum(0.6 * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in lines)
@@ -36,7 +36,7 @@ def fit_start(seed, output, speed, quiet_s):
     reading, noise = (angle, 0.01) if output == "theta_m" else (torque, 0.05)
     log = so.Log.from_arrays(time=t, I=current, **{output: reading + noise * rng.normal(size=N)})
     plant = so.plants.let_stick(so.plants.rotary(link="locked"))
-    start = plant.defaults.update(c_s=C_S, J_m=2e-4, k_s=200.0, f_c=0.01, b_r=3e-4).free(*TRUTH)
+    start = plant.defaults.update(c_s=C_S, J_m=2e-4, k_s=200.0, f_c=friction, b_r=3e-4).free(*TRUTH)
     return so.fit([so.Experiment(plant=plant, log=log, outputs=(output,))], start, diagnostics=False)
 
 
@@ -47,6 +47,14 @@ def test_a_joint_that_is_held_starts_at_rest(seed, output):
     assert fit.status == "converged"
     (state,) = fit.nuisance["experiment"].initial_state
     assert abs(state["thetad_m"]) < 5.0
+    for name, true in TRUTH.items():
+        assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
+
+
+def test_friction_that_holds_the_joint_throughout_is_no_start_to_end_at():
+    """At f_c = 0.4 nothing moves, and no slope tells of anything: the search went off to inertias of 1e10."""
+    fit = fit_start(4, "theta_m", speed=0.0, quiet_s=0.4, friction=0.4)
+    assert fit.status == "converged"
     for name, true in TRUTH.items():
         assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
 
