@@ -20,6 +20,7 @@ import numpy as np
 SOURCE = Path(__file__).with_name("actuator.c")
 RATE_HZ, SUBSTEPS = 500.0, 200  # steps of 10 us
 GRAVITY = 9.81
+ASYMMETRY = 0.4  # of friction, at size 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +77,15 @@ class Actuator:
 
     @property
     def truth(self) -> Mapping[str, float]:
-        """The values that a fit looks for: the tangent stiffness, the friction while it is cold and runs forwards."""
-        return KINDS[self.kind].values
+        """The values that a fit looks for: the tangent stiffness, the friction while it is cold.
+
+        Of friction that depends on the direction it is the mean of both: a symmetrical model can have no other.
+        """
+        of_mean = {"direction": "f_c", "viscous_direction": "b_r"}
+        values = dict(KINDS[self.kind].values)
+        for effect, name in of_mean.items():
+            values[name] *= 1.0 + 0.5 * ASYMMETRY * self.effects.get(effect, 0.0)
+        return values
 
     def record(self, *, seconds: float, amplitude: float, seed: int) -> dict[str, np.ndarray]:
         """Return time, current and readings under a chirp on a multisine; the amplitude is a share of the largest."""
@@ -161,8 +169,8 @@ EFFECTS = {
     },
     "load": lambda p, size: {"load_driving": 0.08 * size, "load_driven": 0.08 * size},
     "efficiency": lambda p, size: {"load_driving": 0.1 * size, "load_driven": 0.03 * size},
-    "direction": lambda p, size: {"coulomb_back": p["coulomb"] * (1 + 0.4 * size)},
-    "viscous_direction": lambda p, size: {"viscous_back": p["viscous"] * (1 + 0.4 * size)},
+    "direction": lambda p, size: {"coulomb_back": p["coulomb"] * (1 + ASYMMETRY * size)},
+    "viscous_direction": lambda p, size: {"viscous_back": p["viscous"] * (1 + ASYMMETRY * size)},
     "lugre": lambda p, size: {
         "bristle": 60.0 * p["coulomb"] / _top_deflection(p) / p["ratio"] / size,
         "bristle_damping": p["viscous"],

@@ -295,10 +295,11 @@ def validate(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Score the fit in DIR on another log, with that log's own initial state and offsets."""
+    """Score the fit in DIR on another log, and compare its values with those that the log has alone."""
     from seaopt.cli.session import Session
 
-    Session(problem, output, design=False).validate(log, like, json, _choose_amount(quiet, verbose))
+    if not Session(problem, output, design=False).validate(log, like, json, _choose_amount(quiet, verbose)):
+        raise typer.Exit(1)
 
 
 def _add_stage(stage: str, text: str) -> None:

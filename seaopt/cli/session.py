@@ -23,7 +23,7 @@ from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, 
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
-from seaopt.estimation import Experiment, Fit, warn_unidentified
+from seaopt.estimation import Experiment, Fit, compare_with_log, warn_unidentified
 from seaopt.estimation.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.executors import Processes
@@ -324,16 +324,21 @@ class Session:
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})
 
-    def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> None:
-        """Score the folder's fit on another log, and print that; all of what the log has to say, if `verbose`."""
+    def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> bool:
+        """Score the folder's fit on another log, and compare its values with the log's own; print that.
+
+        `amount`: all of what the log has to say, if "verbose". False where the log contradicts the fit.
+        """
         fitted = self.parameters()
         if isinstance(fitted, ParameterSet):
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] that is fitted; {WRITE_ONE}")
-        score = fitted.predict(self.problem.experiment_like(log, like))
+        experiment, options = self.problem.experiment_like(log, like), self.problem.fit_options
+        score = fitted.predict(experiment)
+        comparison = compare_with_log(fitted, experiment, options["loss"], options["band_hz"])
         if as_json:
             content = {"schema": "seaopt/validation/1", "log": str(log), "fit_met": fitted.met}
-            sys.stdout.write(to_json(content | {"outputs": score.to_dict()}))
-            return
+            sys.stdout.write(to_json(content | comparison.to_dict() | {"outputs": score.to_dict()}))
+            return comparison.met is not False
         if not fitted.met:
             self.say(f"warning: scored {UNMET}: {fitted.verdict}")
         console = Terminal()
@@ -341,8 +346,10 @@ class Session:
         console.wrap(f"{log}: {percents}")
         if amount != "quiet":
             console.say(repr(score))
+            console.say(repr(comparison))
         if amount == "verbose":
             console.say(repr(fitted))
+        return comparison.met is not False
 
     def _frf(self, tell: Progress) -> None:
         if not self.problem.table.experiment:

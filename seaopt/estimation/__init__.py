@@ -12,6 +12,7 @@ from seaopt.estimation.experiment_design.design import (
     expected_covariance,
 )
 from seaopt.estimation.fit import fit
+from seaopt.estimation.judgement.second_log import LogComparison, compare_with_log
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.losses import Huber, SoftL1, Squares
 from seaopt.estimation.result.covariance import Covariance
@@ -24,7 +25,8 @@ from seaopt.estimation.uncertainty.profile import Profile, profile
 
 __all__ = [
     "Bootstrap", "Chirps", "Comparison", "Covariance", "DerivedFigure", "Design", "Diagnostics", "Experiment", "Fit",
-    "Huber", "Identifiability", "Limits", "Method", "ModelledOutputs", "MultipleShooting", "Multisines", "Nuisance",
-    "OutputError", "OutputFit", "PredictionError", "Profile", "Ranking", "SoftL1", "Squares", "bootstrap", "compare",
-    "design_experiment", "diagnose", "expected_covariance", "fit", "profile", "warn_unidentified",
+    "Huber", "Identifiability", "Limits", "LogComparison", "Method", "ModelledOutputs", "MultipleShooting",
+    "Multisines", "Nuisance", "OutputError", "OutputFit", "PredictionError", "Profile", "Ranking", "SoftL1",
+    "Squares", "bootstrap", "compare", "compare_with_log", "design_experiment", "diagnose", "expected_covariance",
+    "fit", "profile", "warn_unidentified",
 ]  # fmt: skip

@@ -53,6 +53,7 @@ def fit(
     holdout: float = 0.0,
     diagnostics: bool = True,
     alternatives: Sequence[Plant] = (),
+    validation: Sequence[Experiment] = (),
     progress: Progress = ignore,
 ) -> Fit:
     """Fit the free parameters of `params` to one or several experiments that share them.
@@ -77,6 +78,8 @@ def fit(
         outputs' figures are missing, and the fit is not judged.
     alternatives : sequence of Plant
         Other plants that may have been on the bench: where a log is not explained, they are tried.
+    validation : sequence of Experiment
+        Logs that are not fitted: each is refitted alone, and what its values differ by is in the model's std.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`): each iteration, each
         cause that is tried; and without a share where the search could be quicker.
@@ -131,7 +134,7 @@ def fit(
     solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
     result = summarise(solved, chosen, diagnostics, started)
     if diagnostics:
-        result = _name_guesses(judge(result, alternatives, judging), named, params)
+        result = _name_guesses(judge(result, alternatives, judging, validation), named, params)
     progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)
     return result
 

@@ -95,7 +95,8 @@ def fit_problem(
     """
     if not problem.table.experiment:
         raise ProblemError(f"{problem.source}: has no [[experiment]] to fit; {WRITE_ONE}")
-    fitted = problem.choose_fitted(problem.experiments() if experiments is None else experiments)
+    every = problem.experiments() if experiments is None else experiments
+    fitted = problem.choose_fitted(every)
     if not fitted:
         raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them: use = "fit"')
     result = fit(
@@ -103,6 +104,7 @@ def fit_problem(
         problem.parameters,
         progress=progress,
         alternatives=tuple(problem.plants.values()),
+        validation=[experiment for experiment in every if experiment not in fitted],
         **problem.fit_options,
     )
     guesses = find_guesses(problem.table.guessed)

@@ -270,6 +270,7 @@ def test_logs_that_are_not_fitted_are_scored(write, tmp_path, capsys):
     Session(path, tmp_path / "out").validate(tmp_path / "second.csv", None, as_json=True)
     again = json.loads(capsys.readouterr().out)
     assert again["outputs"]["F1"]["fit_percent"] == pytest.approx(scored["fit_percent"], abs=1e-6)
+    assert again["met"] is True and all(row["distance"] < 3.0 for row in again["values"].values())
 
 
 def test_a_design_on_a_fit_that_is_not_met_says_so(write, tmp_path, capsys):

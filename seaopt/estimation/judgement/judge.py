@@ -21,7 +21,10 @@ import numpy as np
 from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
+from seaopt.estimation.judgement.intervals import find_excesses, find_rough, find_single_event
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
+from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
+from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import estimate_model_error
@@ -51,12 +54,19 @@ PUSH = 4.0  # standard deviations that a bound holds an estimate away from where
 NOISELESS = 1e-6  # of the spread: 20 bits, and less than rounding to single precision makes of a log
 FEWEST_SAMPLES, SAMPLES_PER_UNKNOWN = 100, 15
 RIVAL_SHARE = 0.9  # of what the best cause gains: no reason to prefer one
-FAR = 3.0  # times beyond a plausible range
+BEYOND = 3.0  # times beyond a plausible range
 
 
-def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ignore) -> Fit:
-    """Return the fit with how much of its outputs is explained, and what is wrong with it. `fit`: with its minimum;
-    `alternatives`: other plants that may have been on the bench, tried where this one does not explain the logs.
+def judge(
+    fit: Fit,
+    alternatives: Sequence[Plant] = (),
+    progress: Progress = ignore,
+    validation: Sequence[Experiment] = (),
+) -> Fit:
+    """Return the fit with how much of its outputs is explained, and what is wrong with it.
+
+    `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
+    not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's.
     """
     minimum = fit.require_minimum("judge")
     testing, trying = divide(progress, TESTS, CAUSES)
@@ -71,7 +81,7 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ign
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
     error = estimate_model_error(minimum.problem, minimum.z, residuals, noise.matrix)
     excess = error.excess
-    fit = widen(_state_excess(fit, excess), error.matrix)
+    fit = compare_logs(widen(_state_excess(fit, excess), error.matrix), validation)
     findings = [
         *_find_unexplained(fit, shares, excess),
         *_find_held_out(fit),
@@ -80,11 +90,14 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ign
         *_find_contradicting_delays(fit),
         *_find_few_samples(minimum),
         *_find_noiseless(fit, minimum),
+        *find_excesses(fit),
+        *find_rough(fit, error),
+        *find_single_event(fit.experiments),
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum).items() if test.p < DOUBTFUL}
     wrong = (
         bool(suspects)
-        or any(ratio > FAR_ABOVE for ratio in excess.values())  # noise of a colour is so, too
+        or any(ratio > FAR for ratio in excess.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
         or fit.status != "converged"
     )
@@ -162,10 +175,18 @@ def _warn(kind: str, where: str, text: str, *, bad: bool = False) -> FitFinding:
 def _find_unexplained(
     fit: Fit, shares: Mapping[str, CoherentShare], excess: Mapping[str, float]
 ) -> Iterator[FitFinding]:
-    """Yield outputs that are explained less than they could be, and residuals that follow an input. What follows the
-    inputs is an error where it is more than noise: more than the rest of the residual, or far above what neighbouring
-    samples differ by; the rest may be what a nonlinearity leaves.
+    """Yield outputs that are explained less than they could be, and residuals that follow an input.
+
+    What follows the inputs is an error where it is more than noise: more than the rest of the residual, or far above
+    what neighbouring samples differ by; the rest may be what a nonlinearity leaves. Where logs of two amplitudes tell
+    what it does to the values it is none.
     """
+    told = {
+        f"{e.name}.{output}"
+        for e in fit.experiments
+        for output in e.outputs
+        if has_two_amplitudes(fit.logs, e.plant.name)
+    }
     for where, fitted in _list_outputs(fit):
         share, explained, explainable = shares.get(where), fitted.explained, fitted.explainable
         percents = (fitted.fit_percent, fitted.band_fit_percent, fitted.one_step_fit_percent)
@@ -184,8 +205,9 @@ def _find_unexplained(
             yield _warn("explained", where, text, bad=ratio < HALF)
         elif share.p < CHANCE and share.residual > 0.0 and share.power > SMALL:
             band = " to ".join(dict.fromkeys(f"{end:.3g}" for end in share.band_hz))
-            bad = (share.residual > SYSTEMATIC and share.power > LARGE) or (
-                math.sqrt(share.residual) * excess[where] > FAR_ABOVE and share.power > VISIBLE
+            bad = where not in told and (
+                (share.residual > SYSTEMATIC and share.power > LARGE)
+                or (math.sqrt(share.residual) * excess[where] > FAR_ABOVE and share.power > VISIBLE)
             )
             text = (
                 f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at "
@@ -254,7 +276,7 @@ def _find_implausible(fit: Fit) -> Iterator[FitFinding]:
             f"{name} = {value:.4g}{unit_after(parameter.unit)}; actuators of this kind have {low:g} to {high:g}: check "
             "the units of inputs and outputs, such as mA read as A, and the fixed parameters"
         )
-        yield _warn("range", name, text, bad=value > FAR * high or value * FAR < low)
+        yield _warn("range", name, text, bad=value > BEYOND * high or value * BEYOND < low)
 
 
 def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:

@@ -28,6 +28,8 @@ from seaopt.records import record
 
 STATED = 5.0  # times the noise between neighbours that a stated one counts for: more is a weight, not a sensor's noise
 
+ROUNDING = 1e-6  # of the spread: less than that is no sensor's noise
+
 
 @record(eq=False)
 class NoiseFloor:
@@ -70,7 +72,8 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
         neighbours = float(np.sqrt(np.mean(np.concatenate(seconds) ** 2) / 6.0)) if any(map(len, seconds)) else 0.0
         step = find_quantisation(np.concatenate(output.measured)) / np.sqrt(12.0) * gain / sigma
         stated = _weigh_gaussian(loss) if name in experiment.data.sigma else 0.0
-        noise[o] = max(neighbours, step, min(stated, STATED * neighbours))
+        rounding = ROUNDING * output.spread * gain / sigma
+        noise[o] = max(neighbours, step, min(stated, STATED * neighbours), rounding)
     return NoiseFloor(noise=noise, rms=rms, count=count)
 
 

@@ -24,8 +24,8 @@ class FitFinding:
     """A fault of a fit, or a remark, for its user."""
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
-    # for programs: "bound", "cause", "delay", "explained", "fixed", "guess", "held_out", "noise", "range", "residual",
-    # "samples"
+    # for programs: "bound", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out", "noise",
+    # "range", "residual", "rough", "samples"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
@@ -89,6 +89,8 @@ class OutputFit:
         the log is too short to tell.
     excess : float or None
         How many times the noise of its sensor the residual is: 1 where nothing is missing; None without diagnostics.
+    spread : float or None
+        Standard deviation of what was measured, in `unit`; None in older files.
 
     """
 
@@ -103,6 +105,7 @@ class OutputFit:
     explained: float | None = None
     explainable: float | None = None
     excess: float | None = None
+    spread: float | None = None
 
 
 @record
@@ -130,6 +133,32 @@ class DerivedFigure:
     def known(self) -> OrInfinite:
         """Half the width of the 95 % interval over the value."""
         return QUANTILE * self.total_std / abs(self.value) if self.value else math.inf
+
+
+@record
+class LogValues:
+    """What one log says alone of the values of a fit.
+
+    Parameters
+    ----------
+    plant : str
+        The name of its plant.
+    amplitude : float
+        Standard deviation of the spring's force or torque, in the output's unit.
+    excess : float
+        Its residual over its sensor's noise, of the output where that is the largest.
+    values : mapping of parameter to (value, std)
+        Of the parameters that it determines with the fit's other values, with the std of noise.
+    determined : bool
+        Whether it determines all of them.
+
+    """
+
+    plant: str
+    amplitude: OrNaN
+    excess: OrInfinite
+    values: Mapping[str, tuple[float, OrInfinite]]
+    determined: bool
 
 
 @record

@@ -16,7 +16,15 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.estimation.result.findings import GUESS, DerivedFigure, FitFinding, ModelledOutputs, Nuisance, OutputFit
+from seaopt.estimation.result.findings import (
+    GUESS,
+    DerivedFigure,
+    FitFinding,
+    LogValues,
+    ModelledOutputs,
+    Nuisance,
+    OutputFit,
+)
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.estimation.result.nuisance import estimate_nuisance, take_sensors
 from seaopt.estimation.solver.methods import Method
@@ -91,6 +99,8 @@ class Fit(Result, Worded):
         Number of all unknowns, those of the experiments included, sigmas not.
     method : str
         "output_error", "multiple_shooting" or "prediction_error".
+    logs : mapping of experiment to LogValues
+        What each log says alone, where a plant has several: of its own log of the fit, or of one for validation.
     findings : tuple of FitFinding
         Faults and remarks, errors first; empty without diagnostics.
     notes : tuple of str
@@ -108,7 +118,7 @@ class Fit(Result, Worded):
         *("met", "findings", "status", "message", "cost", "iterations", "samples", "parameters", "derived"),
         *("covariance", "white_covariance", Key(field="delay_covariance", name="delay_covariance", omit_none=True)),
         Key(field="model_covariance", name="model_covariance", omit_none=True),
-        *("outputs", "identifiability", Key(field="nuisance", name="experiments"), "step_error_sigma"),
+        *("outputs", "logs", "identifiability", Key(field="nuisance", name="experiments"), "step_error_sigma"),
         *("step_error_parameter", "method", "log_likelihood", "unknowns", "aic", "bic", "notes", "provenance"),
     )
 
@@ -130,6 +140,7 @@ class Fit(Result, Worded):
     log_likelihood: OrNaN = math.nan
     unknowns: int = 0
     method: str = "output_error"
+    logs: Mapping[str, LogValues] = field(default_factory=dict[str, LogValues])
     findings: tuple[FitFinding, ...] = ()
     notes: tuple[str, ...] = ()
     delay_covariance: Covariance | None = field(default=None, repr=False)

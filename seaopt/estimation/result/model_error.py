@@ -26,19 +26,20 @@ lacked. Beyond an excess of 3 none of this suffices: see `seaopt.estimation.judg
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.noise_floor import NoiseFloor, list_excess, measure_floor
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
-from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence
+from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence, take_root
 from seaopt.records import record
 
 PARTS = 8
@@ -50,6 +51,7 @@ INDEPENDENT = 80.0  # values of a model's error
 LEAST_SHARE = 2e-4  # of a value, below which no std is believed
 SCATTER = 3.0  # standard deviations by which the jackknife of a log whose information is in few parts may scatter
 CHANCE = 4.0  # over sqrt(N), the share of a residual's power by which its noise is misjudged: two std of that estimate
+SEEN = 1e-3  # of the whole log's information: what a part has less of it does not show
 LITTLE = 1.5  # excess up to which a residual is taken for noise
 FEWEST = 0.1  # share of the samples that a half has to have
 
@@ -65,6 +67,8 @@ class ModelError:
     parts: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
     halves: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
     few_values: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
+    # what one unit of each moves an output by, the other unknowns following: rms over the output's spread
+    effect: ParameterVector = field(default_factory=lambda: np.zeros(0))
 
     @property
     def matrix(self) -> ParameterMatrix:
@@ -88,7 +92,8 @@ def estimate_model_error(
     bread = problem.evaluate(z).hessian if problem.loss.quadratic else compute_bread(problem, z)
     if not stated.size or not np.all(np.isfinite(bread)):
         zero = np.zeros((stated.size,) * 2)
-        return ModelError(names=names, excess=excess, colour=zero, parts=zero, halves=zero, few_values=zero)
+        parts = dict.fromkeys(("colour", "parts", "halves", "few_values"), zero)
+        return ModelError(names=names, excess=excess, **parts, effect=np.zeros(stated.size))
     columns = invert(bread)[0][:, stated]
     inverse = columns[stated]
     information = invert(inverse)[0]
@@ -106,6 +111,7 @@ def estimate_model_error(
         parts=_jackknife(information, sums, b2, inflation, noise_alone=max(excess.values()) <= LITTLE),
         halves=_compare_halves(information, sums, inflation),
         few_values=inverse @ sums.error_power @ inverse * (sums.count / INDEPENDENT),
+        effect=sums.effect,
     )
 
 
@@ -124,7 +130,8 @@ class _Sums:
     """Sums over the samples, over the parameters and delays alone: H_k and g_k of parts, and of a half of each split.
 
     `share` is how many of the samples are in that half, `windows` the scores' products within a window, `power` and
-    `error_power` the information of the outputs weighted with the power of their residuals and of the model's error.
+    `error_power` the information of the outputs weighted with the power of their residuals and of the model's error,
+    `effect` the largest rms over the outputs' spreads that a unit of each makes.
     """
 
     information: Float[np.ndarray, "parts q q"]
@@ -135,6 +142,7 @@ class _Sums:
     windows: ParameterMatrix
     power: ParameterMatrix
     error_power: ParameterMatrix
+    effect: ParameterVector
     count: float
 
 
@@ -142,10 +150,10 @@ def _jackknife(
     information: ParameterMatrix, sums: _Sums, b2: ParameterVector, inflation: ParameterVector, *, noise_alone: bool
 ) -> ParameterMatrix:
     """Return what the estimates move by without one part of the log, beyond what noise moves them."""
-    q = len(information)
+    q, root = len(information), take_root(invert(information)[0])
     moved, by_noise = np.zeros((PARTS, q)), np.zeros((PARTS, q))
     for k in range(PARTS):
-        without = invert(information - sums.information[k])[0]
+        without = _invert_part(information - sums.information[k], root)
         moved[k] = -without @ sums.score[k]
         by_noise[k] = np.diag(without @ sums.information[k] @ without) * inflation
     apart = moved - np.mean(moved, axis=0)
@@ -161,7 +169,7 @@ def _jackknife(
 
 def _compare_halves(information: ParameterMatrix, sums: _Sums, inflation: ParameterVector) -> ParameterMatrix:
     """Return half of what the estimates of two halves differ by, of the splits that differ the most."""
-    q = len(information)
+    q, root = len(information), take_root(invert(information)[0])
     priors = information - np.sum(sums.information, axis=0)
     whole_score, whole = np.sum(sums.score, axis=0), np.sum(sums.information, axis=0)
     apart = np.zeros((HALVES, q))
@@ -169,7 +177,7 @@ def _compare_halves(information: ParameterMatrix, sums: _Sums, inflation: Parame
         if not FEWEST < sums.share[s] < 1.0 - FEWEST:
             continue
         halves = (sums.half_information[s], whole - sums.half_information[s])
-        inverses = [invert(half + 0.5 * priors)[0] for half in halves]
+        inverses = [_invert_part(half + 0.5 * priors, root) for half in halves]
         scores = (sums.half_score[s] - 0.5 * whole_score, 0.5 * whole_score - sums.half_score[s])
         shift = 0.5 * (inverses[0] @ scores[0] - inverses[1] @ scores[1])
         std = 0.5 * np.sqrt(np.maximum(np.diag(inverses[0] + inverses[1]), 0.0) * inflation)
@@ -177,6 +185,13 @@ def _compare_halves(information: ParameterMatrix, sums: _Sums, inflation: Parame
     largest = np.abs(apart) == np.max(np.abs(apart), axis=0)
     chosen = np.where(largest, apart, 0.0)
     return chosen.T @ chosen
+
+
+def _invert_part(information: ParameterMatrix, root: ParameterMatrix) -> ParameterMatrix:
+    """Return the inverse of a part's information over what it shows; `root`: of the inverse of the whole's."""
+    values, vectors = np.linalg.eigh(root.T @ information @ root)
+    seen = values > SEEN
+    return root @ (vectors[:, seen] / values[seen]) @ vectors[:, seen].T @ root.T
 
 
 def _sum_parts(
@@ -191,14 +206,21 @@ def _sum_parts(
     information, score = np.zeros((PARTS, q, q)), np.zeros((PARTS, q))
     half_information, half_score, in_half = np.zeros((HALVES, q, q)), np.zeros((HALVES, q)), np.zeros(HALVES)
     windows, power, error_power = (np.zeros((q, q)) for _ in range(3))
-    samples, before = sum(experiment.samples for experiment in problem.experiments), 0
+    effect = np.zeros(q)
+    masks = {
+        e.name: [np.any(s.mark_counted(e.weights.settle), axis=1) for s in e.segments] for e in problem.experiments
+    }
+    samples = sum(int(np.count_nonzero(mask)) for rows in masks.values() for mask in rows)
+    before = 0
     for experiment in problem.experiments:
         floor = floors[experiment.name]
         rms2 = floor.rms**2
         error = np.clip(1.0 - (1.0 + CHANCE / np.sqrt(np.maximum(floor.count, 1.0))) / floor.excess**2, 0.0, 1.0)
         length = max(1, min(round(WINDOW_S / experiment.period), experiment.samples // WINDOWS))
-        split = _split(experiment, residuals[experiment.name])
-        for segment, high in zip(experiment.segments, split, strict=True):
+        split = _split(experiment, residuals[experiment.name], masks[experiment.name])
+        grams = np.zeros((len(rms2), q, q))
+        for segment, high, counted in zip(experiment.segments, split, masks[experiment.name], strict=True):
+            order = before + np.cumsum(counted) - counted
             into = map_to_influence(experiment, segment, inverse)
             tail = np.zeros((q, length))
             for rows, columns, used in stream_columns(experiment, segment, z):
@@ -206,7 +228,7 @@ def _sum_parts(
                 r = (columns[:, :, 0] / experiment.sigma).T
                 weighted = along * loss.curvature(r)[:, None, :]
                 scores = np.sum(along * loss.slope(r)[:, None, :], axis=0)
-                part = (before + np.arange(rows.start, rows.stop)) * PARTS // samples
+                part = np.minimum(order[rows] * PARTS // samples, PARTS - 1)
                 for k in range(int(part[0]), int(part[-1]) + 1):
                     chosen = slice(*np.searchsorted(part, [k, k + 1]))
                     information[k] += _gram(weighted[:, :, chosen], along[:, :, chosen])
@@ -215,12 +237,14 @@ def _sum_parts(
                     half_information[s] += _gram(weighted[:, :, mask], along[:, :, mask])
                     half_score[s] += np.sum(scores[:, mask], axis=1)
                 in_half += np.count_nonzero(high[:, rows], axis=1)
-                grams = np.matmul(along, along.transpose(0, 2, 1))
-                power += np.tensordot(rms2, grams, 1)
-                error_power += np.tensordot(rms2 * error, grams, 1)
+                grams += np.matmul(along, along.transpose(0, 2, 1))
                 tail = _add_windows(windows, tail, scores)
             _add_windows(windows, tail, np.zeros((q, length - 1)))
-            before += segment.samples.n
+            before += int(np.count_nonzero(counted))
+        power += np.tensordot(rms2, grams, 1)
+        error_power += np.tensordot(rms2 * error, grams, 1)
+        size = experiment.sigma / np.maximum(experiment.spread * np.sqrt(np.maximum(floor.count, 1.0)), 1e-300)
+        effect = np.maximum(effect, np.max(np.sqrt(np.diagonal(grams, 0, 1, 2)) * size[:, None], axis=0, initial=0.0))
     return _Sums(
         information=information,
         score=score,
@@ -230,6 +254,7 @@ def _sum_parts(
         windows=windows,
         power=power,
         error_power=error_power,
+        effect=effect,
         count=float(sum(np.sum(floor.count) for floor in floors.values())),
     )
 
@@ -250,26 +275,29 @@ def _add_windows(
     return joined[:, joined.shape[1] - length :]
 
 
-def _split(experiment: FitExperiment, residuals: ExperimentResiduals) -> list[Bool[np.ndarray, "halves n"]]:
-    """Return which samples of each segment are late in the log, large, and fast."""
+def _split(
+    experiment: FitExperiment, residuals: ExperimentResiduals, counted: Sequence[Bool[np.ndarray, " n"]]
+) -> list[Bool[np.ndarray, "halves n"]]:
+    """Return which of the samples that count, of each segment, are late in the log, large, and fast."""
     effort, fast = [], []
     for segment, left in zip(experiment.segments, residuals.segments, strict=True):
         model = np.stack(segment.samples.y, axis=1) + left.raw
-        effort.append(_measure_envelope(model[:, _find_effort(experiment)], experiment.period))
+        effort.append(_measure_envelope(model[:, find_effort(experiment.data)], experiment.period))
         fast.append(_measure_speed(experiment, model))
-    middles = [float(np.nanmedian(np.concatenate(parts))) for parts in (effort, fast)]
+    used = np.concatenate(counted)
+    middles = [float(np.nanmedian(np.concatenate(parts)[used])) for parts in (effort, fast)]
     masks: list[Bool[np.ndarray, "halves n"]] = []
-    first, samples = 0, experiment.samples
-    for envelope, speed in zip(effort, fast, strict=True):
-        late = first + np.arange(envelope.size) >= 0.5 * samples
-        masks.append(np.array([late, envelope > middles[0], speed > middles[1]]))
-        first += envelope.size
+    first, samples = 0, int(np.count_nonzero(used))
+    for envelope, speed, mask in zip(effort, fast, counted, strict=True):
+        late = first + np.cumsum(mask) > 0.5 * samples
+        masks.append(mask & np.array([late, envelope > middles[0], speed > middles[1]]))
+        first += int(np.count_nonzero(mask))
     return masks
 
 
-def _find_effort(experiment: FitExperiment) -> int:
+def find_effort(experiment: Experiment) -> int:
     """Return the output that is the spring's force or torque; the first where none is measured."""
-    sensing, outputs = experiment.data.plant.sensing, experiment.data.outputs
+    sensing, outputs = experiment.plant.sensing, experiment.outputs
     regulated = sensing.regulated if sensing is not None else ()
     return next((outputs.index(name) for name in regulated if name in outputs), 0)
 
@@ -288,5 +316,5 @@ def _measure_speed(experiment: FitExperiment, model: Float[np.ndarray, "n ny"]) 
     if sensing is not None and sensing.motor_speed in outputs:
         return np.abs(model[:, outputs.index(sensing.motor_speed)])
     position = sensing.motor_position if sensing is not None else None
-    column = outputs.index(position) if position in outputs else _find_effort(experiment)
+    column = outputs.index(position) if position in outputs else find_effort(experiment.data)
     return np.abs(np.gradient(model[:, column])) if len(model) > 1 else np.zeros(len(model))

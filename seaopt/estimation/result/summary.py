@@ -311,6 +311,7 @@ def describe_outputs(
             sigma=output.sigma,
             unit=output.unit,
             whiteness_p=weighted.whiteness(name),
+            spread=output.spread,
         )
 
     return problem.map_outputs(describe)

@@ -16,6 +16,7 @@ from seaopt.reporting.sections.data import Commands, KeyFigure, Section, Verdict
 KINDS = {
     "Fit": "fit",
     "ModelledOutputs": "prediction",
+    "LogComparison": "log_comparison",
     "Quality": "quality",
     "Responses": "responses",
     "Frontier": "frontier",

@@ -1,0 +1,107 @@
+"""What forbids to believe the intervals of a fit: a residual far above noise, values known only roughly, one event.
+
+An interval holds where the residual is noise, or where logs of two amplitudes tell how far what the model lacks moves
+the values (`second_log`). It has to be narrow enough to design with, and the log has to have the power to refute it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from seaopt.estimation.judgement.second_log import FAR, find_excess, has_two_amplitudes
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.shapes import Signal
+from seaopt.estimation.result.findings import FitFinding
+from seaopt.estimation.result.fit_result import Fit
+from seaopt.estimation.result.model_error import ModelError
+from seaopt.parameters import QUANTILE, Parameter
+from seaopt.plants.friction import list_smoothing
+from seaopt.simulation.simulate import input_samples
+
+ROUGH = 0.2  # half of the width of an interval over its value, beyond which a value is known only roughly
+UNSEEN = 0.02  # of an output's spread: what may be zero is known well enough where half its interval does less
+BLOCKS, EVENT = 64, 0.1  # of a log: in so many blocks an input moves or rests; and the longest event, as a share
+MOVES = 0.01  # of the block in which an input moves the most
+
+
+def find_excesses(fit: Fit) -> Iterator[FitFinding]:
+    """Yield plants whose residual is far above their sensors' noise: errors without logs of two amplitudes."""
+    for plant in dict.fromkeys(experiment.plant.name for experiment in fit.experiments):
+        excess = find_excess(fit, plant)
+        if excess <= FAR:
+            continue
+        where = next(
+            f"{name}.{output}"
+            for name, row in fit.outputs.items()
+            for output, figures in row.items()
+            if figures.excess == excess
+        )
+        told = has_two_amplitudes(fit.logs, plant)
+        what = f"its residual is {excess:.3g} times its sensor's noise: the model lacks something"
+        if told:
+            text = f"{what}, and the intervals are as wide as the values differ between the logs' amplitudes"
+        else:
+            text = (
+                f"{what}, and how far that moves the values one amplitude does not tell: record a second log at half "
+                "the amplitude and give both; or give the sensor's noise, sigma, where it is no white noise"
+            )
+        yield FitFinding(severity="warning" if told else "error", kind="excess", where=where, text=text)
+
+
+def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
+    """Yield free parameters whose interval is wider than a design can use.
+
+    One that may be zero, as a friction that a plant need not have, is known well enough where it hardly does anything.
+    """
+    if fit.status != "converged":
+        return
+    plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
+    smoothing = {name for plant in plants for name in list_smoothing(plant)}
+    for name in fit.covariance.names:
+        parameter = fit.parameters[name]
+        if parameter.known is None or parameter.known <= ROUGH or not parameter.identified or parameter.at_bound:
+            continue
+        if name in smoothing:  # a means of the simulation, no figure of the actuator
+            continue
+        defaults = (plant.parameters.get(name) for plant in plants)
+        may_be_zero = any(isinstance(default, Parameter) and default.value == 0.0 for default in defaults)
+        half = QUANTILE * (parameter.total_std or 0.0)
+        if may_be_zero and half * error.effect[error.names.index(name)] <= UNSEEN:
+            continue
+        yield FitFinding(
+            severity="error",
+            kind="rough",
+            where=name,
+            text=f"known only roughly, to {100.0 * parameter.known:.2g} %: excite it more, measure another output, or "
+            "fix it, or give it a prior",
+        )
+
+
+def find_single_event(experiments: Sequence[Experiment]) -> Iterator[FitFinding]:
+    """Yield that one step is all that happens, which nothing refutes: any model follows one step with some values."""
+    if len(experiments) != 1:
+        return
+    (experiment,) = experiments
+    shares = [_measure_activity(values) for values in input_samples(experiment.plant, experiment.log)]
+    moving = [share for share in shares if share > 0.0]
+    if moving and max(moving) <= EVENT:
+        yield FitFinding(
+            severity="error",
+            kind="event",
+            where=experiment.name,
+            text="its inputs move once and rest: one step tests no model, and other values follow it as well; record "
+            "one that moves throughout, or several steps of several sizes, or fit more logs",
+        )
+
+
+def _measure_activity(values: Signal) -> float:
+    """Return which part of a log an input moves in, from its first move to its last; 0 where it never moves."""
+    steps = np.diff(values[np.isfinite(values)])
+    if steps.size < 2 * BLOCKS:
+        return 0.0
+    power = np.array([float(np.sum(block**2)) for block in np.array_split(steps, BLOCKS)])
+    power -= float(np.median(power))  # of a reading's noise
+    moving = np.flatnonzero(power > MOVES * np.max(power))
+    return (int(moving[-1]) - int(moving[0]) + 1) / BLOCKS if np.max(power) > 0.0 else 0.0

@@ -1,0 +1,139 @@
+"""When intervals are believed: a residual of noise, logs at two amplitudes, values known well, more than one step."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import seaopt as so
+from seaopt.bench import PAPER_STAND
+from seaopt.estimation import Fit, compare_with_log
+from seaopt.files import to_json
+
+N, PERIOD = 8000, 1e-3
+GAIN = so.Plant(
+    name="gain", states={"z": "-"}, inputs={"u": "-"}, outputs={"y": "-"}, parameters={"a": "-"},
+    f=lambda t, x, u, p: {"z": u.u - x.z}, h=lambda t, x, u, p: {"y": p.a * u.u + 0 * x.z},
+)  # fmt: skip
+FREE = so.ParameterSet.of(a=(1.0, "-")).free("a")
+
+
+def record_log(amplitude, cubic, seed, noise=0.01, name="log"):
+    """Return a log of y = 2 u + c u^3 + e, u of a standard deviation."""
+    rng = np.random.default_rng(seed)
+    u = lfilter([1.0], [1.0, -0.98], rng.normal(size=N + 1000))[1000:]
+    u *= amplitude / np.std(u)
+    y = 2.0 * u + cubic * u**3 + noise * rng.normal(size=N)
+    log = so.Log.from_arrays(time=np.arange(N) * PERIOD, u=u, y=y)
+    return so.Experiment(plant=GAIN, log=log, initial_state="rest", offset=False, name=name)
+
+
+def fit(*experiments, **options):
+    return so.fit(experiments, FREE, method=so.OutputError(search=False), **options)
+
+
+def list_kinds(result, severity):
+    return {finding.kind for finding in result.findings if finding.severity == severity}
+
+
+def test_a_residual_far_above_its_noise_is_not_met_by_one_log_and_asks_for_half_the_amplitude():
+    result = fit(record_log(1.0, 0.05, 1))
+    assert result.outputs["log"]["y"].excess > 3.0
+    assert not result.met and "excess" in list_kinds(result, "error")
+    (finding,) = (each for each in result.errors if each.kind == "excess")
+    assert "second log at half the amplitude" in finding.text
+
+
+def test_two_amplitudes_give_intervals_as_wide_as_the_values_differ():
+    """Of Gaussian u the best gain is 2 + 3 c var u: the difference of both is 2.25 c, and the gain at small u is in."""
+    c = 0.05
+    result = fit(record_log(1.0, c, 1, name="full"), record_log(0.5, c, 2, name="half"))
+    assert result.met and "excess" in list_kinds(result, "warning")
+    large, small = (result.logs[name].values["a"][0] for name in ("full", "half"))
+    assert large - small == pytest.approx(3 * c * (1.0 - 0.25), rel=0.1)
+    parameter = result.parameters["a"]
+    assert parameter.model_std >= large - small
+    assert parameter.ci95[0] <= 2.0 <= parameter.ci95[1]
+    assert result.logs["half"].amplitude == pytest.approx(0.5 * result.logs["full"].amplitude, rel=0.1)
+
+
+def test_a_second_log_of_the_same_amplitude_tells_nothing_of_it():
+    result = fit(record_log(1.0, 0.05, 1, name="one"), record_log(0.95, 0.05, 2, name="two"))
+    assert not result.met and "excess" in list_kinds(result, "error")
+
+
+def test_a_log_for_validation_is_a_second_log():
+    full, half = record_log(1.0, 0.05, 1, name="full"), record_log(0.5, 0.05, 2, name="half")
+    result = fit(full, validation=[half])
+    alone = fit(full)
+    assert result.parameters["a"].value == alone.parameters["a"].value
+    assert result.met and not alone.met
+    assert result.logs["half"].values["a"][0] == pytest.approx(2.0 + 3 * 0.05 * 0.25, rel=1e-2)
+    assert result.parameters["a"].ci95[0] <= 2.0
+    read = Fit.from_dict(json.loads(to_json(result.to_dict())))
+    assert read.logs["half"].values["a"] == pytest.approx(result.logs["half"].values["a"])
+    assert read.parameters["a"].known == pytest.approx(result.parameters["a"].known)
+
+
+def test_another_log_contradicts_values_that_it_would_not_give():
+    full, half = (record_log(size, 0.05, seed, name="log") for size, seed in ((1.0, 1), (0.5, 2)))
+    result, same = fit(full), record_log(1.0, 0.0, 5)
+    comparison = compare_with_log(Fit.from_dict(json.loads(to_json(result.to_dict()))), half)
+    assert comparison.met is False and comparison.distances["a"] > 3.0
+    assert comparison.amplitudes[0] == pytest.approx(2.0 * comparison.log.amplitude, rel=0.1)
+    assert "contradicts the fit" in repr(comparison) and "0.4" in repr(comparison)
+    agrees = compare_with_log(fit(record_log(1.0, 0.0, 6)), same)
+    assert agrees.met and "its own values are the fit's" in repr(agrees)
+
+
+def test_logs_that_agree_leave_the_intervals_alone():
+    result = fit(record_log(1.0, 0.0, 1, name="full"), record_log(0.5, 0.0, 2, name="half"))
+    assert result.met and not result.findings
+    parameter = result.parameters["a"]
+    assert parameter.total_std <= 1.2 * max(parameter.std, 2e-4 * parameter.value)
+
+
+def test_a_value_that_is_known_only_roughly_is_named(thor):
+    """Efficiency and torque constant are one scale: a prior of 30 % on the one is all that is known of either."""
+    stand, sensors = so.plants.high_impedance(), so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
+    log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=10, rate_hz=400, seed=3, sensors=sensors)
+    bench, free = so.Experiment(plant=stand, log=log, outputs=("F1", "F2")), thor.free("J", "b_r", "K_tau", "eta")
+    rough, fine = (so.fit([bench], free.prior(K_tau=share * thor["K_tau"].value)) for share in (0.3, 0.03))
+    assert {(finding.kind, finding.where) for finding in rough.errors} == {("rough", "K_tau"), ("rough", "eta")}
+    assert rough.parameters["eta"].known == pytest.approx(1.96 * 0.3, rel=0.1) and not rough.met
+    assert rough.parameters["J"].known < 0.2
+    assert fine.met and fine.parameters["eta"].known == pytest.approx(1.96 * 0.03, rel=0.1)
+
+
+def test_one_step_has_no_power_to_refute():
+    stand, thor = so.plants.high_impedance(), so.plants.thor()
+    time = np.arange(1600) / 400
+    rng = np.random.default_rng(0)
+
+    def step_at(*times):
+        current = sum(np.where(time >= at, 0.5, 0.0) for at in times)
+        run = so.simulate(stand, thor, so.Log.from_arrays(time=time, I=current))
+        noisy = {name: run[name] + rng.normal(scale=2.0, size=time.size) for name in ("F1", "F2")}
+        log = so.Log.from_arrays(time=time, I=current, **noisy)
+        return so.Experiment(plant=stand, log=log, outputs=("F1", "F2"), initial_state="rest")
+
+    params = thor.update(J=2e-6).free("J", "b_r")
+    assert "event" in list_kinds(so.fit([step_at(1.0)], params), "error")
+    assert so.fit([step_at(0.5, 1.5, 2.5, 3.0)], params).met
+    assert "event" not in list_kinds(so.fit([step_at(1.0), step_at(2.0)], params), "error")
+
+
+def test_friction_that_is_not_there_does_not_have_to_be_known(thor):
+    """A Coulomb friction that the plant need not have, truly 0: its interval is 100 % of it, and does nothing."""
+    plant, log_of = so.plants.rotary(link="locked"), so.virtual_log
+    values = plant.defaults.update(J_m=3e-5, b_r=2e-4, K_tau=0.06, N=60.0, k_s=250.0, eta=1.0, f_c=0.0, c_s=0.0)
+    log = log_of(
+        plant, values, PAPER_STAND, duration_s=10, rate_hz=400, seed=3, sensors=so.Sensors(noise_std={"tau_s": 0.05})
+    )
+    bench = so.Experiment(plant=plant, log=log, outputs=("tau_s",))
+    result = so.fit([bench], values.update(J_m=2e-5, c_s=0.01).free("J_m", "b_r", "c_s"))
+    assert result.parameters["c_s"].known > 0.2 or result.parameters["c_s"].at_bound
+    assert "rough" not in list_kinds(result, "error")
