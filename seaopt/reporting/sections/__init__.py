@@ -16,7 +16,7 @@ from seaopt.reporting.sections.data import Commands, KeyFigure, Section, Verdict
 KINDS = {
     "Fit": "fit",
     "ModelledOutputs": "prediction",
-    "LogComparison": "log_comparison",
+    "LogComparison": "prediction",
     "Quality": "quality",
     "Responses": "responses",
     "Frontier": "frontier",

@@ -1,14 +1,48 @@
-"""Measured and modelled outputs of one log in words: how well each output is predicted."""
+"""Another log in words: how well each of its outputs is predicted, and whether its own values are those of the fit."""
 
 from __future__ import annotations
 
-from seaopt.estimation import ModelledOutputs
+from seaopt.estimation import LogComparison, ModelledOutputs
 from seaopt.formatting import format_number
-from seaopt.reporting.sections.data import Section, Table
+from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict
 from seaopt.units import unit_after
 
+APART = 3.0  # standard deviations
 
-def describe(prediction: ModelledOutputs) -> list[Section]:
+
+def judge(result: ModelledOutputs | LogComparison, commands: Commands) -> Verdict | None:
+    """Return the verdict of a comparison, which values the log contradicts; a prediction alone has none."""
+    if isinstance(result, ModelledOutputs):
+        return None
+    comparison = result
+    distances = comparison.distances
+    if comparison.met is None:
+        return Verdict(met=False, text=f"{comparison.name}: undecided, this log alone does not determine the values")
+    if comparison.met:
+        within = format_number(max(distances.values(), default=0.0), 2)
+        return Verdict(met=True, text=f"{comparison.name}: its own values are the fit's, within {within} std")
+    apart = sorted((name for name, each in distances.items() if each > APART), key=lambda name: -distances[name])
+    return Verdict(
+        met=False,
+        text=f"{comparison.name}: contradicts the fit",
+        reasons=tuple(
+            Reason(
+                what=name,
+                where=f"{comparison.log.values[name][0]:.4g} by this log alone, {comparison.values[name][0]:.4g} by "
+                f"the fit: {distances[name]:.2g} std apart{_describe_amplitude(comparison)}",
+            )
+            for name in apart
+        ),
+        next=("fit both logs: values of one model then have the interval that both allow",),
+    )
+
+
+def describe(result: ModelledOutputs | LogComparison) -> list[Section]:
+    """Return the scores of a prediction's outputs, or the values of a comparison."""
+    return _describe_scores(result) if isinstance(result, ModelledOutputs) else _describe_comparison(result)
+
+
+def _describe_scores(prediction: ModelledOutputs) -> list[Section]:
     """Return the scores of the outputs."""
     rows = tuple(
         (
@@ -27,3 +61,40 @@ def describe(prediction: ModelledOutputs) -> list[Section]:
             tables=(Table(head=("output", "fit %", "in the band", "residual", ""), rows=rows, align="<>>><"),),
         )
     ]
+
+
+def _describe_comparison(comparison: LogComparison) -> list[Section]:
+    """Return the values of both."""
+    distances = comparison.distances
+    rows = tuple(
+        (
+            name,
+            f"{comparison.values[name][0]:.6g}",
+            f"± {comparison.values[name][1]:.2g}",
+            f"{value:.6g}",
+            f"± {std:.2g}",
+            format_number(distances[name], 2),
+        )
+        for name, (value, std) in comparison.log.values.items()
+    )
+    return [
+        Section(
+            title=f"Values by {comparison.name} alone",
+            aside=f"{format_number(comparison.log.excess, 2)} times its sensor's noise left",
+            tables=(
+                Table(
+                    label="Values by the fit and by this log alone",
+                    head=("parameter", "fit", "std", "this log", "std", "std apart"),
+                    rows=rows,
+                    align="<>>>>>",
+                ),
+            ),
+        )
+    ]
+
+
+def _describe_amplitude(comparison: LogComparison) -> str:
+    if not comparison.amplitudes:
+        return ""
+    ratio = comparison.log.amplitude / max(max(comparison.amplitudes), 1e-300)
+    return f", at {format_number(ratio, 2)} times the amplitude"
