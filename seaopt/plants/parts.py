@@ -358,7 +358,6 @@ def wrapped(
     >>> from seaopt.plants import high_impedance
     >>> list(wrapped(high_impedance(), ["current_loop", "load_cell"]).states)
     ['q', 'qd', 'I_current_loop_1', 'F1_load_cell_1', 'F2_load_cell_1']
-
     """
     check_parts(parts)
     for part in parts:
@@ -395,18 +394,7 @@ def wrapped(
 
 
 def add_part(plant: Plant, part: str) -> Plant:
-    """Return a plant with one more part, made again where it can be, so that the part is where it acts.
-
-    Raises PlantError: the part does not go with the plant; or sits inside an actuator, and nothing makes that again.
-
-    Examples
-    --------
-    >>> from seaopt.plants import high_impedance, let_stick
-    >>> stiffer = add_part(let_stick(high_impedance(parts=["load_cell"])), "hardening")
-    >>> stiffer.name, stiffer.sticks, "k_3" in stiffer.parameters
-    ('high_impedance(unlumped) with load_cell', True, True)
-
-    """
+    """Return a plant with one more part, made again where it can be. Raises PlantError: the two do not go together."""
     recipe = plant.recipe
     if recipe is None or not _makes(recipe, plant):
         made = wrapped(plant, [part])

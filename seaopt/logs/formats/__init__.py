@@ -49,10 +49,7 @@ _BINARY_NAMES = {".mat": "MAT file of version 4, 5 or 7.3",
 
 
 def open_source(path: Path) -> Source:
-    """Open a file by its content and list its fields; no data are loaded.
-
-    Raises LogError: the file is missing, empty, a folder, damaged, or of no known format.
-    """
+    """Open a file by its content and list its fields, without data. Raises LogError: no file, or no known format."""
     module, function, form = sniff(path)
     opener: Callable[[Path], Source] = getattr(import_module(f"seaopt.logs.formats.{module}"), function)
     with translate_errors(path, form):

@@ -47,10 +47,9 @@ def _open(path: Path, form: str, walk: Any) -> Source:
 
 
 def _check_length(path: Path) -> None:
-    """Refuse a file that is longer or shorter than it says of itself: the library looks at shorter ones alone.
-
-    A superblock (HDF5 File Format Specification, II.A) stands at 0, 512, 1024, ...: it has the address of the file's
-    end as the third of the addresses that begin at byte 24 (version 0), 28 (1) or 12 (2 and 3).
+    """Refuse a file that is longer or shorter than it says of itself: the library looks at shorter ones alone. A
+    superblock (HDF5 File Format Specification, II.A) stands at 0, 512, 1024, ...: it has the address of the file's end
+    as the third of the addresses that begin at byte 24 (version 0), 28 (1) or 12 (2 and 3).
     """
     size, at = path.stat().st_size, 0
     with path.open("rb") as stream:
@@ -116,7 +115,6 @@ def _name_kind(node: Any) -> str:
 
 def _is_standard(stored: Any) -> bool:
     """Tell whether a number is stored as IEEE 754 or as a whole number has it; any other form is converted on reading.
-
     A type's description has no checksum in most files, and one of another exponent would be read as other numbers.
     """
     from h5py import h5t

@@ -141,9 +141,8 @@ class Block:
 
 
 def check_blocks(path: Path) -> None:
-    """Refuse a finished MDF file of which a data group holds other samples than its channel groups count.
-
-    Raises LogError: it does, or a block lies outside the file, or does not unpack to what it says.
+    """Refuse (LogError) a finished MDF file whose data groups hold other samples than their channel groups count, or of
+    which a block lies outside the file, or does not unpack to what it says.
     """
     with path.open("rb") as stream:
         if stream.read(8) != b"MDF     ":  # one that its recorder did not finish has no counts yet

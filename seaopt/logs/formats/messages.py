@@ -92,10 +92,7 @@ class Wire:
 
     @classmethod
     def detect(cls, data: bytes, encoding: str) -> Wire:
-        """Return the encoding of a message.
-
-        Raises ValueError: it is CDR of a kind that ROS does not write.
-        """
+        """Return the encoding of a message. Raises ValueError: it is CDR of a kind that ROS does not write."""
         if encoding == "ros1":
             return cls(cdr=False)
         if len(data) < CDR_HEADER or data[0] != 0 or data[1] not in (0, 1):
@@ -129,14 +126,7 @@ def take_values(node: Node, data: bytes, encoding: str, wanted: Wanted) -> dict[
 
 
 def build_wanted_tree(paths: Mapping[str, str]) -> dict[str | int, Any]:
-    """Return paths such as "a.b[2].c", with what to call them, as nested keys.
-
-    Examples
-    --------
-    >>> build_wanted_tree({"a.b[2]": "x", "a.c": "y"})
-    {'a': {'b': {2: 'x'}, 'c': 'y'}}
-
-    """
+    """Return paths such as "a.b[2].c", with what to call them, as nested keys."""
     root: dict[str | int, Any] = {}
     for path, name in paths.items():
         keys = [int(key) if key.isdecimal() else key for key in re.findall(r"[^.\[\]]+", path)]

@@ -13,16 +13,7 @@ _PAIRS = (("time", ("signals",)), ("Time", ("Data",)))
 
 
 def assign_clocks(fields: Sequence[Field]) -> list[Field]:
-    """Give the signals of "structure with time" and of a timeseries saved as a struct their clock, in seconds.
-
-    Examples
-    --------
-    >>> names = ("out.time", "out.signals.values")
-    >>> fields = assign_clocks([Field(name=name, kind="float64", length=9) for name in names])
-    >>> [(field.name, field.clock, field.unit) for field in fields]
-    [('out.time', 'out.time', 's'), ('out.signals.values', 'out.time', None)]
-
-    """
+    """Give the signals of "structure with time" and of a timeseries saved as a struct their clock, in seconds."""
     lengths = {field.name: field.length for field in fields}
     timed: list[Field] = []
     for field in fields:

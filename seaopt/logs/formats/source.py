@@ -77,17 +77,13 @@ class Source:
     rows: str = ""  # which rows are read, where not all are
 
     def read(self, names: Sequence[str], window: Window | None = None) -> dict[str, Float[np.ndarray, " _"]]:
-        """Return the data of fields that share a clock.
-
-        Raises LogError: the file is damaged, or a cell is not a number.
-        """
+        """Return the data of fields that share a clock. Raises LogError: damage, or a cell that is not a number."""
         with translate_errors(self.path, self.format):
             return self.load(list(dict.fromkeys(names)), window)
 
 
 def keep_rows(source: Source, where: Where) -> Source:
     """Return a source of the rows in which columns have given values: one signal of a table of (name, value, time).
-
     Raises LogError: a column is not there, or (outside text files) holds no numbers.
     """
     rows = ", ".join(f"{name} = {value}" for name, value in where.items())
@@ -169,16 +165,7 @@ class Place:
 def spread(
     name: str, shape: Sequence[int], kind: str, *, matlab: bool = False, unit: str | None = None
 ) -> list[tuple[Field, Place]]:
-    """Return the fields of one array: a vector is one, a matrix one for each column (or row, if it has fewer of them).
-
-    Examples
-    --------
-    >>> [field.name for field, _ in spread("x", (100, 2), "float64")], [f.name for f, _ in spread("x", (2, 9), "int8")]
-    (['x[:,0]', 'x[:,1]'], ['x[0,:]', 'x[1,:]'])
-    >>> [field.name for field, _ in spread("x", (100, 2), "float64", matlab=True)]
-    ['x(:,1)', 'x(:,2)']
-
-    """
+    """Return the fields of an array: a vector is one, a matrix one per column (or row, if it has fewer of them)."""
     sizes = [int(size) for size in shape]
     long = [size for size in sizes if size != 1]
     if len(long) <= 1 and len(sizes) <= 2:
@@ -240,10 +227,7 @@ def summarise_error(error: BaseException) -> str:
 
 
 def import_optional(module: str, extra: str, path: Path, form: str) -> Any:
-    """Import an optional library.
-
-    Raises LogError: it is not installed; the message names the extra.
-    """
+    """Import an optional library. Raises LogError: it is not installed; the message names the extra."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -153,9 +153,8 @@ def _check_lines(layout: TextLayout, block: bytes, number: int) -> None:
 def _parse(
     layout: TextLayout, block: bytes, number: int, index: Mapping[str, int], where: Mapping[int, str | float]
 ) -> dict[str, Any]:
-    """Return the columns of a block, by name; with `where` of the rows in which columns have these values.
-
-    Texts are parsed where floats alone are not there, or blank lines are; what other rows hold is not looked at.
+    """Return the columns of a block, by name; with `where` of the rows in which columns have these values. Texts are
+    parsed where floats alone are not there, or blank lines are; what other rows hold is not looked at.
     """
     import polars as pl
 

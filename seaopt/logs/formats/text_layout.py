@@ -54,10 +54,7 @@ class TextLayout:
 
 
 def find_layout(path: Path) -> TextLayout:
-    """Return the layout of a text file.
-
-    Raises LogError: the file is empty, is not text, has a line beyond 1 MiB, or no data below its header.
-    """
+    """Return a text file's layout. Raises LogError: it is empty, not text, has a line beyond 1 MiB, or no data."""
     encoding, lines = _read_head(path)
     filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not _is_comment(line)]
     if not filled:
@@ -120,14 +117,7 @@ def find_layout(path: Path) -> TextLayout:
 
 
 def _number_header(header: str, number: int) -> str:
-    """Return the header of a column that others have, too, with its number before the brackets.
-
-    Examples
-    --------
-    >>> _number_header("X [s]", 3)
-    'X#3 [s]'
-
-    """
+    """Return the header of a column that others have, too, with its number before the brackets."""
     bare = bare_name(header)
     return f"{bare}#{number}{header[len(bare) :]}"
 
@@ -299,14 +289,7 @@ def _find_headers(
 
 
 def _join_quoted_lines(lines: Sequence[str]) -> list[str]:
-    """Return lines of which one that a quoted cell breaks (RFC 4180) is whole, with empty ones for the rest of it.
-
-    Examples
-    --------
-    >>> _join_quoted_lines(['t,"I', '[A]",F1', "x"])
-    ['t,"I [A]",F1', '', 'x']
-
-    """
+    """Return lines of which one that a quoted cell breaks (RFC 4180) is whole, with empty ones for the rest of it."""
     joined = list(lines)
     start: int | None = None
     for at, line in enumerate(lines):

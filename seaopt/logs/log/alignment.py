@@ -25,7 +25,6 @@ class Hold:
     >>> import numpy as np
     >>> Hold()(np.array([0.0, 1.0, 2.5, 3.1]), np.array([1.0, 3.0]), np.array([5.0, 7.0])).tolist()
     [nan, 5.0, 5.0, nan]
-
     """
 
     max_age_s: float = np.inf
@@ -60,7 +59,6 @@ class Linear:
     >>> import numpy as np
     >>> Linear(max_gap_s=2)(np.array([1.5, 4.0]), np.array([1.0, 3.0, 6.0]), np.array([5.0, 7.0, 8.0])).tolist()
     [5.5, nan]
-
     """
 
     max_gap_s: float = np.inf
@@ -100,7 +98,6 @@ class Nearest:
     >>> import numpy as np
     >>> Nearest(tolerance_s=0.2)(np.array([1.1, 2.0]), np.array([1.0, 3.0]), np.array([5.0, 7.0])).tolist()
     [5.0, nan]
-
     """
 
     tolerance_s: float
@@ -126,10 +123,7 @@ Rule = Hold | Linear | Nearest
 
 
 def check_increasing(time: Float[np.ndarray, " m"], clock: str) -> None:
-    """Refuse a clock that no rule can work on.
-
-    Raises LogError: it is empty, not a number somewhere, repeats or runs backwards.
-    """
+    """Refuse (LogError) a clock that is empty, has NaN, repeats or runs backwards: no rule can work on it."""
     if time.size == 0:
         raise LogError(f"{clock} holds no sample; choose another channel or window_s")
     if not np.all(np.isfinite(time)):

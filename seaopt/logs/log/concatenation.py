@@ -37,7 +37,6 @@ def concatenate(logs: Sequence[Log], *, gap_s: float | None = None) -> Log:
     >>> both = concatenate([log, log], gap_s=1.0)
     >>> both.time.round(9).tolist(), both.gaps
     ([0.0, 0.1, 0.2, 1.2, 1.3, 1.4], [(0.2, 1.2)])
-
     """
     if isinstance(logs, Log) or not logs:
         raise LogError("concatenate takes a list of logs; give at least one")

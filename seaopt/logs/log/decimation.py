@@ -26,10 +26,9 @@ MISSING_WEIGHT = 0.2  # of the filter's weight on missing samples, beyond which 
 def decimate(
     log: Recording, period: float, segments: Sequence[slice], factor: int
 ) -> tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]:
-    """Return every `factor`-th sample behind the filter, and a note of what was done: see `Log.decimate`.
-
-    `log`: uniformly sampled, every `period` s. `segments`: rows between gaps, which are filtered each on its own.
-    Raises LogError: no segment is as long as the filter.
+    """Return every `factor`-th sample behind the filter, and a note: see `Log.decimate`. `log`: uniformly sampled,
+    every `period` s. `segments`: rows between gaps, filtered each on its own. Raises LogError: none is as long as the
+    filter.
     """
     taps = _taps(factor)
     half = taps.size // 2

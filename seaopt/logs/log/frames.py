@@ -34,10 +34,7 @@ def to_polars(log: Recording) -> pl.DataFrame:
 
 
 def to_pandas(log: Recording) -> pd.DataFrame:
-    """Return a pandas frame of a log.
-
-    Raises LogError: pandas is not installed.
-    """
+    """Return a pandas frame of a log. Raises LogError: pandas is not installed."""
     try:
         pandas = importlib.import_module("pandas")
     except ImportError as error:
@@ -48,10 +45,8 @@ def to_pandas(log: Recording) -> pd.DataFrame:
 def read_frame(
     frame: Any, time: str, channels: Mapping[str, str] | None, units: Mapping[str, str], source: str
 ) -> tuple[dict[str, Float[np.ndarray, " n"]], dict[str, str], tuple[str, ...]]:
-    """Return arrays and units by name, time among them, and notes: what `Log.from_frame` makes a log of.
-
-    Raises LogError: the data are not a frame, or a column is missing, not numeric, or given for two channels of one
-    unit.
+    """Return arrays and units by name, and notes, for `Log.from_frame`. Raises LogError: no frame, or a column that is
+    missing, not numeric, or given for two channels of one unit.
     """
     columns = [str(name) for name in getattr(frame, "columns", ())]
     if not columns:

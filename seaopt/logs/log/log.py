@@ -57,7 +57,6 @@ class Log:
     >>> log = Log.from_arrays(time=t, I=np.ones(5), F1=240 * np.ones(5), units={"I": "A", "F1": "N"})
     >>> log.rate_hz, float(log["F1"][0])
     (400.0, 240.0)
-
     """
 
     plot = PlotAccessor()
@@ -108,7 +107,6 @@ class Log:
             Shapes differ, an array is not numeric, or time does not increase.
         UnitError
             A unit is unknown.
-
         """
         require_type(units or {}, Mapping, "units", "give a mapping of channel to unit", LogError)
         units = dict(units or {})
@@ -155,11 +153,8 @@ class Log:
     def segments(self) -> list[slice]:
         """The segments without a gap, as slices of at least two samples; a single sample between gaps is left out.
 
-        Raises
-        ------
-        LogError
-            Inside a segment a step differs by more than 5 % from the period: the log is not uniformly sampled.
-
+        Raises LogError: inside a segment a step differs by more than 5 % from the period: the log is not uniformly
+        sampled.
         """
         segments = split_at_gaps(self.time, self.gap_s)
         for segment in segments:
@@ -175,13 +170,8 @@ class Log:
         return segments
 
     def between(self, start_s: float, stop_s: float) -> Log:
-        """Return the samples with start_s <= time - time[0] <= stop_s.
-
-        Raises
-        ------
-        LogError
-            Fewer than two samples lie there.
-
+        """Return the samples with start_s <= time - time[0] <= stop_s. Raises LogError: fewer than two samples lie
+        there.
         """
         start_s, stop_s = require_number(start_s, "start_s", LogError), require_number(stop_s, "stop_s", LogError)
         elapsed = self.time - self.time[0]
@@ -237,7 +227,6 @@ class Log:
         >>> even = log.resample(rate_hz=10)
         >>> even["F1"].round(9).tolist(), even.notes
         ([0.0, 1.0, 2.0, 3.0, 4.0], ('resampled from 10 Hz to 10 Hz by Linear(max_gap_s=inf)',))
-
         """
         longest = self.gap_s if bridge_s is None else bridge_s
         return self.with_values(*resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, longest_s=longest))
@@ -269,7 +258,6 @@ class Log:
         >>> even = log.restamp()
         >>> bool(np.max(np.abs(even.time - np.arange(400) / 400)) < 1e-3), len(even.segments)
         (True, 1)
-
         """
         if rate_hz is not None and not (isinstance(rate_hz, int | float) and 0.0 < rate_hz < 1e12):
             raise LogError(f"{self.source}: rate_hz = {rate_hz!r} is not a sample rate; give samples per second")
@@ -304,7 +292,6 @@ class Log:
         >>> slow = Log.from_arrays(time=t, F1=np.sin(2 * np.pi * 10 * t) + np.sin(2 * np.pi * 300 * t)).decimate(5)
         >>> bool(np.max(np.abs(slow["F1"] - np.sin(2 * np.pi * 10 * slow.time))) < 1e-3), slow.rate_hz
         (True, 200.0)
-
         """
         if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
             raise LogError(f"{self.source}: factor = {factor!r} is not a whole number; give 2 or more")
@@ -324,19 +311,11 @@ class Log:
         >>> log = Log.from_arrays(time=[0.0, 0.1], F1=[1.0, 2.0], units={"F1": "kN"})
         >>> log.to_polars().columns
         ['time [s]', 'F1 [N]']
-
         """
         return frames.to_polars(self)
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return a pandas frame with the columns of `to_polars`.
-
-        Raises
-        ------
-        LogError
-            pandas is not installed.
-
-        """
+        """Return a pandas frame with the columns of `to_polars`. Raises LogError: pandas is not installed."""
         return frames.to_pandas(self)
 
     @classmethod
@@ -377,7 +356,6 @@ class Log:
         >>> log = Log.from_frame(pl.DataFrame({"t [ms]": [0.0, 2.5], "cur [mA]": [100, None]}), time="t [ms]")
         >>> log.time.tolist(), log["cur"].tolist(), log.signal("cur").unit
         ([0.0, 0.0025], [0.1, nan], 'A')
-
         """
         arrays, units, notes = frames.read_frame(frame, time, channels, units or {}, source)
         return replace(cls.from_arrays(units=units, source=source, **arrays), notes=notes)
@@ -445,10 +423,8 @@ def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
 
 
 def _measure_steps(time: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the sample period and the step above which there is a gap: see `measure_steps`.
-
-    The median that tells the gaps is over at most `STEPS_PER_BLOCK` steps; the odd stride meets both of two steps that
-    alternate.
+    """Return the sample period and the step above which there is a gap: see `measure_steps`. The median that tells the
+    gaps is over at most `STEPS_PER_BLOCK` steps; the odd stride meets both of two steps that alternate.
     """
     first = np.arange(0, time.size - 1, (time.size - 2) // STEPS_PER_BLOCK | 1)
     longest = GAP * float(np.median(time[first + 1] - time[first]))

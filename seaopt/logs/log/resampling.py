@@ -26,10 +26,8 @@ Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], s
 
 
 def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None, longest_s: float) -> Resampled:
-    """Return time and channels on a uniform clock, and a note of what was done: see `Log.resample`.
-
-    `longest_s`: the longest step of time that is interpolated across.
-    Raises LogError: the rate is not positive, or so low that interpolation would alias, or no segment is long enough.
+    """Return time and channels on a uniform clock, and a note: see `Log.resample`. `longest_s`: of a step that is
+    interpolated across. Raises LogError: the rate is not positive, or would alias, or no segment is long enough.
     """
     chosen = rule if rule is not None else Linear()
     if not isinstance(chosen, Hold | Linear | Nearest):
@@ -87,10 +85,8 @@ def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) 
 def restamp(
     log: Recording, period: float, gap_s: float, rate_hz: float | None = None
 ) -> tuple[Float[np.ndarray, " n"], str]:
-    """Return the uniform clock behind rounded or late timestamps, and a note of what was done: see `Log.restamp`.
-
-    Raises LogError: rounding alone does not explain the timestamps, and no rate is stated; or the stated one is not
-    theirs.
+    """Return the uniform clock behind rounded or late timestamps, and a note: see `Log.restamp`. Raises LogError:
+    rounding alone does not explain them and no rate is stated, or the stated one is not theirs.
     """
     if rate_hz is not None:
         return _restamp_at(log, period, rate_hz)
@@ -114,13 +110,11 @@ def restamp(
 
 
 def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Float[np.ndarray, " n"], str]:
-    """Return a clock of a stated rate, with gaps of whole samples where the timestamps move on for good.
-
-    A sample that was stamped late is followed by a step that is too short: the timestamps come back to their line. At a
-    gap they do not: the median of the next `AROUND` samples lies above that of the ones before by whole periods.
-
-    The stated rate is nominal and says how samples are counted. Where the timestamps show by how much the sampling
-    clock is off, as crystals are, theirs is taken.
+    """Return a clock of a stated rate, with gaps of whole samples where the timestamps move on for good. A sample that
+    was stamped late is followed by a step that is too short: the timestamps come back to their line. At a gap they do
+    not: the median of the next `AROUND` samples lies above that of the ones before by whole periods. The stated rate is
+    nominal and says how samples are counted. Where the timestamps show by how much the sampling clock is off, as
+    crystals are, theirs is taken.
     """
     time, period = log.time, 1.0 / rate_hz
     late = time - period * np.arange(time.size)
@@ -157,10 +151,9 @@ def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Flo
 
 
 def _measure_drift(line: Float[np.ndarray, " n"], off: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return by which share timestamps run slower than a line, and how far that leaves them from it, in s.
-
-    The slope is that of the medians of parts of the log, which no spike moves; zero where jitter gives as much. What is
-    left of the medians tells whether timestamps and line count alike from end to end.
+    """Return by which share timestamps run slower than a line, and how far that leaves them from it, in s. The slope is
+    that of the medians of parts of the log, which no spike moves; zero where jitter gives as much. What is left of the
+    medians tells whether timestamps and line count alike from end to end.
     """
     count = min(PARTS, line.size)
     x, y = (np.array([np.median(part) for part in np.array_split(values, count)]) for values in (line, off))

@@ -21,18 +21,8 @@ EXTREME_SAMPLES = 16  # extreme samples among which equal ones give a rail away
 def mask_saturated(
     log: Log, outputs: Collection[str], *, ranges: Mapping[str, tuple[float, float]], search: bool
 ) -> Log:
-    """Make the saturated samples of outputs missing.
-
-    `outputs`: channels to look at. `ranges`: declared (low, high) of sensors, in SI: samples at an end or beyond it are
-    saturated. `search`: whether to look for clear flat tops, as the quality report does, where no range is declared.
-
-    Examples
-    --------
-    >>> log = Log.from_arrays(time=np.arange(5) / 10, F1=[0.0, 8.0, 9.0, 9.0, 3.0], units={"F1": "N"})
-    >>> masked = mask_saturated(log, ["F1"], ranges={"F1": (-9.0, 9.0)}, search=True)
-    >>> masked["F1"].tolist(), masked.notes
-    ([0.0, 8.0, nan, nan, 3.0], ('F1: 2 samples (40 %) at or beyond its declared range of -9 to 9 N masked',))
-
+    """Make the saturated samples of `outputs` missing: those at the ends of declared `ranges` (low, high; SI) or
+    beyond, and, with `search`, clear flat tops, as the quality report finds them, where no range is declared.
     """
     for name in outputs:
         if name in ranges:

@@ -57,15 +57,7 @@ class ChannelQuality:
 
 
 def assess_channel(signal: Signal) -> ChannelQuality:
-    """Return range and faults of one channel, looked at on its own.
-
-    Examples
-    --------
-    >>> channel = assess_channel(Signal(name="F1", values=np.clip(np.sin(np.arange(999.0)), -2, 0.8)))
-    >>> [(rail.side, rail.value) for rail in channel.rails], channel.stuck.samples
-    ([('high', 0.8)], 0)
-
-    """
+    """Return range and faults of one channel, looked at on its own."""
     values = signal.values
     finite = np.isfinite(values)
     missing = RowRanges() if np.all(finite) else faults.find_runs(~finite)

@@ -56,16 +56,7 @@ def sample_rate_hz(period: float) -> float:
 
 
 def advise_clock(period: float, *, rounded: bool = False) -> tuple[str, list[dict[str, Any]]]:
-    """Return how an uneven clock is made uniform, as calls and as keys; `rounded`: only its timestamps are.
-
-    Examples
-    --------
-    >>> advise_clock(0.0025, rounded=True)
-    ('call log.restamp()', [{'resample': 'restamp'}])
-    >>> print(advise_clock(0.0025)[0])
-    call log.resample(rate_hz=400), or log.restamp(rate_hz=400) where a PC stamped the samples of a perfect clock
-
-    """
+    """Return how an uneven clock is made uniform, as calls and as keys; `rounded`: only its timestamps are."""
     if rounded:
         return "call log.restamp()", [{"resample": "restamp"}]
     rate_hz = float(f"{1.0 / period:.3g}")
@@ -75,17 +66,7 @@ def advise_clock(period: float, *, rounded: bool = False) -> tuple[str, list[dic
 
 
 def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
-    """Return rate, jitter, gaps and faults of the timestamps of a log or table.
-
-    Raises LogError: fewer than two of them increase: there is no clock.
-
-    Examples
-    --------
-    >>> clock = assess_clock(np.array([0.0, 0.1, 0.2, 0.5, 0.6]), "log")
-    >>> clock.rate_hz, clock.gaps.tolist(), clock.lost.tolist()
-    (10.0, [3], [2])
-
-    """
+    """Return rate, jitter, gaps and faults of timestamps. Raises LogError: fewer than two of them increase."""
     finite = np.flatnonzero(np.isfinite(time))
     stamps = time if finite.size == time.size else time[finite]
     step = np.diff(stamps)
@@ -114,18 +95,10 @@ def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
 
 
 def measure_steps(step: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the mean of steps of time that are not across a gap, and the length above which one is.
-
-    The mean is insensitive to rounded stamps, the median only tells the gaps. Longer steps that come often are of the
-    clock itself, as where two devices' times alternate, unless they are whole periods: samples were lost there. Whole
-    periods that come in turn are those of timestamps rounded to nearly a period.
-
-    Examples
-    --------
-    >>> period, gap_s = measure_steps(np.tile([2.7e-3, 2.7e-3, 10e-3], 100))
-    >>> round(1.0 / period, 1), round(gap_s, 4)
-    (194.8, 0.02)
-
+    """Return the mean of steps of time that are not across a gap, and the length above which one is. The mean is
+    insensitive to rounded stamps, the median only tells the gaps. Longer steps that come often are of the clock itself,
+    as where two devices' times alternate, unless they are whole periods: samples were lost there. Whole periods that
+    come in turn are those of timestamps rounded to nearly a period.
     """
     usual = float(np.median(step))
     short = step <= GAP * usual
@@ -151,16 +124,7 @@ def split_rows(breaks: Int[np.ndarray, " k"], n: int, least: int = 1) -> list[sl
 
 
 def timestamp_resolution(time: Float[np.ndarray, " n"]) -> float:
-    """Return the step that timestamps are rounded to; 0 where they are as fine as floats.
-
-    Examples
-    --------
-    >>> float(round(timestamp_resolution(np.round(np.arange(400) / 400, 3)), 9))
-    0.001
-    >>> timestamp_resolution(np.arange(400) / 400)
-    0.0
-
-    """
+    """Return the step that timestamps are rounded to; 0 where they are as fine as floats."""
     step = np.diff(time[:ROUNDING_STEPS])
     noise = 16.0 * np.finfo(float).eps * float(np.max(np.abs(time[: step.size + 1])))
     # Differences of rounded stamps are whole multiples of the rounding step, up to the noise of floats.

@@ -58,10 +58,9 @@ class InputExcitation:
 
     @property
     def usable_hz(self) -> tuple[float, float] | None:
-        """The widest run of usable bands, in octaves; None where there is none.
-
-        A dip of the coherence within it is part of it, where the input excites: beside a sharp resonance the window
-        leaks its power, and at an antiresonance little is left of the output.
+        """The widest run of usable bands, in octaves; None where there is none. A dip of the coherence within it is
+        part of it, where the input excites: beside a sharp resonance the window leaks its power, and at an
+        antiresonance little is left of the output.
         """
         best: tuple[float, float] | None = None
         start: float | None = None
@@ -134,10 +133,7 @@ class InputExcitation:
 
 
 def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) -> InputExcitation | None:
-    """Return which bands an input excites, and in which a model can be identified; None where it is constant.
-
-    `spectra`: of input and outputs. `outputs`: channels that may answer to it.
-    """
+    """Return the bands that an input excites and in which `outputs` let a model be identified; None of a constant."""
     f, power = spectra.frequency_hz[1:], spectra.power(channel)[1:]
     total = float(np.sum(power))
     if total <= 0.0:

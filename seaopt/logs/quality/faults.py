@@ -54,10 +54,7 @@ class RowRanges:
 
 @record(eq=False)
 class Rail:
-    """A flat top or bottom: samples piled up at an extreme value.
-
-    `clear` says that nothing else explains it: three or more visits, in a channel whose samples otherwise differ.
-    """
+    """Samples piled up at an extreme value; `clear`: three or more visits, where samples otherwise differ."""
 
     side: str
     value: float
@@ -75,14 +72,7 @@ class CounterLosses:
 
 
 def find_runs(mask: Bool[np.ndarray, " n"]) -> RowRanges:
-    """Return the runs of True.
-
-    Examples
-    --------
-    >>> find_runs(np.array([True, True, False, True])).stop.tolist()
-    [2, 4]
-
-    """
+    """Return the runs of True."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return RowRanges(start=edges[::2], stop=edges[1::2])
 
@@ -103,15 +93,7 @@ def measure_stillness(values: Float[np.ndarray, " n"]) -> float:
 
 
 def find_quantisation(values: Float[np.ndarray, " n"]) -> float:
-    """Return the step whose multiples the samples are; 0 where there is none.
-
-    Examples
-    --------
-    >>> x = np.sin(np.arange(1000.0))
-    >>> float(round(find_quantisation(0.01 * np.round(x / 0.01)), 12)), find_quantisation(x)
-    (0.01, 0.0)
-
-    """
+    """Return the step whose multiples the samples are; 0 where there is none."""
     stride = max(1, values.size // LEVEL_SAMPLES)
     kinds = np.unique(values[::stride][np.isfinite(values[::stride])])
     if kinds.size < 3 or values.size < FEWEST_SAMPLES:
@@ -132,11 +114,10 @@ def find_quantisation(values: Float[np.ndarray, " n"]) -> float:
 
 
 def find_outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.ndarray, " k"]:
-    """Return the rows of samples that stand out from their neighbours (Hampel's test).
-
-    A sample stands out that lies beyond six robust standard deviations from the median of the five samples on each
-    side: both of those ten, and of what is usual for such distances over the whole channel. One of the ten may be an
-    outlier too. Pearson et al., Generalized Hampel filters, EURASIP J. Adv. Signal Process. 2016:87.
+    """Return the rows of samples that stand out from their neighbours (Hampel's test). A sample stands out that lies
+    beyond six robust standard deviations from the median of the five samples on each side: both of those ten, and of
+    what is usual for such distances over the whole channel. One of the ten may be an outlier too. Pearson et al.,
+    Generalized Hampel filters, EURASIP J. Adv. Signal Process. 2016:87.
     """
     if values.size < FEWEST_SAMPLES:
         return np.zeros(0, dtype=int)
@@ -201,11 +182,10 @@ def find_rails(values: Float[np.ndarray, " n"], quantum: float, still: float) ->
 
 
 def find_stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> RowRanges:
-    """Return the runs of equal samples that the channel's usual stillness does not explain.
-
-    With a share p of still steps, L equal samples in a row have a probability of about n p^(L-1): the limit is where
-    that is 1e-3. A channel that is quantised more coarsely than its noise also rests at its extremes, and leaves them
-    by one quantisation step; a run that ends in a larger jump, or with the log and twice as long as any rest, is none.
+    """Return the runs of equal samples that the channel's usual stillness does not explain. With a share p of still
+    steps, L equal samples in a row have a probability of about n p^(L-1): the limit is where that is 1e-3. A channel
+    that is quantised more coarsely than its noise also rests at its extremes, and leaves them by one quantisation step;
+    a run that ends in a larger jump, or with the log and twice as long as any rest, is none.
     """
     n = values.size
     if n < FEWEST_SAMPLES or still > 0.98:
@@ -224,14 +204,7 @@ def find_stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) ->
 
 
 def count_repeats(values: Float[np.ndarray, " n"]) -> int:
-    """Return how many samples each value is repeated, regularly; 1 where it is not.
-
-    Examples
-    --------
-    >>> count_repeats(np.repeat(np.sin(np.arange(50.0)), 4))
-    4
-
-    """
+    """Return how many samples each value is repeated, regularly; 1 where it is not."""
     changes = 1 + np.flatnonzero(values[1:] != values[:-1])
     spacing = np.diff(changes)
     if spacing.size < 8:
@@ -241,16 +214,8 @@ def count_repeats(values: Float[np.ndarray, " n"]) -> int:
 
 
 def find_counter_losses(values: Float[np.ndarray, " n"]) -> CounterLosses | None:
-    """Return the samples that a counter shows to be missing; None where the channel does not count.
-
-    A counter goes up by one, at regular intervals, and may wrap.
-
-    Examples
-    --------
-    >>> losses = find_counter_losses(np.delete(np.repeat(np.arange(20.0), 2), 15))
-    >>> losses.held, losses.rows.tolist(), losses.lost.tolist()
-    (2, [15], [1])
-
+    """Return the samples that a counter shows to be missing; None where the channel does not count. A counter goes up
+    by one, at regular intervals, and may wrap.
     """
     if values.size < FEWEST_SAMPLES or np.any(values[:STILLNESS_BLOCK] != np.round(values[:STILLNESS_BLOCK])):
         return None  # NaN is not equal to itself

@@ -52,7 +52,6 @@ class Finding:
         What it is and what to do.
     keys : tuple of dict
         The same remedy in a problem file: keys of an [[experiment]], each set by itself enough.
-
     """
 
     kind: str

@@ -26,18 +26,7 @@ class ChannelPair:
 
 
 def correlate_channels(spectra: Spectra, first: str, second: str) -> ChannelPair | None:
-    """Return lag and sign of the cross-correlation of two channels; None where one has no power.
-
-    Examples
-    --------
-    >>> from seaopt.logs.quality.spectra import compute_spectra
-    >>> x = np.random.default_rng(1).normal(size=4000)
-    >>> both = compute_spectra({"a": x[5:], "b": -x[:-5]}, [slice(0, 3995)], 0.01)
-    >>> pair = correlate_channels(both, "a", "b")
-    >>> round(pair.lag_s, 3), pair.correlation < -0.9
-    (0.05, True)
-
-    """
+    """Return lag and sign of the cross-correlation of two channels; None where one has no power."""
     powers = [float(np.fft.irfft(spectra.power(name))[0]) for name in (first, second)]
     if min(powers) <= 0.0:
         return None

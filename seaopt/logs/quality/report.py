@@ -64,7 +64,6 @@ class Quality(Result, Worded):
         The most severe first.
     notes : tuple of str
         What was done to the log before.
-
     """
 
     source: str
@@ -155,7 +154,6 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     >>> log = so.Log.from_arrays(time=t, I=rng.normal(size=4000), F1=np.clip(rng.normal(size=4000), -1, 1))
     >>> [(finding.kind, finding.channel) for finding in log.quality.findings if finding.severity == "warning"][:2]
     [('clipping', 'F1'), ('clipping', 'F1')]
-
     """
     if not isinstance(getattr(data, "signals", None), Mapping):
         raise LogError(f"data = {repr(data)[:60]} is a {type(data).__name__}; give a Log")

@@ -59,10 +59,7 @@ class Spectra:
 def compute_spectra(
     channels: Mapping[str, Float[np.ndarray, " n"]], segments: Sequence[slice], period: float
 ) -> Spectra | None:
-    """Return the spectra of the channels over the segments without a gap; None where there is no segment.
-
-    `segments`: rows without a gap. `period`: seconds between samples.
-    """
+    """Return the channels' spectra over `segments` (rows) sampled every `period` s; None without a segment."""
     total = sum(segment.stop - segment.start for segment in segments)
     length = 2 * (min(max(total // 16, SHORTEST_SEGMENT), LONGEST_SEGMENT) // 2)
     starts = welch.thin(welch.list_starts(segments, length), MOST_SEGMENTS)
@@ -100,11 +97,10 @@ class Hum:
 
 
 def find_hum(spectra: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
-    """Return the mains' lines of a channel, None where there are none or the segments are too short to tell.
-
-    A line stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median segment: what comes and goes,
-    such as a chirp, does not count, nor what an input is coherent with, such as a resonance there. Where other lines
-    stand out as well it is a multisine.
+    """Return the mains' lines of a channel, None where there are none or the segments are too short to tell. A line
+    stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median segment: what comes and goes, such as
+    a chirp, does not count, nor what an input is coherent with, such as a resonance there. Where other lines stand out
+    as well it is a multisine.
     """
     f = spectra.frequency_hz
     width = f[1] - f[0]

@@ -49,7 +49,6 @@ class Column:
     --------
     >>> Column(column="load", unit="-", wrap_bits=16, scale=1e-3).describe_conversion("-")
     "two's complement of 16 bits, times 0.001"
-
     """
 
     column: str | int
@@ -112,28 +111,12 @@ class Column:
 
 
 def spell_column(**keys: str | int) -> str:
-    """Return how a column is given: by keys that are called alike in `Column` and in a file of settings.
-
-    Examples
-    --------
-    >>> spell_column(column="cur", unit="A")
-    'column = "cur", unit = "A"'
-
-    """
+    """Return how a column is given: by keys that are called alike in `Column` and in a file of settings."""
     return ", ".join(f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in keys.items())
 
 
 def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> int | None:
-    """Return of how many bits the unsigned field seems to be in which small signed numbers were stored.
-
-    `low`, `high`: the least and the greatest of the samples.
-
-    Examples
-    --------
-    >>> suspect_wrap(np.array([0.0, 3.0, 65530.0, 65535.0, 1.0]), 0.0, 65535.0)
-    16
-
-    """
+    """Return the bits of an unsigned field that seems to hold small signed numbers, from `low` to `high`."""
     # Small numbers of either sign leave the middle half of the unsigned range empty.
     bits = next((bits for bits in (8, 16, 32) if 0.75 * 2**bits <= high < 2**bits and 0 <= low < 0.25 * 2**bits), None)
     if bits is None:

@@ -28,7 +28,6 @@ class Counter:
     >>> time, note = Counter(column="n").open_gaps(np.array([0.0, 1.0, 2.0]), np.array([7.0, 8.0, 10.0]), "log.csv")
     >>> time.tolist()
     [0.0, 1.0, 3.0]
-
     """
 
     column: str = option("A whole number that rises by one every `samples_per_count` samples.")
@@ -42,13 +41,8 @@ class Counter:
     def open_gaps(
         self, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], place: str
     ) -> tuple[Float[np.ndarray, " n"], str]:
-        """Return time with the later samples moved by the lost ones, and a note of what was done.
-
-        Raises
-        ------
-        LogError
-            The column is not a counter: not whole, or falling.
-
+        """Return time with the later samples moved by the lost ones, and a note of what was done. Raises LogError: the
+        column is not a counter: not whole, or falling.
         """
         whole = np.all((np.abs(values) < LARGEST_COUNT) & (values == np.floor(values)))
         if not whole or np.any(np.diff(values) < 0):

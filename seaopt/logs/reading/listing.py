@@ -24,7 +24,6 @@ class Contents:
         Name, kind, length, unit and clock of each column; the name is what `Column(column=...)` takes.
     notes : tuple of str
         Remarks on how the file was read.
-
     """
 
     path: str
@@ -69,7 +68,6 @@ def contents(path: str | Path) -> Contents:
     Zeit [ms] float64 ms
     Strom [mA] float64 mA
     Text text None
-
     """
     require_type(path, (str, Path), "path", "give a path", LogError)
     source = open_source(Path(path))

@@ -87,7 +87,6 @@ def read_table(
     ([0.0, 0.0025], {'cur': ([0.1, 0.15], 'A')})
     >>> table.notes
     ('columns that hold no numbers were left out: note',)
-
     """
     table, _ = _read_files(path, time, channels, align, window_s, counter, rate_hz, digest=digest)
     return table
@@ -179,7 +178,6 @@ def read_log(
     >>> _ = file.write_text("time [s],cur\n0.0,100\n0.0025,150\n")
     >>> read_log(file, time="time [s]", channels={"I": Column(column="cur", unit="mA")})["I"].tolist()
     [0.1, 0.15]
-
     """
     table, clock = _read_files(path, time, channels, align, window_s, counter, rate_hz, digest=digest)
     if duplicates is not None:

@@ -112,10 +112,8 @@ def select(
     counter: Counter | None,
     rate_hz: float | None = None,
 ) -> Selection:
-    """Return the log's clock and its channels.
-
-    Raises LogError: a column is missing, doubled or has no unit, the clock is not clear, or a channel is on another
-    clock without a rule. Raises UnitError: a unit is unknown or of the wrong dimension.
+    """Return the log's clock and channels. Raises LogError: a column is missing, doubled or without a unit, the clock
+    is not clear, or a channel's other clock has no rule. Raises UnitError: a unit is unknown or of the wrong dimension.
     """
     if channels is not None and "time" in channels:
         raise LogError(f'{sources[0].path}: a channel is named "time"; rename it, time is the clock')
@@ -348,14 +346,7 @@ def advise_time(source: Source) -> str:
 
 
 def is_time_name(name: str) -> bool:
-    """Tell whether a column is named like a time.
-
-    Examples
-    --------
-    >>> is_time_name("Zeit [ms]"), is_time_name("imu.t"), is_time_name("F1 [N]")
-    (True, True, False)
-
-    """
+    """Tell whether a column is named like a time."""
     return re.split(r"[./]", bare_name(name))[-1].casefold() in _TIME_NAMES
 
 

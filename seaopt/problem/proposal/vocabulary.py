@@ -12,7 +12,7 @@ from typing import Literal
 
 from seaopt.errors import SeaoptError
 from seaopt.records import record
-from seaopt.units import bare_name, is_unit, same_dimension, si_unit
+from seaopt.units import bare_name, is_unit, si_unit
 
 Quantity = Literal["time", "current", "voltage", "duty", "force", "torque", "angle", "length", "speed", "other", ""]
 Side = Literal["motor", "link", "spring", ""]
@@ -232,9 +232,3 @@ def _find_side(words: list[str]) -> Side:
         if _matches(words, SIDE_WORDS[side]):
             return side
     return ""
-
-
-def is_unit_of(unit: str, quantity: Quantity) -> bool:
-    """Tell whether a unit measures a quantity."""
-    wanted = UNITS_OF.get(quantity)
-    return wanted is not None and bool(unit) and is_unit(unit) and same_dimension(unit, wanted)
