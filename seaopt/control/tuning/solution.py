@@ -49,6 +49,7 @@ QUICKER_INTEGRAL = 10.0  # factor of k_i
 RECHECKS = 3
 NARROW = 1.01  # of a limit: what a law misses by less, it may miss between the frequencies alone
 TIGHTENINGS = 3
+MORE_RESERVE = (2e-3, 5e-3)  # more than a law may miss that counts as keeping its limits while one is looked for
 LEAST_TIGHTENING = 1.0015  # less moves no law: a limit missed by a thousandth counts as kept on a grid
 NO_LEVEL_ABOVE = 10.0  # a frequency further off counts no more: |F/F_ref| along -3 dB falls below it anywhere
 LOWER_FRACTIONS = 4  # of a link's feedforward, by a fifth each
@@ -206,7 +207,8 @@ def tighten_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solu
     """Return a law that keeps limits which the given one misses by next to nothing; that one where none is found.
 
     With no reserve a law is on its limits at the frequencies looked at, and may be beyond them in between. So these
-    are lowered by what is missed, and the law refined.
+    are lowered by what is missed, and the law refined; where that is so little that the law counts as keeping the
+    lowered ones too, or a frequency is missed, with more of a reserve.
     """
     best, factors = (x, loops), dict(task.eased)
     for _ in range(TIGHTENINGS):
@@ -219,6 +221,14 @@ def tighten_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solu
         best = (trial, task.measure(trial))
         if not task.list_broken(best[1]):
             return best
+    missed = measure_missed(task, loops)
+    if missed and all(used <= NARROW or BY_NAME[name].reserve == "curve" for name, used in missed.items()):
+        for reserve in (more for more in MORE_RESERVE if more > task.spec.reserve):
+            tight = replace(task, spec=replace(task.spec, reserve=reserve))
+            trial = refine(tight, make_grid(tight), x)
+            measured = task.measure(trial)
+            if not task.list_broken(measured):
+                return trial, measured
     return x, loops
 
 
