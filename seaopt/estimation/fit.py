@@ -150,10 +150,10 @@ def _count_iterations(progress: Progress) -> Callback:
     """Return what counts the iterations of all searches of a fit; as many as usual are expected to follow."""
     count = 0
 
-    def tell(_: int, cost: float) -> None:
+    def tell(where: str, cost: float) -> None:
         nonlocal count
         count += 1
-        progress(f"iteration {count}, cost {cost:.6g}", count / (count + USUAL_ITERATIONS))
+        progress(f"iteration {count}, cost {cost:.6g} ({where})", count / (count + USUAL_ITERATIONS))
 
     return tell
 

@@ -23,7 +23,7 @@ import numpy as np
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from seaopt.estimation.problem.shapes import Vector
-from seaopt.estimation.solver.least_squares import Callback
+from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.settle import Solved, settle
 
 FURTHEST = 100  # samples to either side
@@ -33,6 +33,7 @@ MOST_MOVES = 4  # cells that a delay may be carried on
 
 def search_delays(solved: Solved, max_iterations: int, callback: Callback | None = None) -> Solved:
     """Return the best of a minimum, those at other delays, and those in the cells beside them."""
+    callback = name_phase(callback, "another delay")
     return _search_cells(_search_further(solved, max_iterations, callback), max_iterations, callback)
 
 

@@ -30,7 +30,7 @@ STILL_MOVING = (
     "still moving when its iterations were used up; start closer, fix a parameter, or in Python give the method a "
     "larger max_iterations"
 )
-Callback = Callable[[int, float], None]
+Callback = Callable[[str, float], None]  # (phase and round, cost) of each iteration of a search
 DampedSolver = Callable[[float, Vector], Vector]  # (lambda, b) -> (H + lambda)^-1 b
 
 DECREMENT = 1e-10  # squared standard deviations still to go
@@ -74,7 +74,7 @@ def minimise(
     first_radius: float = FIRST_RADIUS,
     decrement: float = DECREMENT,
     max_iterations: int = 50,
-    callback: Callback | None = None,
+    callback: Callable[[M], None] | None = None,
     follow: Callable[[M, Vector], M] | None = None,
     before: float = 0.0,
     flat: float = 0.0,
@@ -84,10 +84,10 @@ def minimise(
     `objective`: gives cost, gradient and Gauss-Newton Hessian at any point; `start`: first point, or the model there;
     `low`, `high`: bounds; `first_radius`: of the region, over the size of the first point; `decrement`: squared
     standard deviations to the minimum at which to stop; `max_iterations`: evaluations after the first; `callback`:
-    called with the iteration and the cost; `follow`: (model, z) -> what it says of a z nearby if residuals are straight
-    from there: then a last step needs no evaluation of its own once the whole steps before it have shown how straight
-    they are; `before`: of the search that this one goes on from; `flat`: share of the cost that is no change: a few
-    steps in a row that make none end a search among kinks, whose gradient does not die out.
+    called with the model after each iteration; `follow`: (model, z) -> what it says of a z nearby if residuals are
+    straight from there: then a last step needs no evaluation of its own once the whole steps before it have shown how
+    straight they are; `before`: of the search that this one goes on from; `flat`: share of the cost that is no change:
+    a few steps in a row that make none end a search among kinks, whose gradient does not die out.
     """
     current = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
     if not np.isfinite(current.cost):
@@ -140,7 +140,7 @@ def minimise(
             remaining = trial.distance_squared(~find_blocked(trial, low, high))
             if remaining <= decrement + RELATIVE_DECREMENT * trial.cost:
                 if callback is not None:
-                    callback(iteration, trial.cost)
+                    callback(trial)
                 return Solution(
                     z=trial.z,
                     evaluation=trial,
@@ -160,10 +160,17 @@ def minimise(
             current, before = trial, distance if whole else 0.0
             scale = np.maximum(scale, _column_norms(current))
         if callback is not None:
-            callback(iteration, current.cost)
+            callback(current)
     return Solution(
         z=current.z, evaluation=current, status="max_iterations", iterations=max_iterations, message=STILL_MOVING
     )
+
+
+def name_phase(callback: Callback | None, phase: str) -> Callback | None:
+    """Return what tells a callback of the phase, too."""
+    if callback is None:
+        return None
+    return lambda where, cost: callback(f"{phase}, {where}", cost)
 
 
 def _is_straight(distance: float, before: float, allowed: float) -> bool:

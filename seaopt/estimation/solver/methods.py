@@ -15,7 +15,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.first_guess import guess_from_responses
-from seaopt.estimation.solver.least_squares import Callback
+from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.loosening import loosen_start
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
 from seaopt.estimation.solver.settle import Solved, explains_little, settle, settle_roughly
@@ -66,9 +66,11 @@ class OutputError(Method):
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle from the best start that can be found."""
         best, guesses = find_start(problem, self)
+        spent = 0
         if self.search and any(e.model.sticks for e in problem.experiments) and explains_little(problem, best.power):
-            best = _compare_predicting(problem, best, self)
+            best, spent = _compare_predicting(problem, best, self, callback)
         solved = settle(problem, best, self.max_iterations, callback)
+        solved = replace(solved, solution=replace(solved.solution, iterations=spent + solved.solution.iterations))
         if not self.search:
             return solved
         solved = _bring_back(solved, self, callback)
@@ -77,7 +79,7 @@ class OutputError(Method):
         for start in _further_starts(problem, best, guesses, self):
             evaluation = problem.evaluate(start)
             if not _is_hopeless(problem, evaluation, solved):
-                other = settle(problem, evaluation, self.max_iterations, callback)
+                other = settle(problem, evaluation, self.max_iterations, name_phase(callback, "another start"))
                 solved = min(solved, other, key=lambda each: each.misfit)
                 if not _is_doubtful(solved, guesses):
                     break
@@ -240,21 +242,25 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
     return best, guesses
 
 
-def _compare_predicting(problem: FitProblem, start: Evaluation, method: Method) -> Evaluation:
-    """Return the better of two rough minima, from a start and from where the plant predicts: a search would creep.
+def _compare_predicting(
+    problem: FitProblem, start: Evaluation, method: Method, callback: Callback | None
+) -> tuple[Evaluation, int]:
+    """Return the better of two rough minima, from a start and from where the plant predicts, and their iterations.
 
-    Where joints move at other times than in the log the cost has many minima, and none of them explains it.
+    Where joints move at other times than in the log the cost has many minima, none of which explains it: a search that
+    went all the way would creep.
     """
-    rough = settle_roughly(problem, start) if np.isfinite(start.cost) else None
-    if rough is not None and not explains_little(rough.problem, rough.solution.evaluation.power):
-        return problem.evaluate(rough.solution.z)
-    predicting = find_predicting_start(problem, start.z, method.max_iterations)
-    found = None if predicting is None else problem.evaluate(predicting)
-    if found is None or not np.isfinite(found.cost):
-        return start if rough is None else problem.evaluate(rough.solution.z)
-    other = settle_roughly(problem, found)
-    best = other if rough is None else min(other, rough, key=lambda each: each.misfit)
-    return problem.evaluate(best.solution.z)
+    roughly = name_phase(callback, "looking for a start")
+    minima = [settle_roughly(problem, start, roughly)] if np.isfinite(start.cost) else []
+    if not minima or explains_little(minima[0].problem, minima[0].solution.evaluation.power):
+        z = find_predicting_start(problem, start.z, method.max_iterations, roughly)
+        predicting = None if z is None else problem.evaluate(z)
+        if predicting is not None and np.isfinite(predicting.cost):
+            minima.append(settle_roughly(problem, predicting, roughly))
+    if not minima:
+        return start, 0
+    best = min(minima, key=lambda each: each.misfit)
+    return problem.evaluate(best.solution.z), sum(each.solution.iterations for each in minima)
 
 
 def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> Solved:
@@ -272,7 +278,7 @@ def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> So
         return solved
     again = solved.solution.z.copy()
     again[lost] = start[lost]
-    other = settle(problem, problem.evaluate(again), method.max_iterations, callback)
+    other = settle(problem, problem.evaluate(again), method.max_iterations, name_phase(callback, "another start"))
     return min(solved, other, key=lambda each: each.misfit)
 
 

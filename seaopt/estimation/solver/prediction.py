@@ -16,7 +16,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
-from seaopt.estimation.solver.least_squares import minimise
+from seaopt.estimation.solver.least_squares import Callback, minimise
 from seaopt.estimation.solver.settle import estimate_sigma, measure_flatness
 from seaopt.estimation.solver.step_size import EXACT, bound_steps
 from seaopt.simulation import Point, Segment, run_passes
@@ -25,7 +25,9 @@ PREDICTION_RADIUS = 100.0  # a plant that is held to the log may be moved far at
 LINEARISED_AT = 48  # over which a nonlinear plant is linearised for its filter
 
 
-def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -> Vector | None:
+def find_predicting_start(
+    problem: FitProblem, start: Vector, iterations: int, callback: Callback | None = None
+) -> Vector | None:
     """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log. The
     filter does not trust the plant, so that a plant that is far off predicts badly but cannot run away; its gain is
     recomputed from the states visited, a few times. None where no step is finite.
@@ -45,6 +47,7 @@ def find_predicting_start(problem: FitProblem, start: Vector, iterations: int) -
             high,
             first_radius=PREDICTION_RADIUS,
             max_iterations=iterations,
+            callback=None if callback is None else lambda each: callback("predicting", each.cost),
             flat=measure_flatness(predicting),
         )
         if not np.isfinite(solution.evaluation.cost):

@@ -165,7 +165,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
             unknowns.high,
             decrement=ROUGH if rough else decrement,
             max_iterations=max(max_iterations - iterations, 1),
-            callback=callback,
+            callback=_tell_round(callback, problem, attempt + 1),
             follow=problem.follow if problem.straight and attempt else None,
             before=before,  # in true sigmas
             flat=flat,
@@ -196,17 +196,31 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
     raise AssertionError  # the last attempt returns
 
 
+def _tell_round(callback: Callback | None, problem: FitProblem, number: int) -> Callable[[Evaluation], None] | None:
+    """Return what tells a callback of the round, and of unknowns that are on a bound."""
+    if callback is None:
+        return None
+    unknowns = problem.unknowns
+    held = {name for name, low, high in zip(unknowns.names, unknowns.low, unknowns.high, strict=True) if low == high}
+
+    def tell(evaluation: Evaluation) -> None:
+        at_bound = [name for name in unknowns.find_at_bound(evaluation.z) if name not in held]
+        callback(f"round {number}" + (f", {', '.join(at_bound)} at a bound" if at_bound else ""), evaluation.cost)
+
+    return tell
+
+
 def measure_flatness(problem: FitProblem) -> float:
     """Return the share of the cost that is no change: nothing where no joint sticks, and the cost is smooth."""
     return FLAT if any(experiment.model.sticks for experiment in problem.experiments) else 0.0
 
 
-def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
+def settle_roughly(problem: FitProblem, start: Evaluation, callback: Callback | None = None) -> Solved:
     """Return a minimum near enough to be compared with others: sigma is estimated twice, the step chosen once."""
     problem, evaluation = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
     problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
-    unknowns, solution = problem.unknowns, None
-    for _ in range(ROUGH_ROUNDS):
+    unknowns, solution, iterations = problem.unknowns, None, 0
+    for attempt in range(ROUGH_ROUNDS):
         problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
         evaluation = problem.evaluate(evaluation.z)
         solution = minimise(
@@ -216,12 +230,14 @@ def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
             unknowns.high,
             decrement=NEAR,
             max_iterations=ROUGH_ITERATIONS,
+            callback=_tell_round(callback, problem, attempt + 1),
             flat=measure_flatness(problem),
         )
-        evaluation = solution.evaluation
+        evaluation, iterations = solution.evaluation, iterations + solution.iterations
         if not np.isfinite(evaluation.cost):
             break
     assert solution is not None
+    solution = replace(solution, iterations=iterations)
     return Solved(problem=problem, solution=solution, step_error=StepError())
 
 

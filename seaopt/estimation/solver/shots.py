@@ -8,13 +8,13 @@ can a simulation that restarts at intervals run away from its log, as that of an
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.shapes import ParameterVector, Vector
 from seaopt.estimation.solver.least_squares import Callback, minimise
@@ -67,11 +67,15 @@ def grow_shots(
                 shots.unknowns.high,
                 decrement=NEAR,
                 max_iterations=ITERATIONS,
-                callback=callback,
+                callback=_tell_count(callback, count),
             ).evaluation
         z[:shared] = evaluation.z[:shared]
         yield evaluation.z[:shared]
         count //= GROWTH
+
+
+def _tell_count(callback: Callback | None, count: int) -> Callable[[Evaluation], None] | None:
+    return None if callback is None else lambda evaluation: callback(f"{count} shots", evaluation.cost)
 
 
 def cut_problem(problem: FitProblem, z: Vector, count: int) -> tuple[FitProblem, Float[np.ndarray, " m"]]:

@@ -9,6 +9,7 @@ import pytest
 
 import seaopt as so
 from seaopt.estimation.problem.unknowns import collect
+from seaopt.progress import ignore
 
 PERIOD, N, PARTS = 1e-3, 4000, 20
 TRUTH = {"J_m": 1e-4, "k_s": 300.0, "f_c": 0.03, "b_r": 1e-4}
@@ -28,7 +29,7 @@ def simulate_rotor(current, speed):
     return out
 
 
-def fit_start(seed, output, speed, quiet_s, friction=0.01):
+def fit_start(seed, output, speed, quiet_s, friction=0.01, progress=ignore):
     rng, t = np.random.default_rng(seed), np.arange(N) * PERIOD
     lines = (0.7, 1.9, 4.1, 7.3, 12.1, 20.0)
     current = (t > quiet_s) * sum(0.6 * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in lines)
@@ -37,7 +38,7 @@ def fit_start(seed, output, speed, quiet_s, friction=0.01):
     log = so.Log.from_arrays(time=t, I=current, **{output: reading + noise * rng.normal(size=N)})
     plant = so.plants.let_stick(so.plants.rotary(link="locked"))
     start = plant.defaults.update(c_s=C_S, J_m=2e-4, k_s=200.0, f_c=friction, b_r=3e-4).free(*TRUTH)
-    return so.fit([so.Experiment(plant=plant, log=log, outputs=(output,))], start, diagnostics=False)
+    return so.fit([so.Experiment(plant=plant, log=log, outputs=(output,))], start, diagnostics=False, progress=progress)
 
 
 @pytest.mark.parametrize(("seed", "output"), [(0, "theta_m"), (1, "theta_m"), (2, "tau_s")])
@@ -53,8 +54,12 @@ def test_a_joint_that_is_held_starts_at_rest(seed, output):
 
 def test_friction_that_holds_the_joint_throughout_is_no_start_to_end_at():
     """At f_c = 0.4 nothing moves, and no slope tells of anything: the search went off to inertias of 1e10."""
-    fit = fit_start(4, "theta_m", speed=0.0, quiet_s=0.4, friction=0.4)
+    notes = []
+    fit = fit_start(
+        4, "theta_m", speed=0.0, quiet_s=0.4, friction=0.4, progress=lambda note, share=None: notes.append(note)
+    )
     assert fit.status == "converged"
+    assert any("looking for a start, round 1" in note for note in notes)
     for name, true in TRUTH.items():
         assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
 
