@@ -102,7 +102,10 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
     except ClockError as error:
         if error.column is None or not is_time_name(error.column):
             named = (error.column, error.unit) if error.column is not None else _choose_clock(path, error.candidates)
-            raise LogError(f"{error}; type {_spell_clock(path, *named)}") from error
+            command = (
+                _spell_clock(path, *named) if named else _spell_command(path, "--rate-hz 1000, if that is its rate")
+            )
+            raise LogError(f"{error}; type {command}") from error
         table = read(time=Column(column=error.column, unit=error.unit))
         others = {"s": ("ms", "milliseconds")}.get(error.unit, ("s", "seconds"))
         note = (
@@ -112,9 +115,9 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
         return replace(table, notes=(note, *table.notes))
 
 
-def _choose_clock(path: Path, candidates: Sequence[str]) -> tuple[str, str]:
-    """Return the likely clock and its unit: the column whose header states a unit of time, or that runs on. Of neither
-    kind, the first.
+def _choose_clock(path: Path, candidates: Sequence[str]) -> tuple[str, str] | None:
+    """Return the likely clock and its unit: the column whose header states a unit of time, or that runs on, or else is
+    named like a time; None where there is none.
     """
     from seaopt.problem.proposal.vocabulary import read_header  # deferred: the problem file's classes take time
 
@@ -128,7 +131,7 @@ def _choose_clock(path: Path, candidates: Sequence[str]) -> tuple[str, str]:
         values = source.read([name])[name]
         if runs_on(values):
             return name, guess_time_unit(values)
-    return candidates[0] if candidates else "COLUMN", "s"
+    return next(((name, "s") for name in candidates if is_time_name(name)), None)
 
 
 def _spell_clock(path: Path, column: str, unit: str) -> str:

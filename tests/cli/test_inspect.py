@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND
@@ -181,3 +182,43 @@ def test_the_command_to_type_has_the_unit_of_the_column_s_name(tmp_path, header)
     assert (column, unit) == (header.split(",")[1], "time=ms")
     inspect_log(path, time=column, units=[unit], folder=tmp_path)
     assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 1000.0
+
+
+def test_a_temperature_called_t_is_not_the_clock(tmp_path):
+    path = tmp_path / "warm.csv"
+    rows = "".join(f"{2.5 * at},{at % 3},{20 + at // 30}\n" for at in range(90))
+    path.write_text("stamp,I [A],T [C]\n" + rows, encoding="utf-8")
+    with pytest.raises(SeaoptError, match="--time stamp --unit time=ms"):
+        inspect_log(path)
+
+
+def test_of_several_clocks_the_one_with_most_samples_is_the_command_to_type(tmp_path):
+    """Groups of an MDF file, each with times of its own."""
+    mdf = pytest.importorskip("asammdf")
+    path = tmp_path / "log.mf4"
+    file = mdf.MDF()
+    for name, count in (("slow", 40), ("fast", 200)):
+        time = np.linspace(0.0, 1.0, count)
+        file.append(mdf.Signal(np.sin(time), time, name=name, unit="A"))
+    file.save(path, overwrite=True)
+    with pytest.raises(SeaoptError, match="holds several clocks") as raised:
+        inspect_log(path)
+    command = shlex.split(str(raised.value).rpartition("; type ")[2])
+    assert command[:3] == ["seaopt", "inspect", str(path)]
+    inspect_log(path, time=command[command.index("--time") + 1], align="linear", folder=tmp_path)
+    assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["samples"] == 200
+
+
+def test_numbers_beside_a_log_are_noted_as_such(tmp_path):
+    path = tmp_path / "run.mat"
+    savemat(path, {"time": np.arange(50) / 400, "I": np.sin(np.arange(50.0)), "K_t": 0.03})
+    inspect_log(path, folder=tmp_path)
+    notes = json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["notes"]
+    assert any("not as long as" in note and "K_t" in note for note in notes) and not any("clocks" in n for n in notes)
+
+
+def test_of_a_file_without_a_clock_the_rate_is_asked_for(tmp_path):
+    path = tmp_path / "wave.csv"
+    path.write_text("a,b\n" + "".join(f"{at % 7},{at % 3}\n" for at in range(40)), encoding="utf-8")
+    with pytest.raises(SeaoptError, match=r"type seaopt inspect \S+ --rate-hz 1000"):
+        inspect_log(path)

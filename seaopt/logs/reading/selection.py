@@ -299,9 +299,11 @@ def _find_log_clock(
     source = places[0][0]
     clocks = list(dict.fromkeys(field.clock for _, field in places))
     if len(clocks) > 1:
-        names = [clock for clock in clocks if clock is not None]
-        raise LogError(
-            f"{source.path}: holds several clocks ({_list_names(names)}); name the log's with time= (--time)"
+        lengths = {field.name: field.length or 0 for field in source.fields}
+        names = sorted((clock for clock in clocks if clock is not None), key=lambda name: -lengths.get(name, 0))
+        raise ClockError(
+            f"{source.path}: holds several clocks ({_list_names(names)}); name the log's with time= (--time)",
+            candidates=names,
         )
     column = Column(column=clocks[0]) if clocks[0] is not None else _find_time_column(source)
     return _make_clock(find_column([source], "time", column))
@@ -324,19 +326,23 @@ def _make_rate_clock(
 def _find_time_column(source: Source) -> Column:
     """Return the one column that is named like a time."""
     names = [field.name for field in source.fields if field.numeric]
+    lengths = {field.name: field.length for field in source.fields}
     named = [field for field in source.fields if field.numeric and is_time_name(field.header or field.name)]
-    # Of several, T in degrees is a temperature.
+    # T in degrees is a temperature; of several, one with another unit is no time.
     times = [
         field.name
         for field in named
-        if len(named) == 1 or not field.unit or not is_unit(field.unit) or same_dimension(field.unit, "s")
+        if not field.unit
+        or not is_unit(field.unit)
+        or same_dimension(field.unit, "s")
+        or (len(named) == 1 and si_unit(field.unit) != "degC")
     ]
     if len(times) == 1:
         return Column(column=times[0])
     why = "no column is" if not times else f"{len(times)} columns are"
     raise ClockError(
         f"{source.path}: {why} named like a time; {advise_time(source)}; or rate_hz= where there is none",
-        candidates=times or names,
+        candidates=times or sorted(names, key=lambda name: -(lengths[name] or 0)),
     )
 
 
@@ -394,6 +400,7 @@ def _select_every_channel(
     chosen: list[tuple[Source, Field]] = []
     words: list[str] = []
     elsewhere: list[str] = []
+    longer_or_shorter: list[str] = []
     every = [(source, field) for source in sources for field in source.fields if field.name != clock.name]
     for source, field in every:
         on_clock = is_on_clock(source, field)
@@ -403,11 +410,18 @@ def _select_every_channel(
             continue  # a clock is not a channel too
         elif on_clock or (align is not None and field.clock is not None):
             chosen.append((source, field))
-        else:
+        elif field.clock is not None:
             elsewhere.append(field.name)
+        else:
+            longer_or_shorter.append(field.name)
     notes = [f"columns that hold no numbers were left out: {_list_names(words)}"] if words else []
     if elsewhere:
-        notes.append(f'columns on other clocks than "{clock.name}" were left out: {_list_names(elsewhere)}')
+        notes.append(
+            f'columns on other clocks than "{clock.name}" were left out: {_list_names(elsewhere)}; to have them too, '
+            "align them: align=Linear() (--align linear)"
+        )
+    if longer_or_shorter:
+        notes.append(f'columns that are not as long as "{clock.name}" were left out: {_list_names(longer_or_shorter)}')
     if not chosen:
         raise LogError(
             f'{clock.path}: no column of numbers is on the clock "{clock.name}"; choose another time= (--time)'
