@@ -325,9 +325,8 @@ class Session:
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})
 
     def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> bool:
-        """Score the folder's fit on another log, and compare its values with the log's own; print that.
-
-        `amount`: all of what the log has to say, if "verbose". False where the log contradicts the fit.
+        """Score the folder's fit on another log, and compare its values with the log's own; print that. `amount`: all
+        of what the log has to say, if "verbose". False where the log contradicts the fit.
         """
         fitted = self.parameters()
         if isinstance(fitted, ParameterSet):

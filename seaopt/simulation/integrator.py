@@ -55,7 +55,6 @@ def step_function(model: Model) -> ca.Function:
 
 def _find_moving(model: Model) -> tuple[Any, Any, Any, list[Any]]:
     """Return mode, f, h, and of a joint that sticks its figures, their speed's derivatives, and a force's effect.
-
     Without such a joint the mode is nothing.
     """
     if not model.by_events:

@@ -122,10 +122,8 @@ def has_one_joint(plant: Plant) -> bool:
 
 @memo
 def joint_equations(plant: Plant) -> tuple[Any, Any, Any, Any]:
-    """Return the mode m of a plant's one joint, f with it, [v, holding force, F(0)], and what a force adds to f.
-
-    All are expressions of the plant's own symbols, and of m: 1 or -1 where the joint slides that way, 0 where it is
-    held.
+    """Return the mode m of a plant's one joint, f with it, [v, holding force, F(0)], and what a force adds to f. All
+    are expressions of the plant's own symbols, and of m: 1 or -1 where the joint slides that way, 0 where it is held.
     """
     joints, mode, force = _Joints(plant), ca.SX.sym("mode"), ca.SX.sym("force")
     t, x, u, p = plant.t, plant.x, plant.u, plant.p

@@ -112,12 +112,11 @@ class FrictionMargin:
 
 
 def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> FrictionMargin:
-    """Return the steepest friction for which the test of stability holds, the best over all multipliers tried.
-
-    The loop without friction must be stable, by its eigenvalues, and have no `FrictionLoop.obstacle`; else the margin
-    is zero, and its `multiplier` says why. Sums over aliases are truncated with a bound on the rest; rounding is not
-    enclosed, nor is what lies between the angles looked at. `first`: a multiplier that is tried first, and alone where
-    it shows stability for the curves as they are. `least`: below it nothing is looked for, and the margin is zero.
+    """Return the steepest friction for which the test of stability holds, the best over all multipliers tried. The loop
+    without friction must be stable, by its eigenvalues, and have no `FrictionLoop.obstacle`; else the margin is zero,
+    and its `multiplier` says why. Sums over aliases are truncated with a bound on the rest; rounding is not enclosed,
+    nor is what lies between the angles looked at. `first`: a multiplier that is tried first, and alone where it shows
+    stability for the curves as they are. `least`: below it nothing is looked for, and the margin is zero.
     """
     none = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
     if obstacle := find_obstacle(loop):

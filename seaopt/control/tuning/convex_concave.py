@@ -67,10 +67,7 @@ class _Affine:
 
 
 def improve(task: Task, grid: Grid, start: LawNumbers) -> tuple[float, LawNumbers]:
-    """Return the merit and the numbers after successive quadratic programs in the gains from a stable law.
-
-    Its filters stay as they are.
-    """
+    """Return merit and numbers after quadratic programs in the gains of a stable law; its filters stay as they are."""
     x, radius = start, FIRST_GAIN_RADIUS
     least = _choose_least_gains(task, grid)
     scale = _scale_gains(task, start, least)

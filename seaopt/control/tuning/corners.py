@@ -34,7 +34,6 @@ def corners(ranges: Mapping[str, tuple[float, float]]) -> list[dict[str, float]]
     --------
     >>> corners({"I_p": (0.2, 0.6)})
     [{'I_p': 0.2}, {'I_p': 0.6}]
-
     """
     for name, (low, high) in ranges.items():
         if not low <= high:
@@ -76,7 +75,6 @@ def draw(
     >>> import seaopt as so
     >>> [sorted(values) for values in draw(so.plants.thor().prior(k=3000.0), 2, 1, {"I_p": (0.2, 0.6)})]
     [['I_p', 'k'], ['I_p', 'k']]
-
     """
     rng, uniform = np.random.default_rng(require_seed(seed, ControlError)), dict(ranges or {})
     if isinstance(parameters, Fit):

@@ -221,10 +221,9 @@ class Evolution:
         return usage[order], laws[order]
 
     def find(self, starts: Sequence[LawNumbers] = (), *, again: bool = True) -> list[LawNumbers]:
-        """Return the best stable law found; where limits are nearly kept, the two best.
-
-        Where the first population keeps no limits another one may begin `again`, with its best, and with the best of
-        one without the optional parts.
+        """Return the best stable law found; where limits are nearly kept, the two best. Where the first population
+        keeps no limits another one may begin `again`, with its best, and with the best of one without the optional
+        parts.
         """
         usage, laws = self.run(starts, generations=GENERATIONS if again else SHORT)
         if usage[0] > KEPT and again:

@@ -32,13 +32,8 @@ LEAST_SHARE = 1e-4  # of the sample rate: what is below is called nothing
 
 
 def sensitivity_possible(sensitivity_hz: float, ms: float, sample_time_s: float, late: int) -> bool:
-    """Tell whether a loop that answers `late` (1 or more) samples late can have abs(S) below -3 dB up to a frequency.
-
-    `ms`: the largest abs(S) above.
-
-    >>> [sensitivity_possible(12.0, 1.6, 1e-3, late) for late in (2, 40)]
-    [True, False]
-
+    """Tell whether a loop that answers `late` (1 or more) samples late can have abs(S) below -3 dB up to a frequency,
+    with abs(S) at most `ms` above it.
     """
     omega, n = 2 * np.pi * sensitivity_hz * sample_time_s, np.arange(1, late)
     low, high = np.log(np.sqrt(0.5)), np.log(ms)

@@ -21,9 +21,8 @@ LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
 
 
 def find_light_modes(plant: DigitalPlant | MeasuredPlant) -> list[tuple[float, float]]:
-    """Return frequency (Hz) and the damping ratio's size of the modes that are lightly damped, or grow slowly.
-
-    Of a measured plant there are none: its own frequencies are looked at instead.
+    """Return frequency (Hz) and the damping ratio's size of the modes that are lightly damped, or grow slowly. Of a
+    measured plant there are none: its own frequencies are looked at instead.
     """
     if isinstance(plant, MeasuredPlant):
         return []
@@ -43,7 +42,6 @@ def count_growing(plant: DigitalPlant | MeasuredPlant) -> int:
 
 def place_frequencies(task: Task) -> Curve:
     """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with f_b and all bands' ends in it.
-
     About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
     what falls between is found afterwards.
     """
@@ -68,10 +66,7 @@ def make_grid(task: Task) -> Grid:
 
 
 def choose_prominent(usage: Usage, count: int) -> Indices:
-    """Return flat indices of up to `count` points that matter most: local maxima first, then the largest of others.
-
-    Of the others every third is looked at: neighbours say the same.
-    """
+    """Return flat indices of the `count` points that matter most: local maxima, then the largest of every third."""
     wide = np.full((usage.shape[0], usage.shape[1] + 2), -np.inf)  # `np.pad` would take longer than all the rest
     wide[:, 1:-1] = usage
     top = (usage >= wide[:, :-2]) & (usage >= wide[:, 2:])

@@ -115,10 +115,9 @@ class _Complex:
 
 
 def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5, *, keeping: bool = False) -> LawNumbers:
-    """Return the numbers at a local optimum near a stable start, or the start if no better ones are found.
-
-    `rounds`: solutions at most; each adds the points where the one before broke a limit. `keeping`: whether the first
-    numbers that keep all limits are enough, whatever their objective.
+    """Return the numbers at a local optimum near a stable start, or the start if no better ones are found. `rounds`:
+    solutions at most; each adds the points where the one before broke a limit. `keeping`: whether the first numbers
+    that keep all limits are enough, whatever their objective.
     """
     x, chosen, factor = start, _choose_points(task, grid, start), LARGEST_FACTOR
     rank, stalled = task.rank(grid, start), 0

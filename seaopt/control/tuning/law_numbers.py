@@ -16,10 +16,8 @@ K_P, K_I, K_D, W_R, W_C, K_V, T_F, T_Q, SPEED_RATE, NOTCH_W, NOTCH_WIDTH, NOTCH_
 
 
 def least_integral_rate(x: LawNumbers) -> float:
-    r"""Return the least k_i/(1 + k_p) of numbers, rad/s.
-
-    Behind a speed loop that integrates, two integrals act at the rate :math:`(T_v + k_p/k_i)^{-1}`; with this k_i it is
-    at least the least rate of one for every T_v allowed.
+    r"""Return the least k_i/(1 + k_p) of numbers, rad/s. Behind a speed loop that integrates, two integrals act at the
+    rate :math:`(T_v + k_p/k_i)^{-1}`; with this k_i it is at least the least rate of one for every T_v allowed.
     """
     return INTEGRAL_RAD_S / (1.0 - INTEGRAL_RAD_S / SLOWEST_SPEED_RATE) if x[SPEED_RATE] > 0.0 else INTEGRAL_RAD_S
 

@@ -179,9 +179,8 @@ class Task:
 
     @property
     def curve_names(self) -> tuple[str, ...]:
-        """The limits that are curves and imposed, with the noise gain where that is the objective.
-
-        That on a speed loop's own noise gain is one only where there is such a loop.
+        """The limits that are curves and imposed, with the noise gain where that is the objective. That on a speed
+        loop's own noise gain is one only where there is such a loop.
         """
         imposed = [name for name in CURVES if self.spec.level(name) is not None]
         if self.spec.objective == "noise" and NOISE not in imposed:
@@ -215,9 +214,8 @@ class Task:
         self, x: LawNumbers
     ) -> tuple[Float[np.ndarray, "4 g"], Float[np.ndarray, " 4"], Float[np.ndarray, " 4"]]:
         """Return matrix, least and largest value of the linear limits on the gains of a law that integrates as x does.
-
-        They are what an integral does at least, the least weights, k_r = 0 and c = 0, and what of a step is left to
-        the integral at most, behind a speed loop's own none.
+        They are what an integral does at least, the least weights, k_r = 0 and c = 0, and what of a step is left to the
+        integral at most, behind a speed loop's own none.
         """
         rate = least_integral_rate(x) if self.integrates(x) else 0.0
         weighed = self.integrates(x) and x[SPEED_RATE] == 0.0 and self.spec.reference_weights != "error"
@@ -238,7 +236,6 @@ class Task:
 
     def most_left_to_integral(self, k_p: Any, k_i: Any) -> Any:
         r"""Return the largest w_r, of gains or arrays of them, with which a step is within 2 % when its end is judged.
-
         The feedback alone leaves a step off by :math:`w_r/(1/P(0) + k_p)`, which the integral takes away at the rate
         :math:`\rho = k_i/(1/P(0) + k_p)`. As :math:`e^{\rho t} \ge 1 + \rho t` it is enough that
         :math:`w_r \le 0.02\,(1/P(0) + k_p + k_i t)`, which is linear in the gains.
@@ -265,7 +262,6 @@ class Task:
 
     def bounds(self, x: LawNumbers) -> tuple[LawNumbers, LawNumbers]:
         """Return the least and largest numbers of a law that integrates as x does; equal where one is fixed or absent.
-
         Without an integral k_r is fixed, for a static gain of 1.
         """
         spec, ts, integrates = self.spec, self.spec.sample_time_s, self.integrates(x)
@@ -567,9 +563,8 @@ class Task:
         return float(np.log(np.abs(np.sqrt(2.0) * path.y * law.c_r[at] / path.add_up(law.c_y[at], law.c_v[at])))[0])
 
     def rank(self, grid: Grid, x: LawNumbers) -> tuple[float, float]:
-        """Return what to sort laws by: the worst usage if a limit is broken, then the objective.
-
-        A bandwidth that is missed counts ten times a limit that is.
+        """Return what to sort laws by: the worst usage if a limit is broken, then the objective. A bandwidth that is
+        missed counts ten times a limit that is.
         """
         worst, objective = self.judge(grid, x, bandwidth_price=10.0)
         return (worst if worst > NEARLY_KEPT else 0.0), objective

@@ -57,7 +57,6 @@ def find_possible_bandwidths(
     task: Task, x: LawNumbers, progress: Progress = ignore
 ) -> tuple[PossibleBandwidths, list[LawNumbers]]:
     """Return the bandwidths nearby that keep the limits, and the numbers of the laws at those next to the task's own.
-
     `x`: the numbers that miss them least at the task's bandwidth.
     """
     return _Probes(task, x, progress).find()
@@ -123,9 +122,8 @@ class _Probes:
         return self.tried[bandwidth_hz][0] == 0.0
 
     def _measure(self, bandwidth_hz: float, x: LawNumbers) -> tuple[float, LawNumbers]:
-        """Return usage and numbers, by measurement, of a law that keeps the limits on the frequencies looked at.
-
-        A friction margin is not measured again: it is aimed at with a reserve, and takes long.
+        """Return usage and numbers, by measurement, of a law that keeps the limits on the frequencies looked at. A
+        friction margin is not measured again: it is aimed at with a reserve, and takes long.
         """
         task = self._aim(bandwidth_hz)
         plain = replace(task, spec=replace(task.spec, min_friction_margin=None))
@@ -142,10 +140,9 @@ class _Probes:
         return replace(self.task, spec=spec)
 
     def _tune(self, bandwidth_hz: float) -> tuple[float, LawNumbers]:
-        """Return usage and numbers: from the nearest bandwidth's law, one that keeps the limits if there is any.
-
-        A step away from a bandwidth that is possible its law is refined first, and what misses clearly from there is
-        not looked for anywhere else. From further away a refinement leads nowhere.
+        """Return usage and numbers: from the nearest bandwidth's law, one that keeps the limits if there is any. A step
+        away from a bandwidth that is possible its law is refined first, and what misses clearly from there is not
+        looked for anywhere else. From further away a refinement leads nowhere.
         """
         task = self._aim(bandwidth_hz)
         grid = make_grid(task)
@@ -173,7 +170,6 @@ class _Probes:
 
 def find_largest_fall(task: Task) -> tuple[PlantWithFriction, float, LawNumbers] | None:
     """Return the plant whose friction falls most, the largest share of it with which the limits are kept, and the law.
-
     It is one of the plants that grow as they slide; None where no friction falls, or the limits are not kept without a
     fall either. That a law keeps them is measured, as it is of the answer itself.
     """

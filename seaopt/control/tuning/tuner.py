@@ -143,7 +143,6 @@ def tune(
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> controller.feasible, round(controller.achieved.bandwidth_hz)
     (True, 30)
-
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     raised: list[Exception] = []  # by the caller's own hook, which is how a caller stops a tune
@@ -233,10 +232,7 @@ def _tune(
 
 
 def name_design(plant: Plant | MeasuredResponse) -> Plant:
-    """Return the plant that says what a design plant, a model or a measured one, is commanded by.
-
-    Raises ControlError: it is neither.
-    """
+    """Return the plant that says what commands a design plant, model or measured. Raises ControlError: neither."""
     model = plant.plant if isinstance(plant, MeasuredResponse) else plant
     require_plant(model, "plant", ControlError)
     return model
@@ -245,9 +241,8 @@ def name_design(plant: Plant | MeasuredResponse) -> Plant:
 def _find_possible(
     task: Task, x: LawNumbers, progress: Progress, *, stable: bool
 ) -> tuple[PossibleBandwidths, list[LawNumbers]]:
-    """Return what is possible instead, and laws near it: at other bandwidths, or with friction that falls less.
-
-    The fall is what to ask about where no law is `stable` at this bandwidth, or none keeps the limits at any.
+    """Return what is possible instead, and laws near it: at other bandwidths, or with friction that falls less. The
+    fall is what to ask about where no law is `stable` at this bandwidth, or none keeps the limits at any.
     """
     possible, near = find_possible_bandwidths(task, x, progress)
     if (stable and possible.nearest_hz) or not any(map(count_growing, task.plants)):
@@ -271,10 +266,7 @@ def make_task(
     robust_to: RobustTo,
     draws: Sequence[Mapping[str, float]] = (),
 ) -> Task:
-    """Return the task of a request.
-
-    Raises ControlError: as `tune`.
-    """
+    """Return the task of a request. Raises ControlError: as `tune`."""
     design = name_design(plant)
     values = design.complete(params)
     command = command_of(design, values, spec.regulated)
@@ -364,9 +356,8 @@ def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
 def _find_link(
     spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], on_response: bool, per_effort: float
 ) -> LinkPath | None:
-    """Return the path from the link's motion, of the first plant whose link moves; None where none is requested.
-
-    Raises ControlError: no plant has such a signal, or the design plant is a measured response.
+    """Return the path from the link's motion, of the first plant whose link moves; None where none is requested. Raises
+    ControlError: no plant has such a signal, or the design plant is a measured response.
     """
     feedforward = spec.link_feedforward
     if feedforward is None:
@@ -432,9 +423,8 @@ def _find_friction(
     gain: float,
     before: int,
 ) -> tuple[PlantWithFriction, ...]:
-    """Return the plants of which a friction margin is required, and those that grow as they slide.
-
-    `whole`: of a plant that slides the one with friction. `before`: how many of the task's `plants` precede the pairs.
+    """Return the plants of which a friction margin is required, and those that grow as they slide. `whole`: of a plant
+    that slides the one with friction. `before`: how many of the task's `plants` precede the pairs.
     """
     slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s, len(signals))
     frictions: list[PlantWithFriction] = []
@@ -542,9 +532,8 @@ def describe_law(
 
 
 def _find_rest_gain(task: Task) -> float | None:
-    """Return the noise gain that any integral has on the stuck plant at rest; None where the limit allows it.
-
-    An integral holds the reading at rest: it makes 1/P(0) there, which is far above 1 where bristles hold the motor.
+    """Return the noise gain that any integral has on the stuck plant at rest; None where the limit allows it. An
+    integral holds the reading at rest: it makes 1/P(0) there, which is far above 1 where bristles hold the motor.
     """
     allowed = task.spec.level("max_noise_gain")
     at_rest = max((1.0 / abs(plant.static_gain) for plant in task.plants[1 : task.design_states]), default=0.0)

@@ -51,9 +51,8 @@ def find_excesses(fit: Fit) -> Iterator[FitFinding]:
 
 
 def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
-    """Yield free parameters whose interval is wider than a design can use.
-
-    One that may be zero, as a friction that a plant need not have, is known well enough where it hardly does anything.
+    """Yield free parameters whose interval is wider than a design can use. One that may be zero, as a friction that a
+    plant need not have, is known well enough where it hardly does anything.
     """
     if fit.status != "converged":
         return

@@ -43,10 +43,9 @@ FAR = 3.0  # excess from which intervals of one log hold no more
 
 
 def compare_logs(fit: Fit, validation: Sequence[Experiment] = ()) -> Fit:
-    """Return the fit with what each log says alone, and a model covariance that has what they differ by.
-
-    `validation`: logs that were not fitted. Logs of a plant are compared where it has several, and where the residual
-    of one is not the noise of its sensor; those for validation always are.
+    """Return the fit with what each log says alone, and a model covariance that has what they differ by. `validation`:
+    logs that were not fitted. Logs of a plant are compared where it has several, and where the residual of one is not
+    the noise of its sensor; those for validation always are.
     """
     logs: dict[str, LogValues] = {}
     matrix: ParameterMatrix = np.zeros((0, 0))
@@ -77,7 +76,6 @@ class LogComparison(Worded):
         Those of the fit, with std of noise and model together.
     amplitudes : tuple of float
         Of the fit's logs of the same plant.
-
     """
 
     name: str
@@ -151,7 +149,6 @@ def compare_with_log(
     >>> one, other = (virtual_experiment(stand, thor, seed=n) for n in (1, 2))
     >>> compare_with_log(so.fit([one], thor.update(J=2e-6).free("J", "b_r")), other).met
     True
-
     """
     log = _read_values(fit, _refit(fit, experiment, loss, band_hz), experiment)
     output = experiment.outputs[find_effort(experiment)]

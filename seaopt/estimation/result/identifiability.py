@@ -46,7 +46,6 @@ class Identifiability:
         The same for directions that have hardly any effect.
     structural_rank : int
         Directions that a rich input would show on the same outputs; below `free`, no log can identify all parameters.
-
     """
 
     rank: int
@@ -70,7 +69,6 @@ class Identifiability:
             The figure's derivatives.
         values : mapping of name to float
             The parameters', to which the directions are relative.
-
         """
         for direction in self.unidentifiable:
             parts = [slope.get(name, 0.0) * weight * (abs(values[name]) or 1.0) for name, weight in direction.items()]
@@ -166,7 +164,6 @@ def warn_unidentified(params: ParameterSet, used: Container[str] | None = None) 
         The parameters of a computation.
     used : container of str, optional
         The names that matter; all if left out.
-
     """
     alone = _warn_alone(params.given if isinstance(params, CompletedParameters) else params, used)
     names = [name for name in params.unidentified_names if used is None or name in used]

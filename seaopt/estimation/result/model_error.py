@@ -79,9 +79,8 @@ class ModelError:
 def estimate_model_error(
     problem: FitProblem, z: Vector, residuals: ResidualsByExperiment, noise: ParameterMatrix
 ) -> ModelError:
-    """Return what the residuals at a minimum may move its parameters and delays by, besides their noise.
-
-    `residuals`: at `z`; `noise`: the covariance of the parameters and the fitted delays, in their order.
+    """Return what the residuals at a minimum may move its parameters and delays by, besides their noise. `residuals`:
+    at `z`; `noise`: the covariance of the parameters and the fitted delays, in their order.
     """
     unknowns = problem.unknowns
     delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]

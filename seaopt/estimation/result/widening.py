@@ -13,9 +13,8 @@ from seaopt.estimation.result.summary import derive_figures
 
 
 def widen(fit: Fit, added: ParameterMatrix) -> Fit:
-    """Return the fit with more model covariance: of its free parameters, and of the delays that were fitted.
-
-    `added`: over the names of `fit.delay_covariance`, or of `fit.covariance` where no delay was fitted, in SI.
+    """Return the fit with more model covariance: of its free parameters, and of the delays that were fitted. `added`:
+    over the names of `fit.delay_covariance`, or of `fit.covariance` where no delay was fitted, in SI.
     """
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
     before = fit.model_covariance

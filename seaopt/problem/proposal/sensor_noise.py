@@ -61,9 +61,8 @@ def combine_noise(sensors: dict[str, SensorNoise], actuator: Proposed) -> float:
 def limit_noise_gain(
     logs: Sequence[DescribedLog], output: str, noise: float, bandwidth_hz: float, resonance_hz: float | None
 ) -> float:
-    """Return a limit on the motor's effort over sensor noise that lets noise make a quarter of the largest effort.
-
-    It is at most `NOISE_GAIN`, and no less than a bandwidth so far above the resonance needs.
+    """Return a limit on the motor's effort over sensor noise that lets noise make a quarter of the largest effort. It
+    is at most `NOISE_GAIN`, and no less than a bandwidth so far above the resonance needs.
     """
     needed = (bandwidth_hz / (WIDEST * resonance_hz)) ** 2 if resonance_hz else 1.0
     most, least = NOISE_GAIN * max(1.0, needed), NOISE_GAIN * needed

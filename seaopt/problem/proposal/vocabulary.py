@@ -106,9 +106,8 @@ class Header:
 
 
 def read_header(name: str, unit: str | None = None, *, metres: bool = True, brackets: bool = True) -> Header:
-    """Return what a column's header says; `unit` is what the file itself states.
-
-    Without `metres` an m at the end of a name is the motor; without `brackets` what stands in them is part of the name.
+    """Return what a column's header says; `unit` is what the file itself states. Without `metres` an m at the end of a
+    name is the motor; without `brackets` what stands in them is part of the name.
     """
     stated, bare = _clean_unit(unit), bare_name(name) if brackets else name
     suffix, stem = ("", bare) if stated else _split_suffix(bare)
