@@ -72,10 +72,7 @@ ROUNDS = 3  # of tuning and certifying, where a first look at the draws finds on
 
 
 def fit_problem(
-    problem: Problem,
-    experiments: Sequence[Experiment] | None = None,
-    *,
-    progress: Progress = ignore,
+    problem: Problem, experiments: Sequence[Experiment] | None = None, *, progress: Progress = ignore
 ) -> Fit:
     """Fit the problem's logs, as `seaopt fit` does.
 

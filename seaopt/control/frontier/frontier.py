@@ -19,14 +19,7 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import feed_link, lower_fraction, search, solve
-from seaopt.control.tuning.tuner import (
-    RobustTo,
-    aim_task,
-    disturbance,
-    make_controller,
-    make_task,
-    name_design,
-)
+from seaopt.control.tuning.tuner import RobustTo, aim_task, disturbance, make_controller, make_task, name_design
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor, map_ordered

@@ -279,11 +279,7 @@ def _solve_step(task: Task, grid: Grid, x: LawNumbers, reach: PerGain) -> PerGai
 
 
 def solve_qp(
-    quadratic: Float[np.ndarray, "n n"],
-    linear: Values,
-    matrix: Float[np.ndarray, "m n"],
-    lower: Curve,
-    upper: Curve,
+    quadratic: Float[np.ndarray, "n n"], linear: Values, matrix: Float[np.ndarray, "m n"], lower: Curve, upper: Curve
 ) -> Values | None:
     """Minimise x'Qx/2 + c'x with lower <= A x <= upper by OSQP; None where it refuses, or its status is no solution."""
     import osqp

@@ -374,10 +374,7 @@ def _solve(
     )
     (linear, least, largest), gains = task.linear_limits(start), task.gains_tuned
     rows = np.max(np.abs(linear * scale[gains]), axis=1)  # each in units of its largest term
-    near, far = (
-        np.maximum(low, start / factor),
-        np.minimum(high, factor * np.maximum(start, 0.3 * scale)),
-    )
+    near, far = (np.maximum(low, start / factor), np.minimum(high, factor * np.maximum(start, 0.3 * scale)))
     near[[W_R, W_C]], far[[W_R, W_C]] = low[[W_R, W_C]], high[[W_R, W_C]]
     design, paths = grid.plants.at(0), grid.reads_more
     every = [(p, design.y)] + [(part[column], part) for part in (grid.q, grid.kept, grid.inverse)]

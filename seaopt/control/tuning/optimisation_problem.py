@@ -45,14 +45,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.laws.limits import (
-    BY_NAME,
-    LIMITS,
-    STEADY,
-    STEADY_PERIODS,
-    MeasuredLoop,
-    Scope,
-)
+from seaopt.control.laws.limits import BY_NAME, LIMITS, STEADY, STEADY_PERIODS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import HIGHEST_CORNER, ControllerSpec
 from seaopt.control.laws.structures import (

@@ -26,13 +26,7 @@ from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CASCADE, CUSTOM, DisturbanceObserver, Nominal, SpeedLoop
-from seaopt.control.laws.verdict import (
-    PossibleBandwidths,
-    explain_broken,
-    judge_all,
-    list_active,
-    list_broken,
-)
+from seaopt.control.laws.verdict import PossibleBandwidths, explain_broken, judge_all, list_active, list_broken
 from seaopt.control.loops.compensation.link_feedforward import (
     LinkPath,
     limit_fraction,

@@ -19,13 +19,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
 from seaopt.estimation.problem.shapes import Matrix, ParameterMatrix, ParameterVector, Vector
-from seaopt.estimation.result.covariance import (
-    Covariance,
-    compute_bread,
-    compute_meat,
-    compute_white_meat,
-    mark_unseen,
-)
+from seaopt.estimation.result.covariance import Covariance, compute_bread, compute_meat, compute_white_meat, mark_unseen
 from seaopt.estimation.result.findings import DerivedFigure, OutputFit, find_energy
 from seaopt.estimation.result.fit_result import Fit, FitStatus, Minimum, Provenance
 from seaopt.estimation.result.identifiability import (
@@ -165,13 +159,7 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 
 def _compute_covariances(
     problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
-) -> tuple[
-    ParameterMatrix,
-    ParameterMatrix,
-    Float[np.ndarray, "q q"],
-    ParameterVector,
-    Vector,
-]:
+) -> tuple[ParameterMatrix, ParameterMatrix, Float[np.ndarray, "q q"], ParameterVector, Vector]:
     """Return the parameters' covariance for white residuals and for the actual ones, and how much is unseen. Both are
     over what is seen alone, and so is the third, of parameters and delays together; the fourth is how much of each
     parameter is not seen (0 to 1, squared). The last are the variances of all unknowns: of parameters, delays and gains
