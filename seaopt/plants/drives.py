@@ -60,9 +60,8 @@ INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
 
 @record(eq=False)
 class _Drive:
-    """A drive ahead of a plant's first input: its own input, states and outputs with units, and its equations.
-
-    `solve` is (t, x, u, p) -> (what the plant's input is, {state: rate}, {output: value}).
+    """A drive ahead of a plant's first input: its own input, states and outputs with units, and its equations. `solve`
+    is (t, x, u, p) -> (what the plant's input is, {state: rate}, {output: value}).
     """
 
     name: str

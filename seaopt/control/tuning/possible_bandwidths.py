@@ -86,9 +86,8 @@ def find_end(
 
 
 class _Probes:
-    """What was found at the bandwidths tried: how much of a limit is used, and the numbers.
-
-    The usage is 0 where all limits are kept, and infinite where no law was stable.
+    """What was found at the bandwidths tried: how much of a limit is used, and the numbers. The usage is 0 where all
+    limits are kept, and infinite where no law was stable.
     """
 
     def __init__(self, task: Task, x: LawNumbers, progress: Progress) -> None:

@@ -67,10 +67,9 @@ Solution = tuple[LawNumbers, list[MeasuredLoop]]  # with the loop of every plant
 def solve(
     task: Task, warm: Sequence[LawNumbers] = (), progress: Progress = ignore, *, far_off: float = FAR_OFF
 ) -> Solution:
-    """Find the best numbers, and return them with every plant's loop.
-
-    `warm`: numbers to start from besides those of the scan, which then tries one less. `far_off`: worst usage of the
-    best of two refined starts beyond which no other is refined.
+    """Find the best numbers, and return them with every plant's loop. `warm`: numbers to start from besides those of
+    the scan, which then tries one less. `far_off`: worst usage of the best of two refined starts beyond which no other
+    is refined.
     """
     once, raising = divide(progress, ONCE, (3.0 * ONCE + RAISING) * task.asks_margin)
     x, loops = _solve_once(task, warm, once, far_off)
@@ -78,10 +77,9 @@ def solve(
 
 
 def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], progress: Progress) -> Solution:
-    """Return the best law with the friction margin asked for, from the best without.
-
-    The multiplier that shows most of a law is made a limit, and the best law with that looked for, as another may then
-    show more. Where none has the margin, it is the law with the largest that keeps all other limits.
+    """Return the best law with the friction margin asked for, from the best without. The multiplier that shows most of
+    a law is made a limit, and the best law with that looked for, as another may then show more. Where none has the
+    margin, it is the law with the largest that keeps all other limits.
     """
     broken, best = task.list_broken(loops), (x, loops)
     if not broken:
@@ -103,9 +101,8 @@ def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], 
 def _raise_friction_margin(
     task: Task, x: LawNumbers, loops: list[MeasuredLoop], other: LawNumbers, progress: Progress
 ) -> Solution:
-    """Return the law with the largest friction margin below the one asked, by bisection, all other limits kept.
-
-    At every slope two laws are tried: from the best so far, with the multiplier that shows most of it; and from the
+    """Return the law with the largest friction margin below the one asked, by bisection, all other limits kept. At
+    every slope two laws are tried: from the best so far, with the multiplier that shows most of it; and from the
     `other`, which misses all limits evenly with the simplest.
     """
     high = task.spec.level(FRICTION)
@@ -160,7 +157,6 @@ def _descend(task: Task, grid: Grid, x: LawNumbers, *, keeping: bool = False) ->
 
 def search(task: Task, x: LawNumbers, loops: list[MeasuredLoop], *, again: bool = True) -> Solution:
     """Return a law that keeps the limits as it is; of one that misses them a better one, if an evolution finds it.
-
     `again`: whether a second population is tried where the first has no law that keeps them.
     """
     if not task.list_broken(loops) - {FRICTION}:
@@ -172,9 +168,8 @@ def search(task: Task, x: LawNumbers, loops: list[MeasuredLoop], *, again: bool 
 def retry(
     task: Task, x: LawNumbers, loops: list[MeasuredLoop], starts: Sequence[LawNumbers], *, keeping: bool = False
 ) -> Solution:
-    """Return a better law than the one that misses limits, from other starts; else that one.
-
-    `keeping` is of `refine`: the first numbers that keep the limits may be enough.
+    """Return a better law than the one that misses limits, from other starts; else that one. `keeping` is of `refine`:
+    the first numbers that keep the limits may be enough.
     """
     grid = make_grid(task)
     best, rank = (x, loops), task.rank(grid, x)
@@ -204,11 +199,10 @@ def _finish(task: Task, grid: Grid, x: LawNumbers, checking: Progress) -> Soluti
 
 
 def tighten_limits(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
-    """Return a law that keeps limits which the given one misses by next to nothing; that one where none is found.
-
-    With no reserve a law is on its limits at the frequencies looked at, and may be beyond them in between. So these
-    are lowered by what is missed, and the law refined; where that is so little that the law counts as keeping the
-    lowered ones too, or a frequency is missed, with more of a reserve.
+    """Return a law that keeps limits which the given one misses by next to nothing; that one where none is found. With
+    no reserve a law is on its limits at the frequencies looked at, and may be beyond them in between. So these are
+    lowered by what is missed, and the law refined; where that is so little that the law counts as keeping the lowered
+    ones too, or a frequency is missed, with more of a reserve.
     """
     best, factors = (x, loops), dict(task.eased)
     for _ in range(TIGHTENINGS):
@@ -249,9 +243,8 @@ def measure_missed(task: Task, loops: Sequence[MeasuredLoop]) -> dict[str, float
 
 
 def recheck(task: Task, grid: Grid, x: LawNumbers, rounds: int = ROUNDS) -> LawNumbers:
-    """Refine numbers on a grid until no limit is broken between its frequencies, or no more than on them.
-
-    Of what misses limits clearly on them nothing is refined.
+    """Refine numbers on a grid until no limit is broken between its frequencies, or no more than on them. Of what
+    misses limits clearly on them nothing is refined.
     """
     for _ in range(RECHECKS if task.rank(grid, x)[0] <= HOPELESS else 0):
         missed = _find_missed(task, x, grid)

@@ -72,7 +72,6 @@ def compute_experiment_residuals(experiment: FitExperiment, z: Vector) -> Experi
 @record(eq=False)
 class _Chunk:
     """Rows of a segment: model minus measured, filtered residuals in sigma, which count, and the measured in a band.
-
     Arrays have one row per output. `used` is None where every sample counts.
     """
 

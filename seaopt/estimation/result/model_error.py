@@ -127,7 +127,6 @@ def _resize(matrix: ParameterMatrix, variances: ParameterVector) -> ParameterMat
 @record(eq=False)
 class _Sums:
     """Sums over the samples, over the parameters and delays alone: H_k and g_k of parts, and of a half of each split.
-
     `share` is how many of the samples are in that half, `windows` the scores' products within a window, `power` and
     `error_power` the information of the outputs weighted with the power of their residuals and of the model's error,
     `effect` the largest rms over the outputs' spreads that a unit of each makes.

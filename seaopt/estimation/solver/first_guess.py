@@ -34,9 +34,8 @@ QUICK_WINDOWS = [2**a * 3**b for a in range(15) for b in range(9)]
 
 @record(eq=False)
 class _Target:
-    """The measured responses of an experiment's outputs to its input, and the linearised model of them.
-
-    Rows are frequencies, columns outputs; the weight is zero where an output has no response to be matched.
+    """The measured responses of an experiment's outputs to its input, and the linearised model of them. Rows are
+    frequencies, columns outputs; the weight is zero where an output has no response to be matched.
     """
 
     model: Model
