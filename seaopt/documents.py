@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Strict, ValidationError
 
@@ -84,7 +84,7 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
             f"{at} = {shorten(first['input'])} is not a range; give [low, high]: {at.rpartition('.')[2]} = [1.0, 2.0]"
         )
     if first["type"] == "missing":
-        return f"key {place} is missing; {remedy or f'add it: {key} = ...'}"
+        return f"key {place} is missing; {remedy or f'add it: {key} = {_suggest_value(model, first)}'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
     words = words.replace("List should", "should").replace(" after validation", "")
     words = "should be a table" if first["type"] == "model_type" else words
@@ -119,10 +119,17 @@ def _suggest_number(model: type[BaseModel], mistake: Mapping[str, Any]) -> str:
 
 
 def _suggest_choice(mistake: Mapping[str, Any]) -> str:
-    """Return the text that was likely meant of those that may be given; "..." where they are no texts."""
-    choices = re.findall(r"'([^']*)'", mistake["ctx"]["expected"])
-    nearest = get_close_matches(str(mistake["input"]), choices, n=1, cutoff=0.0)
-    return f'"{nearest[0]}"' if nearest else "..."
+    """Return the text that was likely meant of those that may be given, or the number."""
+    expected = mistake["ctx"]["expected"]
+    nearest = get_close_matches(str(mistake["input"]), re.findall(r"'([^']*)'", expected), n=1, cutoff=0.0)
+    return f'"{nearest[0]}"' if nearest else expected.split()[0]
+
+
+def _suggest_value(model: type[BaseModel], mistake: Mapping[str, Any]) -> str:
+    """Return what a key that is missing may be, where only a few values may; else "..."."""
+    inside = _find_model(model, mistake["loc"]).model_fields
+    kinds = [field.annotation for name, field in inside.items() if mistake["loc"][-1] in (name, field.alias)]
+    return next((_spell(get_args(kind)[0]) for kind in kinds if get_origin(kind) is Literal), "...")
 
 
 def _spell(value: Any) -> str:

@@ -18,6 +18,7 @@ from pydantic import (
     create_model,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from seaopt.control import CompensateFriction, CompensateGravity, CompensateRipple, ControllerSpec, Impedance, MPCSpec
 from seaopt.control.laws.plausibility import GateSpec
@@ -283,7 +284,7 @@ class ExpectTable(StrictTable):
 
 def _require_whole(value: object) -> object:
     if type(value) is not int:  # true == 1 for Python
-        raise ValueError("should be 1")
+        raise PydanticCustomError("literal_error", "should be 1", {"expected": "1"})
     return value
 
 

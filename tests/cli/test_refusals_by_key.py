@@ -25,8 +25,11 @@ controller = { plant = "stand", bandwidth_hz = 30 }
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        ("schema = 1", "schema = true", r"schema = True: should be 1"),
-        ("schema = 1", "schema = 1.0", r"schema = 1.0: should be 1"),
+        ("schema = 1", "schema = true", r"schema = True: should be 1; correct it: schema = 1$"),
+        ("schema = 1", "schema = 1.0", r"schema = 1.0: should be 1; correct it: schema = 1$"),
+        ("schema = 1", "schema = 2", r"schema = 2: should be 1; correct it: schema = 1$"),
+        ("schema = 1", 'schema = "1"', r"schema = '1': should be 1; correct it: schema = 1$"),
+        ("schema = 1", 'title = "x"', r"key schema is missing; add it: schema = 1$"),
         ("3.31e-6 }", '3.31e-6, free = "nan" }', r"parameters.J.free = 'nan'"),
         ("3.31e-6 }", '3.31e-6, min = "low" }', r"parameters.J.min = 'low'"),
         ("= 30", "= -30", r"bandwidth_hz = -30 is not positive.*bandwidth_hz = 30$"),
