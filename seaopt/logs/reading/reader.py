@@ -16,7 +16,7 @@ from jaxtyping import Float
 from seaopt.errors import LogError, require_number, require_type
 from seaopt.files import write_text
 from seaopt.formatting import format_count
-from seaopt.logs.formats import Window, open_source
+from seaopt.logs.formats import Source, Window, open_source
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule, check_increasing
 from seaopt.logs.log.log import Log
 from seaopt.logs.quality.faults import find_counter_losses
@@ -88,35 +88,12 @@ def read_table(
     >>> table.notes
     ('columns that hold no numbers were left out: note',)
     """
-    table, _ = _read_files(path, time, channels, align, window_s, counter, rate_hz, digest=digest)
-    return table
-
-
-def _read_files(
-    path: str | Path | Sequence[str | Path],
-    time: str | int | Column | None,
-    channels: Mapping[str, str | int | Column] | None,
-    align: Rule | None,
-    window_s: tuple[float, float] | None,
-    counter: Counter | None,
-    rate_hz: float | None,
-    *,
-    digest: bool,
-) -> tuple[Table, ClockColumn]:
-    """Return the table, and the column that its time is from; see `read_table`."""
-    files = [path] if isinstance(path, str | Path) else path
-    require_type(files, Sequence, "path", "give a path, or a list of them", LogError)
-    for file in files:
-        require_type(file, (str, Path), "path", "give a path, or a list of them", LogError)
-    files = [Path(file) for file in files]
+    sources = _open_sources(path)
     require_type(channels or {}, Mapping, "channels", "give a mapping of channel to column", LogError)
     if counter is not None:
         require_type(counter, Counter, "counter", "give a Counter", LogError)
     if align is not None:
         require_type(align, (Hold, Linear, Nearest), "align", "give Hold(), Linear() or Nearest(...)", LogError)
-    if not files:
-        raise LogError("path is an empty list; give a file")
-    sources = [open_source(file) for file in files]
     if window_s is not None:
         require_type(window_s, (tuple, list), "window_s", "give (start, stop)", LogError)
         edges = [require_number(edge, "window_s", LogError) for edge in window_s]
@@ -133,8 +110,19 @@ def _read_files(
         digest_of_file = hashes[channel.file_column.source.path]
         signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, digest_of_file)
         notes += _remark_on(signals[name])
-    table = Table(time=clock, signals=signals, source=", ".join(map(str, files)), notes=tuple(notes))
-    return table, chosen.clock
+    names = ", ".join(str(source.path) for source in sources)
+    return Table(time=clock, signals=signals, source=names, notes=tuple(notes))
+
+
+def _open_sources(path: str | Path | Sequence[str | Path]) -> list[Source]:
+    """Return files, opened and listed."""
+    files = [path] if isinstance(path, str | Path) else path
+    require_type(files, Sequence, "path", "give a path, or a list of them", LogError)
+    for file in files:
+        require_type(file, (str, Path), "path", "give a path, or a list of them", LogError)
+    if not files:
+        raise LogError("path is an empty list; give a file")
+    return [open_source(Path(file)) for file in files]
 
 
 def read_log(
@@ -179,7 +167,16 @@ def read_log(
     >>> read_log(file, time="time [s]", channels={"I": Column(column="cur", unit="mA")})["I"].tolist()
     [0.1, 0.15]
     """
-    table, clock = _read_files(path, time, channels, align, window_s, counter, rate_hz, digest=digest)
+    table = read_table(
+        path,
+        time=time,
+        channels=channels,
+        align=align,
+        window_s=window_s,
+        counter=counter,
+        rate_hz=rate_hz,
+        digest=digest,
+    )
     if duplicates is not None:
         table = _merge_duplicates(table, duplicates)
     for signal in table.signals.values():
@@ -188,6 +185,7 @@ def read_log(
     try:
         return Log(time=table.time, signals=table.signals, source=table.source, notes=table.notes)
     except LogError as error:  # the columns have one length: it is their time
+        clock = select(_open_sources(path), time, channels, align, counter, rate_hz).clock
         raise LogError(f'{error}; if "{clock.name}" is not the time, {advise_time(clock.source)}') from error
 
 
