@@ -18,7 +18,7 @@ from seaopt.errors import EstimationError, require_type
 from seaopt.estimation.judgement.judge import CAUSES, TESTS, judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS
-from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
+from seaopt.estimation.problem.fit_problem import FitProblem, count_evaluations, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
 from seaopt.estimation.result.findings import find_guesses, order_findings
 from seaopt.estimation.result.fit_result import Fit
@@ -131,10 +131,13 @@ def fit(
     searching, judging = divide(progress, SEARCH, JUDGEMENT if diagnostics else 0.0)
     searching("looking for a start", 0.0)
     callback = _count_iterations(searching)
+    before = count_evaluations()
     solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
+    evaluations = count_evaluations() - before
     result = summarise(solved, chosen, diagnostics, started)
     if diagnostics:
-        result = _name_guesses(judge(result, alternatives, judging, validation), named, params)
+        judged = judge(result, alternatives, judging, validation, evaluations=evaluations)
+        result = _name_guesses(judged, named, params)
     progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)
     return result
 

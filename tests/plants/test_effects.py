@@ -13,7 +13,7 @@ from seaopt.plants.parts import add_part
 
 TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 2.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0, "c_s": 0.5}
 EFFECTS = {
-    "droop": {"a_i": 0.03},
+    "droop": {"a_i": 0.012},
     "friction_drift": {"w_c": 0.4, "b_t": 8e-5},
     "friction_direction": {"f_a": 0.006, "b_a": -4e-5},
 }
@@ -26,8 +26,8 @@ def _command(t):
 def _rate(t, x, p):
     angle, speed = x
     current, torque = _command(t), p["k_s"] * angle / p["N"] + p["c_s"] * speed / p["N"]
-    motor = p["K_tau"] * current / math.sqrt(1.0 + p.get("a_i", 0.0) * current**2)
-    dry = p["f_c"] * math.tanh(speed / p["v_s"]) * math.exp(-p.get("w_c", 0.0) * t)
+    motor = p["K_tau"] * current * (1.0 - p.get("a_i", 0.0) * current**2)
+    dry = p["f_c"] * math.tanh(speed / p["v_s"]) * (1.0 - p.get("w_c", 0.0) * t)
     viscous = (p["b_r"] + p.get("b_t", 0.0) * t) * speed
     rub = dry + viscous + p.get("f_a", 0.0) + p.get("b_a", 0.0) * abs(speed)
     return speed, (motor - rub - torque / p["N"]) / p["J_m"]
@@ -60,6 +60,16 @@ def test_a_controller_is_designed_on_the_plant_without_the_effect(part):
     assert np.allclose(plant.linearize(params).B[:, 0], at.B[:, 0])
 
 
+def test_a_saturated_motor_makes_no_less_torque_of_more_current():
+    plant, params = _make("droop")
+    largest = 1.0 / math.sqrt(3.0 * 0.012)
+    hold = {"x": dict.fromkeys(plant.states, 0.0), "u": {"I": 2.0 * largest}}
+    assert plant.linearize(params, **hold).B[1, 0] == 0.0
+    log = so.Log.from_arrays(time=np.arange(4000) / 1000, I=np.full(4000, 2.0 * largest))
+    torque = so.simulate(plant, params.update(f_c=0.0, c_s=20.0), log)["tau_s"][-1]
+    assert abs(torque / (100.0 * 0.05 * largest * 2.0 / 3.0) - 1.0) < 1e-6
+
+
 def test_what_sticks_breaks_away_sooner_in_one_direction():
     plant, params = _make("friction_direction")
     stuck = so.plants.let_stick(plant)
@@ -75,7 +85,7 @@ def test_what_sticks_breaks_away_later_as_friction_falls():
     log = so.Log.from_arrays(time=time, I=np.full(time.size, 0.012 / TRUTH["K_tau"]))
     angle = so.simulate(so.plants.let_stick(plant), params, log, rtol=1e-4)["theta_m"]
     started = time[np.flatnonzero(np.abs(angle) > 1e-6)[0]]
-    assert abs(started - math.log(0.02 / 0.012) / 0.4) < 5e-3  # f_c exp(-w_c t) = torque
+    assert abs(started - (1.0 - 0.012 / 0.02) / 0.4) < 5e-3  # f_c (1 - w_c t) = torque
 
 
 @pytest.mark.parametrize("part", [*EFFECTS, "hardening", "stribeck", "backlash", "load_friction", "hysteresis"])

@@ -31,7 +31,6 @@ from seaopt.units import ROTARY, mechanics_of, unit_after
 
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
 SAME_EFFECT = 1e-3  # of a test's figures, by which parameters that act alike may differ
-LOAD, LOAD_SHARE = "load_at_motor", "share_of_load"  # of friction that is tried
 POLE = "load_cell_hz"  # of the part that reads an output through a pole
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
@@ -88,7 +87,6 @@ def list_candidates(
     yield from _read_deflections(experiments, values)
     yield from _free_delays(problem, values)
     yield from _free_parameters(fit, minimum, suspects)
-    yield from _load_friction(experiments, values)
     yield from _clip_outputs(problem, residuals, values)
     yield from _filter_outputs(experiments, values)
 
@@ -186,43 +184,6 @@ def _adds_damping(plant: Plant, output: str, stiffness: str) -> bool:
     ones = np.ones(len(plant.parameters))
     resting, motion = (abs(float(more(0.0, at, 0.0, ones))) for at in (still, 1.0 + np.arange(still.size)))
     return resting < 1e-12 < motion
-
-
-def _load_friction(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
-    """Yield friction that grows with the motor's effort, where no plant's own does."""
-    loaded = {plant: _grow_with_load(plant) for plant in dict.fromkeys(e.plant for e in experiments)}
-    changed = tuple(replace(e, plant=plant) for e in experiments if (plant := loaded[e.plant]) is not None)
-    if len(changed) < len(experiments):
-        return
-
-    def describe(values: Values, stds: Values) -> str | None:
-        share = values[LOAD_SHARE]
-        return None if share < 1e-3 else f"friction grows with the load, by {share:.3g} of it; add part load_friction"
-
-    share = Parameter(name=LOAD_SHARE, value=0.05, unit="-", free=True, min=0.0, max=1.0)
-    yield Candidate(where=experiments[0].name, experiments=changed, params=params.with_parameters(share), says=describe)
-
-
-def _grow_with_load(plant: Plant) -> Plant | None:
-    """Return a plant whose friction takes a share of the motor's effort, too; None where roles do not tell how."""
-    actuation = plant.actuation
-    name, friction = next(iter(plant.friction.items()), ("", None))
-    if actuation is None or friction is None or friction.loads is not None or not list_smoothing(plant):
-        return None
-    smoothing, curve, jump = list_smoothing(plant)[0], friction.force, friction.jump
-
-    def take(p: Any) -> Any:
-        return getattr(p, LOAD_SHARE) * ca.fabs(getattr(p, LOAD))
-
-    grown = replace(
-        friction,
-        force=lambda v, p: curve(v, p) + take(p) * ca.tanh(v / getattr(p, smoothing)),
-        jump=None if jump is None else lambda speed, p: jump(speed, p) + take(p),
-        loads=lambda x, u, p: {LOAD: actuation.effort(p) * getattr(u, actuation.input) / friction.effort(p)},
-        rated={LOAD: 0.0},
-    )
-    share = Parameter(name=LOAD_SHARE, value=0.0, unit="-", min=0.0)
-    return replace(plant, friction={**plant.friction, name: grown}, parameters={**plant.parameters, LOAD_SHARE: share})
 
 
 def _free_delays(problem: FitProblem, params: ParameterSet) -> Iterator[Candidate]:

@@ -6,7 +6,7 @@ only beyond what chance gives a residual of this colour.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,17 +14,19 @@ from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.candidates import Candidate, list_candidates
+from seaopt.estimation.judgement.hypothesis_search import Refit
 from seaopt.estimation.judgement.score_test import ScoreTest
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import measure_spread
-from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_problem
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.settle import ROUGH_ITERATIONS, Solved, settle_roughly, sharpen
+from seaopt.formatting import join_words
 from seaopt.plants import Plant
-from seaopt.progress import Progress, count_off, ignore
+from seaopt.progress import Progress, ignore
 from seaopt.records import record
 
 ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that chance does not give
@@ -44,6 +46,7 @@ class Cause:
     solved: bool  # whether it leaves hardly anything of the residual of any output
     material: bool  # whether it takes half of a residual's power away, or moves an estimate beyond what the fit says
     preferred: Mapping[str, tuple[float, float]]  # value and std that the refit gives what it frees
+    refit: Refit | None = None  # of a hypothesis about what the model lacks
     unknowns: int  # how many its refit had
 
 
@@ -54,25 +57,38 @@ def find_causes(
     alternatives: Sequence[Plant],
     *,
     poor: bool,
+    hypotheses: Sequence[Refit] = (),
+    budget: float = np.inf,
     progress: Progress = ignore,
 ) -> list[Cause]:
     """Return what explains the logs better than the fit, the best first. `fit`: with its minimum; `residuals`: of the
     fit; `suspects`: what was fixed and is at odds with the logs; `alternatives`: other plants that may have been on the
     bench; `poor`: whether the fit explains so little that its estimates are no start: what searches does so from its
-    own; `progress`: called before each that is tried.
+    own; `hypotheses`: those that remove the excess; `budget`: evaluations after which nothing more is tried;
+    `progress`: called before each that is tried.
     """
     minimum = fit.require_minimum("find_causes")
     whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
     colour = _measure_colour(fit)
     causes: list[Cause] = []
     candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor))
-    for candidate in count_off(candidates, "trying cause", progress):
+    causes += _weigh_hypotheses(fit, hypotheses, whole, colour)
+    begun = count_evaluations()
+    for number, candidate in enumerate(candidates, start=1):
+        spent = (count_evaluations() - begun) / budget
+        if spent >= 1.0:
+            break
+        progress(f"trying cause {number} of {len(candidates)}", max(spent, (number - 1) / len(candidates)))
         try:
             solved = _refit(minimum, candidate)
         except SeaoptError:  # what does not make a problem explains nothing
             continue
         before = _measure_kept(fit, minimum, candidate.kept) if candidate.kept else whole
-        cause = None if solved is None else _weigh(fit, candidate, solved, before, colour, poor=poor)
+        cause = (
+            None
+            if solved is None
+            else _weigh(fit, candidate, solved.problem, solved.solution.evaluation, before, colour, poor=poor)
+        )
         if cause is not None:
             causes.append(cause)
             if poor and cause.solved:
@@ -157,23 +173,44 @@ def _compare_gains(problem: FitProblem, z: Vector, gains: Sequence[str]) -> Vect
     return z
 
 
+def _weigh_hypotheses(
+    fit: Fit, hypotheses: Sequence[Refit], before: Float[np.ndarray, "outputs 2"], colour: float
+) -> Iterator[Cause]:
+    """Yield what hypotheses about what the model lacks are worth, each with the part that brings it."""
+    for refit in hypotheses:
+        added = join_words([f"{name} = {refit.values[name]:.4g}" for name in refit.change.frees])
+        parts = join_words(refit.change.parts)
+        word = "part" if len(refit.change.parts) == 1 else "parts"
+        candidate = Candidate(
+            where=", ".join(refit.change.frees),
+            experiments=refit.change.experiments,
+            params=refit.change.params,
+            says=f"{refit.change.effect}; add {word} {parts}, with {added}",
+            frees=dict.fromkeys(refit.change.frees, 0.0),
+        )
+        cause = _weigh(fit, candidate, refit.problem, refit.evaluation, before, colour, poor=False)
+        if cause is not None:
+            yield replace(cause, refit=refit)
+
+
 def _weigh(
     fit: Fit,
     candidate: Candidate,
-    solved: Solved,
+    problem: FitProblem,
+    evaluation: Evaluation,
     before: Float[np.ndarray, "outputs 2"],
     colour: float,
     *,
     poor: bool,
 ) -> Cause | None:
     """Return what a refit is worth; None where chance gives as much, or where it is no other explanation."""
-    after = _measure_powers(solved.solution.evaluation, solved.problem)
+    after = _measure_powers(evaluation, problem)
     if len(after) != len(before):
         return None
     fall = np.log(before[:, 0]) - np.log(after[:, 0])
     gain = 0.5 * float(np.sum(before[:, 1] * fall)) / colour
-    values = dict(zip(solved.problem.unknowns.names, solved.solution.z.tolist(), strict=True))
-    variances = colour * np.diag(invert(solved.solution.evaluation.hessian)[0])
+    values = dict(zip(problem.unknowns.names, evaluation.z.tolist(), strict=True))
+    variances = colour * np.diag(invert(evaluation.hessian)[0])
     stds = dict(zip(values, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
     left = float(np.exp(-np.max(fall)))
     text = candidate.describe(values, stds) if gain > ENOUGH and not (poor and left > HALVED) else None

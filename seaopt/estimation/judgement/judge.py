@@ -21,10 +21,12 @@ import numpy as np
 from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
+from seaopt.estimation.judgement.hypothesis_search import Search, search_hypotheses
 from seaopt.estimation.judgement.intervals import find_excesses, find_rough, find_single_event
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_problem import count_evaluations
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import estimate_model_error
@@ -35,6 +37,8 @@ from seaopt.progress import Progress, divide, ignore
 from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
+EVALUATIONS = 40  # of a fit, at least: one of a linear plant that starts well takes a few
+OF_HYPOTHESES, OF_CAUSES = 3, 2  # times those, that refits of hypotheses and of other causes may take
 TESTS, CAUSES = 1.0, 3.0  # of the time of a judgement that tries causes
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
 WORSE = -1.0  # fit percent below which a constant explains more, beyond rounding and an offset that is fixed
@@ -62,11 +66,14 @@ def judge(
     alternatives: Sequence[Plant] = (),
     progress: Progress = ignore,
     validation: Sequence[Experiment] = (),
+    *,
+    evaluations: int = EVALUATIONS,
 ) -> Fit:
     """Return the fit with how much of its outputs is explained, and what is wrong with it.
 
     `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
-    not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's.
+    not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's;
+    `evaluations`: what the fit took, of which the search for causes may take five times as many.
     """
     minimum = fit.require_minimum("judge")
     testing, trying = divide(progress, TESTS, CAUSES)
@@ -101,11 +108,24 @@ def judge(
         or any(finding.severity != "note" for finding in findings)
         or fit.status != "converged"
     )
-    if wrong:
-        poor = any(finding.kind == "explained" for finding in findings) or fit.status == "not_identifiable"
-        causes = find_causes(fit, residuals, suspects, alternatives, poor=poor, progress=trying)
+    little = any(finding.kind == "explained" for finding in findings)
+    refitting, trying = divide(trying, OF_HYPOTHESES, OF_CAUSES)
+    evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
+    search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting)
+    if wrong or search.able:
+        causes = find_causes(
+            fit,
+            residuals,
+            suspects,
+            alternatives,
+            poor=little or fit.status == "not_identifiable",
+            hypotheses=search.able,
+            budget=(OF_HYPOTHESES + OF_CAUSES) * evaluations - (count_evaluations() - begun),
+            progress=trying,
+        )
         findings += _name_causes(fit, causes, suspects)
-    return _conclude(replace(fit, findings=order_findings(findings)))
+        search = search if not causes or causes[0].refit is not None else search.yield_to_another()
+    return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
 
 
 def _state_excess(fit: Fit, excess: Mapping[str, float]) -> Fit:
@@ -360,4 +380,10 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
         text = f"{len(rivals)} causes fit equally well, and the logs cannot separate them: {text}"
     where = ", ".join(dict.fromkeys(cause.where for cause in rivals))
     finding = _warn("cause", where, text, bad=any(cause.material for cause in rivals))
-    yield replace(finding, preferred={name: value for cause in rivals for name, value in cause.preferred.items()})
+    refit = rivals[0].refit
+    yield replace(
+        finding,
+        preferred={name: value for cause in rivals for name, value in cause.preferred.items()},
+        proposal=refit and refit.proposal,
+        python=refit and refit.python,
+    )

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from seaopt.codec import OrInfinite, OrMinusInfinite, OrNaN
+from seaopt.codec import Key, OrInfinite, OrMinusInfinite, OrNaN
 from seaopt.estimation.problem.shapes import Signal
 from seaopt.parameters import QUANTILE
 from seaopt.records import PlotAccessor, Worded, record
@@ -23,6 +23,12 @@ GUESS = "guess"  # kind of the finding that names unverified values
 class FitFinding:
     """A fault of a fit, or a remark, for its user."""
 
+    json_keys = (
+        *("severity", "kind", "where", "text", "preferred"),
+        Key(field="proposal", name="proposal", omit_none=True),
+        Key(field="python", name="python", omit_none=True),
+    )
+
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
     # for programs: "bound", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out", "noise",
     # "range", "residual", "rough", "samples"
@@ -31,6 +37,9 @@ class FitFinding:
     text: str  # with the remedy
     # value and std of what a "cause" frees, by name
     preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    # what adds a "cause" that a part brings: lines of a problem file for a plant NAME, and calls
+    proposal: str | None = None
+    python: str | None = None
 
 
 def state_guesses(guessed: Sequence[str]) -> str:

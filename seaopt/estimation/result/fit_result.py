@@ -27,6 +27,7 @@ from seaopt.estimation.result.findings import (
 )
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.estimation.result.nuisance import estimate_nuisance, take_sensors
+from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.estimation.solver.methods import Method
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -105,6 +106,8 @@ class Fit(Result, Worded):
         Faults and remarks, errors first; empty without diagnostics.
     notes : tuple of str
         Changes to the logs, and samples without weight, one sentence each.
+    hypotheses : tuple of HypothesisTrial
+        What the model may lack, as it was tried, the best first; empty where the residuals do not ask for it.
     experiments : tuple of Experiment
         The data; empty when read from a file.
     minimum : Minimum or None
@@ -119,7 +122,8 @@ class Fit(Result, Worded):
         *("covariance", "white_covariance", Key(field="delay_covariance", name="delay_covariance", omit_none=True)),
         Key(field="model_covariance", name="model_covariance", omit_none=True),
         *("outputs", "logs", "identifiability", Key(field="nuisance", name="experiments"), "step_error_sigma"),
-        *("step_error_parameter", "method", "log_likelihood", "unknowns", "aic", "bic", "notes", "provenance"),
+        *("step_error_parameter", "method", "log_likelihood", "unknowns", "aic", "bic", "notes", "hypotheses"),
+        "provenance",
     )
 
     status: FitStatus
@@ -143,6 +147,7 @@ class Fit(Result, Worded):
     logs: Mapping[str, LogValues] = field(default_factory=dict[str, LogValues])
     findings: tuple[FitFinding, ...] = ()
     notes: tuple[str, ...] = ()
+    hypotheses: tuple[HypothesisTrial, ...] = ()
     delay_covariance: Covariance | None = field(default=None, repr=False)
     model_covariance: Covariance | None = field(default=None, repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)

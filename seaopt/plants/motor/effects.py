@@ -3,13 +3,13 @@ r"""What real actuators do beside their model, around any plant that states the 
 Parts of `seaopt.plants.parts`; each is nothing where its parameters are zero:
 
 ``droop``
-    The torque of a motor whose iron saturates: the current I makes what :math:`I/\sqrt{1 + a_i I^2}` would, so that
-    the torque constant has fallen by half of :math:`a_i I^2` where that is small. It takes the actuation's role.
+    The torque of a motor whose iron saturates: the current I makes what :math:`I (1 - a_i I^2)` would, up to where that
+    is largest, and no more beyond. It takes the actuation's role.
 ``friction_drift``
     Friction changes while a log is recorded, as grease warms up: after :math:`t` seconds dry friction is
-    :math:`e^{-w_c t}` of what it was, and viscous friction :math:`b_t t` more. The time is an input of its own,
-    `elapsed`, which a log need not have: it is then counted from the log's beginning, and is zero wherever a
-    controller is designed, so that a fit's values are those at the beginning.
+    :math:`1 - w_c t` of what it was, but never less than nothing, and damping :math:`b_t t` more. The time is an input
+    of its own, `elapsed`, which a log need not have: it is then counted from the log's beginning, and is zero wherever
+    a controller is designed, so that a fit's values are those at the beginning.
 ``friction_direction``
     Friction differs between the two directions: :math:`f_a + b_a |v|` is added, so that dry friction is
     :math:`f_c \pm f_a` and damping :math:`b \pm b_a`.
@@ -34,11 +34,12 @@ from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
 ELAPSED = "elapsed"  # the input that is the time since a log's beginning
 AMPERE = "A"
+STRAIGHT = 1e-12  # 1/A^2: a torque constant that droops less does not droop at all
 
 
 def _drift_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
     return (
-        declare("w_c", 0.0, "1/s", -math.inf, "rate at which dry friction falls"),
+        declare("w_c", 0.0, "1/s", -math.inf, "share of dry friction that is lost per second"),
         declare("b_t", 0.0, effort.stiffness, -math.inf, "damping that a second adds"),
     )
 
@@ -51,7 +52,7 @@ def _direction_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
 
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
-    "droop": (declare("a_i", 0.0, "1/A^2", 0.0, "twice the share of torque lost, over the current's square"),),
+    "droop": (declare("a_i", 0.0, "1/A^2", 0.0, "share of torque that is lost, over the current's square"),),
     "friction_drift": _drift_parameters(LINEAR),
     "friction_direction": _direction_parameters(LINEAR),
 }
@@ -72,8 +73,9 @@ def let_droop(plant: Plant) -> Plant:
     current = actuation.input
 
     def saturate(x: Any, u: Any, p: Any) -> SimpleNamespace:
-        ampere = getattr(u, current)
-        return with_values(u, {current: ampere / ca.sqrt(1.0 + p.a_i * ampere**2)})
+        largest = 1.0 / ca.sqrt(3.0 * ca.fmax(p.a_i, STRAIGHT))
+        ampere = ca.fmin(ca.fmax(getattr(u, current), -largest), largest)
+        return with_values(u, {current: ampere * (1.0 - p.a_i * ampere**2)})
 
     friction = put_behind(plant.friction, saturate)
     return _change(plant, "droop", PARTS["droop"], saturate, let_droop, friction=friction)
@@ -88,7 +90,7 @@ def let_friction_drift(plant: Plant) -> Plant:
     refuse_clash(plant, "friction_drift", (ELAPSED,))
 
     def fall(p: Any) -> Any:
-        return ca.exp(-p.w_c * getattr(p, ELAPSED))
+        return ca.fmax(1.0 - p.w_c * getattr(p, ELAPSED), 0.0)
 
     def read_loads(x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return {**({} if loads is None else loads(x, u, p)), ELAPSED: getattr(u, ELAPSED)}

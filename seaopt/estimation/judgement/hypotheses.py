@@ -1,0 +1,208 @@
+"""Physics that a model may lack: each a part that is added, with what it frees and where a refit of it starts.
+
+A hypothesis changes plants by their roles alone, and names no parameters but those of its part. Where a part's effect
+is zero at zero, and straight there, its refit starts from zero: one step then goes as far as the log wants. Others,
+such as play, have no slope there, and start from a size that actuators have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import SeaoptError
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.result.fit_result import Fit
+from seaopt.formatting import join_words
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant, add_part
+from seaopt.plants.plant import name_symbols
+from seaopt.records import record
+from seaopt.simulation import simulate
+
+LARGEST = 0.999  # quantile of a size over a log: what it has at its largest, but for rounding
+SIMULATED = 1e-2  # of a signal: error of the simulation that tells sizes
+
+Starts = Sequence[Mapping[str, float]]
+
+
+@record
+class Sizes:
+    """How large things are in the logs, of the actuator that is fitted: zero where no role tells."""
+
+    current: float  # the commanded input
+    speed: float  # of what rubs
+    travel: float  # of what rubs, from one end to the other
+    friction: float  # dry friction
+    deflection: float  # of the spring
+    stiffness: float
+
+
+@record(eq=False)
+class Hypothesis:
+    """What a model may lack: in words, the part that brings it, and from which values of its own a refit starts.
+
+    Those that it frees are the first of each start; `fixed` are chosen once.
+    """
+
+    effect: str
+    part: str
+    starts: Callable[[Sizes], Starts]
+    fixed: Callable[[Sizes], Mapping[str, float]] = lambda sizes: {}
+
+
+def _zero(*names: str) -> Callable[[Sizes], Starts]:
+    return lambda sizes: [dict.fromkeys(names, 0.0)]
+
+
+def _rise_at_rest(s: Sizes) -> Starts:
+    """Return breakaway friction above what slides, over a slow and over a fast fall."""
+    return [{"f_s": 1.4 * s.friction, "v_st": share * s.speed} for share in (0.03, 0.2) if s.friction and s.speed]
+
+
+# In the order in which they are tried, those that are the quickest to refit first.
+HYPOTHESES = (
+    Hypothesis(
+        effect="the motor's torque droops at large currents",
+        part="droop",
+        starts=lambda s: [{"a_i": 0.1 / s.current**2}] if s.current else [],
+    ),
+    Hypothesis(effect="the spring hardens", part="hardening", starts=_zero("k_3")),
+    Hypothesis(effect="friction changes over the log", part="friction_drift", starts=_zero("w_c", "b_t")),
+    Hypothesis(
+        effect="friction grows with the spring's load",
+        part="load_friction",
+        starts=lambda s: [{"c_e": 0.03}],
+    ),
+    Hypothesis(
+        effect="friction grows with the motor's effort",
+        part="load_friction",
+        starts=lambda s: [{"c_m": 0.03}],
+    ),
+    Hypothesis(effect="breakaway friction is larger than sliding friction", part="stribeck", starts=_rise_at_rest),
+    Hypothesis(effect="damping differs between the directions", part="friction_direction", starts=_zero("b_a")),
+    Hypothesis(effect="dry friction differs between the directions", part="friction_direction", starts=_zero("f_a")),
+    Hypothesis(
+        effect="the spring has play",
+        part="backlash",
+        starts=lambda s: [{"g_b": share * s.deflection} for share in (0.01, 0.05) if s.deflection],
+        fixed=lambda s: {"eps_b": 1e-3 * s.deflection},
+    ),
+    Hypothesis(effect="the spring is damped", part="spring_damping", starts=_zero("c_k")),
+    Hypothesis(
+        effect="the spring loses energy in each cycle",
+        part="hysteresis",
+        starts=lambda s: [{"k_h": 0.05 * s.stiffness, "y_h": 0.1 * s.deflection}] if s.deflection else [],
+    ),
+    Hypothesis(
+        effect="the joint gives way before it slips",
+        part="lugre",
+        starts=lambda s: [{"sigma_0": 50.0 * s.friction / s.travel}] if s.friction and s.travel else [],
+        fixed=lambda s: {"sigma_1": 0.0},
+    ),
+)
+
+
+@record(eq=False)
+class Change:
+    """One or two hypotheses on the experiments of a fit: what is to be refitted."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    experiments: tuple[Experiment, ...]
+    params: ParameterSet
+    starts: Starts  # of what the last of them frees
+    frees: tuple[str, ...]  # of all of them
+    fixed: Mapping[str, float]
+
+    @property
+    def effect(self) -> str:
+        """What the model lacks, in words."""
+        return join_words([hypothesis.effect for hypothesis in self.hypotheses])
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts that are added."""
+        return tuple(dict.fromkeys(hypothesis.part for hypothesis in self.hypotheses))
+
+
+def change_plants(
+    hypothesis: Hypothesis,
+    experiments: tuple[Experiment, ...],
+    params: ParameterSet,
+    sizes: Sizes,
+    before: Change | None = None,
+) -> Change | None:
+    """Return a hypothesis on experiments; None where their plants do not take it, or have it already. `before`: the
+    change of another, which the experiments and parameters have.
+    """
+    starts, fixed = hypothesis.starts(sizes), hypothesis.fixed(sizes)
+    if not starts:
+        return None
+    names = {*starts[0], *fixed}
+    changed: dict[Plant, Plant] = {}
+    for plant in dict.fromkeys(experiment.plant for experiment in experiments):
+        if names <= plant.parameters.keys():
+            if any(name in params and (params[name].free or params[name].value != 0.0) for name in names):
+                return None
+            changed[plant] = plant
+            continue
+        try:
+            changed[plant] = add_part(plant, hypothesis.part)
+        except SeaoptError:  # its roles do not tell how, or another part excludes it
+            return None
+    declared = next(iter(changed.values())).parameters
+    if not names <= declared.keys():  # such plants have it without the part, under a name of their own
+        return None
+    added: list[Parameter] = []
+    for name, value in {**starts[0], **fixed}.items():
+        parameter = declared[name]
+        assert isinstance(parameter, Parameter)
+        added.append(replace(parameter, value=max(value, parameter.min), free=name in starts[0]))
+    return Change(
+        hypotheses=(*(before.hypotheses if before else ()), hypothesis),
+        frees=(*(before.frees if before else ()), *starts[0]),
+        fixed={**(before.fixed if before else {}), **fixed},
+        experiments=tuple(replace(each, plant=changed[each.plant]) for each in experiments),
+        params=params.with_parameters(*added),
+        starts=starts,
+    )
+
+
+def measure_sizes(fit: Fit) -> Sizes:
+    """Return how large things are, of the largest experiment: by a simulation of each with the fit's values."""
+    rows = [_measure(experiment, fit) for experiment in fit.experiments]
+    return Sizes(**{each.name: max(getattr(row, each.name) for row in rows) for each in fields(Sizes)})
+
+
+def _measure(experiment: Experiment, fit: Fit) -> Sizes:
+    plant, log = experiment.plant, experiment.log
+    params = plant.complete(experiment.apply_own(fit.parameters))
+    run = simulate(plant, params, log, rtol=SIMULATED)
+    x, u, p = name_symbols(plant, plant.x, plant.u, plant.p)
+    friction = next((each for each in plant.friction.values() if each.bristles is None), None)
+    spring, values = plant.spring, params.by_attribute
+    rows = [
+        getattr(u, plant.actuation.input) if plant.actuation else ca.SX(0),
+        friction.velocity(x, p) if friction else ca.SX(0),
+        spring.deflection(x, p) if spring else ca.SX(0),
+    ]
+    read = ca.Function("sizes", [plant.x, plant.u, plant.p], [ca.vertcat(*rows)])
+    states, inputs = (np.stack([run[name] for name in names]) for names in (plant.states, plant.inputs))
+    current, speed, deflection = np.array(read(states, inputs, params.vector))
+    dry = 0.0 if friction is None or friction.jump is None else friction.jump(0.0, friction.add_rated(values))
+    return Sizes(
+        current=_find_largest(current),
+        speed=_find_largest(speed),
+        travel=float(np.ptp(np.cumsum(speed))) * log.period,
+        friction=float(ca.DM(dry)),
+        deflection=_find_largest(deflection),
+        stiffness=getattr(values, spring.stiffness) if spring and spring.stiffness else 0.0,
+    )
+
+
+def _find_largest(values: Float[np.ndarray, " n"]) -> float:
+    return float(np.quantile(np.abs(values), LARGEST))

@@ -1,0 +1,245 @@
+"""The search for what a model lacks: every hypothesis is refitted, and taken only where it removes the excess.
+
+The excess is a residual's rms over the noise of its sensor, of the output where it is most. Large misfits bend what one
+step predicts: a spring that hardens ranked sixth by its step, and was the cause. So each hypothesis takes several,
+from the fit's values; one that does not help is left soon. None is taken that leaves the excess high, however much
+of it it takes: friction that grows with the load takes a part of nearly everything. Where one does not suffice the
+others are tried beside the best, two in all.
+
+What this may cost is counted in evaluations of the problem, so that the same log has the same answer on any machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Change, Hypothesis, change_plants, measure_sizes
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
+from seaopt.estimation.problem.noise_floor import measure_excess
+from seaopt.estimation.problem.shapes import Vector
+from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.result.trials import HypothesisTrial, Outcome
+from seaopt.estimation.solver.least_squares import minimise
+from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, estimate_sigma
+from seaopt.estimation.solver.step_size import choose_first_steps
+from seaopt.parameters import ParameterSet
+from seaopt.progress import Progress, ignore
+from seaopt.records import record
+
+ASKS = 1.5  # times its noise a residual is before anything is looked for
+REMOVED = 3.0  # times its noise that a hypothesis may leave
+HALF = 0.5  # of the excess power that one has to take
+TIED = 1.05  # times the least excess, up to which hypotheses are as good
+ROUND, ROUNDS = 4, 5  # iterations of a refit between two looks at whether it helps, and how many looks
+HELPS = 0.02  # of a residual's power, that a round has to take from some output
+BASES = 3  # hypotheses, the best, beside which each other one is tried
+NEAR = 1e-2  # squared standard deviations that may be left to the minimum
+
+
+@record(eq=False)
+class Refit:
+    """A minimum with one or two hypotheses, near enough to be compared."""
+
+    change: Change
+    problem: FitProblem
+    evaluation: Evaluation
+    excess: float
+    evaluations: int
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The unknowns at the minimum."""
+        return dict(zip(self.problem.unknowns.names, self.evaluation.z.tolist(), strict=True))
+
+    @property
+    def proposal(self) -> str:
+        """The lines of a problem file that add its parts to a plant NAME, with their parameters."""
+        recipe, values = self.change.experiments[0].plant.recipe, self.values
+        parts = dict.fromkeys((*(recipe.parts if recipe else ()), *self.change.parts))
+        rows = [f"{name} = {{ value = {values[name]:.4g}, free = true }}" for name in self.change.frees]
+        rows += [f"{name} = {value:.4g}" for name, value in self.change.fixed.items()]
+        listed = ", ".join(f'"{part}"' for part in parts)
+        return "\n".join(["[plant.NAME]", f"parts = [{listed}]", "[parameters]", *rows])
+
+    @property
+    def python(self) -> str:
+        """The calls that add them to a plant and its parameters."""
+        change, values = self.change, self.values | self.change.fixed
+        given = ", ".join(f"{name}={values[name]:.4g}" for name in (*change.frees, *change.fixed))
+        free = ", ".join(f'"{name}"' for name in change.frees)
+        lines = [f'plant = so.plants.add_part(plant, "{part}")' for part in change.parts]
+        lines += [f"params = plant.defaults.with_parameters(*params.values()).update({given}).free({free})"]
+        return "\n".join(lines)
+
+
+@record(eq=False)
+class Search:
+    """What was tried: the hypotheses that remove the excess, those as good as the best, and a row for each."""
+
+    able: tuple[Refit, ...] = ()
+    trials: tuple[HypothesisTrial, ...] = ()
+
+    def yield_to_another(self) -> Search:
+        """Return the search where another cause explains the logs better, so that none is adopted."""
+        rows = (replace(row, outcome="tied") if row.outcome == "adopted" else row for row in self.trials)
+        return replace(self, trials=tuple(rows))
+
+
+def search_hypotheses(fit: Fit, budget: int, progress: Progress = ignore) -> Search:
+    """Return the hypotheses that were tried, the best first; none where the residual asks for none.
+
+    `fit`: with its minimum; `budget`: evaluations that the search may take.
+    """
+    minimum = fit.require_minimum("search_hypotheses")
+    first = max(measure_excess(minimum.problem, minimum.z).values(), default=0.0)
+    if first <= ASKS or minimum.problem.predicts:
+        return Search()
+    end = count_evaluations() + budget
+    refits = _Search(fit, minimum, end, budget, progress).run(first)
+    return _judge(refits, first)
+
+
+class _Search:
+    """A search's budget, and what it knows of the fit; lives only inside `search_hypotheses`."""
+
+    def __init__(self, fit: Fit, minimum: Minimum, end: int, budget: int, progress: Progress) -> None:
+        self.fit, self.minimum, self.end, self.budget, self.progress = fit, minimum, end, budget, progress
+        self.sizes = measure_sizes(fit)
+
+    def run(self, first: float) -> list[Refit]:
+        """Return the refits of single hypotheses, and of pairs with the best of them where none suffices."""
+        base = self.minimum.problem.evaluate(self.minimum.z)
+        single = list(self.try_each(self.minimum.problem, base, self.fit.experiments, self.fit.parameters))
+        refits = sorted(single, key=lambda refit: refit.excess)
+        for number, best in enumerate(refits[:BASES]):
+            least = min(refit.excess for refit in refits)
+            if least <= (REMOVED if number else ASKS) or best.excess >= first:
+                break
+            values, done = _take_values(best), [set(refit.change.hypotheses) for refit in refits]
+            refits += self.try_each(best.problem, best.evaluation, best.change.experiments, values, best.change, done)
+        return refits
+
+    def try_each(
+        self,
+        problem: FitProblem,
+        fitted: Evaluation,
+        experiments: tuple[Experiment, ...],
+        params: ParameterSet,
+        before: Change | None = None,
+        done: Sequence[set[Hypothesis]] = (),
+    ) -> Iterator[Refit]:
+        """Yield the refits of each hypothesis that is not there yet, as long as the budget lasts."""
+        for hypothesis in HYPOTHESES:
+            if before is not None and {*before.hypotheses, hypothesis} in done:
+                continue
+            left = self.end - count_evaluations()
+            if left <= 0:
+                return
+            self.progress(f"trying whether {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
+            change = change_plants(hypothesis, experiments, params, self.sizes, before)
+            try:
+                refit = None if change is None else _refit(change, problem, fitted)
+            except SeaoptError:  # what does not make a problem explains nothing
+                continue
+            if refit is not None:
+                yield refit
+
+
+def _take_values(refit: Refit) -> ParameterSet:
+    """Return a refit's parameters at its minimum."""
+    return refit.problem.params.update(**{name: refit.values[name] for name in refit.problem.shared_names})
+
+
+def _refit(change: Change, old: FitProblem, fitted: Evaluation) -> Refit | None:
+    """Return the minimum with a change, from the fit's; None where it cannot be simulated.
+
+    A search that takes hardly anything from the residual in a round of iterations is given up.
+    """
+    before = count_evaluations()
+    problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
+    problem = problem.with_each(substeps=max(experiment.substeps for experiment in old.experiments))
+    problem = problem.with_values("sigma", {experiment.name: experiment.sigma for experiment in old.experiments})
+    start = _choose_start(change, problem, dict(zip(old.unknowns.names, fitted.z.tolist(), strict=True)))
+    if not np.isfinite(start.cost):
+        return None
+    evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
+    least = _measure_powers(fitted)
+    for number in range(ROUNDS):
+        # The smaller the residual has become, the finer must be the steps.
+        problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
+        solution = minimise(problem, evaluation, unknowns.low, unknowns.high, decrement=NEAR, max_iterations=ROUND)
+        evaluation = solution.evaluation
+        if not np.isfinite(evaluation.cost):
+            return None
+        problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
+        evaluation = problem.assemble(evaluation.passes, evaluation.z)
+        before_round, powers = powers, _measure_powers(evaluation)
+        comes_near = number == 0 and np.any(powers < HALF * before_round)  # a start may be far from the fit
+        if np.all(powers > (1.0 - HELPS) * np.minimum(least, before_round)) and not comes_near:
+            break
+        least = np.minimum(least, powers)
+    excess = max(measure_excess(problem, evaluation.z).values(), default=np.inf)
+    spent = count_evaluations() - before
+    return Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, evaluations=spent)
+
+
+def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> Evaluation:
+    """Return the evaluation at the fit's values and the best start of what is added."""
+    unknowns, evaluations = problem.unknowns, list[Evaluation]()
+    for start in change.starts:
+        values = {**fitted, **start}
+        z = np.array([values.get(name, first) for name, first in zip(unknowns.names, unknowns.start, strict=True)])
+        evaluations.append(problem.evaluate(np.clip(z, unknowns.low, unknowns.high)))
+    return min(evaluations, key=lambda evaluation: evaluation.cost)
+
+
+def _measure_powers(evaluation: Evaluation) -> Vector:
+    return np.concatenate([power.squares / np.maximum(power.counts, 1.0) for power in evaluation.power.values()])
+
+
+def _takes_half(before: float, after: float) -> bool:
+    """Tell whether a refit takes half of the excess power; of noise alone there is none."""
+    return after**2 - 1.0 <= HALF * (before**2 - 1.0)
+
+
+def _judge(refits: Sequence[Refit], first: float) -> Search:
+    """Return what became of each hypothesis, the best first: of those as good the one with the fewest unknowns."""
+    single = [refit for refit in refits if len(refit.change.hypotheses) == 1]
+    best_single = min((refit.excess for refit in single), default=np.inf)
+    # Two effects are taken where one leaves an excess, and the other takes half of that.
+    able = [
+        refit
+        for refit in refits
+        if refit.excess <= REMOVED
+        and _takes_half(first, refit.excess)
+        and (refit in single or (best_single > ASKS and _takes_half(best_single, refit.excess)))
+    ]
+    least = min((refit.excess for refit in able), default=np.inf)
+    tied = [refit for refit in able if refit.excess <= TIED * least]
+    tied.sort(key=lambda refit: (refit.evaluation.z.size, refit.excess))
+    others = sorted((refit for refit in refits if refit not in tied), key=lambda refit: refit.excess)
+    outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *["tried" for _ in others]]
+    rows = zip([*tied, *others], outcomes, strict=True)
+    return Search(able=tuple(tied), trials=tuple(_state(refit, outcome, first) for refit, outcome in rows))
+
+
+def _state(refit: Refit, outcome: Outcome, first: float) -> HypothesisTrial:
+    change, values = refit.change, refit.values
+    return HypothesisTrial(
+        effect=change.effect,
+        parts=change.parts,
+        outcome=outcome,
+        excess_before=first,
+        excess=refit.excess,
+        frees={name: values[name] for name in change.frees},
+        fixed=change.fixed,
+        parameters={name: values[name] for name in refit.problem.shared_names},
+        evaluations=refit.evaluations,
+        proposal=refit.proposal,
+        python=refit.python,
+    )

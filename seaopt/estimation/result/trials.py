@@ -1,0 +1,52 @@
+"""Hypotheses about what a fitted model lacks, as they were tried."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from seaopt.codec import OrInfinite
+from seaopt.records import record
+
+Outcome = Literal["adopted", "tied", "tried"]
+
+
+@record
+class HypothesisTrial:
+    """What a refit with one or two more effects left of the residual.
+
+    Parameters
+    ----------
+    effect : str
+        What the model would lack, in words.
+    parts : tuple of str
+        The parts that bring it, `seaopt.plants.PARTS`.
+    outcome : str
+        "adopted": it removes the excess, and nothing explains the logs better; "tied": it removes it as well; else
+        "tried".
+    excess_before, excess : float
+        How many times its sensor's noise the residual is, of the output where it is most: of the fit, and with it.
+    frees, fixed : mapping of name to value
+        The parts' parameters: what the refit gave, in SI units, and what was chosen for it.
+    parameters : mapping of name to value
+        Every free parameter of the refit.
+    evaluations : int
+        What the refit took.
+    proposal : str
+        Lines of a problem file that add it; NAME stands for the plant's.
+    python : str
+        The same as a call.
+
+    """
+
+    effect: str
+    parts: tuple[str, ...]
+    outcome: Outcome
+    excess_before: OrInfinite
+    excess: OrInfinite
+    frees: Mapping[str, float]
+    fixed: Mapping[str, float]
+    parameters: Mapping[str, float]
+    evaluations: int
+    proposal: str = ""
+    python: str = ""

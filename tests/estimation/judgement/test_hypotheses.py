@@ -1,0 +1,151 @@
+"""What a model lacks is named by what removes the excess: logs of a motor on a held spring that is integrated here."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.estimation.judgement.hypothesis_search import ASKS, REMOVED
+from tests.actuator_logs import integrate
+
+RATE_HZ, STEPS = 400.0, 4
+TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 5.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0, "c_s": 0.5}
+FREE = ("J_m", "b_r", "f_c", "k_s", "eta")
+NONE = dict.fromkeys(("droop", "drift", "harder", "load", "play", "one_way", "breakaway"), 0.0)
+
+
+def record(seconds=5.0, seed=0, **effects):
+    """Return the log of a motor that drives a held spring through a gear, by Runge's and Kutta's classical steps."""
+    rng, n = np.random.default_rng(seed), round(seconds * RATE_HZ)
+    t = np.arange(n) / RATE_HZ
+    sweep = 2 * math.pi * 0.3 * seconds / math.log(60) * (60 ** (t / seconds) - 1.0)
+    current, e, p, clock = 4.0 * np.sin(sweep) + 2.0 * np.sin(2 * math.pi * 0.7 * t + 1.0), NONE | effects, TRUTH, [0.0]
+
+    def spring(angle, speed):
+        deflection = angle / p["N"]
+        stretch = deflection - min(max(deflection, -e["play"]), e["play"])
+        damper = p["c_s"] * speed / p["N"] if stretch or not e["play"] else 0.0
+        return p["k_s"] * stretch * (1.0 + e["harder"] * stretch**2) + damper
+
+    def rates(x, ampere):
+        angle, speed = x
+        torque, cold = spring(angle, speed), 1.0 - e["drift"] * clock[0] / seconds
+        level = cold * p["f_c"] + e["load"] * abs(torque) / p["N"] + e["breakaway"] * math.exp(-((speed / 15.0) ** 2))
+        rub = level * math.tanh(speed / p["v_s"]) + cold * p["b_r"] * speed + e["one_way"] * abs(speed)
+        push = p["K_tau"] * ampere * (1.0 - e["droop"] * ampere**2)
+        clock[0] += 1.0 / (4 * STEPS * RATE_HZ)  # four rates in a step
+        return speed, (push - rub - torque / p["N"]) / p["J_m"]
+
+    angle, speed = integrate(rates, 2, current, 1.0 / RATE_HZ, STEPS)
+    torque = np.array([spring(*x) for x in zip(angle, speed, strict=True)])
+    return so.Log.from_arrays(
+        time=t, I=current, tau_s=torque + rng.normal(scale=0.02, size=n),
+        theta_m=angle + rng.normal(scale=2e-3, size=n),
+    )  # fmt: skip
+
+
+def fit(log, plant=None, *, params=None, **options):
+    plant = plant or so.plants.rotary(link="locked")
+    params = (params or plant.defaults.update(**TRUTH)).update(J_m=3e-5, b_r=2e-4, k_s=250.0, f_c=0.015).free(*FREE)
+    experiment = so.Experiment(plant=plant, log=log, outputs=("tau_s", "theta_m"), name="log", initial_state="rest")
+    return so.fit([experiment], params, **options)
+
+
+def find_error(values):
+    return max(abs(values[name] / TRUTH[name] - 1.0) for name in ("J_m", "k_s", "b_r", "f_c"))
+
+
+@pytest.mark.parametrize(
+    ("effects", "part", "value"),
+    [
+        ({"droop": 0.005}, "droop", {"a_i": 0.005}),
+        ({"harder": 8.0}, "hardening", {"k_3": 2400.0}),
+        ({"drift": 0.4}, "friction_drift", {"w_c": 0.08, "b_t": -0.4 * 1.5e-4 / 5.0}),
+        ({"load": 0.08}, "load_friction", {"c_e": 0.08}),
+        ({"one_way": 4e-5}, "friction_direction", {"b_a": 4e-5}),
+        pytest.param({"play": 2e-3}, "backlash", {"g_b": 2e-3}, marks=pytest.mark.slow),
+        pytest.param({"breakaway": 0.012}, "stribeck", {"f_s": 0.032}, marks=pytest.mark.slow),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_removes_the_excess_is_named_with_its_value(effects, part, value):
+    result = fit(record(**effects))
+    best = result.hypotheses[0]
+    assert (best.parts[0], best.outcome) == (part, "adopted")
+    assert len(best.parts) == 1 or part == "backlash"  # whose corners are rounded, where the log's are sharp
+    assert best.excess_before > ASKS > best.excess or part == "backlash"
+    for name, expected in value.items():
+        assert best.frees[name] == pytest.approx(expected, rel=0.1)
+    fitted = {name: result.parameters[name].value for name in FREE}
+    assert find_error(best.parameters) < 0.02
+    assert find_error(best.parameters) < find_error(fitted)
+    (cause,) = (finding for finding in result.findings if finding.kind == "cause")
+    assert f'parts = ["{part}"' in cause.proposal
+    assert cause.severity == "error"
+    assert not result.met
+
+
+def test_a_right_model_is_asked_nothing():
+    result = fit(record())
+    assert result.met
+    assert result.hypotheses == ()
+
+
+def test_the_calls_of_a_proposal_make_a_fit_that_is_right():
+    log = record(harder=8.0)
+    names = {"so": so, "plant": so.plants.rotary(link="locked")}
+    names["params"] = names["plant"].defaults.update(**TRUTH)
+    exec(fit(log).hypotheses[0].python, names)
+    again = fit(log, names["plant"], params=names["params"])
+    assert again.met
+    assert again.hypotheses == ()
+    assert again.parameters["k_3"].value == pytest.approx(2400.0, rel=0.05)
+
+
+def test_two_effects_are_named_together():
+    best = fit(record(harder=8.0, load=0.08)).hypotheses[0]
+    assert set(best.parts) == {"hardening", "load_friction"}
+    assert best.outcome == "adopted"
+    assert find_error(best.parameters) < 0.02
+
+
+def test_none_is_named_while_the_excess_stays_high():
+    """A bench that shakes at 11 Hz, which nothing that is tried does."""
+    log = record()
+    shake = 0.6 * np.sin(2 * np.pi * 11.0 * log.time)
+    result = fit(so.Log.from_arrays(time=log.time, I=log["I"], tau_s=log["tau_s"] + shake, theta_m=log["theta_m"]))
+    assert result.hypotheses
+    assert all(trial.excess > REMOVED and trial.outcome == "tried" for trial in result.hypotheses)
+    assert not any(finding.proposal for finding in result.findings)
+
+
+def test_the_search_costs_at_most_five_fits_and_its_share_only_rises(monkeypatch):
+    import sys
+
+    from seaopt.estimation.problem.fit_problem import count_evaluations
+
+    judgement, spent = sys.modules["seaopt.estimation.judgement.judge"], []
+    judge = judgement.judge
+
+    def counted(result, *args, evaluations, **options):
+        before = count_evaluations()
+        judged = judge(result, *args, evaluations=evaluations, **options)
+        spent.append((max(evaluations, judgement.EVALUATIONS), count_evaluations() - before))
+        return judged
+
+    monkeypatch.setattr(sys.modules["seaopt.estimation.fit"], "judge", counted)
+    shares = []
+    fit(record(harder=8.0, load=0.08), progress=lambda note, share=None: share is None or shares.append(share))
+    ((fitting, judging),) = spent
+    assert judging <= 5 * fitting
+    assert shares == sorted(shares)
+
+
+def test_they_are_kept_in_its_file():
+    result = fit(record(droop=0.005))
+    again = so.Fit.from_dict(result.to_dict(), ())
+    assert again.hypotheses == result.hypotheses
+    assert [finding.proposal for finding in again.findings] == [finding.proposal for finding in result.findings]
