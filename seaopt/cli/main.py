@@ -314,7 +314,26 @@ def _add_stage(stage: str, text: str) -> None:
         _run_stage(Session(problem, output, design=stage == "report"), stage, json, quiet, verbose)
 
 
-_add_stage("fit", "Fit the parameters to the logs; write fit.json.")
+@app.command()
+def fit(
+    problem: ProblemFile,
+    output: Folder = OUT,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    explain: Annotated[
+        bool,
+        typer.Option(
+            "--explain", help="Add what the model lacks, where that is found, and fit again; write explained.toml."
+        ),
+    ] = False,
+) -> None:
+    """Fit the parameters to the logs; write fit.json."""
+    from seaopt.cli.session import Session
+
+    _run_stage(Session(problem, output, design=False, explain=explain), "fit", json, quiet, verbose)
+
+
 _add_stage("report", "Write report.html and figures from the results in DIR.")
 _add_stage(
     "simulate", "Simulate every experiment with the file's values; write a CSV file of each, and of each virtual log."

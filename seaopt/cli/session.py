@@ -26,12 +26,14 @@ from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, compare_with_log, warn_unidentified
 from seaopt.estimation.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
+from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.executors import Processes
-from seaopt.files import CONTENT, check_folder, read_json, to_json, write_json
+from seaopt.files import CONTENT, check_folder, read_json, to_json, write_json, write_text
 from seaopt.logs import Log, write_log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
+from seaopt.problem.explained import adopt, find_explanation
 from seaopt.problem.problem import WRITE_ONE
 from seaopt.problem.stages import (
     assess_problem,
@@ -72,6 +74,7 @@ LABELS = {
     "report": "writing the report",
 }
 OWN_LAW = "; as a law of your own it is taken by seaopt certify PROBLEM --controller FILE -o DIR"
+EXPLAINED = "explained.toml"  # lines that a problem file lacks
 READING = 0.1  # share of the time of a fit
 # What a law of the user's own states itself, so that the problem's specification does not ask for it.
 OF_THE_LAW = (
@@ -93,6 +96,7 @@ class Session:
         free_law: bool = False,
         workers: int | None = None,
         design: bool = True,
+        explain: bool = False,
     ) -> None:
         check_folder(folder)
         self.problem: Problem = read_problem(problem, design=design)
@@ -104,6 +108,7 @@ class Session:
         self.stretch_s = stretch_s
         self.bandwidths_hz = bandwidths_hz
         self.free_law = free_law
+        self.explain = explain
         self.workers = workers
         self.executor: Executor | None = None
         self.results: dict[str, Any] = {}
@@ -320,9 +325,26 @@ class Session:
         reading, fitting = divide(tell, READING, 1.0 - READING)
         reading("reading logs", 0.0)
         result = fit_problem(self.problem, self.experiments(), progress=fitting)
+        if self.explain and (found := find_explanation(result)) is not None:
+            result = self._explain(found, result)
         self.results["fit"] = result
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})
+
+    def _explain(self, found: HypothesisTrial, before: Fit) -> Fit:
+        """Return the fit of the problem with what explains its logs, which is the problem from here on."""
+        self.problem, lines = adopt(self.problem, found)
+        self._experiments = None
+        place = self.folder / EXPLAINED
+        write_text(place, lines + "\n")
+        self.written.append(place)
+        self.say(
+            f"explained: {found.effect}: the residual is {found.excess:.3g} times its sensor's noise in place of "
+            f"{found.excess_before:.3g}; fitting again with the lines in {place}, which belong into "
+            f"{self.problem.source}"
+        )
+        result = fit_problem(self.problem, self.experiments())
+        return replace(result, hypotheses=(*before.hypotheses, *result.hypotheses))
 
     def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> bool:
         """Score the folder's fit on another log, and compare its values with the log's own; print that. `amount`: all

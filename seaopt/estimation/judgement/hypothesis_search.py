@@ -69,7 +69,7 @@ class Refit:
     @property
     def python(self) -> str:
         """The calls that add them to a plant and its parameters."""
-        change, values = self.change, self.values | self.change.fixed
+        change, values = self.change, {**self.values, **self.change.fixed}
         given = ", ".join(f"{name}={values[name]:.4g}" for name in (*change.frees, *change.fixed))
         free = ", ".join(f'"{name}"' for name in change.frees)
         lines = [f'plant = so.plants.add_part(plant, "{part}")' for part in change.parts]
@@ -140,7 +140,7 @@ class _Search:
             left = self.end - count_evaluations()
             if left <= 0:
                 return
-            self.progress(f"trying whether {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
+            self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
             change = change_plants(hypothesis, experiments, params, self.sizes, before)
             try:
                 refit = None if change is None else _refit(change, problem, fitted)

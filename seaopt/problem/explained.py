@@ -1,0 +1,54 @@
+"""A problem with what its fit found the model to lack, and the lines that say so in its file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from seaopt.documents import check_table
+from seaopt.errors import ProblemError
+from seaopt.estimation import Fit
+from seaopt.estimation.result.trials import HypothesisTrial
+from seaopt.problem.problem import Problem
+from seaopt.problem.reading import make_problem
+from seaopt.problem.schema import ProblemTable
+
+DIGITS = 4  # of the values from which the changed problem's fit starts
+
+
+def find_explanation(fit: Fit) -> HypothesisTrial | None:
+    """Return the hypothesis that explains what the fit leaves; None where there is none, or the logs leave a choice."""
+    adopted = next((trial for trial in fit.hypotheses if trial.outcome == "adopted"), None)
+    tied = any(trial.outcome == "tied" for trial in fit.hypotheses)
+    return None if tied else adopted
+
+
+def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:
+    """Return the problem with a hypothesis that was tried, and the lines of its file that are then other ones.
+
+    The parts go to every plant that is fitted. Raises SeaoptError: a plant does not take them.
+    """
+    content = problem.table.model_dump(by_alias=True, exclude_unset=True, mode="json")
+    fitted = [table.plant for table in problem.table.experiment if table.use == "fit"]
+    lines: list[str] = []
+    for name in dict.fromkeys(fitted):
+        plant = content["plant"][name]
+        plant["parts"] = list(dict.fromkeys([*plant.get("parts", []), *trial.parts]))
+        listed = ", ".join(f'"{part}"' for part in plant["parts"])
+        lines += [f"[plant.{name}]", f"parts = [{listed}]"]
+    values: Mapping[str, Any] = {
+        **{name: {"value": _round(value), "free": True} for name, value in trial.frees.items()},
+        **{name: _round(value) for name, value in trial.fixed.items()},
+    }
+    content["parameters"] = {**content.get("parameters", {}), **values}
+    lines += ["[parameters]", *(f"{name} = {_write(value)}" for name, value in values.items())]
+    table = check_table(ProblemTable, content, problem.source, error=ProblemError)
+    return make_problem(table, problem.source, problem.folder), "\n".join(lines)
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _write(value: Any) -> str:
+    return f"{{ value = {value['value']:g}, free = true }}" if isinstance(value, dict) else f"{value:g}"

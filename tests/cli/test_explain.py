@@ -1,0 +1,63 @@
+"""`seaopt fit --explain` on a log whose spring hardens: the lines it writes make the fit that it goes on with."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import pytest
+
+from tests.actuator_logs import write_csv
+from tests.estimation.judgement.test_hypotheses import TRUTH, record
+
+START = {"J_m": 3e-5, "b_r": 2e-4, "k_s": 250.0, "f_c": 0.015, "eta": 1.0}
+FILE = """
+schema = 1
+[parameters]
+{parameters}
+[plant.stand]
+kind = "rotary"
+link = "locked"
+[[experiment]]
+name = "log"
+plant = "stand"
+log = "log.csv"
+time = "time [s]"
+inputs = {{ I = "I [A]" }}
+outputs = {{ tau_s = "tau_s [N m]", theta_m = "theta_m [rad]" }}
+initial_state = "rest"
+"""
+
+
+@pytest.fixture
+def problem(tmp_path):
+    log = record(harder=8.0)
+    columns = {"time [s]": log.time, "I [A]": log["I"], "tau_s [N m]": log["tau_s"], "theta_m [rad]": log["theta_m"]}
+    write_csv(tmp_path / "log.csv", columns)
+    rows = [f"{name} = {{ value = {value}, free = true }}" for name, value in START.items()]
+    rows += [f"{name} = {TRUTH[name]}" for name in TRUTH if name not in START]
+    path = tmp_path / "problem.toml"
+    path.write_text(FILE.format(parameters="\n".join(rows)), encoding="utf-8")
+    return path
+
+
+def test_what_is_found_is_added_and_fitted(problem, seaopt):
+    out = problem.parent / "out"
+    assert seaopt("fit", problem, "-o", out).returncode == 1
+    first = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    assert first["hypotheses"][0]["parts"] == ["hardening"]
+    explained = seaopt("fit", problem, "-o", out, "--explain")
+    assert explained.returncode == 0
+    assert "explained: the spring hardens" in explained.stderr
+    again = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    assert again["met"]
+    assert again["parameters"]["k_3"]["value"] == pytest.approx(2400.0, rel=0.05)
+    assert again["hypotheses"][0]["excess"] < 1.5 < again["hypotheses"][0]["excess_before"]
+    lines = tomllib.loads((out / "explained.toml").read_text(encoding="utf-8"))
+    assert lines["plant"]["stand"]["parts"] == ["hardening"]
+    assert lines["parameters"]["k_3"]["free"]
+    # A file with these lines is the problem that the folder's fit is of.
+    text = problem.read_text(encoding="utf-8").replace('link = "locked"', 'link = "locked"\nparts = ["hardening"]')
+    value = lines["parameters"]["k_3"]["value"]
+    problem.write_text(text.replace("[plant", f"k_3 = {{ value = {value}, free = true }}\n[plant", 1), encoding="utf-8")
+    assert seaopt("validate", problem, problem.parent / "log.csv", "-o", out).returncode == 0
