@@ -140,10 +140,12 @@ class _Search:
             left = self.end - count_evaluations()
             if left <= 0:
                 return
-            self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
             change = change_plants(hypothesis, experiments, params, self.sizes, before)
+            if change is None:
+                continue
+            self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
             try:
-                refit = None if change is None else _refit(change, problem, fitted)
+                refit = _refit(change, problem, fitted)
             except SeaoptError:  # what does not make a problem explains nothing
                 continue
             if refit is not None:
