@@ -7,7 +7,7 @@ property is computed again: `check_agrees` compares it with the file's.
 
 - a float is a number; `OrInfinite`, `OrMinusInfinite` and `OrNaN` are null in the file where they are not finite
 - a tuple of any length is a list, a tuple of two a range, a Mapping a table, a jaxtyping array lists of numbers
-- `Limits` beside a type in `Annotated` is what its values keep to
+- `Constraints` beside a type in `Annotated` is what its values keep to
 - a class whose instances are not made of their own keys alone has a class method `_from_json`, whose argument's
   annotation says what the file holds: Mapping[str, Any] is its own fields, `Fields` those of another record
 """
@@ -52,7 +52,7 @@ class NullIs:
 
 
 @record
-class Limits:
+class Constraints:
     """What a number, text or list of a file keeps to, in pydantic's words."""
 
     gt: float | None = None
@@ -223,8 +223,8 @@ def _translate_marked(hint: Any, marks: Sequence[Any]) -> Any:
         return Annotated[_translate_marked(hint, [mark]), *further]
     if isinstance(mark, Fields):
         return Annotated[make_model(mark.of), AfterValidator(lambda model: _take_fields(mark.of, model))]
-    if isinstance(mark, Limits):
-        limits = {key.name: value for key in list_keys(Limits) if (value := getattr(mark, key.name)) is not None}
+    if isinstance(mark, Constraints):
+        limits = {key.name: value for key in list_keys(Constraints) if (value := getattr(mark, key.name)) is not None}
         return Annotated[_translate(hint), ModelField(**limits)]
     if not isinstance(mark, NullIs):
         return _translate(hint)

@@ -13,9 +13,9 @@ import pytest
 from jaxtyping import Float
 
 from seaopt.codec import (
+    Constraints,
     Fields,
     Key,
-    Limits,
     OrInfinite,
     OrNaN,
     check_agrees,
@@ -30,7 +30,7 @@ from seaopt.records import record
 
 @record
 class Band:
-    low_hz: Annotated[float, Limits(gt=0.0)]
+    low_hz: Annotated[float, Constraints(gt=0.0)]
     high_hz: OrInfinite = math.inf
 
     def __post_init__(self):

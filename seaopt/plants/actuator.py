@@ -164,7 +164,7 @@ class Actuator:
 
 
 @record
-class Motion:
+class EquationsOfMotion:
     """The accelerations and forces of an actuator, as expressions of state, input and parameters.
 
     Its energy is written down where it is asked for: a spring's may take longer than all the rest.
@@ -179,7 +179,7 @@ class Motion:
     energy: Callable[[], Any]
 
 
-def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
+def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> EquationsOfMotion:
     """Return Lagrange's equations of the module docstring, solved for the accelerations."""
     drive, links, parts = actuator.transmission, actuator.links, actuator.parts
     unlumped, screw = actuator.drive == "unlumped", "screw_mode" in parts
@@ -253,7 +253,7 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
         stored = kinetic + potential + part_laws.spring_energy(parts, deflection, stiffness, p)
         return stored + (0.5 * p.k_b * x.s**2 if screw else 0.0)
 
-    return Motion(
+    return EquationsOfMotion(
         rates={name: value for k, pair in enumerate(names) for name, value in zip(pair, (yd[k], ydd[k]), strict=True)},
         forces=forces,
         places=(x_1, x_2),
@@ -275,7 +275,7 @@ def make_plant(
     actuator: Actuator,
     *,
     name: str,
-    outputs: Mapping[str, tuple[str, Callable[[Motion, Any], Any]]],
+    outputs: Mapping[str, tuple[str, Callable[[EquationsOfMotion, Any], Any]]],
     derived: Derived,
     sensing: Sensing,
     second_order: tuple[str, str] | None = None,

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.impedance.link import Link, find_link
+from seaopt.control.impedance.link import ControlledLink, find_link
 from seaopt.control.impedance.moving_loop import MovingLoop, close_link
 from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.loop import GROWING
@@ -90,7 +90,7 @@ def critical_impedance(
     return find_critical(link, link.speed_filter(velocity_filter_s).velocity_filter_s, stiffness)
 
 
-def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
+def scan_critical(link: ControlledLink, velocity_filter_s: float) -> CriticalImpedances:
     """Return critically damped impedances up to the stiffest: beyond it something slower, of weight, oscillates."""
     p = np.geomspace(SLOWEST_POLE, FASTEST_POLE, POLES)
     loop = close_link(link, velocity_filter_s)
@@ -105,7 +105,7 @@ def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
     return CriticalImpedances(stiffness=k[kept], damping=d[kept], rate=p[kept] / link.sample_time_s)
 
 
-def find_critical(link: Link, velocity_filter_s: float, stiffness: float) -> Impedance:
+def find_critical(link: ControlledLink, velocity_filter_s: float, stiffness: float) -> Impedance:
     """Return the critically damped impedance of a stiffness. Raises ControlError, with those that have one."""
     scan = scan_critical(link, velocity_filter_s)
     stiffnesses = scan.stiffness

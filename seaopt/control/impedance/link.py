@@ -42,7 +42,7 @@ class Load:
 
 
 @record(eq=False)
-class Link:
+class ControlledLink:
     """An actuator under force control, and the link that it moves."""
 
     port: PortModel  # the actuator without its link, sliding where it has friction
@@ -76,7 +76,9 @@ class Link:
         )
 
 
-def find_link(controller: Controller, plant: Plant, params: ParameterSet, link_damping: float | None = None) -> Link:
+def find_link(
+    controller: Controller, plant: Plant, params: ParameterSet, link_damping: float | None = None
+) -> ControlledLink:
     """Return the link of a plant under a controller, linearised at rest, sliding where it has friction. `link_damping`:
     the damper at the link, in place of its own. Raises ControlError: the link is held, the plant has no port, the link
     is not a mass on a spring and a damper, or the damper is negative.
@@ -101,7 +103,7 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet, link_d
             "does"
         )
     load = _read_load(port, linear, plant.name)
-    return Link(
+    return ControlledLink(
         port=port,
         load=load if link_damping is None else replace(load, damping=float(link_damping)),
         law=controller.law,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.impedance.link import Link, Load
+from seaopt.control.impedance.link import ControlledLink, Load
 from seaopt.control.loops.outer_loop import Impedance, OuterLoop
 from seaopt.control.loops.sampled_plant import hold
 from seaopt.records import record
@@ -64,7 +64,7 @@ class MovingLoop:
         return self.matrix(impedance.stiffness, impedance.damping), drive
 
 
-def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -> MovingLoop:
+def close_link(link: ControlledLink, velocity_filter_s: float, load: Load | None = None) -> MovingLoop:
     """Return the loop of a link with an outer loop against `load`, which includes the link; the link alone if None."""
     load = link.load if load is None else load
     port, period = link.port, link.sample_time_s
@@ -95,7 +95,9 @@ def _wait(a: Matrix, b: Vector, c: Matrix, d: Vector) -> tuple[Matrix, Vector, M
     return a, np.append(np.zeros(b.size), 1.0), np.column_stack([c, d]), np.zeros_like(d)
 
 
-def _assemble(link: Link, velocity_filter_s: float, a: Matrix, b: Vector, rows: Matrix, direct: Vector) -> MovingLoop:
+def _assemble(
+    link: ControlledLink, velocity_filter_s: float, a: Matrix, b: Vector, rows: Matrix, direct: Vector
+) -> MovingLoop:
     """Return the loop of a sampled plant, whose rows are what the law reads and the position."""
     law, n, through = link.law, b.size, direct[:-1]
     outer = link.speed_filter(velocity_filter_s)

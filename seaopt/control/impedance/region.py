@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.control.impedance.critical_damping import CriticalImpedances, scan_critical
-from seaopt.control.impedance.link import Link, find_link
+from seaopt.control.impedance.link import ControlledLink, find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.sampled_port import Angles, PortResponses, PortTerms, SampledPort
 from seaopt.control.laws.controller import Controller
@@ -236,7 +236,7 @@ def _bisect_damper(at: PortResponses, impedance: Impedance, low: float, high: fl
     return high
 
 
-def _find_scales(link: Link, spring: float | None) -> tuple[float, float]:
+def _find_scales(link: ControlledLink, spring: float | None) -> tuple[float, float]:
     """Return a stiffness and a damping of the size of what is rendered: the spring's, or that of 10 Hz on the link."""
     stiffness = spring or link.load.inertia * (2 * np.pi * 10.0) ** 2
     return stiffness, 2.0 * float(np.sqrt(stiffness * link.load.inertia))

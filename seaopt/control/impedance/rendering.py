@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.impedance.link import Link, find_link
+from seaopt.control.impedance.link import ControlledLink, find_link
 from seaopt.control.impedance.moving_loop import MovingLoop, close_link
 from seaopt.control.impedance.region import needed_damper
 from seaopt.control.impedance.sampled_port import SampledPort
@@ -242,7 +242,7 @@ def add_impedance(
     return replace(controller, outer=replace(outer, plant=name, direction=round(outer.direction, 9)))
 
 
-def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+def apparent_impedance(link: ControlledLink, outer: OuterLoop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
     """Return F_e/v of the actuator under both loops at frequencies (Hz), without the link and without aliases."""
     response = link.port.response(f)
     reference, feedback = link.law.reference_response(f), link.law.feedback_responses(f)
@@ -254,7 +254,9 @@ def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"])
     return response.motion_to_port + response.motor_to_port * motor
 
 
-def find_breaking(link: Link, outer: OuterLoop, frequencies_hz: Float[np.ndarray, " m"]) -> BreakingEnvironment | None:
+def find_breaking(
+    link: ControlledLink, outer: OuterLoop, frequencies_hz: Float[np.ndarray, " m"]
+) -> BreakingEnvironment | None:
     """Return the mass or the spring at the link that makes it oscillate most of those that some frequencies name."""
     load, best = link.load, None
     reactances = -np.imag(apparent_impedance(link, outer, frequencies_hz))
@@ -275,7 +277,7 @@ def find_breaking(link: Link, outer: OuterLoop, frequencies_hz: Float[np.ndarray
     return None if best is None or best.spectral_radius <= GROWING else best
 
 
-def _find_band(link: Link, outer: OuterLoop) -> tuple[float, float] | None:
+def _find_band(link: ControlledLink, outer: OuterLoop) -> tuple[float, float] | None:
     """Return the band, from the lowest frequency at which the impedance is as asked, within which it stays so."""
     if outer.stiffness == 0.0 and outer.damping == 0.0:
         return None

@@ -41,7 +41,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import polygamma
 
-from seaopt.control.impedance.link import Link
+from seaopt.control.impedance.link import ControlledLink
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.outer_loop import Impedance
 from seaopt.records import record
@@ -125,7 +125,7 @@ class PortResponses:
 class SampledPort:
     """The port of a force-controlled link, with an outer loop of any gains and one filter of its speed."""
 
-    link: Link  # actuator, law and link
+    link: ControlledLink  # actuator, law and link
     velocity_filter_s: float  # T_v of the outer loop
 
     def held_stable(self) -> bool:

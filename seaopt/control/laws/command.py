@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Annotated
 
-from seaopt.codec import Limits
+from seaopt.codec import Constraints
 from seaopt.control.laws.structures import PREFILTER
 from seaopt.control.loops.sampled_plant import static_gain
 from seaopt.errors import ControlError
@@ -40,9 +40,9 @@ class Command:
 
     input: str
     unit: str
-    per_effort: Annotated[float, Limits(gt=0.0)]
+    per_effort: Annotated[float, Constraints(gt=0.0)]
     effort_unit: str
-    largest: Annotated[float, Limits(gt=0.0)] | None = None
+    largest: Annotated[float, Constraints(gt=0.0)] | None = None
     measured_unit: str = ""
 
     @property

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.codec import Fields, Limits, check_agrees, from_content, to_content
+from seaopt.codec import Constraints, Fields, check_agrees, from_content, to_content
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec
@@ -72,7 +72,7 @@ class StoredLaw:
 class StoredObserver:
     """A disturbance observer: the two parts of its nominal plant, and the time constant of Q."""
 
-    kept: Annotated[Float[np.ndarray, " n"], Limits(min_length=1)]
+    kept: Annotated[Float[np.ndarray, " n"], Constraints(min_length=1)]
     inverse: tuple[TransferFunction, ...]
     T_q: float
 
@@ -106,8 +106,8 @@ class StoredController:
     structure: str
     gains: dict[str, float]
     sample_time_s: float
-    compute_delay_samples: Annotated[int, Limits(ge=0)]
-    drive_delay_s: Annotated[float, Limits(ge=0.0)]
+    compute_delay_samples: Annotated[int, Constraints(ge=0)]
+    drive_delay_s: Annotated[float, Constraints(ge=0.0)]
     delay_samples: float
     law: StoredLaw
     measured: tuple[str, ...] | None = None

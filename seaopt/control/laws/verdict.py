@@ -22,7 +22,7 @@ NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the
 
 
 @runtime_checkable
-class Limits(Protocol):
+class LimitSpec(Protocol):
     """The part of a specification that limits need."""
 
     @property
@@ -40,7 +40,7 @@ class Limits(Protocol):
 
 
 @record(eq=False)
-class Verdict:
+class LimitVerdict:
     """One limit against one loop's figure; `plant` is the loop's name, `stuck` the design plant stuck by friction."""
 
     limit: Limit
@@ -112,20 +112,20 @@ class PossibleBandwidths:
         return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
 
 
-def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
+def judge(spec: LimitSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[LimitVerdict]:
     """Judge a loop by a scope's imposed limits; with `stuck`, by those that also hold where friction sticks."""
-    verdicts: list[Verdict] = []
+    verdicts: list[LimitVerdict] = []
     for limit in spec.limits:
         allowed = spec.allowed(limit)
         if limit.scope != scope or allowed is None or (stuck and not limit.stuck_too):
             continue
         value = limit.figure(loop)
         met = limit.keeps(value, allowed) and (limit.condition is None or limit.condition(loop))
-        verdicts.append(Verdict(limit=limit, plant=loop.name, value=value, allowed=allowed, met=met, stuck=stuck))
+        verdicts.append(LimitVerdict(limit=limit, plant=loop.name, value=value, allowed=allowed, met=met, stuck=stuck))
     return verdicts
 
 
-def judge_all(spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[Verdict]:
+def judge_all(spec: LimitSpec, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[LimitVerdict]:
     """Judge every plant's loop, and the design plant's, which is the first, by its own limits too. Of several
     `design_states` the first is the design plant sliding, the others the same plant stuck by friction.
     """
@@ -135,7 +135,7 @@ def judge_all(spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 
     return verdicts + [v for loop in stuck for v in judge(spec, loop, "design plant", stuck=True)]
 
 
-def list_broken(verdicts: Sequence[Verdict]) -> list[str]:
+def list_broken(verdicts: Sequence[LimitVerdict]) -> list[str]:
     """Return the limits that are broken, with the plant that breaks them."""
     return [verdict.label for verdict in verdicts if not verdict.met]
 
@@ -151,7 +151,7 @@ def list_broken_figures(spec: ControllerSpec, states: Sequence[MeasuredLoop]) ->
     return list_broken(judge_all(figures_only, states, len(states)))
 
 
-def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
+def list_active(spec: ControllerSpec, verdicts: Sequence[LimitVerdict]) -> list[str]:
     """Return the limits that are met with no more than the reserve and a hundredth to spare."""
     near = {"figure": 1.0 - NEARLY_USED - spec.reserve, "curve": 1.0 - NEARLY_USED, "none": np.inf}
     return [
@@ -161,11 +161,13 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
     ]
 
 
-def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop | DiscLoop) -> list[str]:
+def explain_broken(
+    spec: LimitSpec, verdicts: Sequence[LimitVerdict], design: MeasuredLoop, loop: Loop | DiscLoop
+) -> list[str]:
     """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
     `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says more.
     """
-    broken: dict[str, list[Verdict]] = {}
+    broken: dict[str, list[LimitVerdict]] = {}
     for verdict in sorted((verdict for verdict in verdicts if not verdict.met), key=lambda each: -each.severity):
         broken.setdefault(verdict.limit.name, []).append(verdict)
     if "stability" in broken:
@@ -180,7 +182,7 @@ def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLo
 
 
 def join_labels(labels: Sequence[str]) -> str:
-    """Return limits, as `Verdict.label` names them, each once with its plants."""
+    """Return limits, as `LimitVerdict.label` names them, each once with its plants."""
     plants: dict[str, list[str]] = {}
     for label in labels:
         name, _, plant = label.removesuffix(")").partition(" (")
@@ -239,7 +241,7 @@ def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[Desi
     return rows
 
 
-def _explain(spec: Limits, verdict: Verdict, design: MeasuredLoop, loop: Loop | DiscLoop) -> str:
+def _explain(spec: LimitSpec, verdict: LimitVerdict, design: MeasuredLoop, loop: Loop | DiscLoop) -> str:
     limit, port = verdict.limit, design.port
     if limit.name == "stability":
         return limit.name
@@ -259,7 +261,7 @@ def _explain(spec: Limits, verdict: Verdict, design: MeasuredLoop, loop: Loop | 
     return f"{limit.name} {verdict.value:.{digits}g} of {verdict.allowed:g}"
 
 
-def _reached(spec: Limits, verdict: Verdict, loop: Loop | DiscLoop) -> str:
+def _reached(spec: LimitSpec, verdict: LimitVerdict, loop: Loop | DiscLoop) -> str:
     """Return how far a curve is off its level: where it first crosses says little when it lies along the level."""
     curve = verdict.limit.curve
     assert curve is not None and curve.until_hz is not None

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.codec import Limits
+from seaopt.codec import Constraints
 from seaopt.errors import ControlError
 from seaopt.options import check_options, option
 from seaopt.records import record
@@ -83,12 +83,12 @@ class OuterLoop:
     6.0
     """
 
-    stiffness: Annotated[float, Limits(ge=0.0)]
+    stiffness: Annotated[float, Constraints(ge=0.0)]
     damping: float
-    velocity_filter_s: Annotated[float, Limits(ge=0.0)]
+    velocity_filter_s: Annotated[float, Constraints(ge=0.0)]
     direction: float
-    sample_time_s: Annotated[float, Limits(gt=0.0)]
-    place_unit: Annotated[str, Limits(pattern="^(m|rad)$")]
+    sample_time_s: Annotated[float, Constraints(gt=0.0)]
+    place_unit: Annotated[str, Constraints(pattern="^(m|rad)$")]
     plant: str = ""
 
     @property

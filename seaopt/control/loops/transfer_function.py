@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.codec import Limits
+from seaopt.codec import Constraints
 from seaopt.records import record
 
 POLE_ROUNDING = 1e-17  # least denominator, over the sum of its coefficients
@@ -17,8 +17,8 @@ POLE_ROUNDING = 1e-17  # least denominator, over the sum of its coefficients
 class TransferFunction:
     """num(q)/den(q): coefficients in ascending powers of q = z^-1, den[0] = 1."""
 
-    num: Annotated[Float[np.ndarray, " n"], Limits(min_length=1)]
-    den: Annotated[Float[np.ndarray, " m"], Limits(min_length=1)]
+    num: Annotated[Float[np.ndarray, " n"], Constraints(min_length=1)]
+    den: Annotated[Float[np.ndarray, " m"], Constraints(min_length=1)]
 
     def response(self, f: Float[np.ndarray, " k"], sample_time_s: float) -> Complex[np.ndarray, " k"]:
         """Return the values at frequencies in Hz; next to a pole on the circle, no more than rounding allows."""

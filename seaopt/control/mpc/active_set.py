@@ -38,7 +38,7 @@ Ending = Literal["solved", "maximum iterations reached", "the bounds contradict 
 
 
 @record(eq=False)
-class Solution:
+class QPSolution:
     """A point, where its rows are held, how the search ended, and the rows taken in or let go after the start."""
 
     x: Float[np.ndarray, " n"]
@@ -116,9 +116,9 @@ def find_nearest(
     high: Float[np.ndarray, " m"],
     sides: Int[np.ndarray, " m"],
     max_iterations: int,
-) -> Solution:
+) -> QPSolution:
     """Return the point nearest to `start` within low <= normals x <= high; of a row held at one end the other is not
-    looked at. `sides`: where rows are held to begin with, linearly independent, as `Solution.sides`. `max_iterations`:
+    looked at. `sides`: where rows are held to begin with, linearly independent, as in a QPSolution. `max_iterations`:
     changes of these at most, besides the rows that are let go at the start.
     """
     bounds = _Bounds(start=start, normals=normals, low=low, high=high)
@@ -135,4 +135,4 @@ def find_nearest(
         iterations += used
     ended = np.zeros_like(sides)
     ended[list(state.sides)] = list(state.sides.values())
-    return Solution(x=state.point, sides=ended, status=status, iterations=iterations)
+    return QPSolution(x=state.point, sides=ended, status=status, iterations=iterations)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.codec import Limits, to_content
+from seaopt.codec import Constraints, to_content
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
@@ -20,8 +20,8 @@ from seaopt.control.mpc.quadratic_program import PENALTY, WIDE, factor_program, 
 from seaopt.files import plain, write_text
 from seaopt.records import record
 
-CName = Annotated[str, Limits(pattern=r"^[A-Za-z_]+$")]
-CText = Annotated[str, Limits(pattern=r'^[^"\\\r\n]*$')]  # stands between quotation marks in C
+CName = Annotated[str, Constraints(pattern=r"^[A-Za-z_]+$")]
+CText = Annotated[str, Constraints(pattern=r'^[^"\\\r\n]*$')]  # stands between quotation marks in C
 SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "arithmetic.h", "example.c")
 
 

@@ -36,7 +36,7 @@ from seaopt.control.laws.delay import LoopDelays, settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.spec import describe_lifted
-from seaopt.control.laws.verdict import Verdict, explain_broken, judge_all, list_broken, shorten_blocked
+from seaopt.control.laws.verdict import LimitVerdict, explain_broken, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
@@ -52,8 +52,8 @@ from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, t
 from seaopt.control.mpc.quadratic_program import (
     PENALTY,
     WIDE,
+    QPSolution,
     QuadraticProgram,
-    Solution,
     factor_program,
     stack_hessian,
 )
@@ -139,7 +139,7 @@ class ForceMPC(LoopDelays, Result, Worded):
 
     @property
     @memo
-    def verdicts(self) -> tuple[Verdict, ...]:
+    def verdicts(self) -> tuple[LimitVerdict, ...]:
         """Every limit of the specification against these loops."""
         return tuple(judge_all(self.spec, self.measured_loops, len(self.measured_loops)))
 
@@ -367,7 +367,7 @@ class ForceMPC(LoopDelays, Result, Worded):
         first = min(self.kalman.delay_samples, references.size - 1)
         return float(currents[-1]), self.static_gain * (currents[first:] + drift)
 
-    def _fault(self, solution: Solution, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> str:
+    def _fault(self, solution: QPSolution, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> str:
         """Return why a solution is not used; an unfinished one is if it keeps the limits."""
         if solution.status not in (SOLVED, UNFINISHED):
             return solution.status
@@ -498,7 +498,7 @@ def _find_possible(mpc: ForceMPC) -> float | None:
             return False
 
     bandwidth_hz = mpc.spec.bandwidth_hz
-    return find_end(keeps, list_steps(bandwidth_hz, bandwidth_hz / LOWEST_SHARE), bandwidth_hz)
+    return find_end(keeps, list_steps(bandwidth_hz, bandwidth_hz / LOWEST_SHARE), bandwidth_hz, bandwidth_hz)
 
 
 def _design(

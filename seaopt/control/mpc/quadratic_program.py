@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.control.mpc.active_set import Solution, find_nearest
+from seaopt.control.mpc.active_set import QPSolution, find_nearest
 from seaopt.control.mpc.prediction import HorizonProgram
 from seaopt.records import record
 
@@ -44,7 +44,7 @@ class QuadraticProgram:
         high: Float[np.ndarray, " m"],
         sides: Int[np.ndarray, " m"],
         max_iterations: int,
-    ) -> Solution:
+    ) -> QPSolution:
         """Return the solution for a gradient and bounds, from rows that are held to begin with."""
         nearest = find_nearest(
             -self.inverse @ q, self.normals, low * self.scale, high * self.scale, sides, max_iterations

@@ -22,7 +22,7 @@ class MPCState:
     plan : array, shape (n,)
         The currents planned at the knots, A.
     sides : array of int, shape (m,)
-        Where the last program held its rows, as in `active_set.Solution`; the next starts there.
+        Where the last program held its rows, as in `active_set.QPSolution`; the next starts there.
     age : int
         Samples since a program was solved: so old is the plan. Of one that never was: the horizon.
     gate : GateState

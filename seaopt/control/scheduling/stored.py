@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from seaopt.codec import Key, Limits, from_content
+from seaopt.codec import Constraints, Key, from_content
 from seaopt.control.laws.stored import TUNE_AGAIN, StoredController
 from seaopt.control.laws.structures import AGREES, LAW_GAINS
 from seaopt.control.scheduling.gain_table import check_points
@@ -28,7 +28,7 @@ class StoredSchedule:
     document: Literal["seaopt/schedule/2"]
     over: str
     unit: str
-    points: Annotated[tuple[float, ...], Limits(min_length=2)]
+    points: Annotated[tuple[float, ...], Constraints(min_length=2)]
     fallback: float
     feasible: bool
     broken: tuple[str, ...]

@@ -19,8 +19,8 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation, Multisine, scale
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.experiment_design.excitation_search import (
-    Candidate,
     Chirps,
+    ExcitationCandidate,
     ExcitationSearch,
     Limits,
     Multisines,
@@ -326,7 +326,7 @@ def _band(band_hz: tuple[float, float] | None, limits: Limits) -> tuple[float, f
     return low, high
 
 
-def _design(search: ExcitationSearch, candidate: Candidate, criterion: str) -> Design:
+def _design(search: ExcitationSearch, candidate: ExcitationCandidate, criterion: str) -> Design:
     """Report a search's best candidate, simulated with steps that are fine enough."""
     bench = search.bench.refine_steps(search.bench.samples(candidate.excitation))
     final = replace(search, bench=bench).scale_to_limits(candidate.excitation)

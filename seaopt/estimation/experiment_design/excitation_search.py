@@ -147,7 +147,7 @@ def make_measure(bench: Bench, criterion: str) -> Measure:
 
 
 @record(eq=False)
-class Candidate:
+class ExcitationCandidate:
     """An excitation within the limits, the trial of it, and its criterion."""
 
     excitation: Excitation
@@ -175,17 +175,17 @@ class ExcitationSearch:
         shares += [trial.peaks[name] / limit for name, limit in self.limits.peaks.items()]
         return float(np.max(shares)) if np.all(np.isfinite(shares)) else np.inf
 
-    def scale_to_limits(self, excitation: Excitation) -> Candidate:
+    def scale_to_limits(self, excitation: Excitation) -> ExcitationCandidate:
         """Scale the excitation to be as large as the limits allow. Raises EstimationError: no size is within."""
         u = self.bench.samples(excitation)
         low, high, factor = 0.0, np.inf, 1.0
-        best: Candidate | None = None
+        best: ExcitationCandidate | None = None
         for _ in range(SCALINGS):
             trial = self.bench.run(factor * u)
             use = self.largest_use(trial)
             if use <= 1.0:
                 low = factor
-                best = Candidate(
+                best = ExcitationCandidate(
                     excitation=scale(excitation, factor), trial=trial, value=self.measure(trial.covariance)
                 )
                 if use > 0.999:
@@ -201,11 +201,11 @@ class ExcitationSearch:
         return best
 
 
-def _choose_better(best: Candidate | None, candidate: Candidate) -> Candidate:
+def _choose_better(best: ExcitationCandidate | None, candidate: ExcitationCandidate) -> ExcitationCandidate:
     return candidate if best is None or candidate.value < best.value else best
 
 
-def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: Multisines) -> Candidate:
+def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: Multisines) -> ExcitationCandidate:
     """Return the best multisine within the limits. Raises EstimationError: nothing in the band distinguishes the free
     parameters, or a setting is out of range.
     """
@@ -232,9 +232,9 @@ def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: 
     return _refine(search, _best_start(search, lines, chosen.spread))
 
 
-def _best_start(search: ExcitationSearch, lines: Spectrum, spread: float) -> Candidate:
+def _best_start(search: ExcitationSearch, lines: Spectrum, spread: float) -> ExcitationCandidate:
     """Return the best of the linearised plant's optimum, if any, and even spectra between any two of BAND_NODES."""
-    best: Candidate | None = None
+    best: ExcitationCandidate | None = None
     with suppress(EstimationError):  # linearised, a friction and a damping are one
         best = _solve_convex(search, lines, spread)
     nodes = np.linspace(0, lines.harmonics.size - 1, BAND_NODES)
@@ -252,7 +252,7 @@ def _best_start(search: ExcitationSearch, lines: Spectrum, spread: float) -> Can
     return best
 
 
-def _solve_convex(search: ExcitationSearch, lines: Spectrum, spread: float) -> Candidate:
+def _solve_convex(search: ExcitationSearch, lines: Spectrum, spread: float) -> ExcitationCandidate:
     """Alternate powers, within peaks guessed as multiples of each rms, and phases, which give those multiples."""
     limits, problem = search.limits, search.bench.problem
     prior = np.diag(problem.unknowns.precision[: problem.unknowns.shared])
@@ -260,7 +260,7 @@ def _solve_convex(search: ExcitationSearch, lines: Spectrum, spread: float) -> C
     information = np.einsum("jk,jab->kab", share, lines.information)
     caps = np.array([np.inf if limits.peak is None else limits.peak, *limits.peaks.values()])
     crest = np.full(caps.size, 2.0)
-    best: Candidate | None = None
+    best: ExcitationCandidate | None = None
     for _ in range(POWER_ROUNDS if np.any(np.isfinite(caps)) else 1):
         rows = np.abs(lines.gains) ** 2 * (crest / caps)[:, None] ** 2
         rows = rows[np.isfinite(caps)]
@@ -309,7 +309,7 @@ def _multisine(bench: Bench, lines: Spectrum, powers: Lines, phases: Lines) -> E
     return (part,)
 
 
-def _refine(search: ExcitationSearch, start: Candidate) -> Candidate:
+def _refine(search: ExcitationSearch, start: ExcitationCandidate) -> ExcitationCandidate:
     """Improve amplitudes and phases of the strongest lines on the information of the samples themselves."""
     search = replace(search, bench=search.bench.refine_steps(search.bench.samples(start.excitation)))
     part = start.excitation[0]
@@ -355,12 +355,12 @@ def with_fine_steps(search: ExcitationSearch, band: tuple[float, float]) -> Exci
     return replace(search, bench=search.bench.refine_steps(search.bench.samples(candidate.excitation)))
 
 
-def best_chirp(search: ExcitationSearch, band: tuple[float, float]) -> Candidate:
+def best_chirp(search: ExcitationSearch, band: tuple[float, float]) -> ExcitationCandidate:
     """Look over a coarse grid of both ends, then refine the best by Nelder and Mead's simplex."""
     from scipy.optimize import minimize  # deferred: 0.3 s
 
     nodes = np.linspace(np.log(band[0]), np.log(band[1]), BAND_NODES)
-    best: Candidate | None = None
+    best: ExcitationCandidate | None = None
     ends = np.zeros(2)
     for i, low in enumerate(nodes):
         for high in nodes[i + 1 :]:

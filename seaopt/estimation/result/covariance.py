@@ -152,8 +152,8 @@ def _sum_twice(
         ]
         if all(part is not None for part in sums):
             return np.sum(np.array(sums), axis=0)
-    whole = _Form.make(r, reach + min(chunk, experiment.longest))
-    twice, together = _Form.make(r, reach), _Form.make(r[:1], chunk)
+    whole = _DoubleSum.make(r, reach + min(chunk, experiment.longest))
+    twice, together = _DoubleSum.make(r, reach), _DoubleSum.make(r[:1], chunk)
     for segment, into in pairs:
         tail = np.zeros((*into.shape[:2], 0))
         for _, columns, used in stream_columns(experiment, segment, z, chunk):
@@ -194,14 +194,14 @@ def compute_influence(
 
 
 @record(eq=False)
-class _Form:
+class _DoubleSum:
     """The double sum over t and s of a_t' R(t - s) a_s, for stretches of a of limited length."""
 
     size: int
     density: Complex[np.ndarray, "ny ny f"]
 
     @classmethod
-    def make(cls, r: Float[np.ndarray, "lags1 ny ny"], n: int) -> _Form:
+    def make(cls, r: Float[np.ndarray, "lags1 ny ny"], n: int) -> _DoubleSum:
         """Return the form for at most n samples."""
         reach, size = len(r) - 1, choose_transform_size(n, len(r))
         kernel = np.zeros((*r.shape[1:], size))

@@ -30,7 +30,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.codec import Limits
+from seaopt.codec import Constraints
 from seaopt.errors import PlantError, require_number
 from seaopt.formatting import html_text, join_words
 from seaopt.parameters import ParameterSet, declare
@@ -43,7 +43,7 @@ COPPER = 0.00393  # 1/K, at 20 to 25 degC
 REFERENCE_DEGC = 25.0
 AMBIENT = "T_ambient"
 PEAK_S = 10.0
-Positive = Annotated[float, Limits(gt=0.0)]
+Positive = Annotated[float, Constraints(gt=0.0)]
 RISES = ("rise_winding", "rise_case")
 TEMPERATURES = ("T_winding", "T_case")
 RESISTANCE = declare("R", 1.0, "ohm", 1e-9, "winding resistance", (1e-3, 1e3))

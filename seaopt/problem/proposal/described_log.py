@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from seaopt.logs.quality.clock import ClockQuality
 from seaopt.problem.proposal.roles import Assignment
-from seaopt.problem.proposal.survey import Survey
+from seaopt.problem.proposal.survey import LogSurvey
 from seaopt.problem.proposal.traits import Traits
 from seaopt.records import record
 from seaopt.signals import Signal, Table
@@ -27,7 +27,7 @@ SI_UNITS = {
 class DescribedLog:
     """A log with its roles."""
 
-    survey: Survey
+    survey: LogSurvey
     roles: Assignment
     name: str
     file: str
@@ -64,6 +64,6 @@ def make_table(log: DescribedLog, outputs: Sequence[str]) -> Table | None:
     return Table(time=time, signals=channels, source=log.survey.name)
 
 
-def doubt_clock(survey: Survey) -> str:
+def doubt_clock(survey: LogSurvey) -> str:
     """Return why a log's clock is a guess; "" where its name says that it is one."""
     return "" if survey.clock is None or survey.clocks else "the time, as it only rises, and evenly"

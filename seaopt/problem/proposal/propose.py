@@ -50,7 +50,7 @@ from seaopt.problem.proposal.roles import (
 )
 from seaopt.problem.proposal.stated import Stated
 from seaopt.problem.proposal.survey import ENOUGH as FEW
-from seaopt.problem.proposal.survey import Survey, SurveyedColumn, regress, slow_sign, survey_log
+from seaopt.problem.proposal.survey import LogSurvey, SurveyedColumn, regress, slow_sign, survey_log
 from seaopt.problem.proposal.traits import OUTLIERS, find_traits
 from seaopt.problem.proposal.vocabulary import COUNTS, UNITS_OF, is_m_open, read_header
 from seaopt.progress import Progress, count_off, divide, ignore
@@ -158,7 +158,7 @@ def propose(
     )
 
 
-def _survey(path: Path, interview: Interview, stated: Stated) -> Survey:
+def _survey(path: Path, interview: Interview, stated: Stated) -> LogSurvey:
     key = f"time:{path.name}"
     survey = survey_log(path, stated.clock or interview.answers.get(key), stated.unit_of)
     stated.check(survey)
@@ -172,7 +172,7 @@ def _survey(path: Path, interview: Interview, stated: Stated) -> Survey:
     return replace(survey, columns=columns)
 
 
-def _settle_m(column: SurveyedColumn, survey: Survey, interview: Interview) -> SurveyedColumn:
+def _settle_m(column: SurveyedColumn, survey: LogSurvey, interview: Interview) -> SurveyedColumn:
     """Return a column of which the m at the end of its name is settled: beside signs of a gear it is the motor."""
     if not is_m_open(column.header):
         return column
@@ -191,7 +191,7 @@ def _settle_m(column: SurveyedColumn, survey: Survey, interview: Interview) -> S
     return replace(column, header=read_header(column.name, metres=False)) if meaning == "motor" else column
 
 
-def _assign(survey: Survey, interview: Interview, turns: bool, stated: Stated) -> Assignment:
+def _assign(survey: LogSurvey, interview: Interview, turns: bool, stated: Stated) -> Assignment:
     """Return the roles of a log's columns, which are asked for one by one where the guess is not right."""
     roles = assign(survey, rotary=turns, given=stated.roles)
     whole = interview.ask("roles", "Are these the right columns?", "yes", "by names and samples", ("yes", "no"))
@@ -217,7 +217,7 @@ def _assign(survey: Survey, interview: Interview, turns: bool, stated: Stated) -
     return _check_outputs(assign(survey, rotary=turns, given=known), survey)
 
 
-def _check_outputs(roles: Assignment, survey: Survey) -> Assignment:
+def _check_outputs(roles: Assignment, survey: LogSurvey) -> Assignment:
     """Refuse a log of an input alone."""
     if not roles.outputs:
         raise LogError(
@@ -228,7 +228,7 @@ def _check_outputs(roles: Assignment, survey: Survey) -> Assignment:
 
 
 def _describe_log(
-    survey: Survey, roles: Assignment, interview: Interview, folder: Path, at: int, stated: Stated
+    survey: LogSurvey, roles: Assignment, interview: Interview, folder: Path, at: int, stated: Stated
 ) -> DescribedLog:
     """Return a log with units, clock and plant."""
     unit, sure = survey.clock_unit()

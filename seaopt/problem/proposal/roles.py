@@ -8,7 +8,7 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.formatting import join_words
-from seaopt.problem.proposal.survey import Survey, SurveyedColumn, find_leader, regress
+from seaopt.problem.proposal.survey import LogSurvey, SurveyedColumn, find_leader, regress
 from seaopt.problem.proposal.vocabulary import UNITS_OF, Quantity
 from seaopt.records import record
 from seaopt.units import header_unit
@@ -62,7 +62,7 @@ def is_rotary(columns: Sequence[SurveyedColumn]) -> tuple[bool, str]:
     return True, "a column is an angle" if "angle" in kinds else "the usual one; no column tells"
 
 
-def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignment:
+def assign(survey: LogSurvey, *, rotary: bool, given: Mapping[str, str]) -> Assignment:
     """Return the roles of a log's columns; `given` are those that are known, column to role ("" for none)."""
     free = [
         column
@@ -129,7 +129,7 @@ def _is_supply(column: SurveyedColumn) -> bool:
     return bool(np.all(values > 0.0) or np.all(values < 0.0)) and bool(least > SUPPLIED * largest)
 
 
-def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str, SurveyedColumn, str]:
+def _find_input(columns: Sequence[SurveyedColumn], survey: LogSurvey) -> tuple[str, SurveyedColumn, str]:
     """Return the input's role, its column, and why that is a guess, if it is one. Raises LogError: no column drives a
     motor.
     """

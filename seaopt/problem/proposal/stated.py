@@ -7,7 +7,7 @@ from dataclasses import field
 
 from seaopt.errors import LogError, suggestion
 from seaopt.problem.proposal.roles import INPUTS, LINEAR_OUTPUTS, ROTARY_OUTPUTS
-from seaopt.problem.proposal.survey import Survey
+from seaopt.problem.proposal.survey import LogSurvey
 from seaopt.records import record
 
 ROLES = tuple(dict.fromkeys((*INPUTS, *ROTARY_OUTPUTS, *LINEAR_OUTPUTS)))
@@ -58,7 +58,7 @@ class Stated:
         turning = any(role in ROTARY_OUTPUTS for role in self.columns)
         return turning or (False if any(role in LINEAR_OUTPUTS for role in self.columns) else None)
 
-    def check(self, survey: Survey) -> None:
+    def check(self, survey: LogSurvey) -> None:
         """Refuse columns that a log does not have, or that do not vary.
 
         Raises LogError: as it says.

@@ -71,7 +71,7 @@ class SurveyedColumn:
 
 
 @record(eq=False)
-class Survey:
+class LogSurvey:
     """The columns of one log."""
 
     path: Path
@@ -98,7 +98,7 @@ class Survey:
         return guess_time_unit(self.clock.values), False
 
 
-def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | None = None) -> Survey:
+def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | None = None) -> LogSurvey:
     r"""Read every column of a log.
 
     `clock` names the time where the file leaves that open, `units` are those of columns whose headers have none, or a
@@ -144,7 +144,7 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
         if column.swing == 0.0 and name != chosen
     }
     words = {field.name: "text" for field in held.fields if not field.numeric}
-    return Survey(
+    return LogSurvey(
         path=path,
         clock=columns[chosen] if chosen is not None else None,
         clocks=tuple(name for name in times if name in members) or ((chosen,) if chosen and chosen in groups else ()),

@@ -169,7 +169,7 @@ class _Outcome:
 
 
 @record(eq=False)
-class _Run:
+class _RunDraw:
     """The draws of one run: parameters, the seed of its noise, its reference and its disturbance."""
 
     draw: dict[str, float]
@@ -206,7 +206,7 @@ class _Case:
     bench: _Bench
     plant: Plant
     values: ParameterSet
-    drawn: _Run
+    drawn: _RunDraw
 
     def play(self) -> _Outcome:
         """Simulate the run, and judge it."""
@@ -360,11 +360,11 @@ def run_constrained(
     rng = np.random.default_rng([require_seed(seed, ControlError), CONSTRAINED_STREAM])
     drawn = unknown.values(unknown.draw(runs, rng))
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name not in DELAYS}
-    parts: list[_Run] = []
+    parts: list[_RunDraw] = []
     for k in range(runs):
         draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
         reference, disturbance = _draw_references(mpc, rng)
-        parts.append(_Run(draw=draw, seed=seed + k, reference=reference, disturbance=disturbance))
+        parts.append(_RunDraw(draw=draw, seed=seed + k, reference=reference, disturbance=disturbance))
     bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, command_step=command_step)
     played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, executor)
     kinds: list[str] = []
@@ -428,7 +428,7 @@ def _count_samples(mpc: ForceMPC) -> tuple[int, int, int]:
     return round(REST_S * rate), round(phase_s * rate), round((phase_s + JUDGED_PERIODS / band) * rate)
 
 
-def _play_run(shared: Shared[tuple[_Bench, dict[str, Plant], ParameterSet]], run: _Run) -> list[_Outcome]:
+def _play_run(shared: Shared[tuple[_Bench, dict[str, Plant], ParameterSet]], run: _RunDraw) -> list[_Outcome]:
     """Simulate one run on every plant, and judge it."""
     bench, plants, nominal = shared.value
     return [

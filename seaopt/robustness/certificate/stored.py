@@ -10,7 +10,7 @@ from dataclasses import field, fields, replace
 from typing import Annotated, Any, Literal
 
 from seaopt.bench import Sensors
-from seaopt.codec import Limits, OrInfinite, from_content
+from seaopt.codec import Constraints, OrInfinite, from_content
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.errors import FileError, SeaoptError
@@ -66,16 +66,16 @@ class StoredRequirement:
     met: bool
     where: str
     sense: Literal["≤", "≥", "="] | None = None
-    tolerance: Annotated[float, Limits(ge=0.0, le=0.5)] | None = None
+    tolerance: Annotated[float, Constraints(ge=0.0, le=0.5)] | None = None
     unit: str = ""
     plant: str | None = None
     state: str = ""
-    place: Annotated[dict[str, float], Limits(min_length=1, max_length=1)] | None = None
+    place: Annotated[dict[str, float], Constraints(min_length=1, max_length=1)] | None = None
     scenario: str = ""
     draw: DrawnAt | None = None
     text: str = ""
     remedy: str = ""
-    count: Annotated[int, Limits(ge=1)] = 1
+    count: Annotated[int, Constraints(ge=1)] = 1
 
     def build(self) -> Requirement:
         """Return the row; of an older file, which does not say it, one that is to be equal may be off by a half."""

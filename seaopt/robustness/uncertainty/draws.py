@@ -60,7 +60,7 @@ class Varied:
 
 
 @record(eq=False)
-class ModeTable:
+class ModeMap:
     """Which values of a parameter put a mode where, ascending in frequency."""
 
     parameter: str
@@ -89,7 +89,7 @@ class Uncertainty:
         The uncertain parameters of the Gaussian part, with `covariance`, shape (n, n).
     ranges : mapping of name to (low, high)
         Uniform, independent of the rest.
-    modes : mapping of name to ModeTable
+    modes : mapping of name to ModeMap
         For every range of a mode's frequency, which values of its parameter put it where.
     absent : mapping of name to Parameter
         What a range may name besides `nominal`: the plants' defaults, and conditions.
@@ -99,7 +99,7 @@ class Uncertainty:
     names: tuple[str, ...]
     covariance: Float[np.ndarray, "n n"]
     ranges: Ranges
-    modes: Mapping[str, ModeTable] = field(default_factory=dict[str, ModeTable])
+    modes: Mapping[str, ModeMap] = field(default_factory=dict[str, ModeMap])
     absent: Mapping[str, Parameter] = field(default_factory=dict[str, Parameter])
 
     @property
@@ -364,7 +364,7 @@ def _mode(plant: Plant) -> Mode:
     return plant.mode
 
 
-def _tabulate_mode(plant: Plant, nominal: ParameterSet, wanted: tuple[float, float]) -> ModeTable:
+def _tabulate_mode(plant: Plant, nominal: ParameterSet, wanted: tuple[float, float]) -> ModeMap:
     """Tabulate where the values of one parameter put a plant's mode."""
     mode, complete = _mode(plant), plant.complete(nominal)
     values = complete[mode.parameter].value * np.geomspace(20.0, 0.05, 400)
@@ -382,7 +382,7 @@ def _tabulate_mode(plant: Plant, nominal: ParameterSet, wanted: tuple[float, flo
             f"range of {mode.name} = [{wanted[0]:g}, {wanted[1]:g}] is beyond what {mode.parameter} alone can do, "
             f"{frequencies[0]:.3g} to {frequencies[-1]:.3g} Hz; keep inside, or give ranges of the parameters"
         )
-    return ModeTable(parameter=mode.parameter, frequency_hz=frequencies, value=values)
+    return ModeMap(parameter=mode.parameter, frequency_hz=frequencies, value=values)
 
 
 def confidence_radius(dimensions: int) -> float:

@@ -11,7 +11,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Impedance, ImpedanceRegion, Law, passive_region, passivity, render
-from seaopt.control.impedance.link import Link, Load, find_link
+from seaopt.control.impedance.link import ControlledLink, Load, find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.region import needed_damper
 from seaopt.control.impedance.rendering import find_breaking
@@ -36,7 +36,7 @@ def region(controller: so.Controller) -> ImpedanceRegion:
     return passive_region(controller, FREE, KNEE)
 
 
-def make_rigid_link(sample_time_s: float, delay_samples: int) -> Link:
+def make_rigid_link(sample_time_s: float, delay_samples: int) -> ControlledLink:
     """Return a motor that pushes a bare mass, its effort being its reference: a haptic display."""
     law = Law(
         a=np.zeros((0, 0)), b=np.zeros((0, 2)), c=np.zeros(0), d=np.array([1.0, 0.0]), sample_time_s=sample_time_s
@@ -44,7 +44,7 @@ def make_rigid_link(sample_time_s: float, delay_samples: int) -> Link:
     a = np.array([[0.0, 1.0], [0.0, 0.0]])
     push = np.array([0.0, 1.0])
     port = PortModel(a=a, motor=push, force=push, read=np.array([[0.0, 0.0, 1.0, 0.0]]), speed=1, place=0, mass=1.0)
-    return Link(port=port, load=Load(inertia=1.0), law=law, delay_samples=delay_samples, direction=1.0)
+    return ControlledLink(port=port, load=Load(inertia=1.0), law=law, delay_samples=delay_samples, direction=1.0)
 
 
 @pytest.mark.parametrize(("stiffness", "damping", "filter_s", "delay"), [
@@ -100,7 +100,7 @@ def test_without_an_outer_loop_it_is_the_passivity_of_the_force_loop(controller:
     assert rendering.needed_damper == pytest.approx(-port.least_damping_N_s_per_m, rel=1e-3)
 
 
-def link_of_gain(gain: float, sample_time_s: float, spring_damper: float, controller: so.Controller) -> Link:
+def link_of_gain(gain: float, sample_time_s: float, spring_damper: float, controller: so.Controller) -> ControlledLink:
     """Return the knee's link under u = (1 + k_p) F_ref - k_p F, without delay."""
     law = Law(
         a=np.zeros((0, 0)), b=np.zeros((0, 2)), c=np.zeros(0), d=np.array([1.0 + gain, -gain]),

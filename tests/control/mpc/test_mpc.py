@@ -13,7 +13,7 @@ import seaopt as so
 from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, sample
 from seaopt.control.mpc.active_set import INFEASIBLE, SOLVED, UNFINISHED
 from seaopt.control.mpc.knots import interpolate_knots, spread_knots
-from seaopt.control.mpc.quadratic_program import QuadraticProgram, Solution
+from seaopt.control.mpc.quadratic_program import QPSolution, QuadraticProgram
 from seaopt.errors import ControlError
 from tests.c_code import CompiledMPC
 
@@ -190,7 +190,7 @@ def test_designed_on_the_stand_it_holds_on_the_swing(swing, thor, mpc):
 )
 def test_a_solver_that_fails_leaves_the_safe_current(mpc, monkeypatch, status, x, said):
     def fail(*_):
-        return Solution(x=np.full(12, x), sides=np.zeros(24, dtype=int), status=status, iterations=7)
+        return QPSolution(x=np.full(12, x), sides=np.zeros(24, dtype=int), status=status, iterations=7)
 
     monkeypatch.setattr(QuadraticProgram, "solve", fail)
     step = mpc.step(mpc.start, 1000.0, 0.0)

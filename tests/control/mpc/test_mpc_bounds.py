@@ -11,7 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.control import MPCSpec, close_loop, force_mpc, sample
 from seaopt.control.mpc.active_set import UNFINISHED
-from seaopt.control.mpc.quadratic_program import QuadraticProgram, Solution
+from seaopt.control.mpc.quadratic_program import QPSolution, QuadraticProgram
 from seaopt.errors import ControlError
 from tests.c_code import CompiledMPC
 
@@ -185,7 +185,7 @@ def test_without_a_solution_the_last_plan_goes_on_and_after_a_horizon_the_curren
     step, currents = good, []
 
     def fail(program, q, low, high, sides, max_iterations):
-        return Solution(x=np.full(q.size, 3.0), sides=sides, status=UNFINISHED, iterations=max_iterations)
+        return QPSolution(x=np.full(q.size, 3.0), sides=sides, status=UNFINISHED, iterations=max_iterations)
 
     monkeypatch.setattr(QuadraticProgram, "solve", fail)
     for _ in range(mpc.spec.samples + 1):

@@ -50,7 +50,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from seaopt.codec import Limits
+from seaopt.codec import Constraints
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import linearise_sets
@@ -126,8 +126,8 @@ class LinkPath:
     damping: float
     is_speed: bool
     fraction: float
-    corner_hz: Annotated[float, Limits(gt=0.0)]
-    high_pass_hz: Annotated[float, Limits(ge=0.0)]
+    corner_hz: Annotated[float, Constraints(gt=0.0)]
+    high_pass_hz: Annotated[float, Constraints(ge=0.0)]
 
     def feedback(self, sample_time_s: float) -> TransferFunction:
         """Return C of u = - C x, in q = 1/z."""

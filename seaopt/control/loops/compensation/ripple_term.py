@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.codec import Limits
+from seaopt.codec import Constraints
 from seaopt.errors import ControlError, require_number
 from seaopt.options import check_options, option
 from seaopt.records import record
@@ -32,7 +32,7 @@ MOST_TURNS = 1e9  # which a C long holds
 SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(7, -1, -1))
 COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(8, -1, -1))
 POINTS_PER_CYCLE = 64
-Cycles = Annotated[int, Limits(ge=1, le=MOST_CYCLES)]
+Cycles = Annotated[int, Constraints(ge=1, le=MOST_CYCLES)]
 
 
 @record
@@ -97,13 +97,13 @@ class RippleTerm:
     """Compensation of torque ripple as it runs."""
 
     # harmonics, in cycles per revolution
-    cycles: Annotated[tuple[Cycles, ...], Limits(min_length=1, max_length=MOST_CYCLES)]
+    cycles: Annotated[tuple[Cycles, ...], Constraints(min_length=1, max_length=MOST_CYCLES)]
     cos: tuple[float, ...]  # cos, sin: of each, the fraction in them, in the command's unit of effort
     sin: tuple[float, ...]
-    period: Annotated[float, Limits(gt=0.0)]  # what the reading moves in one revolution, in its unit
-    reads: Annotated[str, Limits(min_length=1)]  # the output that is the motor's position
+    period: Annotated[float, Constraints(gt=0.0)]  # what the reading moves in one revolution, in its unit
+    reads: Annotated[str, Constraints(min_length=1)]  # the output that is the motor's position
     unit: str
-    fraction: Annotated[float, Limits(gt=0.0)]  # of the ripple
+    fraction: Annotated[float, Constraints(gt=0.0)]  # of the ripple
 
     def __post_init__(self) -> None:
         if not len(set(self.cycles)) == len(self.cycles) == len(self.cos) == len(self.sin):

@@ -141,7 +141,7 @@ def compensation_margin(
         slope=0.0, asked=asked, frequency_hz=0.0, multiplier="it is not without compensation either"
     )
     for name, multiplier in sorted(list_multipliers(loop), key=lambda named: named[0] != first):
-        form = _Form.of(search.base, multiplier)
+        form = _MultiplierTest.of(search.base, multiplier)
         if form is None:
             continue
         for shift in SHIFTS:
@@ -176,7 +176,7 @@ class _Readings:
 
 
 @record(eq=False)
-class _Form:
+class _MultiplierTest:
     """The test for one multiplier of the friction: factors of Gamma, and of what it is tested with."""
 
     at: _Readings
@@ -184,7 +184,7 @@ class _Form:
     inner: Complex[np.ndarray, "m 3 3"]
 
     @classmethod
-    def of(cls, at: _Readings, multiplier: Multiplier) -> _Form | None:
+    def of(cls, at: _Readings, multiplier: Multiplier) -> _MultiplierTest | None:
         """Return the form at angles; None where the test fails without compensation."""
         gram = _gather(at, multiplier(at.friction.s))
         if gram is None:
@@ -228,7 +228,9 @@ class _Search:
     asked: float
     base: _Readings
 
-    def measure(self, form: _Form, multiplier: Multiplier, shift: str, least: float) -> CompensationMargin | None:
+    def measure(
+        self, form: _MultiplierTest, multiplier: Multiplier, shift: str, least: float
+    ) -> CompensationMargin | None:
         """Return what a pair of multipliers shows, looked at between the angles too; None where it is below `least`."""
         result, needed, count = form.find_least_inverse(shift), -np.inf, self.base.through.size
         worst = result.worst_angle
@@ -238,7 +240,7 @@ class _Search:
             if result.inverse > needed:
                 needed, worst = result.inverse, result.worst_angle
             theta = refine_angles(result.theta, -result.at_ratio(result.ratio))
-            finer = _Form.of(_Readings.at(self.loop, self.reading, theta), multiplier)
+            finer = _MultiplierTest.of(_Readings.at(self.loop, self.reading, theta), multiplier)
             if finer is None:
                 return None
             result, count = finer.find_least_inverse(shift), count + theta.size

@@ -29,7 +29,7 @@ from typing import Annotated, Any, Literal
 
 from numpy.polynomial.chebyshev import chebder, chebval
 
-from seaopt.codec import Limits, to_content
+from seaopt.codec import Constraints, to_content
 from seaopt.control.loops.compensation.ripple_term import RippleTerm, sum_ripple
 from seaopt.errors import ControlError
 from seaopt.options import check_options, option
@@ -102,12 +102,12 @@ class GravityTerm:
     """Compensation of gravity as it runs."""
 
     # of Chebyshev's polynomials, the fraction in them, in the unit of the reference
-    coefficients: Annotated[tuple[float, ...], Limits(min_length=1, max_length=100)]
+    coefficients: Annotated[tuple[float, ...], Constraints(min_length=1, max_length=100)]
     low: float  # low, high: the range of the link's position in which they hold, in its unit
     high: float
-    reads: Annotated[str, Limits(min_length=1)]  # the output that is the link's position
+    reads: Annotated[str, Constraints(min_length=1)]  # the output that is the link's position
     unit: str
-    fraction: Annotated[float, Limits(gt=0.0)]  # of what the spring carries at rest
+    fraction: Annotated[float, Constraints(gt=0.0)]  # of what the spring carries at rest
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
@@ -146,10 +146,10 @@ class GravityTerm:
 class FrictionTerm:
     """Compensation of friction as it runs."""
 
-    effort: Annotated[float, Limits(gt=0.0)]  # full size, fraction times Coulomb friction, in the command's unit
-    speed: Annotated[float, Limits(gt=0.0)]  # v_0, at the friction
+    effort: Annotated[float, Constraints(gt=0.0)]  # full size, fraction times Coulomb friction, in the command's unit
+    speed: Annotated[float, Constraints(gt=0.0)]  # v_0, at the friction
     speed_unit: str  # m/s or rad/s
-    fraction: Annotated[float, Limits(gt=0.0)]  # of the Coulomb friction of the design plant
+    fraction: Annotated[float, Constraints(gt=0.0)]  # of the Coulomb friction of the design plant
     source: FrictionSource  # where the velocity is from
     reads: str  # the output that is differenced, a position of the motor; empty where it is the reference
     velocity_per_rate: float  # g, the velocity at the friction per rate of what is differenced
