@@ -174,9 +174,7 @@ def _draw_diagnostics(panel: Callable[[Diagnostics, str], Panel]) -> Make:
 
 
 def _draw_responses(fit: Fit, experiment: str | None = None, pair: str | None = None) -> list[Panel]:
-    """Draw H1 and the fitted model: magnitude, phase, coherence; `pair` such as F1/I. `ax`: three Axes,
-    for one pair.
-    """
+    """Draw H1 and the fitted model: magnitude, phase, coherence; `pair` such as F1/I. `ax`: three Axes, of one pair."""
     experiments = _choose_experiments(fit, experiment)
     surveys = {each.name: experiment_survey(each, fit) for each in experiments}
     return _list_responses(experiments, surveys, {"model, fitted": fit}, pair)

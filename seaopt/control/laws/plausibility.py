@@ -217,9 +217,7 @@ class PlausibilityGate:
 
 
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:
-    """Return how far an output moves at most in a sample under a limited effort. Raises ControlError:
-    it never rests.
-    """
+    """Return how far an output moves at most in a sample, the effort limited. Raises ControlError: it never rests."""
     if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) >= 1.0:
         raise ControlError("the plant does not come to rest by itself, so that no step is the largest; give max_step_N")
     x, before, total, largest = plant.b, plant.d, abs(plant.d), abs(plant.d)

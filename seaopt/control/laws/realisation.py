@@ -333,9 +333,7 @@ def choose_limit(command: Command, spec: ControllerSpec, requested: float | None
 
 
 def find_raised_limit(command: Command, spec: ControllerSpec, requested: float | None) -> str:
-    """Return the limit that a controller was designed and certified with, where the one asked for is
-    higher; else "".
-    """
+    """Return the limit that a controller was designed and certified with, where a higher one is asked for; else ""."""
     designed, running = (choose_limit(command, spec, limit) for limit in (None, requested))
     return command.show(designed) if designed is not None and running is not None and running > designed else ""
 

@@ -268,9 +268,7 @@ class ScheduledController(Result, Worded):
 
 
 def make_table(over: str, unit: str, points: Sequence[float], controllers: Sequence[Controller]) -> GainTable:
-    """Return the gains of controllers at points. Raises ControlError: they cannot be interpolated, or
-    differ in rate.
-    """
+    """Return the gains of controllers at points. Raises ControlError: they cannot be interpolated; rates differ."""
     first = controllers[0]
     for point, controller in zip(points, controllers, strict=True):
         gains = controller.gains

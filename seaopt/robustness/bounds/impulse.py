@@ -33,10 +33,7 @@ DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 
 
 @record(eq=False)
 class ImpulseTransfer:
-    """P_i(z) = (head_i + tail_i / z) / (z^whole denominator), coefficients in ascending powers of w = z - 1.
-
-    Polynomials have the shape (b, n + 1).
-    """
+    """P_i(z) = (head_i + tail_i / z) / (z^whole denominator) of polynomials (b, n + 1), ascending in w = z - 1."""
 
     heads: tuple[Taylor, ...]  # of each measured output
     tails: tuple[Taylor, ...]
