@@ -69,16 +69,20 @@ def list_steps(asked: float, end: float) -> list[float]:
 
 
 def find_end(
-    keeps: Callable[[float], bool], steps: Sequence[float], asked: float, outside: float | None
+    keeps: Callable[[float], bool], steps: Sequence[float], outside: float | None, asked: float | None = None
 ) -> float | None:
-    """Return the first bandwidth that keeps the limits, moved towards the one before, which does not."""
+    """Return the first bandwidth that keeps the limits, moved towards the one before, which does not.
+
+    `outside`: the one before the first step, if there is any; `asked`: which the resolution depends on, if not on that.
+    """
+    asked = asked or outside
     for inside in steps:
         if keeps(inside):
             break
         outside = inside
     else:
         return None
-    resolution = max(RESOLUTION, FAR_RESOLUTION * abs(np.log(inside / asked)))
+    resolution = max(RESOLUTION, FAR_RESOLUTION * abs(np.log(inside / (asked or inside))))
     while outside is not None and abs(np.log(outside / inside)) > resolution:
         middle = float(np.sqrt(inside * outside))
         inside, outside = (middle, outside) if keeps(middle) else (inside, middle)
@@ -102,8 +106,8 @@ class _Probes:
         highest = min(max(self.asked * FARTHEST_ABOVE, USUAL_HZ), HIGHEST_BANDWIDTH * spec.sample_rate_hz)
         down, up = (list_steps(self.asked, end) for end in (lowest, highest))
         self.expected = len(down) + len(up) + BISECTIONS
-        below, above = (find_end(self._keeps, steps, self.asked, self.asked) for steps in (down, up))
-        largest = below if above is None else find_end(self._keeps, [*reversed(up), above], self.asked, None)
+        below, above = (find_end(self._keeps, steps, self.asked) for steps in (down, up))
+        largest = below if above is None else find_end(self._keeps, [*reversed(up), above], None, self.asked)
         nearest = tuple(f for f in (below, above) if f is not None)
         missed, closest = min((usage, f) for f, (usage, _) in self.tried.items())
         possible = PossibleBandwidths(nearest_hz=nearest, largest_hz=largest)

@@ -35,7 +35,7 @@ from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.result.widening import widen
 from seaopt.estimation.solver.methods import OutputError
 from seaopt.estimation.solver.settle import settle_roughly
-from seaopt.records import Worded, record
+from seaopt.records import Result, Worded, record
 
 SECOND = 0.75  # of the larger amplitude, up to which another log is a second amplitude
 APART = 3.0  # standard deviations from which the values of logs differ
@@ -63,7 +63,7 @@ def compare_logs(fit: Fit, validation: Sequence[Experiment] = ()) -> Fit:
 
 
 @record(repr=False)
-class LogComparison(Worded):
+class LogComparison(Result, Worded):
     """What a log that was not fitted says of the values of a fit.
 
     Parameters
