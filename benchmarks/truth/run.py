@@ -33,6 +33,7 @@ FREE = {True: ("J", "b_r", "k", "f_c", "eta"), False: ("J_m", "b_r", "k_s", "f_c
 SILENT = {"efficiency", "stand"}  # what no such log can tell: only words can warn
 BAD_SHARE, BAD_STDS, QUANTILE = 0.03, 4.0, 1.959964
 AMPLITUDES = (1.0, 0.5)  # of the largest, of the first and the second log
+LEAST = 2e-4  # of a value, below which no std is believed: widths are over that, or over the noise's std
 KNOWN = 0.2  # half the width of an interval over its value
 
 
@@ -137,7 +138,11 @@ def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
         late = sum(row["status"].startswith("not done") for row in group)
         done = [row for row in group if row["parameters"]]
         known = [all(map(is_known, row["parameters"].values())) for row in done]
-        widths = [p["std"] / p.get("noise_std", p["std"]) for row in done for p in row["parameters"].values()]
+        widths = [
+            p["std"] / max(p.get("noise_std", p["std"]), LEAST * abs(p["value"]))
+            for row in done
+            for p in row["parameters"].values()
+        ]
         width = f"{np.median(widths):.2f}" if widths else "-"
         yield (
             f"{name:26s} {len(group):4d} {len(met):4d} {sum(map(is_bad, met)):11d} {cover(met):>12s} "

@@ -18,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from seaopt.estimation.judgement.another_start import find_other_minimum
 from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
@@ -100,6 +101,7 @@ def judge(
         *find_excesses(fit),
         *find_rough(fit, error),
         *find_single_event(fit.experiments),
+        *find_other_minimum(fit),
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum).items() if test.p < DOUBTFUL}
     wrong = (

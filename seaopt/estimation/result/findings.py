@@ -31,7 +31,7 @@ class FitFinding:
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
     # for programs: "bound", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out", "noise",
-    # "range", "residual", "rough", "samples"
+    # "range", "residual", "rough", "samples", "starts"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy

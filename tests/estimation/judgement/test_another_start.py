@@ -1,0 +1,44 @@
+"""A second search: on a cost of many lobes it finds the lowest, on one of a single minimum it says nothing."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+import seaopt as so
+
+N = 4000
+WAVE = so.Plant(
+    name="wave", states={"z": "-"}, inputs={"u": "-"}, outputs={"y": "-"}, parameters={"a": "-"},
+    f=lambda t, x, u, p: {"z": u.u - x.z}, h=lambda t, x, u, p: {"y": ca.sin(p.a * u.u) + 0 * x.z},
+)  # fmt: skip
+
+
+def fit_from(start):
+    """Return the fit of y = sin(a u), a = 1, u up to 20: its cost has a lobe every 0.3 or so."""
+    rng = np.random.default_rng(2)
+    u = np.linspace(0.0, 20.0, N)
+    y = np.sin(u) + 0.05 * rng.normal(size=N)
+    log = so.Log.from_arrays(time=np.arange(N) * 1e-2, u=u, y=y)
+    bench = so.Experiment(plant=WAVE, log=log, initial_state="rest", offset=False, name="log")
+    params = so.ParameterSet.of(a=(start, "-")).free("a")
+    return so.fit([bench], params, method=so.OutputError(search=False))
+
+
+def list_starts(fit):
+    return [finding for finding in fit.findings if finding.kind == "starts"]
+
+
+def test_a_start_in_a_higher_lobe_is_told_of_the_lowest():
+    fit = fit_from(1.45)
+    assert abs(fit.parameters["a"].value - 1.0) > 0.2
+    (finding,) = list_starts(fit)
+    assert finding.severity == "error" and not fit.met
+    assert abs(finding.preferred["a"][0] - 1.0) < 0.01
+    assert "explains the logs better" in finding.text
+
+
+def test_the_lowest_lobe_is_not_doubted():
+    fit = fit_from(1.02)
+    assert abs(fit.parameters["a"].value - 1.0) < 0.01
+    assert not list_starts(fit) and fit.met
