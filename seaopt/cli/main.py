@@ -183,8 +183,7 @@ def inspect(
         list[str] | None, typer.Option(metavar="NAME=UNIT", help="Unit of a channel, or of time. Repeatable.")
     ] = None,
     driven_by: Annotated[
-        list[str] | None,
-        typer.Option("--input", metavar="NAME", help="A channel that drives the others. Repeatable."),
+        list[str] | None, typer.Option("--input", metavar="NAME", help="A channel that drives the others. Repeatable.")
     ] = None,
     align: Annotated[
         str | None,

@@ -24,9 +24,8 @@ def find_explanation(fit: Fit) -> HypothesisTrial | None:
 
 
 def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:
-    """Return the problem with a hypothesis that was tried, and the lines of its file that are then other ones.
-
-    The parts go to every plant that is fitted. Raises SeaoptError: a plant does not take them.
+    """Return the problem with a hypothesis that was tried, and the lines of its file that are then other ones. The
+    parts go to every plant that is fitted. Raises SeaoptError: a plant does not take them.
     """
     content = problem.table.model_dump(by_alias=True, exclude_unset=True, mode="json")
     fitted = [table.plant for table in problem.table.experiment if table.use == "fit"]

@@ -27,9 +27,7 @@ class TransferFunction:
         least = POLE_ROUNDING * np.sum(np.abs(self.den))
         return np.polynomial.polynomial.polyval(q, self.num) / np.where(np.abs(below) < least, least, below)
 
-    def state_space(
-        self,
-    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+    def state_space(self) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
         """Return a controllable canonical realisation."""
         n = max(self.num.size, self.den.size) - 1
         num, den = np.zeros(n + 1), np.zeros(n + 1)

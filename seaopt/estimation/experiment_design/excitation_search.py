@@ -283,10 +283,7 @@ def _solve_convex(search: ExcitationSearch, lines: Spectrum, spread: float) -> E
 
 def _select_lines(lines: Spectrum, kept: Bool[np.ndarray, " K"]) -> Spectrum:
     return replace(
-        lines,
-        harmonics=lines.harmonics[kept],
-        information=lines.information[kept],
-        gains=lines.gains[:, kept],
+        lines, harmonics=lines.harmonics[kept], information=lines.information[kept], gains=lines.gains[:, kept]
     )
 
 

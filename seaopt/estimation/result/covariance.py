@@ -35,11 +35,7 @@ from seaopt.estimation.problem.correlation import choose_transform_size, load_ff
 from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import add_gram
-from seaopt.estimation.problem.residual_statistics import (
-    ResidualStatistics,
-    StatisticsByExperiment,
-    stream_columns,
-)
+from seaopt.estimation.problem.residual_statistics import ResidualStatistics, StatisticsByExperiment, stream_columns
 from seaopt.estimation.problem.shapes import Matrix, ParameterMatrix, ParameterVector, Vector
 from seaopt.records import record
 from seaopt.simulation import double_sum
@@ -118,10 +114,7 @@ def _sum_weighted(
 
 
 def compute_meat(
-    problem: FitProblem,
-    z: Vector,
-    inverse: Float[np.ndarray, "n p"],
-    statistics: StatisticsByExperiment,
+    problem: FitProblem, z: Vector, inverse: Float[np.ndarray, "n p"], statistics: StatisticsByExperiment
 ) -> ParameterMatrix:
     """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E: B for residuals of any colour."""
     p = inverse.shape[1]
@@ -135,10 +128,7 @@ def compute_meat(
 
 
 def _sum_twice(
-    experiment: FitExperiment,
-    z: Vector,
-    inverse: Float[np.ndarray, "n p"],
-    r: Float[np.ndarray, "lags1 ny ny"],
+    experiment: FitExperiment, z: Vector, inverse: Float[np.ndarray, "n p"], r: Float[np.ndarray, "lags1 ny ny"]
 ) -> Float[np.ndarray, "2 p p"]:
     """Return one experiment's part of the double sum, and of that what t = s gives."""
     total = np.zeros((2, *(inverse.shape[1],) * 2))

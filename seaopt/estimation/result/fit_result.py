@@ -112,7 +112,6 @@ class Fit(Result, Worded):
         The data; empty when read from a file.
     minimum : Minimum or None
         The problem and its unknowns, from which refits start; None when read from a file.
-
     """
 
     plot = PlotAccessor()
@@ -267,7 +266,6 @@ class Fit(Result, Worded):
         ------
         EstimationError
             The fit was read from a file.
-
         """
         if self.minimum is None:
             raise EstimationError(f"{what} needs the fit itself, and this one was read from a file; call fit again")
@@ -287,7 +285,6 @@ class Fit(Result, Worded):
         ------
         EstimationError
             The log is too short, or has a free parameter of its own that the fit has not.
-
         """
         for name, parameter in experiment.list_own().items():
             if parameter.name not in self.parameters:
@@ -347,7 +344,6 @@ class Fit(Result, Worded):
         ------
         FileError
             A field is missing or malformed.
-
         """
         filled = {"white_covariance": content.get("covariance"), **content}  # an older file has one
         fields = read_fields(cls, filled, "fit.json", remedy=FIT_AGAIN)

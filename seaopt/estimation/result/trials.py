@@ -36,7 +36,6 @@ class HypothesisTrial:
         Lines of a problem file that add it; NAME stands for the plant's.
     python : str
         The same as a call.
-
     """
 
     effect: str

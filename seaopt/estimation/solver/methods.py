@@ -246,7 +246,6 @@ def _compare_predicting(
     problem: FitProblem, start: Evaluation, method: Method, callback: Callback | None
 ) -> tuple[Evaluation, int]:
     """Return the better of two rough minima, from a start and from where the plant predicts, and their iterations.
-
     Where joints move at other times than in the log the cost has many minima, none of which explains it: a search that
     went all the way would creep.
     """

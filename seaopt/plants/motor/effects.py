@@ -82,9 +82,7 @@ def let_droop(plant: Plant) -> Plant:
 
 
 def let_friction_drift(plant: Plant) -> Plant:
-    """Return a plant whose friction changes with the time since its log began. Raises PlantError: it states no
-    friction, or has such a part.
-    """
+    """Return a plant whose friction changes with time. Raises PlantError: it has none, or has such a part."""
     name, friction = _find_friction(plant, "friction_drift")
     force, jump, loads = friction.force, friction.jump, friction.loads
     refuse_clash(plant, "friction_drift", (ELAPSED,))
@@ -119,9 +117,7 @@ def let_friction_drift(plant: Plant) -> Plant:
 
 
 def let_friction_differ(plant: Plant) -> Plant:
-    """Return a plant whose friction differs between the directions of its motion. Raises PlantError: it states no
-    friction, or has such a part.
-    """
+    """Return a plant whose friction differs by direction. Raises PlantError: it has none, or has such a part."""
     name, friction = _find_friction(plant, "friction_direction")
 
     def push(x: Any, u: Any, p: Any) -> SimpleNamespace:

@@ -26,11 +26,7 @@ from seaopt.errors import LogError, ProblemError
 from seaopt.files import check_name
 from seaopt.formatting import format_count, join_words
 from seaopt.logs.quality.clock import assess_clock
-from seaopt.problem.proposal.actuators import (
-    Facts,
-    propose_linear,
-    propose_rotary,
-)
+from seaopt.problem.proposal.actuators import Facts, propose_linear, propose_rotary
 from seaopt.problem.proposal.described_log import GEARED, DescribedLog, doubt_clock, make_table
 from seaopt.problem.proposal.problem_text import write_problem_text
 from seaopt.problem.proposal.questions import Interview, Question, name_entry
@@ -111,12 +107,10 @@ def propose(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> Proposal:
-    """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's.
-
-    `columns` and `units` are those of roles that are known, "time" among them. `progress` is called before each log is
-    read, and before each is looked at.
-
-    Raises SeaoptError: a log cannot be read or lies outside the folder, or an answer is not one.
+    """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's. `columns`
+    and `units` are those of roles that are known, "time" among them. `progress` is called before each log is read, and
+    before each is looked at. Raises SeaoptError: a log cannot be read or lies outside the folder, or an answer is not
+    one.
     """
     interview, stated = Interview(answers), Stated(columns=columns or {}, units=units or {})
     reading, looking = divide(progress, READING, LOOKING)

@@ -130,9 +130,7 @@ def _is_supply(column: SurveyedColumn) -> bool:
 
 
 def _find_input(columns: Sequence[SurveyedColumn], survey: LogSurvey) -> tuple[str, SurveyedColumn, str]:
-    """Return the input's role, its column, and why that is a guess, if it is one. Raises LogError: no column drives a
-    motor.
-    """
+    """Return the input's role, column, and why that is a guess, or "". Raises LogError: no column drives a motor."""
     for role, quantity in OF_INPUT.items():
         named = [column for column in columns if column.header.quantity == quantity and not _is_supply(column)]
         if role in ("torque", "goal"):  # which are measured as often

@@ -59,10 +59,7 @@ class Stated:
         return turning or (False if any(role in LINEAR_OUTPUTS for role in self.columns) else None)
 
     def check(self, survey: LogSurvey) -> None:
-        """Refuse columns that a log does not have, or that do not vary.
-
-        Raises LogError: as it says.
-        """
+        """Refuse (LogError) columns that a log does not have, or that do not vary."""
         names: Sequence[str] = [column.name for column in survey.columns]
         for role, column in self.columns.items():
             if role == "time" or column in names:

@@ -99,12 +99,8 @@ class LogSurvey:
 
 
 def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | None = None) -> LogSurvey:
-    r"""Read every column of a log.
-
-    `clock` names the time where the file leaves that open, `units` are those of columns whose headers have none, or a
-    wrong one.
-
-    Raises LogError: the file cannot be read, or holds no numbers that vary.
+    r"""Read every column of a log. `clock` names the time where the file leaves that open, `units` are those of columns
+    whose headers have none, or a wrong one. Raises LogError: the file cannot be read, or holds no numbers that vary.
     """
     held = contents(path)
     numeric = {field.name: field for field in held.fields if field.numeric}
@@ -180,10 +176,9 @@ def _read_raw(path: Path, fields: Mapping[str, Field]) -> dict[str, Float[np.nda
 def _group_by_clock(
     fields: Sequence[Field], times: Sequence[str], raw: Mapping[str, Float[np.ndarray, " n"]]
 ) -> dict[str | None, list[str]]:
-    """Return the columns of each clock, those of most samples first; of no clock those as long as most are.
-
-    A column without a clock of the format's belongs to the time that has as many samples; of several of one length, to
-    the first.
+    """Return the columns of each clock, those of most samples first; of no clock those as long as most are. A column
+    without a clock of the format's belongs to the time that has as many samples; of several of one length, to the
+    first.
     """
     clocks = dict.fromkeys(each.clock for each in fields if each.clock)
     if clocks:

@@ -32,12 +32,7 @@ from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
 from seaopt.robustness.certificate.requirement import KEPT_TO, DrawnAt, Requirement
-from seaopt.robustness.certificate.scheduled import (
-    PlaceCertificate,
-    ScheduleCertificate,
-    Standing,
-    list_held,
-)
+from seaopt.robustness.certificate.scheduled import PlaceCertificate, ScheduleCertificate, Standing, list_held
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo

@@ -199,11 +199,7 @@ class Uncertainty:
 
 
 def combine_uncertainty(
-    source: Source,
-    others: ParameterSet,
-    ranges: Ranges,
-    plants: Plants,
-    drive: Drive | None = None,
+    source: Source, others: ParameterSet, ranges: Ranges, plants: Plants, drive: Drive | None = None
 ) -> Uncertainty:
     """Combine a fit's covariance, of noise and model, (or prior_stds) and the declared ranges into one description.
 
