@@ -1,6 +1,7 @@
 """The search for what a model lacks: every hypothesis is refitted, and taken only where it removes the excess.
 
-The excess is a residual's rms over the noise of its sensor, of the output where it is most. Large misfits bend what one
+The excess is a residual's rms over the noise of its sensor, of the output where it is most, over the samples that are
+fitted and over those that are held out: what follows the one part alone explains neither. Large misfits bend what one
 step predicts: a spring that hardens ranked sixth by its step, and was the cause. So each hypothesis takes several,
 from the fit's values; one that does not help is left soon. None is taken that leaves the excess high, however much
 of it it takes: friction that grows with the load takes a part of nearly everything. Where one does not suffice the
@@ -20,7 +21,8 @@ from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Change, Hypothesis, change_plants, measure_sizes
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
-from seaopt.estimation.problem.noise_floor import measure_excess
+from seaopt.estimation.problem.noise_floor import measure_floor
+from seaopt.estimation.problem.residual_statistics import compute_residuals
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome
@@ -96,7 +98,7 @@ def search_hypotheses(fit: Fit, budget: int, progress: Progress = ignore) -> Sea
     `fit`: with its minimum; `budget`: evaluations that the search may take.
     """
     minimum = fit.require_minimum("search_hypotheses")
-    first = max(measure_excess(minimum.problem, minimum.z).values(), default=0.0)
+    first = _measure_excess(minimum.problem, minimum.z)
     if first <= ASKS or minimum.problem.predicts:
         return Search()
     end = count_evaluations() + budget
@@ -185,7 +187,7 @@ def _refit(change: Change, old: FitProblem, fitted: Evaluation) -> Refit | None:
         if np.all(powers > (1.0 - HELPS) * np.minimum(least, before_round)) and not comes_near:
             break
         least = np.minimum(least, powers)
-    excess = max(measure_excess(problem, evaluation.z).values(), default=np.inf)
+    excess = _measure_excess(problem, evaluation.z)
     spent = count_evaluations() - before
     return Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, evaluations=spent)
 
@@ -198,6 +200,21 @@ def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float])
         z = np.array([values.get(name, first) for name, first in zip(unknowns.names, unknowns.start, strict=True)])
         evaluations.append(problem.evaluate(np.clip(z, unknowns.low, unknowns.high)))
     return min(evaluations, key=lambda evaluation: evaluation.cost)
+
+
+def _measure_excess(problem: FitProblem, z: Vector) -> float:
+    """Return how many times its noise a residual is, where it is most: of the samples used and of those held out."""
+    residuals, ratios = compute_residuals(problem, z), [0.0]
+    for experiment in problem.experiments:
+        floor = measure_floor(experiment, residuals[experiment.name])
+        ratios += floor.excess.tolist()
+        if experiment.holdout and problem.band_hz is None:
+            parts = zip(experiment.segments, residuals[experiment.name].segments, strict=True)
+            pairs = [(np.stack(part.samples.keep, axis=1) == 0, left.raw) for part, left in parts]
+            squares = np.concatenate([np.where(held_out, raw**2, np.nan) for held_out, raw in pairs])
+            count = np.maximum(np.count_nonzero(np.isfinite(squares), axis=0), 1)
+            ratios += (np.sqrt(np.nansum(squares, axis=0) / count) / (floor.noise * experiment.sigma)).tolist()
+    return float(np.nanmax(ratios))
 
 
 def _measure_powers(evaluation: Evaluation) -> Vector:

@@ -105,6 +105,17 @@ def test_the_calls_of_a_proposal_make_a_fit_that_is_right():
     assert again.parameters["k_3"].value == pytest.approx(2400.0, rel=0.05)
 
 
+def test_hypotheses_are_compared_on_what_was_held_out():
+    """A spring that hardens, and a cell whose gain changes for the last fifth: what is fitted shows the first alone."""
+    log = record(harder=8.0)
+    late = log.time > 0.8 * log.time[-1]
+    other = so.Log.from_arrays(
+        time=log.time, I=log["I"], tau_s=np.where(late, 1.1, 1.0) * log["tau_s"], theta_m=log["theta_m"]
+    )
+    assert fit(log, holdout=0.2).hypotheses[0].outcome == "adopted"
+    assert all(trial.excess > REMOVED for trial in fit(other, holdout=0.2).hypotheses)
+
+
 def test_two_effects_are_named_together():
     best = fit(record(harder=8.0, load=0.08)).hypotheses[0]
     assert set(best.parts) == {"hardening", "load_friction"}
