@@ -56,6 +56,7 @@ def test_two_amplitudes_give_intervals_as_wide_as_the_values_differ():
     assert large - small == pytest.approx(3 * c * (1.0 - 0.25), rel=0.1)
     parameter = result.parameters["a"]
     assert parameter.model_std >= large - small
+    assert "Values by each log alone" in repr(result) and f"{small:.6g}" in repr(result)
     assert parameter.ci95[0] <= 2.0 <= parameter.ci95[1]
     assert result.logs["half"].amplitude == pytest.approx(0.5 * result.logs["full"].amplitude, rel=0.1)
 

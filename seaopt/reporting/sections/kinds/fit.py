@@ -73,6 +73,7 @@ def describe(fit: Fit) -> list[Section]:
             tables=(_tabulate_outputs(fit),),
             remarks=(EXPLAINED,) if fit.outputs else (),
         ),
+        *_describe_logs(fit),
         *list_notes("the fit", fit.notes, _list_findings(fit)),
         *_describe_details(fit),
     ]
@@ -110,6 +111,38 @@ def _tabulate_parameters(fit: Fit) -> Table:
         rows=tuple(rows),
         align="<>>>>><<<",
         optional=("model std", "95 % interval", "meaning"),
+    )
+
+
+def _describe_logs(fit: Fit) -> Iterator[Section]:
+    """Yield what each log says alone, where several were compared."""
+    if not fit.logs:
+        return
+    rows = tuple(
+        (
+            name,
+            format_number(log.amplitude, 3),
+            format_number(log.excess, 2),
+            parameter,
+            f"{value:.6g}",
+            _spread(std),
+            f"{fit.parameters[parameter].value:.6g}",
+        )
+        for name, log in fit.logs.items()
+        for parameter, (value, std) in log.values.items()
+    )
+    yield Section(
+        title="Values by each log alone",
+        part="parameters",
+        tables=(
+            Table(
+                label="Values by each log alone",
+                head=("log", "amplitude", "over noise", "parameter", "by it alone", "std", "by all"),
+                rows=rows,
+                align="<>><>>>",
+            ),
+        ),
+        remarks=("amplitude: standard deviation of the spring's force or torque, in the output's unit",),
     )
 
 
