@@ -17,10 +17,10 @@ from typing import Any
 from seaopt.errors import EstimationError, require_type
 from seaopt.estimation.judgement.judge import CAUSES, TESTS, judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
-from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS
+from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem, count_evaluations, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
-from seaopt.estimation.result.findings import find_guesses, order_findings
+from seaopt.estimation.result.findings import find_guesses, find_sharp_friction, order_findings
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.delay_cells import search_delays
@@ -29,7 +29,7 @@ from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.estimation.solver.step_size import hold_bristles
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import can_stick, list_smoothing
+from seaopt.plants.friction import can_stick, let_stick, list_smoothing
 from seaopt.plants.motor.thermal import list_guessed_heat
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
@@ -41,6 +41,7 @@ SEARCH, JUDGEMENT = 0.25, 0.75  # of the time of a fit that goes wrong; one that
 SCALED = SEARCH + JUDGEMENT * TESTS / (TESTS + CAUSES)
 USUAL_ITERATIONS = 10  # of a whole fit
 SLOW_STEPS, SLOW = 2.0, 1e5  # steps in a sample, and in a pass, from which smoothed friction is said to be slow
+SHARP_STEPS = 8.0  # in a sample, from which so slow a friction is fitted as it jumps
 
 
 def fit(
@@ -126,8 +127,10 @@ def fit(
     )
     _check_samples(problem)
     _check_stiffness(problem)
-    for advice in _advise_sticking(problem):
-        progress(advice)
+    sharp = _list_sharp(problem)
+    for experiment, steps in _list_slow(problem):
+        progress(_say_slow(experiment, steps, switched=experiment.name in sharp))
+    problem = _let_stick(problem, sharp)
     searching, judging = divide(progress, SEARCH, JUDGEMENT if diagnostics else 0.0)
     searching("looking for a start", 0.0)
     callback = _count_iterations(searching)
@@ -138,6 +141,8 @@ def fit(
     if diagnostics:
         judged = judge(result, alternatives, judging, validation, evaluations=evaluations)
         result = _name_guesses(judged, named, params)
+    if sharp:
+        result = replace(result, findings=order_findings((*result.findings, *map(find_sharp_friction, sharp))))
     progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)
     return result
 
@@ -234,17 +239,36 @@ def _check_motion(experiments: tuple[Experiment, ...]) -> None:
         )
 
 
-def _advise_sticking(problem: FitProblem) -> Iterator[str]:
-    """Yield where smoothed friction makes a search slow that a sticking joint makes in fewer steps."""
+def _list_slow(problem: FitProblem) -> Iterator[tuple[FitExperiment, float]]:
+    """Yield experiments whose smoothed friction makes a search slow, and their steps in a sample."""
     for experiment in problem.experiments:
-        plant, samples = experiment.data.plant, experiment.samples
-        steps = experiment.count_stable_steps(problem.unknowns.start)
-        if can_stick(plant) and not plant.sticks and steps >= SLOW_STEPS and steps * samples >= SLOW:
-            yield (
-                f"experiment {experiment.name}: friction smoothed over {' and '.join(list_smoothing(plant))} takes "
-                f"{math.ceil(steps)} steps in each of {samples} samples; where the joint sticks, sticks = true "
-                "(so.plants.let_stick) is quicker"
-            )
+        plant, steps = experiment.data.plant, experiment.count_stable_steps(problem.unknowns.start)
+        slow = steps >= SLOW_STEPS and steps * experiment.samples >= SLOW
+        if slow and can_stick(plant) and not plant.sticks:
+            yield experiment, steps
+
+
+def _say_slow(experiment: FitExperiment, steps: float, *, switched: bool) -> str:
+    speeds = " and ".join(list_smoothing(experiment.data.plant))
+    remedy = "it is fitted as it jumps at rest" if switched else "where the joint sticks, sticks = true is quicker"
+    return (
+        f"experiment {experiment.name}: friction smoothed over {speeds} takes {math.ceil(steps)} steps in each of "
+        f"{experiment.samples} samples; {remedy} (so.plants.let_stick)"
+    )
+
+
+def _list_sharp(problem: FitProblem) -> list[str]:
+    """Return experiments whose friction is smoothed so sharply that a fit would take minutes.
+
+    There are none where a smoothing speed is free: it is searched for.
+    """
+    return [] if problem.find_smoothing() else [e.name for e, steps in _list_slow(problem) if steps >= SHARP_STEPS]
+
+
+def _let_stick(problem: FitProblem, names: Sequence[str]) -> FitProblem:
+    """Return the problem with friction that jumps in some experiments."""
+    data = {e.name: replace(e.data, plant=let_stick(e.data.plant)) for e in problem.experiments if e.name in names}
+    return problem.rebuild(problem.params, problem.unknowns.start, data)[0] if data else problem
 
 
 def _check_stiffness(problem: FitProblem) -> None:

@@ -31,7 +31,7 @@ class FitFinding:
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
     # for programs: "bound", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out", "noise",
-    # "range", "residual", "rough", "samples", "starts"
+    # "range", "residual", "rough", "samples", "sharp", "starts"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
@@ -62,6 +62,17 @@ def find_guesses(guessed: Sequence[str]) -> tuple[FitFinding, ...]:
         "value, and take its name out of guessed = [...]"
     )
     return (FitFinding(severity="warning", kind=GUESS, where=state_guesses(guessed), text=text),)
+
+
+def find_sharp_friction(experiment: str) -> FitFinding:
+    """Return a note that an experiment was fitted with friction that jumps in place of its sharply smoothed curve."""
+    return FitFinding(
+        severity="note",
+        kind="sharp",
+        where=experiment,
+        text="its friction is smoothed too sharply to be simulated in time, and was fitted as it jumps at rest; write "
+        "sticks = true (so.plants.let_stick), or give a larger smoothing speed",
+    )
 
 
 def find_energy(fit_percent: float) -> float:

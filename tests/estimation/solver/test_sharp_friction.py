@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,24 @@ def test_what_is_told_of_smooth_friction_is_no_bound(bench, truth):
     assert truth["v_s"].min < value < 1e-4 and value < 4.0 * std
     again = so.fit([bench], truth.update(v_s=value).free(*FREE))
     assert again.met and not again.findings
+
+
+def test_friction_that_takes_too_long_is_fitted_as_it_jumps(bench, truth):
+    notes, log, repeats = [], bench.log, 8
+    long = so.Log.from_arrays(
+        time=np.arange(repeats * len(log)) / RATE_HZ, **{name: np.tile(log[name], repeats) for name in ("I", "F1", "q")}
+    )
+    one = replace(bench, log=long)
+    params = truth.update(v_s=6e-6).free(*FREE)
+    steps = count_stable_steps(make_model(bench.plant, truth.update(v_s=6e-6)), np.zeros(0), 1.0 / RATE_HZ)
+    assert 8.0 < steps < 50.0
+    fit = so.fit([one], params, diagnostics=False, progress=lambda note, share=None: notes.append(note))
+    sticking = so.fit([replace(one, plant=so.plants.let_stick(bench.plant))], params, diagnostics=False)
+    assert [finding.kind for finding in fit.findings] == ["sharp"] and not sticking.findings
+    assert any("fitted as it jumps" in note for note in notes)
+    assert fit.experiments[0].plant.sticks
+    for name in FREE:
+        assert fit.parameters[name].value == pytest.approx(sticking.parameters[name].value, rel=1e-9)
 
 
 def test_friction_too_sharp_to_simulate_is_refused_with_the_speed_that_can_be(bench, truth):
