@@ -23,6 +23,7 @@ MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trus
 NEARBY = 10.0  # standard deviations, over which a step error does not change
 # Of an order: where a joint that sticks stops, residuals jump, and finer steps make that no better for ever.
 MOST_STEPS = {4: MAX_SUBSTEPS, 2: 32}
+MOST_STEPS_BY_EVENTS = 16  # between events order four needs no more, and what turns or stops by chance gains nothing
 STIFF, STIFFER = 8.0, 4.0  # stable steps per sample that a search may always take, and times those at its start
 SAME_COST = 1e-2  # relative change of a cost, with steps of half the length, that bristles at the start may make
 EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
@@ -75,8 +76,7 @@ def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most:
         stop = min(segment.samples.n, FIRST_SAMPLES)
         fine.append(halved.run(segment, z, stop=stop, sums=False, outputs=True))
     error = _measure_output_error(experiment, z, evaluation.passes.by_experiment[experiment.name], fine)
-    order = experiment.model.order
-    return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR, order), most)
+    return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR, experiment), most)
 
 
 def hold_bristles(problem: FitProblem) -> FitProblem:
@@ -109,7 +109,7 @@ def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) ->
         checks = check_steps(problem, evaluation, checks)
         substeps = [experiment.count_steps(evaluation.z) for experiment in problem.experiments]
         finer = [
-            _choose_steps(steps, checks[e.name].error, STEP_ERROR_SIGMA, e.model.order)
+            _choose_steps(steps, checks[e.name].error, STEP_ERROR_SIGMA, e)
             for e, steps in zip(problem.experiments, substeps, strict=True)
         ]
         if finer == substeps:
@@ -177,13 +177,15 @@ def _with_substeps(problem: FitProblem, substeps: Sequence[int]) -> FitProblem:
     return problem.with_values("substeps", {e.name: m for e, m in zip(problem.experiments, substeps, strict=True)})
 
 
-def _choose_steps(steps: int, error: StepError, allowed: float, order: int) -> int:
+def _choose_steps(steps: int, error: StepError, allowed: float, experiment: FitExperiment) -> int:
     """Return how many steps per sample an error asks for."""
     over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
     if over <= 1.0 or not np.isfinite(over):
         return steps
+    model = experiment.model
+    order, most = model.order, MOST_STEPS_BY_EVENTS if model.by_events else MOST_STEPS[model.order]
     finer = steps * min(1.1 * over ** (1.0 / order), MUCH_FINER)
-    return min(max(int(np.ceil(finer)), steps + 1), MOST_STEPS[order])
+    return min(max(int(np.ceil(finer)), steps + 1), max(most, steps))
 
 
 @np.errstate(all="ignore")
