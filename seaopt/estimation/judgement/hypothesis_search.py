@@ -5,7 +5,7 @@ fitted and over those that are held out: what follows the one part alone explain
 step predicts: a spring that hardens ranked sixth by its step, and was the cause. So each hypothesis takes several,
 from the fit's values; one that does not help is left soon. None is taken that leaves the excess high, however much
 of it it takes: friction that grows with the load takes a part of nearly everything. Where one does not suffice the
-others are tried beside the best, two in all.
+best three are joined with each other, and then with every other one, two in all.
 
 What this may cost is counted in evaluations of the problem, so that the same log has the same answer on any machine.
 """
@@ -118,12 +118,18 @@ class _Search:
         base = self.minimum.problem.evaluate(self.minimum.z)
         single = list(self.try_each(self.minimum.problem, base, self.fit.experiments, self.fit.parameters))
         refits = sorted(single, key=lambda refit: refit.excess)
-        for number, best in enumerate(refits[:BASES]):
+        bases = refits[:BASES]
+        partners = [refit.change.hypotheses[-1] for refit in bases]
+        # The best with each other first: of two effects either alone may take little.
+        rounds = [(best, partners[number:]) for number, best in enumerate(bases[:-1], start=1)]
+        for number, (best, others) in enumerate([*rounds, *((best, HYPOTHESES) for best in bases)]):
             least = min(refit.excess for refit in refits)
-            if least <= (REMOVED if number else ASKS) or best.excess >= first:
+            if least <= (REMOVED if number >= len(bases) else ASKS) or best.excess >= first:
                 break
             values, done = _take_values(best), [set(refit.change.hypotheses) for refit in refits]
-            refits += self.try_each(best.problem, best.evaluation, best.change.experiments, values, best.change, done)
+            refits += self.try_each(
+                best.problem, best.evaluation, best.change.experiments, values, best.change, done, others
+            )
         return refits
 
     def try_each(
@@ -134,9 +140,10 @@ class _Search:
         params: ParameterSet,
         before: Change | None = None,
         done: Sequence[set[Hypothesis]] = (),
+        hypotheses: Sequence[Hypothesis] = HYPOTHESES,
     ) -> Iterator[Refit]:
         """Yield the refits of each hypothesis that is not there yet, as long as the budget lasts."""
-        for hypothesis in HYPOTHESES:
+        for hypothesis in hypotheses:
             if before is not None and {*before.hypotheses, hypothesis} in done:
                 continue
             left = self.end - count_evaluations()
