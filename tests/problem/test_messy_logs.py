@@ -256,3 +256,22 @@ def test_a_second_log_at_half_the_amplitude_is_offered(tmp_path):
     assert np.std(scored.log["I"]) == pytest.approx(0.5 * np.std(fitted.log["I"]))
     several = propose([tmp_path / "run.csv", tmp_path / "run_half.csv"], {}, tmp_path).text
     assert "half the amplitude" not in several
+
+
+def test_signals_of_one_sample_less_than_their_time_are_named(tmp_path, held):
+    """As where differences were saved beside the time that they were taken of."""
+    t, of = held
+    write_v5(tmp_path / "run.mat", {"time": t, "iq": of["I"][1:], "tau": of["tau_s"][1:]})
+    with pytest.raises(SeaoptError, match=r'log.iq and log.tau have other numbers of samples than "log.time" \(2400\)'):
+        propose([tmp_path / "run.mat"], {}, tmp_path)
+
+
+@pytest.mark.parametrize("names", [("theta_x", "theta_y"), ("theta_y", "theta_x")])
+def test_without_a_gear_the_motor_is_what_the_current_moves_at_once(tmp_path, names):
+    """Two masses and a shaft: both angles swing alike, and their names do not say which is which."""
+    t, current = drive(6.0, 1000.0, 2.0, top_hz=150.0)
+    of = knee(current, 1000.0, N=1.0, J_m=1e-3, J_l=2e-3, k_s=100.0, K_tau=0.5, f_c=0.0, b_r=1e-2, d_l=0.02, noise=0.1)
+    columns = {"t [s]": t, "iq [A]": of["I"], f"{names[0]} [rad]": of["theta_m"], f"{names[1]} [rad]": of["theta_l"]}
+    assert np.std(of["theta_l"]) > 0.8 * np.std(of["theta_m"])
+    roles = roles_of(propose([write_csv(tmp_path / "shaft.csv", columns)], {}, tmp_path))
+    assert (roles["theta_m"], roles["theta_l"]) == (f"{names[0]} [rad]", f"{names[1]} [rad]")

@@ -216,7 +216,7 @@ def _check_outputs(roles: Assignment, survey: LogSurvey) -> Assignment:
     if not roles.outputs:
         raise LogError(
             f"{survey.name}: nothing is measured besides the input, {roles.columns[roles.input].name}; log a force, a "
-            "torque or an angle as well"
+            "torque or an angle as well, or put it into this file if another file of the test has it"
         )
     return roles
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.formatting import join_words
-from seaopt.problem.proposal.survey import LogSurvey, SurveyedColumn, find_leader, regress
+from seaopt.problem.proposal.survey import LogSurvey, SurveyedColumn, find_leader, regress, share_of_jerk
 from seaopt.problem.proposal.vocabulary import UNITS_OF, Quantity
 from seaopt.records import record
 from seaopt.units import header_unit
@@ -31,6 +31,9 @@ DESCRIPTIONS = {
 FOLLOWS = 0.9  # share of variance from which two channels are one but for a factor
 BY_SIZE, BY_DEFAULT = "by the size of its numbers", "the usual one"  # why a unit is guessed
 TURN, MOVES = 6.5, 0.5  # of an angle without a unit: more than a turn in radians, unless it moves less
+GEARED_APART = 2.0  # swings of motor and link between which no gear tells them apart
+RESPONDS = 0.02  # share of an angle's jerk that the input explains at once: of a motor, not behind a spring
+SURELY = 3.0  # times the other's share
 STILL = 0.02  # of the motor's motion: a link that moves less is held
 SUPPLIED = 0.5  # of its largest value: a voltage that never falls below is a supply's
 
@@ -185,6 +188,11 @@ def _place_rotary(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn
         ),
         key=lambda column: -column.swing,
     )
+    if len(open_angles) > 1 and open_angles[0].swing < GEARED_APART * open_angles[1].swing:
+        driver = next(iter(roles.values()))
+        shares = {column.name: share_of_jerk(column, driver) for column in open_angles[:2]}
+        if max(shares.values()) > max(RESPONDS, SURELY * min(shares.values())):
+            open_angles[:2] = sorted(open_angles[:2], key=lambda column: -shares[column.name])
     for column, role in zip(open_angles, [r for r in ("theta_m", "theta_l") if r not in roles], strict=False):
         roles[role] = column
         doubts[column.name] = f"the {DESCRIPTIONS[role]}, as its header does not say which angle"

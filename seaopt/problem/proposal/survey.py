@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
+from seaopt.formatting import join_words
 from seaopt.logs import contents
 from seaopt.logs.formats import Field, open_source
 from seaopt.logs.quality.faults import find_quantisation
@@ -24,6 +25,7 @@ SLOW_HZ = 1.0
 ALIKE = 0.5  # of the correlation below SLOW_HZ, from which its sign means something
 ENOUGH = 64  # samples for a correlation
 ESTIMATED = 0.9999  # share of variance from which a torque is a current times a constant
+MOST_NAMED = 5  # columns in a message
 SAME = 1.0 - 1e-6  # share of variance from which a column is another one, rounded
 
 
@@ -130,6 +132,12 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
     wrong = {name: _describe_length(raw[name].size, size) for name in numeric if name not in {**columns, **groups}}
     moving = [column for name, column in columns.items() if name != chosen and name not in times and column.swing > 0.0]
     if not moving:
+        others = [name for name in wrong if raw[name].size > 1]
+        if others:
+            raise LogError(
+                f"{path}: {join_words(others[:MOST_NAMED])} have other numbers of samples than "
+                f'"{chosen or members[0]}" ({size}); save each with times of its own, or cut them to one length'
+            )
         raise LogError(f"{path}: no column varies; record a log in which the actuator moves")
     copies = _find_copies(moving)
     copies |= _find_estimates([column for column in moving if column.name not in copies])
@@ -303,6 +311,16 @@ def _lead(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> fl
     scale = float(np.sqrt(np.sum(a**2) * np.sum(b**2))) or 1.0
     at = int(np.argmax(np.abs(cross)))
     return (at - reach) * float(np.abs(cross[at])) / scale
+
+
+def share_of_jerk(column: SurveyedColumn, driver: SurveyedColumn) -> float:
+    """Return the share of a column's third differences that the first ones of another explain within two samples: a
+    force accelerates what it acts on at once, and what is behind a spring later.
+    """
+    jerk, push = np.diff(column.values, 3), np.diff(driver.values)
+    if jerk.size <= ENOUGH:
+        return 0.0
+    return max(regress(jerk[late:], push[1 : push.size - 1 - late])[1] for late in range(3))
 
 
 def slow_sign(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"], rate_hz: float) -> int:
