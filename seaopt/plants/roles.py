@@ -309,7 +309,7 @@ class Recipe:
     """How a plant is made: its parts, and what makes it with others, ``parts -> Plant``."""
 
     parts: tuple[str, ...]
-    make: Callable[[tuple[str, ...]], Any]
+    make: Callable[[tuple[Any, ...]], Any]  # of names of parts, which `check_parts` has checked
 
 
 @record(eq=False)
