@@ -125,9 +125,25 @@ def judge(
             budget=(OF_HYPOTHESES + OF_CAUSES) * evaluations - (count_evaluations() - begun),
             progress=trying,
         )
-        findings += _name_causes(fit, causes, suspects)
+        named = list(_name_causes(fit, causes, suspects))
+        told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)
+        if causes and causes[0].refit is not None and told:
+            # Both amplitudes and the hypothesis tell how far the values are off: the interval has all three.
+            fit = _widen_to(fit, causes[0].refit.values)
+            findings = [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
+            named = [replace(each, severity="warning") if each.kind == "cause" else each for each in named]
+        findings += named
         search = search if not causes or causes[0].refit is not None else search.yield_to_another()
     return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
+
+
+def _widen_to(fit: Fit, values: Mapping[str, float]) -> Fit:
+    """Return the fit with intervals that reach to other values of its parameters, by what they differ."""
+    noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
+    free = fit.covariance.names
+    shift = [values.get(name, fit.parameters[name].value) - fit.parameters[name].value for name in free]
+    shift = np.array([*shift, *([0.0] * (len(noise.names) - len(free)))])
+    return widen(fit, np.outer(shift, shift))
 
 
 def _state_excess(fit: Fit, excess: Mapping[str, float]) -> Fit:
