@@ -86,8 +86,8 @@ def list_candidates(
         yield _free_gains(experiments, problem.params)
     yield from _read_deflections(experiments, values)
     yield from _free_delays(problem, values)
-    yield from _free_parameters(fit, minimum, suspects)
     yield from _clip_outputs(problem, residuals, values)
+    yield from _free_parameters(fit, minimum, suspects)
     yield from _filter_outputs(experiments, values)
 
 
