@@ -140,7 +140,8 @@ def test_moving_output_is_the_hand_written_pendulum(drive, values, inertia, arm)
     s = 1j * FREQUENCIES
     for row, output in enumerate(("F1", "F2")):
         hand = expected(s, squeeze=False)[row, 0]
-        np.testing.assert_allclose(response(plant, params, output, s), hand, rtol=1e-8, atol=1e-9 * abs(hand).max())
+        # Seven tonnes of reflected rotor beside a light link: the hand-written inverse loses seven digits.
+        np.testing.assert_allclose(response(plant, params, output, s), hand, rtol=1e-8, atol=1e-8 * abs(hand).max())
 
 
 def test_linearize_names_its_signals(swing, thor):

@@ -180,6 +180,8 @@ def measure_sizes(fit: Fit) -> Sizes:
 
 def _measure(experiment: Experiment, fit: Fit) -> Sizes:
     plant, log = experiment.plant, experiment.log
+    longest = max(log.segments, key=lambda segment: segment.stop - segment.start)  # no gap is simulated over
+    log = log.between(*(log.time[[longest.start, longest.stop - 1]] - log.time[0]))
     params = plant.complete(experiment.apply_own(fit.parameters))
     run = simulate(plant, params, log, rtol=SIMULATED)
     x, u, p = name_symbols(plant, plant.x, plant.u, plant.p)

@@ -160,3 +160,13 @@ def test_they_are_kept_in_its_file():
     again = so.Fit.from_dict(result.to_dict(), ())
     assert again.hypotheses == result.hypotheses
     assert [finding.proposal for finding in again.findings] == [finding.proposal for finding in result.findings]
+
+
+def test_a_log_with_a_gap_is_searched_too():
+    log = record(droop=0.005)
+    keep = np.delete(np.arange(len(log)), slice(1000, 1080))
+    cut = so.Log.from_arrays(time=log.time[keep], **{name: log[name][keep] for name in ("I", "tau_s", "theta_m")})
+    plant = so.plants.rotary(link="locked")
+    params = plant.defaults.update(**TRUTH).update(J_m=3e-5, k_s=250.0).free(*FREE)
+    result = so.fit([so.Experiment(plant=plant, log=cut, outputs=("tau_s", "theta_m"))], params)
+    assert result.hypotheses[0].parts == ("droop",)
