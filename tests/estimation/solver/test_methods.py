@@ -239,7 +239,9 @@ def test_noise_that_rules_a_state_does_not_slow_the_search(thor):
     fit = so.fit([experiment(plant, log)], start, method=so.PredictionError())
     assert fit.status == "converged"
     assert fit.iterations < 80
-    so.testing.assert_recovered(fit, truth, sigmas=4)
+    assert {finding.kind for finding in fit.errors} == {"rough"}  # J, b_r and eta enter nearly as their ratios alone
+    for name in start.free_names:
+        assert abs(fit.parameters[name].value - truth[name].value) < 4.0 * fit.parameters[name].total_std
 
 
 @pytest.mark.slow
