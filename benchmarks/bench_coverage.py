@@ -80,7 +80,9 @@ def coloured(seed: int, excitation: Excitation = BROAD) -> so.Fit:
     log = so.virtual_log(STAND, THOR, excitation, duration_s=6, rate_hz=RATE_HZ, seed=seed)
     rng = np.random.default_rng([seed, 1])
     forces = {name: log[name] + NOISE_N * autoregression(len(log), rng) for name in ("F1", "F2")}
-    return fitted(so.Log.from_arrays(time=log.time, I=log["I"], **forces), start())
+    # Stated, as noise of a colour is told from physics that the model lacks by nothing else.
+    stated = {"F1": NOISE_N, "F2": NOISE_N}
+    return fitted(so.Log.from_arrays(time=log.time, I=log["I"], **forces), start(), sigma=stated)
 
 
 def coloured_chirp(seed: int) -> so.Fit:

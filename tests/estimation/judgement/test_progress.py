@@ -48,5 +48,5 @@ def test_what_sticks_or_is_short_gets_no_advice(plant, samples):
 
 @pytest.mark.slow
 def test_causes_that_are_tried_are_told():
-    with pytest.raises(Heard, match="cause 1 of"):
+    with pytest.raises(Heard, match="cause"):
         so.fit([make_experiment(so.plants.let_stick(PLANT), 3000, 1.0)], VALUES.free("b_r"), progress=stop_at_cause)
