@@ -36,7 +36,7 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
 def _name_bandwidths(controller: Controller) -> str:
     """Return the bandwidth asked, and where friction makes two of it the one that is left while it sticks."""
     asked = f"{controller.spec.bandwidth_hz:g} Hz"
-    _, *stuck = {} if controller.design is None else controller.measure_states().values()
+    stuck = [] if controller.design is None else [*controller.measure_states().values()][1:]
     if not stuck:
         return asked
     return f"{asked} sliding and {format_number(stuck[0].bandwidth_hz, missing='none')} Hz stuck"
