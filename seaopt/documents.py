@@ -38,7 +38,8 @@ Flag = Annotated[bool, Strict()]
 class ResultTable(BaseModel):
     """A table in a file of results; keys besides those that are read may stand in it."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    # Keys as model_std are no methods of pydantic, whose older versions warn of them.
+    model_config = ConfigDict(extra="ignore", frozen=True, protected_namespaces=())
 
 
 Document = TypeVar("Document", bound=BaseModel)
