@@ -67,10 +67,11 @@ def format_toml(value: Any) -> str:
 
 def format_keys(keys: Mapping[str, Any]) -> str:
     """Return keys with their values as a problem file writes them, on one line."""
-    return ", ".join(f"{_format_key(name)} = {format_toml(value)}" for name, value in keys.items())
+    return ", ".join(f"{format_key(name)} = {format_toml(value)}" for name, value in keys.items())
 
 
-def _format_key(name: str) -> str:
+def format_key(name: str) -> str:
+    """Return a key as a problem file writes it."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else format_toml(name)
 
 

@@ -42,7 +42,7 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
     if not np.isfinite(solved.misfit):
         return
     gain = 0.5 * (_measure_misfit(minimum) - solved.misfit) / _measure_colour(fit)
-    values = dict(zip(problem.unknowns.names, solved.solution.z.tolist(), strict=True))
+    values = problem.unknowns.by_name(solved.solution.z)
     moved: dict[str, tuple[float, float]] = {}
     for name in fit.covariance.names:
         parameter = fit.parameters[name]

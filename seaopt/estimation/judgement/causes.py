@@ -138,7 +138,7 @@ def _refit(minimum: Minimum, candidate: Candidate) -> Solved | None:
     if old.predicts:
         solved = replace(minimum.method, max_iterations=ROUGH_ITERATIONS, search=False).solve(problem, None)
         return solved if np.isfinite(solved.solution.evaluation.cost) else None
-    fitted = dict(zip(old.unknowns.names, minimum.z.tolist(), strict=True))
+    fitted = old.unknowns.by_name(minimum.z)
     for i, name in enumerate(names):
         if i >= problem.unknowns.shared:  # parameters start from the candidate's own
             z[i] = fitted.get(name, z[i])
@@ -209,7 +209,7 @@ def _weigh(
         return None
     fall = np.log(before[:, 0]) - np.log(after[:, 0])
     gain = 0.5 * float(np.sum(before[:, 1] * fall)) / colour
-    values = dict(zip(problem.unknowns.names, evaluation.z.tolist(), strict=True))
+    values = problem.unknowns.by_name(evaluation.z)
     variances = colour * np.diag(invert(evaluation.hessian)[0])
     stds = dict(zip(values, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
     left = float(np.exp(-np.max(fall)))

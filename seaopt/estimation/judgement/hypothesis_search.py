@@ -56,7 +56,7 @@ class Refit:
     @property
     def values(self) -> dict[str, float]:
         """The unknowns at the minimum."""
-        return dict(zip(self.problem.unknowns.names, self.evaluation.z.tolist(), strict=True))
+        return self.problem.unknowns.by_name(self.evaluation.z)
 
     @property
     def proposal(self) -> str:
@@ -175,7 +175,7 @@ def _refit(change: Change, old: FitProblem, fitted: Evaluation) -> Refit | None:
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
     problem = problem.with_each(substeps=max(experiment.substeps for experiment in old.experiments))
     problem = problem.with_values("sigma", {experiment.name: experiment.sigma for experiment in old.experiments})
-    start = _choose_start(change, problem, dict(zip(old.unknowns.names, fitted.z.tolist(), strict=True)))
+    start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
     if not np.isfinite(start.cost):
         return None
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
@@ -203,8 +203,7 @@ def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float])
     """Return the evaluation at the fit's values and the best start of what is added."""
     unknowns, evaluations = problem.unknowns, list[Evaluation]()
     for start in change.starts:
-        values = {**fitted, **start}
-        z = np.array([values.get(name, first) for name, first in zip(unknowns.names, unknowns.start, strict=True)])
+        z = unknowns.start_from({**fitted, **start})
         evaluations.append(problem.evaluate(np.clip(z, unknowns.low, unknowns.high)))
     return min(evaluations, key=lambda evaluation: evaluation.cost)
 

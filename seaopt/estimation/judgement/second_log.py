@@ -205,11 +205,9 @@ def _refit(
     elif old is None:
         solved = settle_roughly(problem, problem.evaluate(problem.unknowns.start))
     else:
-        values, z = dict(zip(old.unknowns.names, fit.require_minimum("").z.tolist(), strict=True)), []
-        for name, first in zip(problem.unknowns.names, problem.unknowns.start.tolist(), strict=True):
-            z.append(values.get(name, first))
+        z = problem.unknowns.start_from(old.unknowns.by_name(fit.require_minimum("").z))
         problem = problem.with_each(substeps=max(e.substeps for e in old.experiments))
-        solved = settle_roughly(problem, problem.evaluate(np.array(z)))
+        solved = settle_roughly(problem, problem.evaluate(z))
     refit = summarise(solved, method, True, started)
     # What its own residual's colour and parts add belongs to how well it knows its values.
     found = refit.require_minimum("_refit")

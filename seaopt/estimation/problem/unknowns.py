@@ -77,6 +77,14 @@ class Unknowns:
         lows[places], highs[places] = low, high
         return replace(self, low=lows, high=highs)
 
+    def by_name(self, z: Vector) -> dict[str, float]:
+        """Return the unknowns by their names."""
+        return dict(zip(self.names, z.tolist(), strict=True))
+
+    def start_from(self, values: Mapping[str, float]) -> Vector:
+        """Return the start, with values in place of those of the same name."""
+        return np.array([values.get(name, first) for name, first in self.by_name(self.start).items()])
+
     def find_at_bound(self, z: Vector) -> tuple[str, ...]:
         """Return the names of those that lie on a bound, to rounding."""
         width = 1e-9 * np.maximum(np.abs(z), 1e-300)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -13,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.formatting import format_count, format_figure
+from seaopt.formatting import format_count, format_figure, format_key
 from seaopt.logs.quality.channel import BEYOND, ChannelQuality
 from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality, advise_clock
 from seaopt.logs.quality.excitation import InputExcitation
@@ -156,7 +155,7 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
             text += ": it is clipped; a fit masks these samples of an output"
         else:
             text += ": clipped, or at rest there; if clipped, declare its range, "
-            text += f"saturation = {{ {_spell_key(name)} = [low, high] }}"
+            text += f"saturation = {{ {format_key(name)} = [low, high] }}"
         severity: Severity = "warning" if rail.clear else "note"
         yield fault(rail.runs, kind="clipping", severity=severity, value=rail.value, unit=unit, sentence=text)
     yield from _find_level_faults(channel)
@@ -197,11 +196,6 @@ def _find_longest_without(runs: RowRanges, time: Float[np.ndarray, " n"]) -> tup
     begin = float(np.nanmin(time))
     # Rounded inwards, so that the samples beside are not in it.
     return np.ceil(1e6 * (time[first] - begin)) / 1e6, np.floor(1e6 * (time[last] - begin)) / 1e6
-
-
-def _spell_key(name: str) -> str:
-    """Return a name as a key that a file of settings may have."""
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
 
 
 def _find_level_faults(channel: ChannelQuality) -> Iterator[Finding]:
