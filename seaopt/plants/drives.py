@@ -8,6 +8,9 @@ Parts around any plant:
     motor makes, before the losses of the transmission. The plant's actuation states the speed that this takes.
 ``duty_input``
     The input is the duty of a full bridge on the supply V_s: :math:`V = V_s \min(\max(d, -1), 1)`.
+``supply_input``
+    With a duty: the supply that was logged is an input, `supply` (V), in place of V_s wherever it is above zero. A log
+    without it, and a controller's design, have V_s.
 ``inductance``
     With one of them: :math:`V = R I + L_m \dot I + K_e \omega`; the current is then a state.
 ``position_servo``
@@ -28,7 +31,7 @@ With one of the first two the current I (A) is among the outputs.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -45,6 +48,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "voltage_input": (RESISTANCE,),
     "duty_input": (RESISTANCE, declare("V_s", 24.0, "V", 1e-9, "supply voltage", (1.0, 1e3))),
     "inductance": (declare("L_m", 1e-3, "H", 1e-12, "winding inductance", (1e-7, 1)),),
+    "supply_input": (),
     "position_servo": (
         declare("k_p", 1.0, "-", 0.0, "gain of the servo, in the units that g_s, 1 unless given, converts"),
         declare("k_d", 0.0, "s", 0.0, "damping of the servo, in its own units"),
@@ -56,6 +60,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
 SERVO = ("position_servo", "servo_integral", "servo_limit")
 STATED = ("k_p",)  # without a default: who has a servo knows its gain, and any other one would be a guess
 INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
+SUPPLY = "supply"  # the input that is the voltage on which a duty is
 
 
 @record(eq=False)
@@ -73,6 +78,7 @@ class _Drive:
     solve: Callable[[Any, Any, Any, Any], tuple[Any, Mapping[str, Any], Mapping[str, Any]]]
     effort: Callable[[Any], Any]  # of the parameters: what one unit of the new input is of the plant's, at rest
     largest: Callable[[Any], Any] | None = None  # of the new input
+    optional: Mapping[str, str] = field(default_factory=dict[str, str])  # further inputs, zero where a log has none
 
 
 def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
@@ -93,8 +99,11 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
         lossless = p if actuation.efficiency is None else with_values(p, {actuation.efficiency: 1.0})
         return actuation.effort(lossless) * speed(x, p)
 
+    def find_supply(u: Any, p: Any) -> Any:
+        return ca.if_else(u.supply > 0.0, u.supply, p.V_s) if "supply_input" in parts else p.V_s
+
     def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
-        applied = u.V if part == "voltage_input" else p.V_s * ca.fmin(ca.fmax(u.duty, -1.0), 1.0)
+        applied = u.V if part == "voltage_input" else find_supply(u, p) * ca.fmin(ca.fmax(u.duty, -1.0), 1.0)
         if inductive:
             flows = getattr(x, current)
             dropped = find_resistance(winding, x, p) * flows
@@ -117,6 +126,7 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
             solve=solve,
             effort=lambda p: (1.0 if part == "voltage_input" else p.V_s) / find_resistance(winding, None, p),
             largest=(lambda p: 1.0) if part == "duty_input" else None,
+            optional={SUPPLY: "V"} if "supply_input" in parts else {},
         ),
         change_ports(plant.ports, drive_electrically, tuple(parts)),
     )
@@ -171,7 +181,10 @@ def _put_before(plant: Plant, drive: _Drive, ports: tuple[Port, ...]) -> Plant:
     """Return a plant behind a drive, with ports whose plants are behind it, too."""
     source = next(iter(plant.inputs))
     refuse_clash(
-        plant, drive.name, (drive.input, *drive.outputs, *(parameter.name for parameter in drive.parameters)), source
+        plant,
+        drive.name,
+        (drive.input, *drive.optional, *drive.outputs, *(parameter.name for parameter in drive.parameters)),
+        source,
     )
 
     def solve_inside(t: Any, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, Mapping[str, Any], Mapping[str, Any]]:
@@ -206,9 +219,9 @@ def _put_before(plant: Plant, drive: _Drive, ports: tuple[Port, ...]) -> Plant:
         h=h,
         actuation=actuation,
         states={**plant.states, **drive.states},
-        inputs={drive.input: drive.unit, **remaining},
+        inputs={drive.input: drive.unit, **remaining, **drive.optional},
         outputs={**plant.outputs, **drive.outputs},
-        optional_inputs=frozenset(optional),
+        optional_inputs=frozenset((*optional, *drive.optional)),
         parameters={**plant.parameters, **added},
         friction=put_behind(plant.friction, lambda x, u, p: solve_inside(0.0, x, u, p)[0]),
         ports=ports,

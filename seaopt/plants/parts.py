@@ -108,6 +108,7 @@ Part = Literal[
     "measurement_delay",
     "voltage_input",
     "duty_input",
+    "supply_input",
     "inductance",
     "position_servo",
     "servo_integral",
@@ -174,6 +175,7 @@ NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
     **dict.fromkeys(("load_stribeck", "load_square"), (("stribeck",), ("load_friction",))),
     **dict.fromkeys(("servo_integral", "servo_limit", "servo_delay"), (("position_servo",),)),
     "inductance": (tuple(drives.INPUTS),),
+    "supply_input": (("duty_input",),),
 }
 LOADS = {"motor": 0.0, "output": 0.0}  # of friction that grows with them, as linear analysis takes it
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -68,6 +69,30 @@ def test_voltage_and_duty_are_those_of_a_motor_with_back_emf(part, inductance):
     assert np.allclose(run["theta_m"], expected[:, 0], atol=1e-6 * np.max(np.abs(expected[:, 0])))
     current = expected[:, 4] if inductance else (volts - MOTOR["K_tau"] * expected[:, 1]) / MOTOR["R"]
     assert np.allclose(run["I"], current, atol=1e-6 * np.max(np.abs(current)))
+
+
+def test_a_supply_that_sags_is_an_input_and_a_log_without_it_has_the_rated_one():
+    plant = so.plants.rotary(parts=["duty_input", "supply_input"])
+    n = 200
+    drive = 1.3 * np.sin(np.linspace(0.0, 12.0, n) ** 1.5)
+    supply = 11.0 - 3.0 * np.abs(drive)
+
+    def rates(t, x, k):
+        volts = supply[k] * np.clip(drive[k], -1.0, 1.0)
+        return motion(t, x, (volts - MOTOR["K_tau"] * x[1]) / MOTOR["R"], MOTOR)
+
+    expected, time = integrate(rates, 4, n), np.arange(n) / RATE_HZ
+    run = so.simulate(
+        plant, values_of(plant), so.Log.from_arrays(time=time, duty=drive, supply=supply), rtol=1e-9, hold="zero"
+    )
+    assert np.allclose(run["theta_m"], expected[:, 0], atol=1e-6 * np.max(np.abs(expected[:, 0])))
+    log, rated = so.Log.from_arrays(time=time, duty=drive), so.plants.rotary(parts=["duty_input"])
+    assert np.allclose(
+        so.simulate(plant, values_of(plant), log)["theta_m"], so.simulate(rated, values_of(rated), log)["theta_m"]
+    )
+    assert plant.actuation.effort(SimpleNamespace(**MOTOR)) == rated.actuation.effort(SimpleNamespace(**MOTOR))
+    with pytest.raises(PlantError, match='"supply_input" needs duty_input'):
+        so.plants.rotary(parts=["voltage_input", "supply_input"])
 
 
 def test_a_screw_takes_from_the_supply_what_it_heats_and_makes():
