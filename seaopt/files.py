@@ -188,8 +188,10 @@ def parse_file(
     try:
         content = parse(text)
         check_content(content)
-    except (ValueError, RecursionError) as problem:  # also a number of more digits than Python reads
-        raise error(f"{source}: is not valid {form} ({problem}); correct that place, or {remedy}") from problem
+    except (ValueError, RecursionError) as problem:
+        # Of a number of more digits than it reads, Python says how a program changes that.
+        reason, *_ = str(problem).split("; use sys.")
+        raise error(f"{source}: is not valid {form} ({reason}); correct that place, or {remedy}") from problem
     return content
 
 

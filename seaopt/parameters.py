@@ -82,10 +82,16 @@ class Parameter:
                 f"min = {self.max:g}, max = {self.min:g}"
             )
         if not self.min <= self.value <= self.max:
+            # A bound just above 0 keeps a division possible: wider bounds are no remedy there.
+            remedy = (
+                "give it a positive value"
+                if self.value <= 0.0 < self.min
+                else "change the value or the bounds: "
+                f"min = {min(self.min, self.value):g}, max = {max(self.max, self.value):g}"
+            )
             raise ParameterError(
                 f"parameter {self.name} = {self.value:g}{unit_after(self.unit)} is outside its bounds "
-                f"[{self.min:g}, {self.max:g}]; change the value or the bounds: "
-                f"min = {min(self.min, self.value):g}, max = {max(self.max, self.value):g}"
+                f"[{self.min:g}, {self.max:g}]; {remedy}"
             )
         if self.prior_std is not None and not 0.0 < self.prior_std < math.inf:
             raise ParameterError(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 
 import pytest
 
 from seaopt.errors import FileError
-from seaopt.files import check_content, digest_content, write_bytes
+from seaopt.files import check_content, digest_content, parse_file, write_bytes
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
@@ -45,6 +46,13 @@ def test_integers_of_64_bits_are_read(value):
 def test_integers_of_more_are_refused(value):
     with pytest.raises(ValueError, match="an integer has 64 bits, and 63 beside its sign are the most"):
         check_content({"seed": [value]})
+
+
+def test_a_number_of_too_many_digits_is_refused_without_advice_to_programmers(tmp_path):
+    path = tmp_path / "fit.json"
+    path.write_text('{"seed": ' + 5000 * "1" + "}")
+    with pytest.raises(FileError, match=r"not valid JSON \(Exceeds the limit [^;]*5000 digits\); correct that place"):
+        parse_file(path, json.loads, "JSON", remedy="run it again")
 
 
 def test_the_clock_has_no_part_in_a_digest():

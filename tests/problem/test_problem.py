@@ -122,6 +122,7 @@ kind = "high_impedance"
         ('unit = "kg m^2", free', 'unit = "kg m^3", free', "kg m\\^3"),
         ('unit = "kg m^2", free', 'unit = "flurb", free', "flurb"),
         ("value = 1.5e-6", "value = 1.5e-9", "J = 1.5e-09 kg m\\^2 is outside its bounds"),
+        ("value = 1.5e-6", "value = 0", "J = 0 kg m\\^2 is outside its bounds .*; give it a positive value$"),
         ("J   =", "JJ  =", 'unknown parameter "JJ"'),
         ('kind = "high_impedance"', 'kind = "high"', "plant.stand"),
         ('drive = "unlumped"', 'drive = "unlumpt"', "unlumpt"),
