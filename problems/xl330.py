@@ -3,7 +3,8 @@
 This script puts the logs beside the problem file, reads off them how the firmware turns position error into duty, fits
 with and without friction that grows with the load (Duclusaud and Passault, Extended Friction Models for the Physics
 Simulation of Servo Actuators, 2024), and says by how many degrees the angle is wrong on trajectories that were not
-fitted, from rest, by the goal alone.
+fitted, from rest, by the goal and the supply. Both gains are fitted; how far one gain's values hold at the other is
+said, too.
 
     python problems/xl330.py [folder with the JSON files [folder to work in]]
 """
@@ -60,14 +61,22 @@ def fit(problem: so.Problem, load_friction: bool = True) -> so.Fit:
     if not load_friction:
         guess = guess.update(**dict.fromkeys(LOAD, 0.0)).fix(*LOAD)
     fitted = problem.choose_fitted(problem.experiments())
-    return so.fit(fitted, guess, **problem.fit_options, diagnostics=False)
+    return so.fit(fitted, guess, **problem.fit_options, diagnostics=load_friction)
+
+
+def fit_gain(problem: so.Problem, gain: int) -> so.Fit:
+    """Fit every trajectory at one gain, to see how far its values hold at the other."""
+    fitted = [experiment for experiment in problem.experiments() if experiment.parameters["k_p"] == gain]
+    return so.fit(fitted, problem.parameters, **problem.fit_options, diagnostics=False)
 
 
 def errors_deg(fit: so.Fit, problem: so.Problem, fitted: bool) -> dict[str, float]:
-    """Return the mean absolute error of the angle (deg) by log, from rest by the goal alone, of those fitted or not."""
-    experiments, out = problem.experiments(), {}
-    known = {experiment.name for experiment in problem.choose_fitted(experiments)}
-    for experiment in experiments:
+    """Return the mean absolute error of the angle (deg) by log, from rest by the goal and the supply, of those fitted
+    or not.
+    """
+    out: dict[str, float] = {}
+    known = {experiment.name for experiment in fit.experiments}
+    for experiment in problem.experiments():
         if (experiment.name in known) == fitted:
             parameters = fit.parameters.update(**experiment.parameters)
             run = so.simulate(experiment.plant, parameters, experiment.log, hold="first", rtol=1e-5)
@@ -104,6 +113,9 @@ def main(logs: Path, folder: Path) -> None:
             listed = ", ".join(f"{name}: {value:.2f}" for name, value in errors.items())
             print(f"{title}: mean absolute error {average(errors):.2f} deg ({listed})")
             found[load_friction] = average(errors)
+    for gain, other in ((100, 400), (400, 100)):
+        errors = average(errors_deg(fit_gain(problem, gain), problem, fitted=False))
+        print(f"all four trajectories at gain {gain} fitted: {errors:.2f} deg on those at {other}")
     check(result)
     assert found[True] < PUBLISHED_DEG
     assert found[True] < 0.6 * found[False]

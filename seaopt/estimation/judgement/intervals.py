@@ -73,8 +73,8 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
             severity="error",
             kind="rough",
             where=name,
-            text=f"known only roughly, to {100.0 * parameter.known:.2g} %: excite it more, measure another output, or "
-            "fix it, or give it a prior",
+            text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "
+            "output, fix it, or give it a prior",
         )
 
 

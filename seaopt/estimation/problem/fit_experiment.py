@@ -206,9 +206,10 @@ class FitExperiment:
     def power(self, passes: Sequence[Pass], moved: Vector) -> ResidualPower:
         """Return the power of the residuals after unknowns in which they are straight have moved."""
         squares, counts = np.zeros(len(self.sigma)), np.zeros(len(self.sigma))
+        of_place = np.append(moved, 0.0)  # the last one is of places that are no unknown, -1
         for segment, sums in zip(self.segments, passes, strict=True):
             for o, places in enumerate(self.columns(segment)):
-                step = np.concatenate([[1.0], np.where(places >= 0, moved[places], 0.0)])
+                step = np.concatenate([[1.0], of_place[places]])
                 squares[o] += max(float(step @ sums.gram[o] @ step), 0.0)
                 counts[o] += sums.count[o]
         return ResidualPower(squares=squares, counts=counts)

@@ -51,6 +51,17 @@ def test_another_log_is_predicted_from_its_own_start_and_offset(fitted):
     assert "second" in repr(score) and f"{expected:.2f}" in repr(score)
 
 
+def test_a_log_that_has_nothing_of_its_own_is_scored(fitted):
+    """Neither an initial state nor an offset is to be found then."""
+    log, truth = make_log(2, [0.0, 0.0], 0.0)
+    score = fitted.predict(so.Experiment(plant=PLANT, log=log, name="second", initial_state="rest", offset=False))
+    assert np.sqrt(np.mean((score.model["x"] - truth) ** 2)) < 3e-5
+
+
+def test_a_fit_that_is_not_judged_says_so(fitted):
+    assert "not judged" in str(fitted)
+
+
 def test_a_fit_with_nothing_free_scores_a_log(fitted):
     log, _ = make_log(3, [0.1, 0.0], 0.0)
     score = so.fit([so.Experiment(plant=PLANT, log=log)], fitted.parameters.fix())

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 
 from seaopt.estimation import Fit
-from seaopt.estimation.result.findings import DerivedFigure, FitFinding
+from seaopt.estimation.result.findings import DerivedFigure, FitFinding, LogValues
 from seaopt.formatting import MISSING, format_count, format_number
 from seaopt.parameters import Parameter
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
@@ -25,6 +25,8 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     """Return the verdict on a fit: what forbids its use, each reason once with its places."""
     size = f"{fit.samples} samples"
     percents = [each.fit_percent for row in fit.outputs.values() for each in row.values()]
+    if fit.met and not fit.outputs:
+        return Verdict(met=True, text=f"Fit: converged, {size}; not judged, as diagnostics = False leaves that out")
     if fit.met:
         ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
         outputs = f", outputs fit to {' to '.join(ends)} %" if ends else ""
@@ -67,11 +69,10 @@ def describe(fit: Fit) -> list[Section]:
             sentences=tuple(_list_caveats(fit)),
             tables=(_tabulate_parameters(fit),),
         ),
-        Section(
-            title="Fit of every output",
-            part="fit",
-            tables=(_tabulate_outputs(fit),),
-            remarks=(EXPLAINED,) if fit.outputs else (),
+        *(
+            [Section(title="Fit of every output", part="fit", tables=(_tabulate_outputs(fit),), remarks=(EXPLAINED,))]
+            if fit.outputs
+            else []
         ),
         *_describe_logs(fit),
         *list_notes("the fit", fit.notes, _list_findings(fit)),
@@ -118,32 +119,34 @@ def _describe_logs(fit: Fit) -> Iterator[Section]:
     """Yield what each log says alone, where several were compared."""
     if not fit.logs:
         return
+    logs = tuple(
+        (name, format_number(log.amplitude, 3), format_number(log.excess, 2)) for name, log in fit.logs.items()
+    )
     rows = tuple(
-        (
-            name,
-            format_number(log.amplitude, 3),
-            format_number(log.excess, 2),
-            parameter,
-            f"{value:.6g}",
-            _spread(std),
-            f"{fit.parameters[parameter].value:.6g}",
-        )
+        (parameter, f"{fit.parameters[parameter].value:.6g}", name, *_find_own_value(log, parameter))
+        for parameter in fit.covariance.names
         for name, log in fit.logs.items()
-        for parameter, (value, std) in log.values.items()
+        if parameter in log.values
     )
     yield Section(
         title="Values by each log alone",
         part="parameters",
         tables=(
+            Table(label="Logs that were compared", head=("log", "amplitude", "over noise"), rows=logs, align="<>>"),
             Table(
                 label="Values by each log alone",
-                head=("log", "amplitude", "over noise", "parameter", "by it alone", "std", "by all"),
+                head=("parameter", "by all", "log", "by it alone", "std"),
                 rows=rows,
-                align="<>><>>>",
+                align="<><>>",
             ),
         ),
         remarks=("amplitude: standard deviation of the spring's force or torque, in the output's unit",),
     )
+
+
+def _find_own_value(log: LogValues, parameter: str) -> tuple[str, str]:
+    value, std = log.values[parameter]
+    return f"{value:.6g}", _spread(std)
 
 
 def _tabulate_figure(name: str, figure: DerivedFigure, remark: str) -> tuple[str, ...]:
