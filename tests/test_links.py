@@ -1,4 +1,4 @@
-"""Every link of the documentation leads to a page, a heading or a file that is there; no network is needed."""
+"""Every link of the documentation leads somewhere, and no line of it is left out; no network is needed."""
 
 from __future__ import annotations
 
@@ -59,3 +59,9 @@ def test_a_broken_link_is_seen(tmp_path):
     page.write_text("# A title: of two\n\n```text\n# no heading\n```\n[here](#a-title-of-two) and `[not](a link)`\n")
     assert list_anchors(page) == {"a-title-of-two"}
     assert list_links(page.read_text()) == ["#a-title-of-two"]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_line_is_taken_for_a_comment(name):
+    text = strip_code((ROOT / name).read_text(encoding="utf-8"))
+    assert not re.findall(r"^ *%.*", text, flags=re.MULTILINE), "MyST leaves a line out that begins with %"
