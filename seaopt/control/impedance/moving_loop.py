@@ -7,14 +7,16 @@ maps of them are batches of eigenvalues.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.impedance.link import ControlledLink, Load
-from seaopt.control.loops.outer_loop import Impedance, OuterLoop
+from seaopt.control.loops.outer_loop import POSITION, SPEED, Impedance, OuterLoop
 from seaopt.control.loops.sampled_plant import hold
+from seaopt.control.systems.block import REFERENCE, Block, connect, make_plant
 from seaopt.records import record
 
 Matrix = Float[np.ndarray, "_ _"]
@@ -83,47 +85,20 @@ def close_link(link: ControlledLink, velocity_filter_s: float, load: Load | None
     position[port.place] = 1.0
     rows, direct = np.vstack([c, position]), np.append(d, 0.0)
     held = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
-    plant = tuple(part[0] for part in held)
-    for _ in range(link.delay_samples):
-        plant = _wait(*plant)
-    return _assemble(link, velocity_filter_s, *plant)
+    a, b, c, d = (part[0] for part in held)
+    plant = make_plant(a, b, c, d, link.delay_samples)
+    return _assemble(link, velocity_filter_s, replace(plant, outputs=(*plant.outputs[:-1], POSITION)))
 
 
-def _wait(a: Matrix, b: Vector, c: Matrix, d: Vector) -> tuple[Matrix, Vector, Matrix, Vector]:
-    """Return a sampled plant whose input acts one sample later."""
-    a = np.block([[a, b[:, None]], [np.zeros((1, b.size + 1))]])
-    return a, np.append(np.zeros(b.size), 1.0), np.column_stack([c, d]), np.zeros_like(d)
-
-
-def _assemble(
-    link: ControlledLink, velocity_filter_s: float, a: Matrix, b: Vector, rows: Matrix, direct: Vector
-) -> MovingLoop:
-    """Return the loop of a sampled plant, whose rows are what the law reads and the position."""
-    law, n, through = link.law, b.size, direct[:-1]
+def _assemble(link: ControlledLink, velocity_filter_s: float, plant: Block) -> MovingLoop:
+    """Return the loop of a sampled plant that tells what the law reads and the position."""
     outer = link.speed_filter(velocity_filter_s)
-    size = n + law.c.size + 1
-    inner, speed = slice(n, size - 1), size - 1
-    # Over the states (plant, law, filter of the speed): effort, readings, position.
-    effort, read, position = np.zeros(size), np.zeros((through.size, size)), np.zeros(size)
-    effort[inner], read[:, :n], position[:n] = law.c, rows[:-1], rows[-1]
-    gain = 1.0 / (1.0 - law.d[1:] @ through)
-    effort = gain * (effort + law.d[1:] @ read)
-    read = read + np.outer(through, effort)
-    per_reference = gain * law.d[0]  # of the effort
-    matrix, drive = np.zeros((size, size)), np.zeros(size)
-    matrix[:n, :n] = a
-    matrix[:n] += np.outer(b, effort)
-    drive[:n] = b * per_reference
-    matrix[inner, inner] = law.a
-    matrix[inner] += law.b[:, 1:] @ read
-    drive[inner] = law.b[:, 0] + law.b[:, 1:] @ (through * per_reference)
-    filtered = outer.rate * position
-    filtered[speed] += 1.0
-    matrix[speed] = outer.pole * filtered - outer.rate * position
+    loop = connect([plant, link.law.block, outer.block], [REFERENCE], [POSITION, SPEED])
+    drive, (position, speed) = loop.b[:, 0], loop.c
     return MovingLoop(
-        fixed=matrix,
+        fixed=loop.a,
         by_stiffness=-link.direction * np.outer(drive, position),
-        by_damping=-link.direction * np.outer(drive, filtered),
+        by_damping=-link.direction * np.outer(drive, speed),
         reference=drive,
         position=position,
         outer=outer,

@@ -44,6 +44,7 @@ from seaopt.control.loops.minimal import (
     split_integrators,
 )
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.systems.block import COMMAND, EFFORT, REFERENCE, Block, name_readings
 from seaopt.errors import ControlError
 from seaopt.formatting import format_count
 from seaopt.records import record
@@ -92,6 +93,13 @@ class Law:
     def integrators(self) -> int:
         """How many of the first states are the chain of accumulators."""
         return _count_integrators(self)
+
+    @property
+    def block(self) -> Block:
+        """The law with named signals; its effort is a part of the command, which may have others."""
+        rows = np.ones((2, 1))
+        inputs = (REFERENCE, *name_readings(self.d.size - 1))
+        return Block(a=self.a, b=self.b, c=rows * self.c, d=rows * self.d, inputs=inputs, outputs=(EFFORT, COMMAND))
 
     @property
     def rest(self) -> tuple[Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]:

@@ -170,7 +170,7 @@ class Loop:
 
     def system(self) -> ClosedLoop:
         """Return plant, hold, delay and controller as one system."""
-        return close(self.plant.delayed(), self.law)
+        return close(self.plant.block, self.law)
 
     def to_control(self) -> control.StateSpace:
         """Return the closed loop as python-control's `StateSpace`: from noise and reference to measured and effort.

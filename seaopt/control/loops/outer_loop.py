@@ -16,10 +16,13 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.codec import Constraints
+from seaopt.control.systems.block import Block
 from seaopt.errors import ControlError
 from seaopt.options import check_options, option
 from seaopt.records import record
 from seaopt.units import mechanics_of
+
+POSITION, SPEED = "position", "speed"  # of the link
 
 
 @record
@@ -131,6 +134,12 @@ class OuterLoop:
         speed = state + self.rate * position
         reference_effort = self.direction * (self.stiffness * (reference - position) - self.damping * speed)
         return reference_effort, self.pole * speed - self.rate * position
+
+    @property
+    def block(self) -> Block:
+        """The filtered speed of the position."""
+        a, rate = np.full((1, 1), self.pole), self.rate
+        return Block(a=a, b=rate * (a - 1.0), c=np.ones((1, 1)), d=rate + 0.0 * a, inputs=(POSITION,), outputs=(SPEED,))
 
     def difference(self, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return D at points of the z plane."""

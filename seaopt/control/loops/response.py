@@ -40,7 +40,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.sampled_plant import StateSpace
+from seaopt.control.systems.block import COMMAND, EFFORT, REFERENCE, Block, connect
 from seaopt.records import record
 
 SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
@@ -199,37 +199,22 @@ class ClosedLoop:
         return m, k
 
 
-def close(plant: StateSpace, law: Law) -> ClosedLoop:
+def close(plant: Block, law: Law) -> ClosedLoop:
     """Return the loop of a plant and u = C_r r - C_y m; of a plant that is not finite an unstable one."""
     from scipy.linalg import matrix_balance, schur
 
-    ap, bp, cp, dp = plant
-    ak, bk, ck, dk = law.a, -law.b[:, 1:], law.c, -law.d[1:]
-    measured = dk.size
-    # u and m = y + n satisfy u = c_k x_k + d_r r - d_y m, m = c_p x_p + d_p (u + w) + n; inputs w, r and every n.
-    n, m = bp.size, ck.size
-    loop = 1.0 / (1.0 + float(dk @ dp))
-    c_u = np.concatenate([-dk @ cp, ck]) * loop
-    d_u = np.concatenate([[-float(dk @ dp), law.d[0]], -dk]) * loop
-    to_command = np.eye(1, 2 + measured)[0]
-    c_m = np.hstack([cp, np.zeros((measured, m))]) + np.outer(dp, c_u)
-    d_m = np.eye(measured, 2 + measured, k=2) + np.outer(dp, d_u + to_command)
-    a, b = np.zeros((n + m, n + m)), np.zeros((n + m, 2 + measured))
-    a[:n, :n], a[n:, n:] = ap, ak
-    a[:n] += np.outer(bp, c_u)
-    a[n:] -= bk @ c_m
-    b[:n], b[n:] = np.outer(bp, d_u + to_command), -bk @ d_m
-    b[n:, 1] += law.b[:, 0]
-    if measured == 1:  # noise, reference; measured, effort
-        b, c, d = b[:, [2, 1]], np.stack([c_m[0], c_u]), np.stack([d_m[0], d_u])[:, [2, 1]]
-    else:
-        c, d = np.stack([c_u, c_u, c_m[0]]), np.stack([d_u + to_command, d_u, d_m[0]])
+    measured, regulated, *_ = len(plant.outputs), *plant.outputs
+    inputs, outputs = (regulated, REFERENCE), (regulated, EFFORT)
+    if measured > 1:
+        inputs, outputs = (COMMAND, REFERENCE, *plant.outputs), (COMMAND, EFFORT, regulated)
+    system = connect([plant, law.block], inputs, outputs)
+    a, b, c, d, n = system.a, system.b, system.c, system.d, len(system.a)
     table = list_curves(measured)
     through = d[table.outputs, table.inputs] * table.factors + table.offsets
-    opened = np.full(n + m, np.inf + 0j)
-    side = max(b.shape[1], c.shape[0])
-    whole = np.zeros((n + m + side, n + m + side))
-    whole[: n + m, : n + m + b.shape[1]], whole[n + m : n + m + len(c), : n + m] = np.hstack([a, b]), c
+    opened = np.full(n, np.inf + 0j)
+    side = max(b.shape[1], len(c))
+    whole = np.zeros((n + side, n + side))
+    whole[:n, : n + b.shape[1]], whole[n : n + len(c), :n] = np.hstack([a, b]), c
     if not np.max(np.abs(whole)) < LARGEST_ENTRY:
         gone = np.diag(opened)
         return ClosedLoop(
@@ -241,18 +226,18 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
             right=b + 0j,
             left=c + 0j,
             opened=opened,
-            blocks=(ap, law.rest[0]),
+            blocks=(plant.a, law.rest[0]),
             table=table,
             through=through,
         )
     with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
         scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
-        scale = scale[: n + m] / np.prod(scale[n + m :]) ** (1.0 / side)
+        scale = scale[:n] / np.prod(scale[n:]) ** (1.0 / side)
         balanced = a * scale / scale[:, None], b / scale[:, None], c * scale
     if all(np.all(np.isfinite(matrix)) for matrix in balanced):
         a, b, c = balanced
     triangle, basis = (np.asarray(matrix) for matrix in schur(a, output="complex")[:2])
-    opened = np.concatenate([np.linalg.eigvals(ap), law.poles]).astype(complex)
+    opened = np.concatenate([np.linalg.eigvals(plant.a), law.poles]).astype(complex)
     return ClosedLoop(
         a=a,
         b=b,
@@ -262,7 +247,7 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
         right=basis.conj().T @ b,
         left=c @ basis,
         opened=opened,
-        blocks=(ap, law.rest[0]),
+        blocks=(plant.a, law.rest[0]),
         table=table,
         through=through,
     )

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
 from seaopt.control.loops.drift import leave_out_drift
+from seaopt.control.systems.block import Block, make_plant
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant
@@ -35,9 +36,7 @@ from seaopt.plants.plant import DRIVE_DELAY, dynamics_function, refuse_samples
 from seaopt.records import record
 from seaopt.units import factor
 
-# a, b, c, d from one input; c and d have a row for each output
-StateSpace = tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]
-LinearPlants = tuple[
+LinearPlants = tuple[  # a, b, c, d from one input; c and d have a row for each output
     Inexact[np.ndarray, "k n n"], Inexact[np.ndarray, "k n"], Inexact[np.ndarray, "k y n"], Inexact[np.ndarray, "k y"]
 ]
 SampledPlants = tuple[  # with more states, of commands on their way
@@ -101,15 +100,10 @@ class DigitalPlant:
         x = np.linalg.solve(z[:, None, None] * np.eye(self.b.size) - self.a, self.b[None, :, None])[..., 0]
         return np.array([(x @ c + d) * z**-self.delay_samples for c, d in zip(*self.sensed, strict=True)])
 
-    def delayed(self) -> StateSpace:
-        """Return a state-space model with the delay as states."""
-        k, n, (rows, through) = self.delay_samples, self.b.size, self.sensed
-        if k == 0:
-            return self.a, self.b, rows, through
-        a = np.eye(n + k, k=-1)  # each command moves on by one place a sample
-        a[:n, :n], a[n, n - 1], a[:n, -1] = self.a, 0.0, self.b
-        c = np.hstack([rows, np.zeros((len(rows), k - 1)), through[:, None]])
-        return a, np.eye(n + k)[n], c, 0.0 * through
+    @property
+    def block(self) -> Block:
+        """The plant from the command to every output, with the delay as states."""
+        return make_plant(self.a, self.b, *self.sensed, self.delay_samples)
 
 
 def sample(

@@ -21,6 +21,7 @@ from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.response import LARGEST_ENTRY
 from seaopt.control.loops.sampled_plant import LinearPlants, conditions, find_delay, hold, linearise, read_conditions
+from seaopt.control.systems.block import COMMAND, connect, make_plant
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
@@ -176,30 +177,14 @@ def compute_products(
     d: Float[np.ndarray, "n y"],
 ) -> Products:
     """Return S of every plant behind its hold, from the eigenvalues of the open and of the closed loop."""
-    law = controller.law
-    ac, bc, cc, dc = law.a, -law.b[:, 1:], law.c, -law.d[1:]
-    count, nx, k = a.shape[0], a.shape[1], controller.compute_delay_samples
-    n, m = nx + k, cc.size
-    plant, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, dc.size, n))
-    plant[:, :nx, :nx], sense[:, :, :nx] = a, c
-    through = d
-    if k:
-        plant[:, :nx, n - 1], sense[:, :, n - 1], drive[:, nx] = b, d, 1.0
-        for i in range(1, k):
-            plant[:, nx + i, nx + i - 1] = 1.0
-        through = np.zeros_like(d)
-    else:
-        drive = b
-    scale = 1.0 / (1.0 + through @ dc)
-    at_once = scale[:, None] * np.einsum("y,nyx->nx", dc, sense)  # what the law makes of the plant's state at once
-    closed = np.zeros((count, n + m, n + m))
-    closed[:, :n, :n] = plant - drive[:, :, None] * at_once[:, None, :]
-    closed[:, :n, n:] = scale[:, None, None] * drive[:, :, None] * cc
-    closed[:, n:, :n] = -bc @ (sense - through[:, :, None] * at_once[:, None, :])
-    closed[:, n:, n:] = ac - scale[:, None, None] * (through @ bc.T)[:, :, None] * cc
-    fixed = np.concatenate([law.poles, np.zeros(k)])
-    opened = np.concatenate([np.linalg.eigvals(a), np.broadcast_to(fixed, (count, m + k))], axis=1)
-    return Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)
+    law, k = controller.law, controller.compute_delay_samples
+    loops = connect([make_plant(a, b, c, d, k), law.block], [COMMAND], [COMMAND])  # what adds to it comes back as S
+    fixed = np.broadcast_to(np.concatenate([law.poles, np.zeros(k)]), (len(a), law.c.size + k))
+    return Products(
+        opened=np.concatenate([np.linalg.eigvals(a), fixed], axis=1).astype(complex),
+        closed=np.linalg.eigvals(loops.a).astype(complex),
+        scale=loops.d[:, 0, 0],
+    )
 
 
 def find_peaks(loop: Products) -> tuple[Peaks, Peaks]:

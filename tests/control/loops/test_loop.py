@@ -12,6 +12,7 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control import DigitalPlant, Gains, Loop, command_of, sample
 from seaopt.control.loops.response import find_zeros
+from tests.blocks import of_one_input
 from tests.laws import law_of, measurement_matrices
 
 
@@ -148,7 +149,7 @@ def test_stability_is_what_a_simulation_shows(name, request, thor):
     plant = request.getfixturevalue(name)
     for factor in (1.0, 4.0, 7.0, 9.0, 14.0):
         loop = loop_of("pd", plant, thor, k_p=3.2 * factor, k_d=0.033 * factor)
-        a, b, (c,), _ = loop.plant.delayed()
+        a, b, (c,), _ = of_one_input(loop.plant.block)
         ac, bc, cc, dc = measurement_matrices(loop.law)
         x, xc = np.full(len(b), 1e-3), np.zeros(len(bc))
         sizes = []

@@ -16,6 +16,7 @@ from seaopt.control import DigitalPlant, Loop
 from seaopt.control.loops import peaks
 from seaopt.control.loops.margins import margins, nu_gap
 from seaopt.errors import ControlError
+from tests.blocks import of_one_input
 from tests.control.loops.test_loop import loop_of
 from tests.laws import law_of, measurement_matrices
 
@@ -61,10 +62,11 @@ def independent(loop, f):
 
 def poles_of(loop, factor=1.0, extra=0):
     """The poles with a (complex) factor and extra samples of delay in the loop."""
-    a, b, (c,), (d,) = DigitalPlant(
+    plant = DigitalPlant(
         a=loop.plant.a, b=loop.plant.b, c=loop.plant.c, d=loop.plant.d, sample_time_s=1.0,
         delay_samples=loop.plant.delay_samples + extra, static_gain=1.0,
-    ).delayed()  # fmt: skip
+    )  # fmt: skip
+    a, b, (c,), (d,) = of_one_input(plant.block)
     ac, bc, cc, dc = measurement_matrices(loop.law)
     inner = 1.0 + factor * d * dc
     u_x, u_k = -factor * dc * c / inner, -factor * cc / inner

@@ -19,6 +19,7 @@ from seaopt.robustness import batch_figures
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
+from tests.blocks import of_one_input
 from tests.control.running.test_closed_loop import swing_by_hand
 from tests.laws import scaled
 
@@ -147,7 +148,7 @@ def test_small_steps_there_are_the_linear_loops(controller, swing, thor):
     phases = (Phase(duration_s=0.3, force_N=0.05),)
     trace = play(Stage(controller=controller, plant=swing), Scenario(name="s", phases=phases), [drawn])
     plant = controller.close(swing, drawn).plant
-    a, b, (c,), (d,) = plant.delayed()
+    a, b, (c,), (d,) = of_one_input(plant.block)
     law, x, forces = Difference(controller, 0.0, 0.0, 0.0), np.zeros(b.size), []
     for _ in range(300):
         forces.append(float(c @ x))

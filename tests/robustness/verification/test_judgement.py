@@ -16,6 +16,7 @@ from seaopt.robustness.verification.linear import linearise_last_phase
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
+from tests.blocks import of_one_input
 from tests.laws import scaled
 
 
@@ -150,7 +151,7 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
     expected = c @ solve_discrete_lyapunov(system.a, read) @ c + d
     only_read = replace(view, step_N=0.0)
     assert only_read.force_std() == pytest.approx(np.sqrt(expected), rel=2e-3)
-    a, b, (y,), _ = controller.close(stand, thor).plant.delayed()
+    a, b, (y,), _ = of_one_input(controller.close(stand, thor).plant.block)
     f = np.arange(0.5, 500.0)
     rounding = np.abs([y @ np.linalg.solve(np.exp(2j * np.pi * x * 1e-3) * np.eye(b.size) - a, b) for x in f])
     rounding = rounding * np.abs(controller.close(stand, thor).sensitivity(f))

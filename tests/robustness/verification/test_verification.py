@@ -20,6 +20,7 @@ from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Stage, _build_reference, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, find_step_limit, list_left_out
 from seaopt.robustness.verification.verification import verify
+from tests.blocks import of_one_input
 
 CELL = so.Sensors(noise_std={"F1": 1.0}, quantisation={"F1": 0.5})
 
@@ -97,7 +98,7 @@ def test_the_step_limit_is_where_the_current_saturates(controller, stand, thor):
     """The first samples of the law by hand: the largest motor force for a step, before the plant answers and after."""
     law = runnable(controller, command_limit=math.inf)
     loop = controller.close(stand, thor)
-    a, b, (c,), _ = loop.plant.delayed()
+    a, b, (c,), _ = of_one_input(loop.plant.block)
     x, memory, largest = np.zeros(len(b)), law.reset(), 0.0
     for _ in range(200):
         current, memory = law.step(memory, 1.0, float(c @ x))

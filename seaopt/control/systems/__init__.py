@@ -1,0 +1,1 @@
+"""Sampled linear systems with named signals, and what they make when they are connected."""
