@@ -18,8 +18,8 @@ from seaopt.errors import PlantError, UnitError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants import Actuation, Friction, Mode, Plant, Port, Sensing, SeriesSpring, wrapped
 from seaopt.plants.equations.expressions import MAX_LENGTH, RESERVED, list_names, parse
-from seaopt.plants.equations.stored_equations import StoredFunction, store_function
-from seaopt.problem.bench_tables import AnyPlant, EquationsTable, Formula, FrictionTable, PortTable
+from seaopt.plants.equations.stored_equations import ARGUMENTS, StoredFunction, store_function
+from seaopt.problem.bench_tables import AnyPlant, EquationsTable, Formula, PortTable
 from seaopt.problem.option_tables import StrictTable
 from seaopt.records import record
 from seaopt.units import factor, si_unit
@@ -30,6 +30,7 @@ KINDS = {
     "states": "a state", "inputs": "an input", "friction": "a friction", "parameters": "a parameter",
     "definitions": "a definition",
 }  # fmt: skip
+FRICTION_FORMULAS = ("velocity", "force", "effort", "slopes", "jump", "loads")
 Read = Callable[[str, Formula], Any]  # returns the expression of a formula, given its place
 
 
@@ -79,14 +80,17 @@ def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) 
         f=texts.store(write_rates, *everything),
         h=texts.store(write_outputs, *everything),
         derived=texts.derive(),
-        energy=texts.of_states("energy", table.energy),
+        energy=texts.take("energy", table.energy, ARGUMENTS["energy"]),
         optional_inputs=frozenset(table.optional_inputs),
-        actuation=texts.actuate(),
-        sensing=None if table.sensing is None else Sensing(**_list_fields(table.sensing)),
-        spring=texts.spring(),
+        actuation=texts.make(Actuation, "actuation", table.actuation, "effort", "speed", "largest"),
+        sensing=texts.make(Sensing, "sensing", table.sensing),
+        spring=texts.make(SeriesSpring, "spring", table.spring, "deflection"),
         ports=tuple(texts.port(f"ports.{number}", port, partners) for number, port in enumerate(table.ports, 1)),
-        friction={key: texts.rub(f"friction.{key}", curve) for key, curve in table.friction.items()},
-        mode=None if table.mode is None else Mode(**table.mode.model_dump()),
+        friction={
+            key: texts.make(Friction, f"friction.{key}", curve, *FRICTION_FORMULAS)
+            for key, curve in table.friction.items()
+        },
+        mode=texts.make(Mode, "mode", table.mode),
         sticks=table.sticks,
     )
     _check_outputs(plant)
@@ -179,14 +183,6 @@ class _Texts:
 
         return parse(text, symbols, place, explain)
 
-    def of_states(self, place: str, text: Formula | None) -> Any:
-        """Return a formula of states and parameters as a function; None where there is none."""
-        return None if text is None else self.store(lambda read: read(place, text), self.states, self.parameters)
-
-    def of_parameters(self, place: str, text: Formula | None) -> Any:
-        """Return a formula of the parameters as a function; None where there is none."""
-        return None if text is None else self.store(lambda read: read(place, text), self.parameters)
-
     def derive(self) -> StoredFunction | None:
         """Return the function of the derived figures."""
         figures = self.table.derived
@@ -196,61 +192,37 @@ class _Texts:
 
         return self.store(write, self.parameters) if figures else None
 
-    def actuate(self) -> Actuation | None:
-        """Return what a controller commands."""
-        role = self.table.actuation
-        if role is None:
-            return None
-        functions: dict[str, Any] = {
-            "effort": self.of_parameters("actuation.effort", role.effort),
-            "speed": self.of_states("actuation.speed", role.speed),
-            "largest": self.of_parameters("actuation.largest", role.largest),
-        }
-        return Actuation(**_list_fields(role) | functions)
+    def take(self, place: str, value: Any, takes: str, loads: Iterable[str] = ()) -> StoredFunction | None:
+        """Return a formula, or several in a list or a table, as a function of what it `takes`: the letters of
+        `ARGUMENTS`. None where there is none.
+        """
+        spaces: dict[str, Any] = {"x": self.states, "u": tuple(self.table.inputs), "p": self.parameters, "v": VELOCITY}
+        spaces["l"] = (*self.parameters, *loads)
 
-    def spring(self) -> SeriesSpring | None:
-        """Return the elastic element."""
-        role = self.table.spring
+        def write(read: Read) -> Any:
+            if isinstance(value, Mapping):
+                return {name: read(f"{place}.{name}", text) for name, text in value.items()}
+            return tuple(read(place, text) for text in value) if isinstance(value, tuple) else read(place, value)
+
+        none = value is None or value == {}
+        return None if none else self.store(write, *(spaces[letter] for letter in takes))
+
+    def make(self, kind: Any, place: str, role: StrictTable | None, *formulas: str, **others: Any) -> Any:
+        """Return a role of a table whose keys are its fields, some of them formulas; None where there is no table."""
         if role is None:
             return None
-        return SeriesSpring(**_list_fields(role) | {"deflection": self.of_states("spring.deflection", role.deflection)})
+        fields = {name: tuple(value) if isinstance(value, list) else value for name, value in role}
+        loads = fields.get("loads", ())
+        functions = {name: self.take(f"{place}.{name}", fields[name], ARGUMENTS[name], loads) for name in formulas}
+        return kind(**fields | functions | others)
 
     def port(self, place: str, role: PortTable, partners: Mapping[str, Plant]) -> Port:
         """Return a port; the plants that it names are made already."""
-        makers: dict[str, Any] = {
+        makers = {
             key: None if name is None else lambda name=name: partners[name]
             for key, name in (("held", role.held), ("probe", role.probe))
         }
-        return Port(**_list_fields(role) | makers | {"ratio": self.of_parameters(f"{place}.ratio", role.ratio)})
-
-    def rub(self, place: str, role: FrictionTable) -> Friction:
-        """Return a friction."""
-        known = (*self.parameters, *role.loads)
-
-        def curve(key: str, text: Formula) -> StoredFunction:
-            return self.store(lambda read: read(f"{place}.{key}", text), VELOCITY, known)
-
-        def write_slopes(read: Read) -> tuple[Any, ...]:
-            return tuple(read(f"{place}.slopes", text) for text in role.slopes or ())
-
-        def write_loads(read: Read) -> dict[str, Any]:
-            return {name: read(f"{place}.loads.{name}", text) for name, text in role.loads.items()}
-
-        loaded_by = (self.states, tuple(self.table.inputs), self.parameters)
-        functions: dict[str, Any] = {
-            "velocity": self.of_states(f"{place}.velocity", role.velocity),
-            "force": curve("force", role.force),
-            "effort": self.of_parameters(f"{place}.effort", role.effort),
-            "slopes": None if role.slopes is None else self.store(write_slopes, known),
-            "jump": None if role.jump is None else curve("jump", role.jump),
-            "loads": self.store(write_loads, *loaded_by) if role.loads else None,
-        }
-        return Friction(**_list_fields(role) | functions)
-
-
-def _list_fields(table: StrictTable) -> dict[str, Any]:
-    """Return the keys of a role's table, which are the fields of the role."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in table}
+        return self.make(Port, place, role, "ratio", **makers)
 
 
 def _list_kinds(table: EquationsTable) -> dict[str, str]:

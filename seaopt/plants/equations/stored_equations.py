@@ -81,7 +81,7 @@ def _arrange(layout: Any, leaves: list[Any]) -> Any:
 
 # What the functions of a plant and of its roles take: time t, states x, inputs u, parameters p (with rated loads, l), a
 # velocity v and the deflection of bristles z.
-_ARGUMENTS = {
+ARGUMENTS = {
     "f": "txup", "h": "txup", "derived": "p", "energy": "xp",
     "effort": "p", "speed": "xp", "largest": "p", "deflection": "xp", "ratio": "p",
     "velocity": "xp", "force": "vl", "slopes": "l", "jump": "vl", "loads": "xup",
@@ -97,9 +97,9 @@ def store_plant(plant: Any) -> dict[str, Any]:
     def store(owner: Any, loads: Iterable[str] = ()) -> dict[str, Any]:
         """Return the functions of a plant or a role that do not pickle as they are, stored."""
         names_of = spaces | {"l": (*spaces["p"], *loads)}
-        functions = {name: getattr(owner, name, None) for name in _ARGUMENTS}
+        functions = {name: getattr(owner, name, None) for name in ARGUMENTS}
         return {
-            name: store_function(function, *(names_of[letter] for letter in _ARGUMENTS[name]))
+            name: store_function(function, *(names_of[letter] for letter in ARGUMENTS[name]))
             for name, function in functions.items()
             if callable(function) and not _has_name(function)
         }
