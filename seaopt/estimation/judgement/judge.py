@@ -47,11 +47,10 @@ RUNS_AWAY = -1e3  # fit percent below which a free run is ten times as large as 
 LITTLE = 0.02  # of an output's energy: where no model explains more, explaining less is no fault
 CHANCE = 1e-6  # probability below which a test is not chance
 DOUBTFUL = 1e-3  # probability of a score below which a refit decides: far from the truth a score falls short of that
-SYSTEMATIC = 0.5  # of a residual's power: more than its noise
-LARGE = 3e-3  # of an output's energy: a systematic residual of 5 % of its size
-VISIBLE = 1e-4  # of one of 1 %
+# What follows the inputs in a residual is an error where it is so many times its sensor's noise (`noise_floor`), and
+# takes more than such a share of the output's energy: 5 % and 1 % of its size.
+SYSTEMATIC = ((1.0, 3e-3), (5.0, 1e-4))
 SMALL = 1e-5  # below which a systematic residual is worth no word
-FAR_ABOVE = 5.0  # times the noise of its sensor (`noise_floor`)
 HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
@@ -215,9 +214,8 @@ def _find_unexplained(
 ) -> Iterator[FitFinding]:
     """Yield outputs that are explained less than they could be, and residuals that follow an input.
 
-    What follows the inputs is an error where it is more than noise: more than the rest of the residual, or far above
-    what neighbouring samples differ by; the rest may be what a nonlinearity leaves. Where logs of two amplitudes tell
-    what it does to the values it is none.
+    What follows the inputs is measured in its sensor's noise, on every plant alike, and is an error by `SYSTEMATIC`.
+    Where logs of two amplitudes tell what it does to the values it is none.
     """
     told = {
         f"{e.name}.{output}"
@@ -229,7 +227,10 @@ def _find_unexplained(
         share, explained, explainable = shares.get(where), fitted.explained, fitted.explainable
         percents = (fitted.fit_percent, fitted.band_fit_percent, fitted.one_step_fit_percent)
         if explained is not None and max(percent for percent in percents if percent is not None) < WORSE:
-            text = "the model explains it worse than a constant: look for jumps, such as a counter that wraps"
+            text = (
+                "the model explains it worse than a constant: another plant, sign or unit, or jumps such as a counter "
+                "that wraps"
+            )
             yield _warn("explained", where, text, bad=True)
             continue
         if explained is None or explainable is None or share is None:
@@ -243,13 +244,11 @@ def _find_unexplained(
             yield _warn("explained", where, text, bad=ratio < HALF)
         elif share.p < CHANCE and share.residual > 0.0 and share.power > SMALL:
             band = " to ".join(dict.fromkeys(f"{end:.3g}" for end in share.band_hz))
-            bad = where not in told and (
-                (share.residual > SYSTEMATIC and share.power > LARGE)
-                or (math.sqrt(share.residual) * excess[where] > FAR_ABOVE and share.power > VISIBLE)
-            )
+            follows = math.sqrt(share.residual) * excess[where]
+            bad = where not in told and any(follows > least and share.power > power for least, power in SYSTEMATIC)
             text = (
-                f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at "
-                f"{band} Hz: the model lacks something, and the stds allow for noise alone"
+                f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at {band} Hz, "
+                f"{follows:.2g} times its sensor's noise: the model lacks something"
             )
             yield _warn("residual", where, text, bad=bad)
 
