@@ -11,6 +11,8 @@ Parts around any plant:
 ``supply_input``
     With a duty: the supply that was logged is an input, `supply` (V), in place of V_s wherever it is above zero. A log
     without it, and a controller's design, have V_s.
+``supply_sag``
+    The supply has a resistance R_b: the bridge takes d I from it, and the supply's voltage is less by :math:`R_b d I`.
 ``inductance``
     With one of them: :math:`V = R I + L_m \dot I + K_e \omega`; the current is then a state.
 ``position_servo``
@@ -49,6 +51,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "duty_input": (RESISTANCE, declare("V_s", 24.0, "V", 1e-9, "supply voltage", (1.0, 1e3))),
     "inductance": (declare("L_m", 1e-3, "H", 1e-12, "winding inductance", (1e-7, 1)),),
     "supply_input": (),
+    "supply_sag": (declare("R_b", 0.0, "ohm", 0.0, "resistance of the supply", (0, 100)),),
     "position_servo": (
         declare("k_p", 1.0, "-", 0.0, "gain of the servo, in the units that g_s, 1 unless given, converts"),
         declare("k_d", 0.0, "s", 0.0, "damping of the servo, in its own units"),
@@ -103,16 +106,17 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
         return ca.if_else(u.supply > 0.0, u.supply, p.V_s) if "supply_input" in parts else p.V_s
 
     def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
-        applied = u.V if part == "voltage_input" else find_supply(u, p) * ca.fmin(ca.fmax(u.duty, -1.0), 1.0)
+        share = 1.0 if part == "voltage_input" else ca.fmin(ca.fmax(u.duty, -1.0), 1.0)
+        driving = share * (u.V if part == "voltage_input" else find_supply(u, p)) - find_emf(x, p)
+        # The bridge takes share * I from the supply, and gives share of its voltage.
+        resistance = find_resistance(winding, x, p) + (p.R_b * share**2 if "supply_sag" in parts else 0.0)
         if inductive:
             flows = getattr(x, current)
-            dropped = find_resistance(winding, x, p) * flows
-            return flows, {current: (applied - dropped - find_emf(x, p)) / p.L_m}, {current: flows}
-        flows = (applied - find_emf(x, p)) / find_resistance(winding, x, p)
-        return flows, {}, {current: flows}
+            return flows, {current: (driving - resistance * flows) / p.L_m}, {current: flows}
+        return driving / resistance, {}, {current: driving / resistance}
 
-    added = (*PARTS[part], *(PARTS["inductance"] if inductive else ()))
-    added = tuple(parameter for parameter in added if winding is None or parameter is not RESISTANCE)
+    chosen = [parameter for each in (part, "supply_sag", "inductance") if each in parts for parameter in PARTS[each]]
+    added = tuple(parameter for parameter in chosen if winding is None or parameter is not RESISTANCE)
     unit_of_current = plant.inputs[current]
     return _put_before(
         plant,

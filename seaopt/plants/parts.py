@@ -59,8 +59,9 @@ Around any plant, besides those of `seaopt.plants.drives`:
     Dead times T_c before the input and T_m behind the same outputs, as Padé approximants of order three: the phase is
     right to one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are
     for linearisation and continuous-time loops.
-``droop``, ``friction_drift``, ``friction_direction``
-    A motor that saturates, friction that changes over a log, or with the direction: `seaopt.plants.motor.effects`.
+``droop``, ``friction_drift``, ``friction_direction``, ``back_driving``, ``cogging``, ``stand``
+    A motor that saturates or cogs, friction that changes over a log, with the direction or with who drives whom, a
+    stand that gives: `seaopt.plants.motor.effects`.
 ``deflection_sensor``
     One more output, what two encoders and a nominal stiffness make: `seaopt.plants.sensors.deflection`.
 """
@@ -102,6 +103,9 @@ Part = Literal[
     "droop",
     "friction_drift",
     "friction_direction",
+    "back_driving",
+    "cogging",
+    "stand",
     "current_loop",
     "load_cell",
     "command_delay",
@@ -109,6 +113,7 @@ Part = Literal[
     "voltage_input",
     "duty_input",
     "supply_input",
+    "supply_sag",
     "inductance",
     "position_servo",
     "servo_integral",
@@ -174,6 +179,7 @@ BREAKAWAY = 1.5  # of Coulomb friction, where bristles need a default
 NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
     **dict.fromkeys(("load_stribeck", "load_square"), (("stribeck",), ("load_friction",))),
     **dict.fromkeys(("servo_integral", "servo_limit", "servo_delay"), (("position_servo",),)),
+    **dict.fromkeys(("supply_input", "supply_sag"), (("duty_input",),)),
     "inductance": (tuple(drives.INPUTS),),
     "supply_input": (("duty_input",),),
 }
@@ -322,6 +328,9 @@ _EFFECTS: dict[str, Callable[[Plant], Plant]] = {
     "droop": effects.let_droop,
     "friction_drift": effects.let_friction_drift,
     "friction_direction": effects.let_friction_differ,
+    "back_driving": effects.let_back_driving_differ,
+    "cogging": effects.let_cog,
+    "stand": effects.let_stand_give,
 }
 _WRAPPERS: dict[str, Callable[[Plant, Sequence[str]], Plant]] = {
     "position_servo": drives.add_servo,

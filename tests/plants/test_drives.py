@@ -95,6 +95,29 @@ def test_a_supply_that_sags_is_an_input_and_a_log_without_it_has_the_rated_one()
         so.plants.rotary(parts=["voltage_input", "supply_input"])
 
 
+@pytest.mark.parametrize("inductance", [False, True])
+def test_a_supply_sags_by_what_the_bridge_takes_from_it(inductance):
+    """I from E + R I = d (V_s - R_b d I) in the rotor's rest frame, and that voltage given as a log of the supply."""
+    plant = so.plants.rotary(parts=["duty_input", "supply_sag", *(["inductance"] if inductance else [])])
+    n, sag = 200, 0.15
+    duty = 0.9 * np.sin(np.linspace(0.0, 12.0, n) ** 1.5)
+
+    def find_current(x, k):
+        return (12.0 * duty[k] - MOTOR["K_tau"] * x[1]) / (MOTOR["R"] + sag * duty[k] ** 2)
+
+    def rates(t, x, k):
+        if not inductance:
+            return motion(t, x, find_current(x, k), MOTOR)
+        volts = duty[k] * (12.0 - sag * duty[k] * x[4])
+        return [*motion(t, x, x[4], MOTOR), (volts - MOTOR["R"] * x[4] - MOTOR["K_tau"] * x[1]) / MOTOR["L_m"]]
+
+    expected = integrate(rates, 5 if inductance else 4, n)
+    log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, duty=duty)
+    run = so.simulate(plant, values_of(plant, R_b=sag), log, rtol=1e-9)
+    assert np.allclose(run["theta_m"], expected[:, 0], atol=1e-6 * np.max(np.abs(expected[:, 0])))
+    assert plant.linearize(values_of(plant, R_b=sag)).B[1, 0] == plant.linearize(values_of(plant)).B[1, 0]
+
+
 def test_a_screw_takes_from_the_supply_what_it_heats_and_makes():
     """V I = R I^2 + F_m qd/eta: the back-EMF is that of K_tau, whatever the losses of the screw."""
     plant = so.plants.high_impedance(parts=["voltage_input"])

@@ -16,7 +16,11 @@ EFFECTS = {
     "droop": {"a_i": 0.012},
     "friction_drift": {"w_c": 0.4, "b_t": 8e-5},
     "friction_direction": {"f_a": 0.006, "b_a": -4e-5},
+    "back_driving": {"d_e": 0.06},
+    "cogging": {"a_g": 0.01, "b_g": -0.006, "n_g": 1.4},
+    "stand": {"c_t": 1.0 / (15.0 * 300.0)},
 }
+NONLINEAR = ("droop", "friction_drift", "friction_direction")
 
 
 def _command(t):
@@ -25,11 +29,15 @@ def _command(t):
 
 def _rate(t, x, p):
     angle, speed = x
-    current, torque = _command(t), p["k_s"] * angle / p["N"] + p["c_s"] * speed / p["N"]
+    k = 1.0 / (1.0 / p["k_s"] + p.get("c_t", 0.0))
+    current, torque = _command(t), k * angle / p["N"] + p["c_s"] * speed / p["N"]
     motor = p["K_tau"] * current * (1.0 - p.get("a_i", 0.0) * current**2)
     dry = p["f_c"] * math.tanh(speed / p["v_s"]) * (1.0 - p.get("w_c", 0.0) * t)
     viscous = (p["b_r"] + p.get("b_t", 0.0) * t) * speed
     rub = dry + viscous + p.get("f_a", 0.0) + p.get("b_a", 0.0) * abs(speed)
+    phase = p.get("n_g", 0.0) * angle
+    rub += p.get("a_g", 0.0) * math.sin(phase) + p.get("b_g", 0.0) * math.cos(phase)
+    rub += p.get("d_e", 0.0) * k * angle / p["N"] ** 2
     return speed, (motor - rub - torque / p["N"]) / p["J_m"]
 
 
@@ -51,7 +59,7 @@ def test_a_plant_moves_as_its_equations_say(part):
     assert np.max(np.abs(run["theta_m"] - plain[0])) > 0.01 * np.max(np.abs(exact[0]))
 
 
-@pytest.mark.parametrize("part", EFFECTS)
+@pytest.mark.parametrize("part", NONLINEAR)
 def test_a_controller_is_designed_on_the_plant_without_the_effect(part):
     plant, params = _make(part)
     bare = so.plants.rotary(link="locked")
@@ -88,7 +96,17 @@ def test_what_sticks_breaks_away_later_as_friction_falls():
     assert abs(started - (1.0 - 0.012 / 0.02) / 0.4) < 5e-3  # f_c (1 - w_c t) = torque
 
 
-@pytest.mark.parametrize("part", [*EFFECTS, "hardening", "stribeck", "backlash", "load_friction", "hysteresis"])
+@pytest.mark.parametrize(
+    "part",
+    [
+        *(part for part in EFFECTS if part != "stand"),
+        "hardening",
+        "stribeck",
+        "backlash",
+        "load_friction",
+        "hysteresis",
+    ],
+)
 def test_a_part_is_added_as_if_the_plant_were_made_with_it(part):
     made = so.plants.let_stick(so.plants.rotary(link="pendulum", parts=["current_loop", part]))
     plant = so.plants.let_stick(so.plants.rotary(link="pendulum", parts=["current_loop"]))
@@ -107,11 +125,21 @@ def test_what_was_changed_since_it_was_made_takes_parts_around_it_alone():
         add_part(so.plants.high_impedance(parts=["hardening"]), "hardening")
 
 
+def test_a_stand_gives_in_series_with_the_spring_alone():
+    plant, params = _make("stand")
+    bare = so.plants.rotary(link="locked")
+    softer = bare.defaults.update(**TRUTH | {"k_s": 300.0 * 15.0 / 16.0})
+    assert np.allclose(plant.linearize(params).A, bare.linearize(softer).A)
+    with pytest.raises(PlantError, match="holds a link"):
+        so.plants.rotary(link="pendulum", parts=["stand"])
+
+
 def test_a_part_says_which_role_it_lacks():
     bare = so.Plant(
         name="mass", states={"x": "m", "v": "m/s"}, inputs={"F": "N"}, outputs={"x": "m"}, parameters={"m": "kg"},
         f=lambda t, x, u, p: {"x": x.v, "v": u.F / p.m}, h=lambda t, x, u, p: {"x": x.x},
     )  # fmt: skip
-    for part, needs in (("droop", "current"), ("friction_drift", "friction"), ("friction_direction", "friction")):
+    needed = {"droop": "current", "stand": "stiffness"} | dict.fromkeys(set(EFFECTS) - {"droop", "stand"}, "friction")
+    for part, needs in needed.items():
         with pytest.raises(PlantError, match=needs):
             so.plants.wrapped(bare, [part])

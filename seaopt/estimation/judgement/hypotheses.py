@@ -46,13 +46,15 @@ class Sizes:
 class Hypothesis:
     """What a model may lack: in words, the part that brings it, and from which values of its own a refit starts.
 
-    Those that it frees are the first of each start; `fixed` are chosen once.
+    Those that it frees are the first of each start; `fixed` are chosen once. `usual` is of what logs often do not show
+    at all: a size that actuators have, with a spring of that stiffness (`silence`).
     """
 
     effect: str
     part: str
     starts: Callable[[Sizes], Starts]
     fixed: Callable[[Sizes], Mapping[str, float]] = lambda sizes: {}
+    usual: Callable[[float], float] | None = None
 
 
 def _zero(*names: str) -> Callable[[Sizes], Starts]:
@@ -103,6 +105,18 @@ HYPOTHESES = (
         part="lugre",
         starts=lambda s: [{"sigma_0": 50.0 * s.friction / s.travel}] if s.friction and s.travel else [],
         fixed=lambda s: {"sigma_1": 0.0},
+    ),
+    Hypothesis(
+        effect="the stand gives",
+        part="stand",
+        starts=lambda s: [{"c_t": 0.02 / s.stiffness}] if s.stiffness else [],
+        usual=lambda stiffness: 0.04 / stiffness,
+    ),
+    Hypothesis(
+        effect="friction differs between driving and back-driving",
+        part="back_driving",
+        starts=_zero("d_e"),
+        usual=lambda stiffness: 0.05,
     ),
 )
 

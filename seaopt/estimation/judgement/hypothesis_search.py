@@ -112,6 +112,7 @@ class _Search:
     def __init__(self, fit: Fit, minimum: Minimum, end: int, budget: int, progress: Progress) -> None:
         self.fit, self.minimum, self.end, self.budget, self.progress = fit, minimum, end, budget, progress
         self.sizes = measure_sizes(fit)
+        self.silent = {effect.part for effect in fit.silent}  # which no refit tells from other values
 
     def run(self, first: float) -> list[Refit]:
         """Return the refits of single hypotheses, and of pairs with the best of them where none suffices."""
@@ -144,7 +145,7 @@ class _Search:
     ) -> Iterator[Refit]:
         """Yield the refits of each hypothesis that is not there yet, as long as the budget lasts."""
         for hypothesis in hypotheses:
-            if before is not None and {*before.hypotheses, hypothesis} in done:
+            if hypothesis.part in self.silent or (before is not None and {*before.hypotheses, hypothesis} in done):
                 continue
             left = self.end - count_evaluations()
             if left <= 0:

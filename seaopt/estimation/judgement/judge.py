@@ -26,6 +26,7 @@ from seaopt.estimation.judgement.hypothesis_search import Search, search_hypothe
 from seaopt.estimation.judgement.intervals import find_excesses, find_rough, find_single_event
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
+from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import count_evaluations
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
@@ -89,6 +90,7 @@ def judge(
     error = estimate_model_error(minimum.problem, minimum.z, residuals, noise.matrix)
     excess = error.excess
     fit = compare_logs(widen(_state_excess(fit, excess), error.matrix), validation)
+    fit = replace(fit, silent=find_silent(fit))
     findings = [
         *_find_unexplained(fit, shares, excess),
         *_find_held_out(fit),

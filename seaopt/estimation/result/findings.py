@@ -42,6 +42,34 @@ class FitFinding:
     python: str | None = None
 
 
+@record
+class SilentEffect:
+    """An effect that the logs of a fit cannot tell: other values of some parameters follow them as well with it.
+
+    Parameters
+    ----------
+    effect : str
+        In words.
+    part, parameter, unit : str
+        What would bring it, and the parameter that is its size.
+    size : float
+        One that actuators have.
+    shifts : mapping of name to float
+        By how much each parameter that it touches would be more, per unit of it, in SI.
+    seen : float
+        Standard deviations by which such a size would change the residuals.
+
+    """
+
+    effect: str
+    part: str
+    parameter: str
+    unit: str
+    size: float
+    shifts: Mapping[str, float]
+    seen: float
+
+
 def state_guesses(guessed: Sequence[str]) -> str:
     """Return the guesses that a result rests on, in words; "" where there are none."""
     count = "1 guess" if len(guessed) == 1 else f"{len(guessed)} guesses"

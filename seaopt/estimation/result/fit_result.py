@@ -24,6 +24,7 @@ from seaopt.estimation.result.findings import (
     ModelledOutputs,
     Nuisance,
     OutputFit,
+    SilentEffect,
 )
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.estimation.result.nuisance import estimate_nuisance, take_sensors
@@ -108,6 +109,8 @@ class Fit(Result, Worded):
         Changes to the logs, and samples without weight, one sentence each.
     hypotheses : tuple of HypothesisTrial
         What the model may lack, as it was tried, the best first; empty where the residuals do not ask for it.
+    silent : tuple of SilentEffect
+        What the logs cannot tell, and the parameters that it touches.
     experiments : tuple of Experiment
         The data; empty when read from a file.
     minimum : Minimum or None
@@ -121,7 +124,8 @@ class Fit(Result, Worded):
         *("covariance", "white_covariance", Key(field="delay_covariance", name="delay_covariance", omit_none=True)),
         Key(field="model_covariance", name="model_covariance", omit_none=True),
         *("outputs", "logs", "identifiability", Key(field="nuisance", name="experiments"), "step_error_sigma"),
-        *("step_error_parameter", "method", "log_likelihood", "unknowns", "aic", "bic", "notes", "hypotheses"),
+        *("step_error_parameter", "method", "log_likelihood", "unknowns", "aic", "bic", "notes", "silent"),
+        "hypotheses",
         "provenance",
     )
 
@@ -147,6 +151,7 @@ class Fit(Result, Worded):
     findings: tuple[FitFinding, ...] = ()
     notes: tuple[str, ...] = ()
     hypotheses: tuple[HypothesisTrial, ...] = ()
+    silent: tuple[SilentEffect, ...] = ()
     delay_covariance: Covariance | None = field(default=None, repr=False)
     model_covariance: Covariance | None = field(default=None, repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)

@@ -13,6 +13,17 @@ Parts of `seaopt.plants.parts`; each is nothing where its parameters are zero:
 ``friction_direction``
     Friction differs between the two directions: :math:`f_a + b_a |v|` is added, so that dry friction is
     :math:`f_c \pm f_a` and damping :math:`b \pm b_a`.
+``back_driving``
+    A transmission rubs by a share of the spring's effort that is larger where the motor drives the spring than where
+    the spring drives the motor, by :math:`2 d_e`: the motor feels :math:`1 + d_e` of that effort. Half of what both
+    have in common is ``load_friction``'s c_e. Where inertia, friction and efficiency are free no log tells it: all of
+    them times :math:`1 + d_e` move alike.
+``cogging``
+    A force on the motor that its position alone decides, :math:`a_g \sin(n_g \theta) + b_g \cos(n_g \theta)`, of
+    magnets that meet slots, or of balls that meet a groove.
+``stand``
+    What holds the spring gives, :math:`c_t` per unit of its effort, so that spring and stand are in series:
+    :math:`k/(1 + k c_t)` is what a held link feels.
 """
 
 from __future__ import annotations
@@ -29,7 +40,7 @@ from seaopt.errors import PlantError
 from seaopt.parameters import Parameter, declare
 from seaopt.plants.friction import bound_slopes
 from seaopt.plants.plant import Plant, refuse_clash
-from seaopt.plants.roles import Friction, change_ports, put_behind, with_values
+from seaopt.plants.roles import Friction, SeriesSpring, change_ports, put_behind, with_values
 from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
 ELAPSED = "elapsed"  # the input that is the time since a log's beginning
@@ -51,14 +62,32 @@ def _direction_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
     )
 
 
+def _cogging_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
+    return (
+        declare("a_g", 0.0, effort.unit, -math.inf, "cogging, sine of the motor's position"),
+        declare("b_g", 0.0, effort.unit, -math.inf, "cogging, cosine of the motor's position"),
+        declare("n_g", 6.0, f"rad/{effort.place}", 0.0, "phase of cogging over the motor's position"),
+    )
+
+
+def _stand_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
+    return (declare("c_t", 0.0, f"{effort.place}/({effort.unit})", 0.0, "compliance of the stand"),)
+
+
+BACK_DRIVING = declare("d_e", 0.0, "-", -0.9, "share of the spring's effort lost driving, less driven")
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "droop": (declare("a_i", 0.0, "1/A^2", 0.0, "share of torque that is lost, over the current's square"),),
     "friction_drift": _drift_parameters(LINEAR),
     "friction_direction": _direction_parameters(LINEAR),
+    "back_driving": (BACK_DRIVING,),
+    "cogging": _cogging_parameters(LINEAR),
+    "stand": _stand_parameters(LINEAR),
 }
 ROTARY_PARTS: dict[str, tuple[Parameter, ...]] = {
     "friction_drift": _drift_parameters(ROTARY),
     "friction_direction": _direction_parameters(ROTARY),
+    "cogging": _cogging_parameters(ROTARY),
+    "stand": _stand_parameters(ROTARY),
 }
 
 
@@ -137,6 +166,74 @@ def let_friction_differ(plant: Plant) -> Plant:
     )
 
 
+def let_back_driving_differ(plant: Plant) -> Plant:
+    """Return a plant that is driven back against less friction. Raises PlantError: no friction, or no spring."""
+    name, friction = _find_friction(plant, "back_driving")
+    spring, stiffness = _find_spring(plant, "back_driving")
+
+    def push(x: Any, u: Any, p: Any) -> SimpleNamespace:
+        effort = getattr(p, stiffness) * spring.deflection(x, p) / friction.effort(p)
+        return with_values(u, {name: getattr(u, name) + p.d_e * effort})
+
+    return _change(plant, "back_driving", (BACK_DRIVING,), push, let_back_driving_differ)
+
+
+def let_cog(plant: Plant) -> Plant:
+    """Return a plant whose motor cogs. Raises PlantError: it has no friction, or no position of the motor."""
+    name, friction = _find_friction(plant, "cogging")
+    position = plant.sensing.motor_position if plant.sensing is not None else None
+    if position is None or position not in plant.states:
+        raise PlantError(
+            f'plant {plant.name}: part "cogging" needs a state that is the motor\'s position; give the role '
+            "sensing = Sensing(regulated, motor_position=...)"
+        )
+
+    def push(x: Any, u: Any, p: Any) -> SimpleNamespace:
+        phase = p.n_g * getattr(x, position)
+        return with_values(u, {name: getattr(u, name) + p.a_g * ca.sin(phase) + p.b_g * ca.cos(phase)})
+
+    return _change(plant, "cogging", _cogging_parameters(mechanics_of(friction.unit)), push, let_cog)
+
+
+def let_stand_give(plant: Plant) -> Plant:
+    """Return a plant on a stand that gives. Raises PlantError: its link moves, or it has no stiffness."""
+    if plant.moves:
+        raise PlantError(f'plant {plant.name}: part "stand" holds a link, and this one moves; leave it out')
+    spring, stiffness = _find_spring(plant, "stand")
+    derived, energy = plant.derived, plant.energy
+
+    def soften(p: Any) -> SimpleNamespace:
+        k = getattr(p, stiffness)
+        return with_values(p, {stiffness: k / (1.0 + k * p.c_t)})
+
+    def feel(friction: Friction) -> Friction:
+        loads = friction.loads
+        return friction if loads is None else replace(friction, loads=lambda x, u, p: loads(x, u, soften(p)))
+
+    return _change(
+        plant,
+        "stand",
+        _stand_parameters(mechanics_of(spring.unit)),
+        lambda x, u, p: u,
+        let_stand_give,
+        soften,
+        derived=None if derived is None else lambda p: derived(soften(p)),
+        energy=None if energy is None else lambda x, p: energy(x, soften(p)),
+        friction={name: feel(friction) for name, friction in plant.friction.items()},
+    )
+
+
+def _find_spring(plant: Plant, part: str) -> tuple[SeriesSpring, str]:
+    """Return a plant's spring, and the parameter that is its stiffness."""
+    spring = plant.spring
+    if spring is None or spring.stiffness is None:
+        raise PlantError(
+            f'plant {plant.name}: part "{part}" needs the stiffness of its spring; give the role '
+            "spring = SeriesSpring(deflection, unit, stiffness=...)"
+        )
+    return spring, spring.stiffness
+
+
 def _find_friction(plant: Plant, part: str) -> tuple[str, Friction]:
     """Return name and role of the friction that a part changes: the first without bristles."""
     for name, friction in plant.friction.items():
@@ -154,18 +251,19 @@ def _change(
     parameters: tuple[Parameter, ...],
     find_inputs: Callable[[Any, Any, Any], SimpleNamespace],
     change: Callable[[Plant], Plant],
+    find_parameters: Callable[[Any], Any] = lambda p: p,
     **fields: Any,
 ) -> Plant:
-    """Return a plant that sees other inputs and friction forces than it is given, a function of (x, u, p). `change`
-    makes the same of the plants of its ports; `fields` are what else is another.
+    """Return a plant that sees other inputs and friction forces than it is given, a function of (x, u, p), and other
+    parameters, one of p. `change` makes the same of the plants of its ports; `fields` are what else is another.
     """
     refuse_clash(plant, part, [parameter.name for parameter in parameters])
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return plant.f(t, x, find_inputs(x, u, p), p)
+        return plant.f(t, x, find_inputs(x, u, p), find_parameters(p))
 
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return plant.h(t, x, find_inputs(x, u, p), p)
+        return plant.h(t, x, find_inputs(x, u, p), find_parameters(p))
 
     added = {parameter.name: parameter for parameter in parameters}
     return replace(

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import DerivedFigure, FitFinding, LogValues
-from seaopt.formatting import MISSING, format_count, format_number
+from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.parameters import Parameter
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
 from seaopt.units import unit_after
@@ -30,7 +30,7 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     if fit.met:
         ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
         outputs = f", outputs fit to {' to '.join(ends)} %" if ends else ""
-        return Verdict(met=True, text=f"Fit: converged, {size}{outputs}")
+        return Verdict(met=True, text=f"Fit: converged, {size}{outputs}{_name_silent(fit)}")
     status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
     errors = [(each.text, each.where) for each in fit.errors]
     if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
@@ -39,7 +39,7 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     again = f"correct the file, then type {commands.fit}" if commands.fit else ""
     return Verdict(
         met=False,
-        text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met",
+        text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met{_name_silent(fit)}",
         reasons=reasons,
         next=tuple(filter(None, (cures, again))),
     )
@@ -86,6 +86,27 @@ def _list_caveats(fit: Fit) -> Iterator[str]:
         yield f"{fit.caveat[:1].upper()}{fit.caveat[1:]}."
     for direction in fit.identifiability.unidentifiable:
         yield f"Not identifiable: {' + '.join(f'{weight:.2g} {name}' for name, weight in direction.items())}."
+    yield from _say_silent(fit)
+
+
+def _name_silent(fit: Fit) -> str:
+    """Return what the logs cannot tell, for the verdict; "" where there is nothing."""
+    ties = [f"{join_words(list(each.shifts))} where {each.effect}" for each in fit.silent]
+    return f"; cannot be told from such a log: {'; '.join(ties)}" if ties else ""
+
+
+def _say_silent(fit: Fit) -> Iterator[str]:
+    """Yield of each effect that no such log tells by how much the values would be other ones with it."""
+    for each in fit.silent:
+        moves: dict[str, list[str]] = {}
+        for name, shift in each.shifts.items():
+            percent = 100.0 * shift * each.size / abs(fit.parameters[name].value)
+            moves.setdefault(f"{abs(percent):.2g} % {'more' if percent > 0.0 else 'less'}", []).append(name)
+        would = " and ".join(f"{join_words(names)} would be {by}" for by, names in moves.items())
+        yield (
+            f"Such logs cannot tell whether {each.effect}: with {each.parameter} = {each.size:.3g}"
+            f"{unit_after(each.unit)} (part {each.part}) {would}, and the outputs the same."
+        )
 
 
 def _tabulate_parameters(fit: Fit) -> Table:

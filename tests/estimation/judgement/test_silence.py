@@ -1,0 +1,113 @@
+"""What no log of a held spring tells, and which values it touches: logs of actuators that are integrated here."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from tests.actuator_logs import drive, integrate
+
+RATE_HZ = 400.0
+ROTARY = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 5.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0}
+SCREW = {"m_l": 0.646, "k": 655e3, "l": 0.002, "N_p": 3.0, "K_tau": 0.0255, "J": 3.31e-6, "b_r": 1.31e-4, "f_c": 60.0,
+         "v_s": 2e-3}  # fmt: skip
+
+
+def record(*, linear=False, give=0.0, driving=0.0, driven=0.0):
+    """Return the log of a motor on a held spring, in series with a stand that gives by a share of the spring; friction
+    grows by shares of the spring's effort, where the motor drives it and where it drives the motor.
+    """
+    p = SCREW if linear else ROTARY
+    t, current = drive(6.0, RATE_HZ, 2.5, seed=1, top_hz=25.0)
+    lead = p["l"] / (2 * math.pi * p["N_p"]) if linear else 1.0
+    ratio, spring = (1.0, p["k"]) if linear else (p["N"], p["k_s"])
+    inertia = p["J"] / lead**2 + p["m_l"] if linear else p["J_m"]
+    stiffness = spring / (1.0 + give)
+
+    def rates(x, ampere):
+        place, speed = x
+        effort = stiffness * place / ratio**2
+        level = p["f_c"] + 0.5 * (driving + driven) * abs(effort)
+        rub = level * math.tanh(speed / p["v_s"]) + p["b_r"] / lead**2 * speed
+        rub += 0.5 * (driving - driven) * effort  # where it slides: more against the spring than with it
+        return speed, (p["K_tau"] / lead * ampere - rub - effort) / inertia
+
+    place, speed = integrate(rates, 2, current, 1.0 / RATE_HZ, 4)
+    noise, effort = np.random.default_rng(2), stiffness * place / ratio
+    if linear:
+        pushed = np.array([rates(x, u)[1] for x, u in zip(zip(place, speed, strict=True), current, strict=True)])
+        readings = {"F1": (effort, 1.0), "F2": (effort + p["m_l"] * pushed, 1.0), "q": (place, 1e-7)}
+    else:
+        readings = {"tau_s": (effort, 0.02), "theta_m": (place, 1e-3)}
+    noisy = {name: values + noise.normal(scale=std, size=t.size) for name, (values, std) in readings.items()}
+    return so.Log.from_arrays(time=t, I=current, **noisy)
+
+
+def fit(log, *, linear=False, parts=(), free=None):
+    plant = so.plants.high_impedance(parts=parts) if linear else so.plants.rotary(link="locked", parts=parts)
+    names = free or (("J", "b_r", "f_c", "k", "eta") if linear else ("J_m", "b_r", "f_c", "k_s", "eta"))
+    params = plant.defaults.update(**(SCREW if linear else ROTARY)).free(*names)
+    params = params.update(c_e=0.03).free("c_e") if parts else params
+    outputs = tuple(name for name in log.signals if name != "I")
+    return so.fit([so.Experiment(plant=plant, log=log, outputs=outputs, initial_state="rest")], params)
+
+
+def follow(result, part, size):
+    """Return the values with an effect of a size, along the direction that the residual does not show."""
+    (silent,) = (each for each in result.silent if each.part == part)
+    assert silent.seen < 1.0
+    return {name: result.parameters[name].value + shift * size for name, shift in silent.shifts.items()}
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_stand_in_series_is_said_to_touch_the_stiffness(linear):
+    result = fit(record(linear=linear, give=0.04), linear=linear)
+    name, truth = ("k", SCREW["k"]) if linear else ("k_s", ROTARY["k_s"])
+    assert result.met
+    assert result.parameters[name].value == pytest.approx(truth / 1.04, rel=2e-3)
+    values = follow(result, "stand", 0.04 / truth)
+    assert values.keys() == {name}
+    assert values[name] == pytest.approx(truth, rel=3e-3)
+    assert f"told from such a log: {name} where the stand gives" in repr(result)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_back_driving_is_said_to_touch_all_that_scales_with_it(linear):
+    """Shares of 0.13 and 0.03 are 0.08 with 0.05 beside it."""
+    result = fit(record(linear=linear, driving=0.13, driven=0.03), linear=linear, parts=("load_friction",))
+    truth = SCREW if linear else ROTARY
+    assert result.met
+    values = follow(result, "back_driving", 0.05)
+    inertia = "J" if linear else "J_m"
+    assert result.parameters["eta"].value == pytest.approx(1.0 / 1.05, rel=5e-3)
+    assert values.keys() == {inertia, "b_r", "f_c", "eta", "c_e"}
+    for name, value in values.items():
+        expected = {"eta": 1.0, "c_e": 0.08}.get(name) or truth[name]
+        assert value == pytest.approx(expected, rel=0.01), name
+
+
+def test_what_a_log_does_tell_is_not_named():
+    log = record()
+    assert [each.part for each in fit(log).silent] == ["stand", "back_driving"]
+    assert [each.part for each in fit(log, free=("J_m", "b_r", "f_c", "eta")).silent] == ["back_driving"]
+    assert [each.part for each in fit(log, free=("J_m", "b_r", "f_c", "k_s")).silent] == ["stand"]
+
+
+def test_forces_alone_do_not_tell_a_stand_from_another_inertia():
+    """F = k I K/r/(M s^2 + b s + k): with k given, M and b take what the stand takes from it."""
+    plant = so.plants.high_impedance()
+    log = record(linear=True)
+    log = so.Log.from_arrays(time=log.time, **{name: log[name] for name in ("I", "F1")})
+    params = plant.defaults.update(**SCREW).free("J", "b_r")
+    result = so.fit([so.Experiment(plant=plant, log=log, outputs=("F1",), initial_state="rest")], params)
+    silent = next((each for each in result.silent if each.part == "stand"), None)
+    assert silent is None or silent.shifts.keys() >= {"J"}
+
+
+def test_they_are_kept_in_its_file():
+    result = fit(record())
+    assert so.Fit.from_dict(result.to_dict(), ()).silent == result.silent
+    assert result.silent
