@@ -377,9 +377,9 @@ def export(
         float | None, typer.Option(metavar="SECONDS", help="Time constant of the anti-windup.")
     ] = None,
     derate: Annotated[
-        bool,
-        typer.Option("--derate", help='Lower the limit as the winding warms up; the plant needs the part "thermal".'),
-    ] = False,
+        bool | None,
+        typer.Option(help='Lower the limit as the winding warms up; the plant needs the part "thermal".'),
+    ] = None,
     derate_margin: Annotated[
         float | None, typer.Option(metavar="KELVIN", help="Derate, and keep this far below T_max.")
     ] = None,

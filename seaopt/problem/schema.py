@@ -133,6 +133,10 @@ class ControllerTable(table_of(ControllerSpec, leave_out=("bandwidth_tolerance",
     gate: GateTable | None = key(
         "Which readings the exported law believes, and what it does about the others.", default=None
     )
+    derate: bool = key(
+        'Whether the exported law lowers its limit as the winding warms up; the design plant needs the part "thermal".',
+        default=False,
+    )
 
     @property
     def compensation(self) -> CompensationTable:

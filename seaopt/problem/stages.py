@@ -245,7 +245,7 @@ def _needs_reserve(problem: Problem, controller: Controller, source: Fit | Param
 
 
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
-    """Return a controller with the problem's outer loop, its plausibility gate, and with what it compensates. Raises
+    """Return a controller with the problem's outer loop, its guards, and with what it compensates. Raises
     SeaoptError: as `seaopt.control.add_compensation`, or the stiffness has no critically damped impedance.
     """
     outer, values = problem.table.impedance, problem.values(source)
@@ -256,7 +256,13 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
         else:
             impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
         controller = add_impedance(controller, plant, values, impedance, name=outer.plant)
-    controller = replace(controller, gate=_make_gate(problem, controller))
+    derate = problem.controller_table.derate
+    if derate and controller.heat_guard is None:
+        raise ProblemError(
+            f"{problem.source}: controller.derate: nothing is known of the motor's heat; give the design plant the "
+            "part thermal and a current to command, or leave it out"
+        )
+    controller = replace(controller, gate=_make_gate(problem, controller), derate=derate)
     tables = problem.controller_table.compensation
     kinds = {"friction": CompensateFriction, "gravity": CompensateGravity, "ripple": CompensateRipple}
     terms = {name: make_record(kind, table) for name, kind in kinds.items() if (table := getattr(tables, name))}

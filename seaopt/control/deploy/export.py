@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal
 
 import numpy as np
@@ -65,7 +66,7 @@ def export(
     command_limit: float | None = None,
     tracking_time_s: float | None = None,
     gate: PlausibilityGate | Literal[False] | None = None,
-    derate: bool | HeatGuard = False,
+    derate: bool | HeatGuard | None = None,
     allow_infeasible: bool = False,
     fit_met: bool | None = None,
 ) -> tuple[Path, ...]:
@@ -89,9 +90,10 @@ def export(
     gate : PlausibilityGate or False, optional
         Which readings the law believes, and what it does about the others; the controller's own if left out, none with
         False.
-    derate : bool or HeatGuard
+    derate : bool or HeatGuard, optional
         Lower the limit as the winding warms up, by `seaopt.plants.motor.heat_guard`: of a design plant with the part
         "thermal" that is commanded a current; or by a guard of your own, with a margin say, at the law's sample time.
+        What the controller says if left out.
     allow_infeasible : bool
         Also write a controller that misses its limits; the files state it.
     fit_met : bool, optional
@@ -124,7 +126,7 @@ def export(
     prefix = check_prefix(name)
     check_folder(Path(folder))
     check_command_limits(current_limit_A, command_limit)
-    require_type(derate, (bool, HeatGuard), "derate", "give True, False or a HeatGuard", ControlError)
+    require_type(derate, (bool, HeatGuard, NoneType), "derate", "give True, False or a HeatGuard", ControlError)
     limit = command_limit if current_limit_A is None else current_limit_A
     if isinstance(controller, Mapping) and fit_met is None:
         fit_met = controller.get("fit_met", True) is True
@@ -141,6 +143,7 @@ def export(
         numbers: dict[str, dict[str, Any]] = {}
     else:
         stored, figures, heat = _read(content)
+        derate = stored["derate"] if derate is None else derate
         templates, missed, met, kind = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"
         heat = derate if isinstance(derate, HeatGuard) else heat
         if derate and heat is None:
@@ -298,6 +301,7 @@ def _numbers(
     )
     others = [strip_markup(name) for name in _list_signals(stored)[1:]]
     added = law.compensation or Compensation(sample_time_s=law.sample_time_s)
+    at_rest = added.gravity, added.ripple if law.integrators else None  # without an integral no effort is set
     units = name_gain_units(stored["command"])
     largest = float(LARGEST_NUMBER[precision])
     return {
@@ -347,7 +351,7 @@ def _numbers(
         ],
         "resets": [
             f"read_{identifier(name)}"
-            for name in dict.fromkeys(term.reads for term in (added.gravity, added.ripple) if term is not None)
+            for name in dict.fromkeys(term.reads for term in at_rest if term is not None)
             if name not in others
         ],
         "transfer_functions": [

@@ -103,6 +103,8 @@ class Controller(LoopDelays, Result, Worded):
         friction margin are those of the law without it.
     gate : PlausibilityGate or None
         Which readings the exported law believes.
+    derate : bool
+        The exported law lowers its limit as the winding warms up.
     """
 
     plot = PlotAccessor()
@@ -130,6 +132,7 @@ class Controller(LoopDelays, Result, Worded):
     reads: tuple[str, ...] = ()
     compensation: Compensation | None = None
     gate: PlausibilityGate | None = None
+    derate: bool = False
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -406,7 +409,7 @@ class Controller(LoopDelays, Result, Worded):
             "link_feedforward": self.link,
             "impedance": self.outer,
             "compensation": self.compensation,
-            "guards": {"gate": self.gate},
+            "guards": {"gate": self.gate, "derate": self.derate},
             "blocked_by": self.blocked_by,
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
             "possible": self.possible,

@@ -212,7 +212,7 @@ class PlausibilityGate:
         low, high = self.range_N
         return (
             f"readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample are "
-            f"believed, {self.max_held} others in a row are bridged; the certificate's runs are without this gate"
+            f"believed, {self.max_held} others in a row are bridged"
         )
 
 

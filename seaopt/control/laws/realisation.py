@@ -33,6 +33,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from types import NoneType
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -280,10 +281,10 @@ def runnable(
     *,
     command_limit: float | None = None,
     tracking_time_s: float | None = None,
-    gate: PlausibilityGate | None = None,
-    heat: HeatGuard | None = None,
+    gate: PlausibilityGate | Literal[False] | None = None,
+    heat: HeatGuard | Literal[False] | None = None,
 ) -> RunnableLaw:
-    """Return a controller's law ready to run.
+    """Return a controller's law ready to run, as it is exported.
 
     Parameters
     ----------
@@ -294,10 +295,10 @@ def runnable(
         infinite where none of them is given.
     tracking_time_s : float, optional
         T_t of the anti-windup; the module's docstring has the default.
-    gate : PlausibilityGate, optional
-        Which readings are believed.
-    heat : HeatGuard, optional
-        What lowers the limit as the winding warms up; `controller.heat_guard` of a plant with the part "thermal".
+    gate : PlausibilityGate or False, optional
+        Which readings are believed; the controller's own if left out, none with False.
+    heat : HeatGuard or False, optional
+        What lowers the limit as the winding warms up; `controller.heat_guard` if left out and the controller derates.
 
     Raises
     ------
@@ -319,8 +320,8 @@ def runnable(
         command_limit=choose_limit(controller.command, controller.spec, command_limit),
         command=(controller.command.input, controller.command.unit),
         tracking_time_s=tracking_time_s,
-        gate=gate,
-        heat=heat,
+        gate=controller.gate if gate is None else gate or None,
+        heat=(controller.heat_guard if controller.derate else None) if heat is None else heat or None,
         compensation=controller.compensation,
     )
 

@@ -97,6 +97,7 @@ class StoredGuards:
     """The guards between the law and the hardware."""
 
     gate: PlausibilityGate | None = None
+    derate: bool = False
 
 
 @record(eq=False)
@@ -181,6 +182,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "outer": outer,
         "compensation": terms and Compensation(sample_time_s=ts, **terms),
         "gate": table.guards.gate,
+        "derate": table.guards.derate,
     }
 
 

@@ -184,7 +184,7 @@ def run_loop(
     matrices = _linearise_at_rest(loop, values[0])
     substeps, before, wall_s = _first_guess(matrices[0], loop.law.sample_time_s, rtol), None, 0.0
     motion = _bound_motion(matrices, loop.law.sample_time_s)
-    execute = make_kernel(loop)
+    execute = make_kernel(loop, job)
     while True:
         begin = time.perf_counter()
         arrays = execute(job, substeps)

@@ -71,8 +71,8 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
         if law.compensation is not None and law.compensation.gravity is not None:
             gravity = law.compensation.gravity
             reference -= gravity.effort(float(y[names.index(gravity.reads)])) if gravity.reads in names else 0.0
-        forgotten = np.zeros(loop.law_states - inner.size)
-        z[run] = np.concatenate([inner, forgotten, np.full(loop.waiting, u[0])])
+        forgotten = np.zeros(loop.law_states - inner.size - 1)
+        z[run] = np.concatenate([inner, forgotten, np.full(1 + loop.waiting, u[0])])
         figures[run] = reference, force, u[0], 0.0 if plant.energy is None else y[-1]
     reference, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)

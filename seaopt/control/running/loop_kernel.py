@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from importlib.resources import files
 from typing import Any
@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
-from seaopt.control.loops.compensation.terms import CompensationShape, compensate
+from seaopt.control.laws.plausibility import LARGEST
+from seaopt.control.running.law_step import LawShape, express_step, list_numbers
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_names
 from seaopt.errors import SimulationError, require_memory
 from seaopt.plants import Plant
@@ -50,6 +51,13 @@ class Job:
     late_s: Float[np.ndarray, " runs"]
     start: LoopState
     start_s: float
+
+    @property
+    def fails(self) -> bool:
+        """Whether something that a law is given is not a number. Without that a reading beyond what it takes for one
+        is that of a loop that runs away, which is followed up to what floats can hold.
+        """
+        return not all(np.all(np.abs(signal) <= LARGEST) for signal in (self.reference, self.noise))
 
 
 @record(eq=False)
@@ -93,36 +101,25 @@ def _describe_device(sensors: Sensors, name: str) -> tuple[_Device, list[float]]
 class _Structure:
     """What the functions of a loop depend on besides its plant; all else is data."""
 
+    law: LawShape
     measured: tuple[str, ...]
-    fed_back: int
-    law_states: int
     waiting: int
     rounds_current: bool
     devices: tuple[_Device, ...]  # one per measured output
     encoders: tuple[tuple[str, _Device], ...]  # with errors, of those that the reading is computed from
-    limits_current: bool
     sticks: bool
-    compensation: CompensationShape
-
-    @property
-    def kept(self) -> int:
-        """How many numbers law and compensation keep from one sample to the next."""
-        return self.law_states + self.compensation.remembered
 
 
-def _structure_of(loop: SampledLoop) -> _Structure:
+def _structure_of(loop: SampledLoop, job: Job) -> _Structure:
     sensors, names = loop.sensors, loop.signals
     return _Structure(
+        law=replace(LawShape.of_law(loop.law), holds=job.fails or loop.law.gate is not None),
         measured=names,
-        fed_back=loop.law.measured,
-        law_states=loop.law.c.size,
         waiting=loop.waiting,
         rounds_current=bool(loop.command_step),
         devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
-        limits_current=math.isfinite(loop.law.command_limit),
         sticks=loop.sticks,
-        compensation=CompensationShape() if loop.law.compensation is None else loop.law.compensation.shape,
     )
 
 
@@ -130,13 +127,11 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     """Return the CasADi function (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y): sensor, law and delay at a sample.
     `u` holds the current in force at first, `late` is the one after it.
     """
-    n, queue, measured, fed_back = structure.law_states, structure.waiting, len(structure.measured), structure.fed_back
-    kept = structure.kept
+    law, queue, measured, kept = structure.law, structure.waiting, len(structure.measured), structure.law.kept
     z, r, w = ca.SX.sym("z", kept + queue), ca.SX.sym("r"), ca.SX.sym("w", measured)
     e, devices = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("devices", 3, measured + len(structure.encoders))
-    numbers = ca.SX.sym("c", n * n + (3 + fed_back) * n + 5 + fed_back)
-    added = ca.SX.sym("added", structure.compensation.size)
-    c = ca.vertcat(numbers, ca.vec(devices), added)
+    numbers, amplifier = ca.SX.sym("c", sum(law.number_sizes)), ca.SX.sym("amplifier", 2)
+    c = ca.vertcat(numbers, amplifier, ca.vec(devices))
     observe = observe_function(plant, structure.sticks)
     lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[kept:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
@@ -153,23 +148,14 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
             if name in weights:
                 reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
         readings.append(device.read(reading, devices[:, column]))
-    read = ca.vertcat(*readings[:fed_back])
-    sizes = [n * n, n, fed_back * n, n, n, 1, fed_back, 1, 1, 1, 1]
-    a, b_r, b_y, out, windup, d_r, d_y, limit, gain, step, most = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
-    a, b_y, x = ca.reshape(a, n, n), ca.reshape(b_y, n, fed_back), ca.reshape(z[:n], n, 1)
-    further = [readings[structure.measured.index(name)] for name in structure.compensation.reads]
-    r_law, effort, memory = compensate(
-        structure.compensation, ca.vertsplit(added), ca.vertsplit(z[n:kept]), r, further, ca
-    )
-    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r_law - ca.dot(d_y, read) + effort
-    limited = ca.fmin(ca.fmax(force, -limit), limit) if structure.limits_current else force
-    after = ca.mtimes(a, x) + b_r * r_law - ca.mtimes(b_y, read) + windup * (limited - force)
-    current = gain * limited
+    further = [readings[structure.measured.index(name)] for name in law.compensation.reads]
+    current, after = express_step(law, numbers, z[:kept], r, readings[: law.measured], further)
     if structure.rounds_current:
+        step, most = ca.vertsplit(amplifier)
         current = step * ca.floor(current / step + 0.5)
-        if structure.limits_current:
+        if law.limited:
             current = ca.fmin(ca.fmax(current, -most), most)
-    moved = ca.vertcat(after, *memory, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
+    moved = ca.vertcat(after, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
     commands = ca.vertcat(current, behind)
     u, late = ca.vertcat(ca.dot(first, commands), e), ca.dot(second, commands)
     arguments = [plant.t, plant.x, z, e, r, w, plant.p, c, lag]
@@ -177,16 +163,10 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
 
 
 def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
-    law = loop.law
-    limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.command_limit) else (0.0, 0.0)
-    numbers = [law.d_reference, *np.ravel(law.d_measurement), limit, law.per_effort, loop.command_step, most]
+    numbers = [loop.command_step, loop.most_A if math.isfinite(loop.most_A) else 0.0]
     for name in (*loop.signals, *loop.encoders):
         numbers += _describe_device(loop.sensors, name)[1]
-    if law.compensation is not None:
-        numbers += law.compensation.numbers
-    return np.concatenate(
-        [law.a.ravel("F"), law.b_reference, law.b_measurement.ravel("F"), law.c, law.anti_windup, numbers]
-    )
+    return np.concatenate([list_numbers(loop.law), numbers])
 
 
 @memo
@@ -222,9 +202,9 @@ def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | Non
     return sample, advance, load_kernel(_source(plant, structure, sample, advance), "seaopt_loops")
 
 
-def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
+def make_kernel(loop: SampledLoop, job: Job) -> Callable[[Job, int], LoopArrays]:
     """Return what runs a job: compiled code or, without a compiler, CasADi's virtual machine."""
-    native, constants = _kernel(loop.plant, _structure_of(loop))[2], _constants(loop)
+    native, constants = _kernel(loop.plant, _structure_of(loop, job))[2], _constants(loop)
     if native is None:
         return partial(_run_interpreted, loop, constants)
     return partial(_run_compiled, loop, constants, native)
@@ -233,7 +213,7 @@ def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
 def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: ca.Function) -> str:
     constants = {
         "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1, "NW": len(structure.measured),
-        "NY": len(channel_names(plant)), "NZ": structure.kept + structure.waiting,
+        "NY": len(channel_names(plant)), "NZ": structure.law.kept + structure.waiting,
         "INSTANT": INSTANT,
     }  # fmt: skip
     template = files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8")
@@ -292,7 +272,7 @@ def _run_interpreted(loop: SampledLoop, c: Float[np.ndarray, " m"], job: Job, su
     runs, n = job.reference.shape
     chunk = min(n, CHAINED_SAMPLES)
     split = bool(np.any(job.late_s))
-    chain = _chain(loop.plant, _structure_of(loop), loop.law.sample_time_s, substeps, chunk, split)
+    chain = _chain(loop.plant, _structure_of(loop, job), loop.law.sample_time_s, substeps, chunk, split)
     times = job.start_s + loop.law.sample_time_s * np.arange(n)
     for run in range(runs):
         state = np.concatenate([getattr(arrays, name)[run] for name in _CARRIED])
@@ -322,7 +302,7 @@ def _chain(plant: Plant, structure: _Structure, sample_time_s: float, substeps: 
 def _period_function(plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, split: bool) -> Any:
     """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s) -> (the same a sample later, y, current, x)."""
     sample, advance, _ = _kernel(plant, structure)
-    sizes = [len(plant.states), structure.kept + structure.waiting, len(channel_names(plant))]
+    sizes = [len(plant.states), structure.law.kept + structure.waiting, len(channel_names(plant))]
     state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
     t, r, late_s = (ca.MX.sym(name) for name in ("t", "r", "late_s"))
     e, w, p, c, lag = (

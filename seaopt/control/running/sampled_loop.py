@@ -13,6 +13,7 @@ from jaxtyping import Float
 from seaopt.bench import Sensors
 from seaopt.control.laws.realisation import RunnableLaw
 from seaopt.control.loops.sampled_plant import Measured, find_delay, read_conditions, whole_samples
+from seaopt.control.running.law_step import LawShape
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -80,9 +81,6 @@ class SampledLoop:
                 f"measured = {list(self.fed_back)} are {len(self.fed_back)} outputs, and the law reads "
                 f"{self.law.measured}; give as many"
             )
-        for part, name in ((self.law.gate, "plausibility gate"), (self.law.heat, "heat guard")):
-            if part is not None:
-                raise SimulationError(f"law has a {name}, which this simulation leaves out; use close_loop")
         if self.sticks and not can_stick(plant):
             raise SimulationError(
                 f"sticks = True, but {plant.name} has no friction that jumps at rest; give its Friction a jump"
@@ -125,9 +123,8 @@ class SampledLoop:
 
     @property
     def law_states(self) -> int:
-        """How many numbers the law keeps: its states, and what its compensation remembers."""
-        remembered = 0 if self.law.compensation is None else self.law.compensation.shape.remembered
-        return self.law.c.size + remembered
+        """How many numbers the law keeps."""
+        return LawShape.of_law(self.law).kept
 
     @property
     def regulated(self) -> str:
@@ -174,9 +171,11 @@ class LoopState:
 
 
 def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None = None) -> LoopState:
-    """Return `runs` loops whose law is at zero and whose plant is in state x, zero if left out."""
+    """Return `runs` loops whose law was reset and whose plant is in state x, zero if left out."""
     start = np.zeros(len(loop.plant.states)) if x is None else x
-    return LoopState(x=np.tile(start, (runs, 1)), z=np.zeros((runs, loop.law_states + loop.waiting)))
+    law = loop.law.reset().x
+    z = np.concatenate([law, np.zeros(loop.law_states - law.size + loop.waiting)])
+    return LoopState(x=np.tile(start, (runs, 1)), z=np.tile(z, (runs, 1)))
 
 
 def largest_current(limit_A: float, step_A: float) -> float:

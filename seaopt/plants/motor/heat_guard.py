@@ -21,6 +21,9 @@ as long as the current limit warms it more slowly than that.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -87,15 +90,38 @@ class HeatGuard:
 
     def limit(self, rises: tuple[float, float]) -> float:
         """Return the largest current (A) of the next sample, from winding and case above the ambient (K)."""
-        winding, case = rises
-        target = winding + self.share * (self.allowed_rise - winding)
-        room = target - (self.a_11 * winding + self.a_12 * case)
-        return math.sqrt(max(room, 0.0) / (self.b_1 * (self.resistance + self.slope * target)))
+        return limit_current(self.numbers, rises, _FLOATS)
 
     def warm(self, rises: tuple[float, float], current_A: float) -> tuple[float, float]:
         """Return winding and case above the ambient (K) after a sample of a current."""
-        winding, case = rises
-        free, squared = self.a_11 * winding + self.a_12 * case, current_A * current_A
-        end = free + self.b_1 * (self.resistance + self.slope * winding) * squared
-        loss = (self.resistance + self.slope * max(winding, end)) * squared
-        return free + self.b_1 * loss, self.a_21 * winding + self.a_22 * case + self.b_2 * loss
+        winding, case = warm_winding(self.numbers, rises, current_A, _FLOATS)
+        return winding, case
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Its numbers, in the order in which `limit_current` and `warm_winding` take them."""
+        heating = self.a_11, self.a_12, self.a_21, self.a_22, self.b_1, self.b_2
+        return *heating, self.resistance, self.slope, self.allowed_rise, self.share
+
+
+HEAT_NUMBERS = 10
+_FLOATS = SimpleNamespace(sqrt=math.sqrt, fmax=max)
+
+
+def limit_current(numbers: Sequence[Any], rises: Sequence[Any], operations: Any) -> Any:
+    """Return the largest current of the next sample; `operations`: casadi for expressions."""
+    a_11, a_12, _, _, b_1, _, resistance, slope, allowed_rise, share = numbers
+    winding, case = rises
+    target = winding + share * (allowed_rise - winding)
+    room = target - (a_11 * winding + a_12 * case)
+    return operations.sqrt(operations.fmax(room, 0.0) / (b_1 * (resistance + slope * target)))
+
+
+def warm_winding(numbers: Sequence[Any], rises: Sequence[Any], current_A: Any, operations: Any) -> list[Any]:
+    """Return winding and case after a sample of a current; `operations`: casadi for expressions."""
+    a_11, a_12, a_21, a_22, b_1, b_2, resistance, slope, *_ = numbers
+    winding, case = rises
+    free, squared = a_11 * winding + a_12 * case, current_A * current_A
+    end = free + b_1 * (resistance + slope * winding) * squared
+    loss = (resistance + slope * operations.fmax(winding, end)) * squared
+    return [free + b_1 * loss, a_21 * winding + a_22 * case + b_2 * loss]

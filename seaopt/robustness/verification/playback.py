@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
@@ -14,6 +14,7 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.control.loops.sampled_plant import DELAYS, find_rows
 from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
+from seaopt.control.running.law_step import find_faults
 from seaopt.control.running.sampled_loop import channel_names, find_longest_delay
 from seaopt.errors import ControlError, require_memory, require_seed
 from seaopt.parameters import Parameter, ParameterSet
@@ -69,7 +70,7 @@ class Stage:
         """The stage with no limit of the command."""
         spec = replace(self.controller.spec, current_limit_A=None, command_limit=None)
         command = replace(self.controller.command, largest=None)
-        return replace(self, controller=replace(self.controller, spec=spec, command=command))
+        return replace(self, controller=replace(self.controller, spec=spec, command=command, derate=False))
 
     @property
     def is_ideal(self) -> bool:
@@ -112,6 +113,7 @@ class Playback:
     rest: Equilibrium | None  # where runs started; None where the scenario has an initial state
     edges: tuple[int, ...]  # first samples of the phases, and one past the last
     contacts: tuple[Contact, ...]
+    faulted: Bool[np.ndarray, " runs"]  # the law's gate gave up the sensor
     error: float  # estimated integration error of the worst sample, relative
     substeps: int  # integration steps per sample, the largest number of all phases
     wall_s: float  # time of computing
@@ -261,6 +263,7 @@ def _join_phases(
         rest=rest,
         edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
         contacts=contacts,
+        faulted=find_faults(runnable(stage.controller), runs[-1].end.z),
         error=max(run.error for run in runs),
         command=runs[0].command,
         substeps=max(run.substeps for run in runs),

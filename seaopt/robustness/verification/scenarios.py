@@ -346,7 +346,7 @@ def find_step_limit(controller: Controller) -> float | None:
     sliding = take_sliding(plant, params)
     if not controller.close(sliding, params).figures().stable:
         return controller.force_limit(0.0)
-    loop = build_loop(controller, sliding, params, runnable(controller, command_limit=math.inf))
+    loop = build_loop(controller, sliding, params, runnable(controller, command_limit=math.inf, gate=False, heat=False))
     tried = NOMINAL_EFFORT[controller.command.mechanics]
     run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), tried))
     step, held = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.0)

@@ -10,8 +10,7 @@ from scipy.signal import cont2discrete
 
 from seaopt.control import GateState, MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.control.laws.plausibility import largest_step
-from seaopt.control.running.sampled_loop import SampledLoop
-from seaopt.errors import ControlError, SimulationError
+from seaopt.errors import ControlError
 from tests.c_code import CompiledLaw, CompiledMPC
 
 TS, BEGIN = 1e-3, 300
@@ -242,5 +241,3 @@ def test_what_cannot_be_is_refused(tuned, thor, stand):
     bare = replace(tuned, spec=replace(tuned.spec, current_limit_A=None))
     with pytest.raises(ControlError, match="no current limit"):
         PlausibilityGate.of_controller(bare, range_N=(-1e3, 1e3))
-    with pytest.raises(SimulationError, match="close_loop"):
-        SampledLoop(plant=stand, law=runnable(tuned, gate=GATE), measured="F1", delay_samples=1)

@@ -9,7 +9,7 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control.laws.realisation import realise
-from seaopt.control.running.closed_loop import LoopState, SampledLoop, run_loop
+from seaopt.control.running.closed_loop import LoopState, SampledLoop, at_rest, run_loop
 from seaopt.control.running.force_run import close_loop
 from seaopt.control.running.sampled_loop import largest_current
 from seaopt.errors import SimulationError
@@ -62,7 +62,7 @@ def hard_case(swing, thor, friction, sensors, step):
     reference = np.where(np.arange(400) < 200, 120.0, -60.0)
     start = np.array([1e-4, 0.0, 0.8, -1.0])
     start[0] -= 0.0725 * np.sin(0.8)
-    state = LoopState(x=start[None], z=np.zeros((1, loop.law.c.size + 2)))
+    state = at_rest(loop, 1, start)
     params = thor.update(f_c=friction, d=0.05)
     run = run_loop(loop, [params], reference, start=state, seed=5)
     assert np.max(np.abs(run.current)) == pytest.approx(3.0)
@@ -209,7 +209,7 @@ def test_peaks_between_samples_are_seen(thor):
     silent = realise(law_of([0.0], sample_time_s=3.1e-3), per_effort=GAIN)
     params = plant.defaults.update(m_2=1e6, b_r=0.0, J=1e-3)
     loop = SampledLoop(plant=plant, law=silent, measured="F1", delay_samples=1)
-    state = LoopState(x=np.array([[0.0, 0.0, 1e-4, 0.0]]), z=np.zeros((1, 1)))
+    state = at_rest(loop, 1, np.array([0.0, 0.0, 1e-4, 0.0]))
     run = run_loop(loop, [params], np.zeros(30), start=state)
     assert run.peaks["F1"][0] == pytest.approx(65.5, rel=1e-2)
 
@@ -233,7 +233,7 @@ def test_bristles_that_slip_fast_are_no_loop_that_runs_away(speed):
     loop = SampledLoop(plant=plant, law=realise(LAW, per_effort=1 / 1.5, command_limit=9.0), measured="tau_s",
                        delay_samples=1)  # fmt: skip
     x = np.array([-60.0, speed, -0.02])
-    start = LoopState(x=x[None], z=np.zeros((1, loop.law.c.size + 1)))
+    start = at_rest(loop, 1, x)
     run = run_loop(loop, [params], np.zeros(40), start=start)
 
     def rate(t, x, current):

@@ -207,3 +207,5 @@ def _describe_surroundings(controller: Controller) -> Iterator[str]:
             yield f"Compensates {line}."
     if controller.gate is not None:
         yield f"{controller.gate.describe(controller.command.reference_unit)}."
+    if controller.derate:
+        yield "The limit falls as the winding warms up."

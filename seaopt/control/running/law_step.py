@@ -1,0 +1,139 @@
+"""`RunnableLaw.step` as an expression of CasADi, from the same numbers: gate, hold, terms, limit, heat guard.
+
+A law whose inputs are numbers (within +-1e15) gives finite ones, so that only the inputs are asked. What is kept from
+one sample to the next is the law's state, what its terms remember, the gate's last reading with how many were refused
+since, the temperatures, and the last command, which is repeated where a sample cannot be used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.control.laws.plausibility import LARGEST
+from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.control.loops.compensation.terms import CompensationShape, compensate
+from seaopt.plants.motor.heat_guard import HEAT_NUMBERS, limit_current, warm_winding
+from seaopt.records import record
+
+GATE_NUMBERS = 5
+
+
+@record
+class LawShape:
+    """What a law's step depends on; all else is numbers."""
+
+    states: int
+    measured: int
+    limited: bool
+    gated: bool
+    heated: bool
+    compensation: CompensationShape
+    holds: bool = True  # the last command where an input is not a number
+
+    @classmethod
+    def of_law(cls, law: RunnableLaw) -> LawShape:
+        """Return the shape of a law."""
+        return cls(
+            states=law.c.size,
+            measured=law.measured,
+            limited=bool(np.isfinite(law.command_limit)),
+            gated=law.gate is not None,
+            heated=law.heat is not None,
+            compensation=CompensationShape() if law.compensation is None else law.compensation.shape,
+        )
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many numbers are kept: of state, terms, gate, temperatures, command."""
+        return self.states, self.compensation.remembered, 3 * self.gated, 2 * self.heated, 1
+
+    @property
+    def kept(self) -> int:
+        """How many in all."""
+        return sum(self.sizes)
+
+    @property
+    def number_sizes(self) -> tuple[int, ...]:
+        """How many numbers of each kind `list_numbers` gives."""
+        n, y = self.states, self.measured
+        guards = GATE_NUMBERS * self.gated, HEAT_NUMBERS * self.heated
+        return n * n, n, y * n, n, n, 1, y, 1, 1, *guards, self.compensation.size
+
+
+def list_numbers(law: RunnableLaw) -> Float[np.ndarray, " m"]:
+    """Return the numbers of a law, as `express_step` takes them."""
+    gate, limit = law.gate, law.force_limit_N if np.isfinite(law.command_limit) else 0.0
+    numbers = [law.d_reference, *np.ravel(law.d_measurement), limit, law.per_effort]
+    if gate is not None:
+        numbers += [*gate.range_N, gate.max_step_N, gate.max_held, gate.ramp_A_per_s * law.sample_time_s]
+    numbers += [] if law.heat is None else law.heat.numbers
+    numbers += [] if law.compensation is None else law.compensation.numbers
+    matrices = law.a.ravel("F"), law.b_reference, law.b_measurement.ravel("F"), law.c, law.anti_windup
+    return np.concatenate([*matrices, numbers])
+
+
+def find_faults(law: RunnableLaw, kept: Float[np.ndarray, "runs n"]) -> Bool[np.ndarray, " runs"]:
+    """Tell where the gate of a law, of which this is kept, has given up its sensor."""
+    shape = LawShape.of_law(law)
+    if law.gate is None:
+        return np.zeros(len(kept), dtype=bool)
+    return kept[:, sum(shape.sizes[:3]) - 1] > law.gate.max_held
+
+
+def _is_number(value: Any) -> Any:
+    return ca.fabs(value) <= LARGEST
+
+
+def express_step(
+    shape: LawShape, numbers: Any, kept: Any, reference: Any, measured: Sequence[Any], further: Sequence[Any]
+) -> tuple[Any, Any]:
+    """Return the command and what is kept after a sample; `further`: the readings of what the terms read."""
+    n, y = shape.states, shape.measured
+    ends = np.cumsum([0, *shape.number_sizes]).tolist()
+    a, b_r, b_y, out, windup, d_r, d_y, most, gain, gate, heat, added = ca.vertsplit(numbers, ends)
+    x, memory, seen, rises, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
+    a, b_y, fault, known = ca.reshape(a, n, n), ca.reshape(b_y, n, y), 0.0, 1.0
+    measured, memory, rises = list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
+    if shape.gated:
+        measured[0], seen, fault = _screen(ca.vertsplit(gate), ca.vertsplit(seen), measured[0])
+        known = seen[1]
+    limit = most * gain
+    if shape.heated:
+        cool = limit_current(ca.vertsplit(heat), rises, ca)
+        limit = ca.fmin(limit, cool) if shape.limited else cool
+        most = limit / gain
+    read = ca.vertcat(*measured)
+    r, effort, after = compensate(shape.compensation, ca.vertsplit(added), memory, reference, further, ca)
+    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - ca.dot(d_y, read) + effort
+    bounded = shape.limited or shape.heated
+    applied = ca.fmin(ca.fmax(force, -most), most) if bounded else force
+    following = ca.mtimes(a, x) + b_r * r - ca.mtimes(b_y, read) + windup * (applied - force)
+    command, moved = gain * applied, ca.vertcat(following, *after)
+    if shape.holds:
+        usable = reduce(ca.logic_and, map(_is_number, [reference, *measured, *further]))
+        usable = ca.logic_and(ca.logic_and(usable, known), ca.logic_not(fault))
+        command, moved = (ca.if_else(usable, *pair) for pair in ((command, last), (moved, ca.vertcat(x, *memory))))
+    if shape.gated:
+        ramp = ca.vertsplit(gate)[-1]
+        command = ca.if_else(fault, last - ca.fmin(ca.fmax(last, -ramp), ramp), command)
+    if shape.heated:
+        command = ca.fmin(ca.fmax(command, -limit), limit)
+        rises = warm_winding(ca.vertsplit(heat), rises, command, ca)
+    return command, ca.vertcat(moved, *(seen if shape.gated else ()), *rises, command)
+
+
+def _screen(numbers: Sequence[Any], seen: Sequence[Any], reading: Any) -> tuple[Any, list[Any], Any]:
+    """Return the reading to use, what the gate has seen, and whether that is a fault: `PlausibilityGate.screen`."""
+    (low, high, step, longest, _), (last, known, refused) = numbers, seen
+    near = ca.logic_or(ca.logic_not(known), ca.fabs(reading - last) <= step * (refused + 1.0))
+    believed = ca.logic_and(ca.logic_and(reading >= low, reading <= high), near)
+    believed = ca.logic_and(believed, refused <= longest)  # beyond that a fault, which lasts
+    used = ca.if_else(believed, reading, last)
+    after = ca.if_else(believed, 0.0, ca.if_else(refused <= longest, refused + 1.0, refused))
+    return used, [used, ca.logic_or(known, believed), after], after > longest
