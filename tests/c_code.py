@@ -97,21 +97,23 @@ class CompiledSchedule:
 
         class Law(ctypes.Structure):
             _fields_ = (
-                *((name, real) for name in ("integral", "reference", "measurement", "place", "current_A")),
+                ("x", real * len(schedule.runnable().reset().x)), ("place", real), ("current_A", real),
                 ("held", ctypes.c_ulong), ("misplaced", ctypes.c_ulong), ("status", ctypes.c_int),
             )  # fmt: skip
 
-        self.law, self.library = Law(), ctypes.CDLL(str(library))
-        self.library.law_step.argtypes = [ctypes.POINTER(Law), *[real] * 3]
+        self.law, self.library, count = Law(), ctypes.CDLL(str(library)), schedule.table.order.measured
+        read = real if count == 1 else ctypes.POINTER(real)
+        self.pack = (lambda y: float(np.ravel(y)[0])) if count == 1 else (lambda y: (real * count)(*y))
+        self.library.law_step.argtypes = [ctypes.POINTER(Law), real, read, real]
         self.library.law_step.restype = real
-        self.library.law_reset.argtypes = [ctypes.POINTER(Law), *[real] * 4]
+        self.library.law_reset.argtypes = [ctypes.POINTER(Law), real, read, real, real]
         self.library.law_init(ctypes.byref(self.law))
 
-    def step(self, *values):
-        return self.library.law_step(ctypes.byref(self.law), *values)
+    def step(self, reference, measurement, place):
+        return self.library.law_step(ctypes.byref(self.law), reference, self.pack(measurement), place)
 
-    def reset(self, *values):
-        self.library.law_reset(ctypes.byref(self.law), *values)
+    def reset(self, reference, measurement, place, command):
+        self.library.law_reset(ctypes.byref(self.law), reference, self.pack(measurement), place, command)
 
 
 class CompiledMPC(LoadedMPC):

@@ -1,31 +1,34 @@
 """A scheduled controller for the target: C99 with the table of its gains, which needs no library.
 
-The C code is `RunnableSchedule.step` with the numbers filled in, operation for operation: one struct, `init`, `reset`
-and `step`, no allocation, and no include but its own header. The step takes the scheduling variable beside reference
-and measurement; outside the table the gains of its ends count, and one that is not finite is replaced by the last that
-was, or by the table's `fallback` where there was none since the reset.
+The C code is `RunnableSchedule.step`, operation for operation: the step of `seaopt.control.scheduling.step_order` is
+traced. One struct, `init`, `reset` and `step`, no allocation, and no include but its own header. The step takes the
+scheduling variable beside reference and measurement; outside the table the gains of its ends count, and one that is not
+finite is replaced by the last that was, or by the table's `fallback` where there was none since the reset.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, cast
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
 from seaopt.control.deploy.c_text import LARGEST_NUMBER, Precision, describe_timing, identifier, literal, strip_markup
+from seaopt.control.deploy.trace import Term, Trace
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.realisation import choose_limit
-from seaopt.control.laws.structures import AGREES, LAW_GAINS
-from seaopt.control.scheduling.gain_table import GainTable
+from seaopt.control.laws.structures import AGREES
+from seaopt.control.loops.sampled_plant import list_names
+from seaopt.control.scheduling.gain_table import CORNERS, GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
 from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
+from seaopt.control.scheduling.step_order import SHARE
 from seaopt.errors import FileError
 
 SCHEDULE_TEMPLATES = {"{}.h": "schedule.h.jinja", "{}.c": "schedule.c.jinja"}
-COLUMNS = (*LAW_GAINS, "anti_windup")
+WARPED = "tan(pi f T)"  # the unit of a corner in the table, in words
 
 
 def is_schedule(content: Mapping[str, Any]) -> bool:
@@ -54,9 +57,10 @@ def read_runnable(
             over=table.over,
             unit=table.unit,
             points=np.array(table.points),
-            gains={name: np.array(table.gains[name]) for name in LAW_GAINS},
+            gains={name: np.array(row) for name, row in table.gains.items()},
             structure=first["structure"],
             sample_time_s=first["sample_time_s"],
+            speed=first["spec"].find_speed_loop(first["reads"] or list_names(first["spec"].measured)),
         ),
         per_effort=command.per_effort,
         limit=choose_limit(command, first["spec"], limit),
@@ -75,12 +79,13 @@ def describe_schedule(
     """Return words and numbers of the files."""
     command, spec, table = first["command"], first["spec"], law.table
     number, largest = literal(precision), float(LARGEST_NUMBER[precision])
-    units = name_gain_units(command)
-    rows = {**table.gains, "anti_windup": law.anti_windup}
+    units = name_gain_units(command) | dict.fromkeys(CORNERS.values(), WARPED)
+    rows = {**table.columns, SHARE: law.anti_windup}
     most = law.limit / law.per_effort
     return {
+        **_trace(law, list(rows), number),
         "structure": table.structure,
-        "measured": strip_markup(cast(str, spec.measured)),
+        "measured": strip_markup(", ".join(list_names(spec.measured))),
         "effort": command.mechanics.word,
         "command": {key: strip_markup(getattr(command, key)) for key in ("word", "unit", "effort_unit")},
         "symbol": command.symbol,
@@ -91,7 +96,7 @@ def describe_schedule(
         "feasible": content["feasible"],
         "broken": [strip_markup(limit) for limit in content["broken"]],
         "limited": math.isfinite(law.limit),
-        "integrates": table.integrates,
+        "integrates": table.integrates or "T_v" in table.gains,
         "over": strip_markup(table.over),
         "over_unit": strip_markup(table.unit),
         "place": f"at_{identifier(table.over)}",
@@ -99,13 +104,46 @@ def describe_schedule(
         "shown_fallback": f"{law.fallback:g}",
         "count": table.points.size,
         "points": ", ".join(number(float(value)) for value in table.points),
-        "columns": [f"{key}{f' [{units[key]}]' if key in units else ''}" for key in COLUMNS],
-        "rows": [", ".join(number(float(rows[key][i])) for key in COLUMNS) for i in range(table.points.size)],
+        "columns": [f"{key}{f' [{units[key]}]' if key in units else ''}" for key in rows],
+        "rows": [", ".join(number(float(row[i])) for row in rows.values()) for i in range(table.points.size)],
         "fallback": number(law.fallback),
         "period": number(table.sample_time_s),
-        "half_period": number(0.5 * table.sample_time_s),
         "largest": number(LARGEST),
         "effort_limit": number(min(most, largest)),
         "command_limit": number(min(law.limit, largest)),
         "per_effort": number(law.per_effort),
+    }
+
+
+def _trace(law: RunnableSchedule, columns: list[str], number: Callable[[float], str]) -> dict[str, Any]:
+    """Return step and reset as lines of C, and what they are given and keep."""
+    order, count = law.table.order, law.table.order.measured
+    states = list(order.rest(0.0, [0.0] * count))
+
+    def begin() -> tuple[Trace, dict[str, Term], dict[str, Term], Term, list[Term]]:
+        trace = Trace(number)
+        gains = {name: Term(trace, f"g[{i}]") for i, name in enumerate(columns)}
+        x = {name: Term(trace, f"law->x[{i}]") for i, name in enumerate(states)}
+        readings = ["measurement"] if count == 1 else [f"measurement[{i}]" for i in range(count)]
+        return trace, gains, x, Term(trace, "reference"), [Term(trace, text) for text in readings]
+
+    trace, gains, x, reference, readings = begin()
+    effort, applied, after = order.step(
+        gains, x, reference, readings, lambda effort: trace.keep(f"limited({effort.text}, EFFORT_LIMIT)", [effort.text])
+    )
+    results = [trace.write(value) for value in (effort, applied, *after.values())]
+    step = trace.list_needed(results)
+    trace, gains, x, reference, readings = begin()
+    start = order.continue_from(gains, Term(trace, "effort"), reference, readings)
+    starts = [trace.write(value) for value in start.values()]
+    return {
+        "states": states,
+        "several": count > 1,
+        "signals": count,
+        "step_lines": step,
+        "unlimited": results[0],
+        "applied": results[1],
+        "after": results[2:],
+        "reset_lines": trace.list_needed(starts),
+        "starts": starts,
     }

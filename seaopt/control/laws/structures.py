@@ -99,6 +99,8 @@ STRUCTURES = (*TUNED, CUSTOM)
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
 PREFILTER = "prefilter_corner_hz"  # the gain that every prefilter has
 LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
+PREFILTER_DAMPING = "prefilter_damping"  # that of one of second order
+NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
 INNER_GAINS = ("k_v", "k_ff")  # of a cascade besides; and T_v where its speed loop integrates
 SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms
 AGREES = 1e-6  # numbers for reading give the law's response to this share
@@ -370,12 +372,12 @@ class Gains:
         """Return the gains of `by_name`; observer, what a speed loop reads and link are given."""
         notch = inner = prefilter = None
         if PREFILTER in numbers:
-            damping = numbers.get("prefilter_damping")
+            damping = numbers.get(PREFILTER_DAMPING)
             order = PREFILTER_ORDERS[damping is not None]
             prefilter = Prefilter(order=order, corner_hz=numbers[PREFILTER], damping=damping)
         if speed is not None:
             inner = InnerLoop(k_v=numbers["k_v"], k_ff=numbers["k_ff"], T_v=numbers.get("T_v", math.inf), speed=speed)
-        if "notch_depth" in numbers:
+        if NOTCH_GAINS[0] in numbers:
             notch = Notch(**{field.name: numbers[f"notch_{field.name}"] for field in fields(Notch)})
         return cls(
             **{name: numbers[name] for name in LAW_GAINS},

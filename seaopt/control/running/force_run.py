@@ -19,7 +19,15 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
-from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditions, whole_samples
+from seaopt.control.loops.sampled_plant import (
+    DELAYS,
+    Measured,
+    find_delay,
+    find_rows,
+    list_names,
+    read_conditions,
+    whole_samples,
+)
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
 from seaopt.control.running.sampled_loop import largest_current
@@ -102,7 +110,7 @@ def close_loop(
     params: ParameterSet,
     reference: Float[np.ndarray, " n"],
     *,
-    measured: str = "F1",
+    measured: Measured = "F1",
     sample_time_s: float = 1e-3,
     delay_samples: int = 1,
     preview_samples: int = 0,
@@ -130,8 +138,8 @@ def close_loop(
         `delay_samples`.
     reference : array, shape (n,)
         N, one value per sample.
-    measured : str
-        The output that the law sees.
+    measured : str or tuple of str
+        The output that the law sees; or several, the regulated one first, which it then sees as an array.
     sample_time_s : float
         Seconds.
     delay_samples : int
@@ -176,10 +184,10 @@ def close_loop(
     newer, n, p = delay_samples + whole, reference.size, values.vector
     output, integrator = DirectCall(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
     idle = [0.0] * (len(plant.inputs) - 1)
-    devices, row = sensors or Sensors(), list(plant.outputs).index(measured)
-    read = _place_sensor(devices, plant, values, measured)
-    noise_std, _ = devices.combine_errors(plant, values, measured)
-    noise = noise_std * np.random.default_rng(require_seed(seed, ControlError)).normal(size=n)
+    devices, signals = sensors or Sensors(), list_names(measured)
+    rng = np.random.default_rng(require_seed(seed, ControlError))
+    row, reads = find_rows(plant, signals)[0], [_place_sensor(devices, plant, values, name) for name in signals]
+    noise = np.array([devices.combine_errors(plant, values, name)[0] * rng.normal(size=n) for name in signals])
     if not command_step >= 0.0:
         raise ControlError(f"command_step = {command_step:g} is negative; give the amplifier's step, 0 for none")
     most = largest_current(command_limit, command_step)
@@ -205,7 +213,8 @@ def close_loop(
         force[k] = outputs[row]
         call_start_s = time.perf_counter()
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
-        command, law = step(law, coming, read(outputs, float(noise[k])), *x[seen].tolist())
+        readings = [read(outputs, float(each)) for read, each in zip(reads, noise[:, k], strict=True)]
+        command, law = step(law, coming, readings[0] if len(reads) == 1 else np.array(readings), *x[seen].tolist())
         law_time_s[k] = time.perf_counter() - call_start_s
         current[k] = _convert_command(command, command_step, most)
         states[k] = x
@@ -221,7 +230,7 @@ def close_loop(
         state=states,
         error=integrator.error,
         substeps=2 * integrator.substeps,
-        unit=plant.outputs[measured],
+        unit=plant.outputs[signals[0]],
         command=name_input(plant),
     )
 
@@ -251,12 +260,9 @@ def _place_sensor(
     return read
 
 
-def _check(plant: Plant, params: CompletedParameters, measured: str, delay_samples: int) -> float:
+def _check(plant: Plant, params: CompletedParameters, measured: Measured, delay_samples: int) -> float:
     """Return the delay besides the whole samples, s, of arguments that fit together."""
-    if measured not in plant.outputs:
-        raise ControlError(
-            f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
-        )
+    rows = find_rows(plant, measured)
     conditions = read_conditions(plant, params)
     moved = [name for name, value in conditions.items() if value and name not in DELAYS]
     if moved:
@@ -264,10 +270,10 @@ def _check(plant: Plant, params: CompletedParameters, measured: str, delay_sampl
             f"the parameters hold {', '.join(moved)}, but close_loop starts at rest at zero; leave it out"
         )
     extra_delay_s = float(find_delay(plant, conditions))
-    row = plant.output[list(plant.outputs).index(measured)]
-    if not delay_samples and not extra_delay_s and ca.depends_on(row, plant.u[0]):
+    if not delay_samples and not extra_delay_s and ca.depends_on(plant.output[rows], plant.u[0]):
         raise ControlError(
-            f"{measured} of {plant.name} contains the present command, which a law without delay sets from it; give "
+            f"{' or '.join(list_names(measured))} of {plant.name} contains the present command, which a law without "
+            "delay sets from it; give "
             "delay_samples = 1 or more, or measure another output"
         )
     return extra_delay_s

@@ -5,9 +5,10 @@ Between two points every gain is interpolated by itself,
 
 .. math:: g(s) = g_i + t\,(g_{i+1} - g_i), \qquad t = \frac{s - s_i}{s_{i+1} - s_i},
 
-and beyond the ends it stays. The gains are those of `seaopt.control.laws.structures`, in one realisation whose states
-mean the same at every s (`seaopt.control.scheduling.runnable_schedule`); matrices of a balanced realisation have
-coordinates of their own at every point, and cannot be interpolated.
+and beyond the ends it stays. The gains are those of `seaopt.control.laws.structures`, of which the law is made at s, in
+step order with states that mean the same everywhere (`seaopt.control.scheduling.step_order`); matrices of a balanced
+realisation have coordinates of their own at every point, and cannot be interpolated. A corner f is interpolated as the
+filter has it, :math:`\tan \pi f T_s`.
 
 **How much the law changes.** With :math:`\bar s` the middle of a stretch between two points, h its half width and a
 dash for a slope,
@@ -22,23 +23,39 @@ The real part of 1 - q is not negative, so that this derivative is largest where
     |C_y(s) - C_y(\bar s)| \le h\,|k_p' + k_i' I + k_d' D(\bar s)|
         + \max k_d \; h\,|T_f'|\,\max \Big|\frac{\partial D}{\partial T_f}\Big|
 
-holds at every frequency for the whole stretch, which `bound_change` returns over :math:`|C_y(\bar s)|`.
+holds at every frequency for the whole stretch, which `bound_change` returns over :math:`|C_y(\bar s)|`. There is no
+such rule yet for a notch and a cascade, whose change is not bounded.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.laws.structures import LAW_GAINS, Gains, Structure, evaluate_terms
+from seaopt.control.laws.structures import (
+    CASCADE,
+    INNER_GAINS,
+    LAW_GAINS,
+    NOTCH_GAINS,
+    PREFILTER,
+    PREFILTER_DAMPING,
+    PREFILTER_ORDERS,
+    Gains,
+    SpeedLoop,
+    Structure,
+    evaluate_terms,
+)
 from seaopt.control.loops.law import Law
+from seaopt.control.scheduling.step_order import StepOrder
 from seaopt.errors import ControlError
 from seaopt.records import record
 
-STRUCTURES = ("pd", "pid")  # whose gains can be interpolated
+STRUCTURES = ("pd", "pid", CASCADE)  # whose gains can be interpolated
+CORNERS = {NOTCH_GAINS[0]: "notch_w", PREFILTER: "prefilter_w"}  # tan(pi f T_s) of a frequency in Hz
 MOST_POINTS = 100
 
 
@@ -53,10 +70,12 @@ class GainTable:
     points : array, shape (n,)
         Its values, ascending.
     gains : mapping of name to array, shape (n,)
-        k_p, k_i, k_d, T_f, k_r and c at these.
-    structure : {"pd", "pid"}
+        k_p, k_i, k_d, T_f, k_r and c at these; and those of a notch, a prefilter and a cascade, where there are such.
+    structure : {"pd", "pid", "cascade"}
     sample_time_s : float
         Seconds.
+    speed : SpeedLoop, optional
+        What a cascade's speed loop reads.
 
     Raises
     ------
@@ -83,17 +102,16 @@ class GainTable:
     gains: Mapping[str, Float[np.ndarray, " n"]]
     structure: Structure
     sample_time_s: float
+    speed: SpeedLoop | None = None
 
     def __post_init__(self) -> None:
         check_points(self.over, self.points)
         if self.structure not in STRUCTURES:
+            raise refuse_structure(self.structure)
+        if unlike := set(self.gains) ^ set(self._list_expected()):
             raise ControlError(
-                f'structure = "{self.structure}" cannot be scheduled: its states change their meaning from point to '
-                'point; use structure = "pid" or "pd"'
-            )
-        if set(self.gains) != set(LAW_GAINS):
-            raise ControlError(
-                f"gains of a schedule are {', '.join(sorted(self.gains))}; give {', '.join(LAW_GAINS)} and no others"
+                f"gains of a schedule are {', '.join(sorted(self.gains))}: {', '.join(sorted(unlike))} is missing or "
+                f"does not go with the others; give {', '.join(LAW_GAINS)}, and all of a notch, prefilter or cascade"
             )
         for name, values in self.gains.items():
             if np.shape(values) != self.points.shape or not np.all(np.isfinite(values)):
@@ -105,6 +123,23 @@ class GainTable:
                 f"k_i is 0 at {self.over} = {at} and not elsewhere: what was integrated would stay in the command "
                 'there for ever; use structure = "pd", or other points'
             )
+
+    def _list_expected(self) -> list[str]:
+        """Return the gains that go with those that say which parts there are."""
+        optional = [name for name in (PREFILTER, PREFILTER_DAMPING) if name in self.gains]
+        optional += NOTCH_GAINS if set(NOTCH_GAINS) & set(self.gains) else ()
+        inner = () if self.speed is None else (*INNER_GAINS, *(("T_v",) if "T_v" in self.gains else ()))
+        return [*LAW_GAINS, *inner, *optional]
+
+    @property
+    def order(self) -> StepOrder:
+        """What the law is made of, as it runs."""
+        return _find_order(self)
+
+    @property
+    def columns(self) -> Mapping[str, Float[np.ndarray, " n"]]:
+        """The rows of numbers that are interpolated, by the names that `StepOrder` has for them."""
+        return _list_columns(self)
 
     @property
     def integrates(self) -> bool:
@@ -118,21 +153,33 @@ class GainTable:
         i = min(max(bisect_right(points, inside) - 1, 0), points.size - 2)
         return i, (inside - float(points[i])) / (float(points[i + 1]) - float(points[i]))
 
-    def interpolate(self, value: float, **more: Float[np.ndarray, " n"]) -> dict[str, float]:
-        """Return the gains at a finite value, by name, and of `more` rows of numbers at the points."""
+    def interpolate(self, value: float) -> dict[str, float]:
+        """Return the gains at a finite value, by name."""
+        numbers, per_hz = self.find_numbers(value), np.pi * self.sample_time_s
+        return {
+            name: float(np.arctan(numbers[CORNERS[name]])) / per_hz if name in CORNERS else numbers[name]
+            for name in self.gains
+        }
+
+    def find_numbers(self, value: float, **more: Float[np.ndarray, " n"]) -> dict[str, float]:
+        """Return the numbers of `columns` at a finite value, and of `more` rows at the points."""
         i, t = self.find_stretch(value)
-        return {name: float(row[i] + t * (row[i + 1] - row[i])) for name, row in {**self.gains, **more}.items()}
+        return {name: float(row[i] + t * (row[i + 1] - row[i])) for name, row in {**self.columns, **more}.items()}
 
     def law(self, value: float) -> Law:
         """Return the law while the variable stands at a value."""
-        return Gains.from_names(self.interpolate(value)).law(self.structure, self.sample_time_s).balanced()
+        gains = Gains.from_names(self.interpolate(value), speed=self.speed)
+        return gains.law(self.structure, self.sample_time_s).balanced()
 
     def bound_change(self, low: float, high: float, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return what abs(C_y(s)/C_y(middle) - 1) stays below for every s from low to high, at frequencies in Hz.
-        Raises ControlError: a point of the table lies between the two.
+        Infinite where there is no rule for a part of the law. Raises ControlError: a point of the table lies between
+        the two.
         """
         if np.any((self.points > low) & (self.points < high)):
             raise ControlError(f"a stretch from {low:g} to {high:g} has a point of the table in it; end it there")
+        if self.speed is not None or NOTCH_GAINS[0] in self.gains:
+            return np.full(f.size, np.inf)
         ts, half = self.sample_time_s, 0.5 * (high - low)
         first, last, middle = (self.interpolate(value) for value in (low, high, 0.5 * (low + high)))
         width = max(high - low, np.finfo(float).tiny)
@@ -145,6 +192,34 @@ class GainTable:
         change = half * np.abs(slope["k_p"] + slope["k_i"] * integral + slope["k_d"] * terms.rate)
         change = change + max(first["k_d"], last["k_d"]) * filtering
         return change / np.abs(middle["k_p"] + middle["k_i"] * integral + middle["k_d"] * terms.rate)
+
+
+@lru_cache(maxsize=16)
+def _find_order(table: GainTable) -> StepOrder:
+    """Return what the law of a table is made of, once."""
+    return StepOrder(
+        sample_time_s=table.sample_time_s,
+        integrates=table.integrates,
+        prefilter=PREFILTER_ORDERS[PREFILTER_DAMPING in table.gains] if PREFILTER in table.gains else None,
+        notch=NOTCH_GAINS[0] in table.gains,
+        speed=table.speed,
+        speed_integrates="T_v" in table.gains,
+    )
+
+
+@lru_cache(maxsize=16)
+def _list_columns(table: GainTable) -> Mapping[str, Float[np.ndarray, " n"]]:
+    """Return the rows of a table with its corners warped, once."""
+    return {
+        CORNERS.get(name, name): np.tan(np.pi * row * table.sample_time_s) if name in CORNERS else np.asarray(row)
+        for name, row in table.gains.items()
+    }
+
+
+def refuse_structure(structure: str) -> ControlError:
+    """Return what is raised of a structure that cannot be scheduled."""
+    names = ", ".join(f'"{name}"' for name in STRUCTURES)
+    return ControlError(f'structure = "{structure}" cannot be scheduled; use one of {names}')
 
 
 def check_points(over: str, points: Float[np.ndarray, " n"]) -> None:

@@ -271,11 +271,13 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
     """Return the gains of controllers at points. Raises ControlError: they cannot be interpolated; rates differ."""
     first = controllers[0]
     for point, controller in zip(points, controllers, strict=True):
-        gains = controller.gains
-        if set(gains) != set(LAW_GAINS) or not Gains.from_names(gains).makes(controller.law, controller.spec.structure):
+        gains, speed = controller.gains, controller.speed_loop
+        made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, speed=speed)
+        if set(gains) != set(first.gains) or not made or not made.makes(controller.law, controller.spec.structure):
             raise ControlError(
-                f"the controller at {over} = {point:g} is more than k_p, k_i, k_d, T_f, k_r and c, which are what can "
-                'be interpolated; use structure = "pid" or "pd" without a notch or other parts'
+                f"the controller at {over} = {point:g} is more than its gains, or has other parts than that at "
+                f"{points[0]:g}, and only gains are interpolated; use the same structure, notch and prefilter at all "
+                "points, and no other parts"
             )
         if controller.sample_time_s != first.sample_time_s or not math.isclose(
             controller.command.per_effort, first.command.per_effort, rel_tol=1e-9
@@ -288,9 +290,10 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
         over=over,
         unit=unit,
         points=np.array(points, dtype=float),
-        gains={name: np.array([controller.gains[name] for controller in controllers]) for name in LAW_GAINS},
+        gains={name: np.array([controller.gains[name] for controller in controllers]) for name in first.gains},
         structure=first.spec.structure,
         sample_time_s=first.sample_time_s,
+        speed=first.speed_loop,
     )
 
 
@@ -302,15 +305,16 @@ def freeze(
     """
     plant, params = design[0], place_variable(*design, table.over, value)
     task = make_task(plant, plant.complete(params), spec, place_plants(others, table.over, value))
-    gains, law = table.interpolate(value), table.law(value)
+    numbers, law = table.interpolate(value), table.law(value)
+    gains = Gains.from_names(numbers, speed=table.speed)
 
     def describe(task: Task) -> Controller:
         loops = task.measure_law(
             law,
-            filter_samples=gains["T_f"] / table.sample_time_s if gains["k_d"] else math.inf,
-            integral_rad_s=gains["k_i"] / (1.0 + gains["k_p"]) if table.integrates else math.inf,
+            filter_samples=gains.T_f / table.sample_time_s if gains.k_d else math.inf,
+            integral_rad_s=gains.integral_rad_s if table.integrates else math.inf,
         )
-        return describe_law(task, law, loops, (plant, params), gains=gains)
+        return describe_law(task, law, loops, (plant, params), gains=numbers)
 
     frozen = describe(task)
     band = frozen.achieved.bandwidth_hz

@@ -54,7 +54,7 @@ def read_schedule(content: Mapping[str, Any]) -> StoredSchedule:
         )
     if table.fallback not in table.points:
         raise FileError(f"schedule.json: fallback = {table.fallback:g} is none of the points; {TUNE_AGAIN}")
-    for name in LAW_GAINS:
+    for name in dict.fromkeys((*LAW_GAINS, *table.gains, *table.controllers[0].gains)):
         tuned = [controller.gains.get(name, np.nan) for controller in table.controllers]
         stated = table.gains.get(name, [])
         if len(stated) != count or not np.allclose(stated, tuned, rtol=AGREES, atol=0.0):

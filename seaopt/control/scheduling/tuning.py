@@ -24,7 +24,7 @@ from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.sampled_plant import DELAYS
-from seaopt.control.scheduling.gain_table import STRUCTURES, check_points
+from seaopt.control.scheduling.gain_table import STRUCTURES, check_points, refuse_structure
 from seaopt.control.scheduling.scheduled_controller import (
     Plants,
     ScheduledController,
@@ -72,7 +72,7 @@ def tune_schedule(
     params : Fit or ParameterSet
         Its parameters.
     spec : ControllerSpec
-        Limits, the same at every point; the structure "pd" or "pid" without a notch, and one measured output.
+        Limits, the same at every point; the structure "pd", "pid" or "cascade", with notch and prefilter or without.
     over : str
         The variable: a state that is measured, such as an angle, at which the plants are linearised; or a parameter
         that is known while the law runs, such as a load.
@@ -151,15 +151,8 @@ def _check_structure(spec: ControllerSpec) -> None:
             "link_feedforward reads the link's motion, and a scheduled law reads one signal, what it regulates; leave "
             "link_feedforward out, or tune one law for all points: so.tune(..., draws=[{name: value}, ...])"
         )
-    parts = {"a notch": spec.notch, "a prefilter": spec.prefilter}
-    if spec.structure not in STRUCTURES or any(part is not None for part in parts.values()):
-        part = next((name for name, part in parts.items() if part is not None), f'structure = "{spec.structure}"')
-        raise ControlError(
-            f'{part} cannot be scheduled: its states change their meaning from point to point; use structure = "pid" '
-            'or "pd" without it'
-        )
-    if not isinstance(spec.measured, str):
-        raise ControlError(f"measured = {list(spec.measured)}: a schedule feeds back one output; name one")
+    if spec.structure not in STRUCTURES:
+        raise refuse_structure(spec.structure)
 
 
 def _pair_plants(robust_to: Mapping[str, Any], values: ParameterSet) -> Plants:

@@ -71,6 +71,9 @@ def bound_stretch(
     """Bound Ms of a schedule on a stretch between points, `middle` at its middle, on a plant without friction."""
     frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s
     change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
+    if np.isinf(change):
+        reason = "how far a law with a notch or a speed loop changes between two values is not bounded"
+        return StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=reason)
     moves = table.over in plant.parameters or table.over in plant.states
     ranges = {table.over: (low, high)} if moves else {}  # of a plant without the variable the law alone changes
     values = ParameterSet(replace(each, std=None) for each in params.values())  # of a fit its values alone count here

@@ -87,7 +87,7 @@ class _Pushing:
     def run(self, size: float) -> ForceRun:
         """Return the loop under pushes of a size."""
         law, start = self.schedule.runnable(), self.start
-        state, reference = law.reset(start.output, start.output, self.middle, start.command), size * self.pushes
+        state, reference = start.reset(law, self.middle), size * self.pushes
         return start.run(law.step, state, self.plant, start.params, reference, place=self.schedule.over)
 
     def follow(self, run: ForceRun) -> Signal:

@@ -30,9 +30,10 @@ import casadi as ca
 import numpy as np
 
 from seaopt.codec import OrInfinite
-from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.laws.realisation import Reading
+from seaopt.control.loops.sampled_plant import find_rest, find_rows
 from seaopt.control.running.force_run import ForceRun, close_loop
-from seaopt.control.scheduling.runnable_schedule import ScheduleState
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
 from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
 from seaopt.errors import ControlError, SimulationError
 from seaopt.executors import Shared, map_ordered
@@ -195,13 +196,13 @@ def _run_sweep(
     )
 
     def step(
-        state: tuple[int, ScheduleState], reference: float, measurement: float
+        state: tuple[int, ScheduleState], reference: float, measurement: Reading
     ) -> tuple[float, tuple[int, ScheduleState]]:
         number, before = state  # of the sample
         command, after = law.step(before, reference, measurement, float(place[number]))
         return command, (number + 1, after)
 
-    reset = 0, law.reset(start.output, start.output, low, start.command)
+    reset = 0, start.reset(law, low)
     make_sweep = partial(Sweep, plant=name, rate=0.5 * (high - low) * omega, frequency_hz=frequency_hz)
     try:
         calm, moved = (start.run(step, reset, swept, values, size * pulse) for size in (0.0, pulses.size))
@@ -228,7 +229,7 @@ class RestStart:
     schedule: ScheduledController
     params: ParameterSet
     states: dict[str, float]
-    output: float
+    readings: tuple[float, ...]
     command: float
 
     @classmethod
@@ -236,15 +237,18 @@ class RestStart:
         """Return where a plant rests with the variable at a value."""
         placed = plant.complete(place_variable(plant, params, schedule.over, value))
         x, u = find_rest(plant, placed)
-        row = list(plant.outputs).index(schedule.spec.regulated)
-        output = float(output_function(plant)(0.0, x, u, placed.vector)[row])
+        outputs = np.array(output_function(plant)(0.0, x, u, placed.vector)).ravel()
         return cls(
             schedule=schedule,
             params=placed.drop_conditions(),
             states=dict(zip(plant.states, x.tolist(), strict=True)),
-            output=output,
+            readings=tuple(outputs[find_rows(plant, schedule.controllers[0].signals)].tolist()),
             command=float(u[0]),
         )
+
+    def reset(self, law: RunnableSchedule, value: float) -> ScheduleState:
+        """Return the state of a law at rest there."""
+        return law.reset(self.readings[0], np.array(self.readings), value, self.command)
 
     def run(
         self, step: Callable[..., Any], reset: Any, plant: Plant, values: ParameterSet, reference: Signal, **more: Any
@@ -256,8 +260,8 @@ class RestStart:
             reset,
             plant,
             values,
-            self.output + reference,
-            measured=spec.regulated,
+            self.readings[0] + reference,
+            measured=self.schedule.controllers[0].signals,
             sample_time_s=spec.sample_time_s,
             delay_samples=spec.loop_delay_samples,
             start_state=np.array([self.states[name] for name in plant.states]),

@@ -140,7 +140,7 @@ class TestRunnableSchedule:
         law = make_runnable(make_table(), limit=50.0)
         command, state = law.step(law.reset(place=0.2), 0.3, 0.1, 0.2)
         held, after = law.step(state, 0.3, math.nan, 0.4)
-        assert held == command and after.held == 1 and after.effort == state.effort
+        assert held == command and after.held == 1 and after.x == state.x
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +206,6 @@ class TestTuneSchedule:
         spec = so.ControllerSpec(measured="tau", bandwidth_hz=30)
         for changed, over, what in (
             ({"structure": "pid_dob"}, "phi", "pid_dob"),
-            ({"notch": so.control.Notch()}, "phi", "notch"),
             ({}, "ph", "phi"),
             ({}, "delay_s", "delay"),
         ):

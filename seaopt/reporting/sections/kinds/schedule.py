@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from seaopt.control import ScheduledController
 from seaopt.control.laws.command import name_gain_units
-from seaopt.control.laws.structures import LAW_GAINS
 from seaopt.formatting import format_count, format_number
 from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met
 from seaopt.units import unit_after
@@ -32,13 +31,13 @@ def judge(schedule: ScheduledController, commands: Commands) -> Verdict:
 def describe(schedule: ScheduledController) -> list[Section]:
     """Return the gains and figures at every point, what was found between them, and the findings."""
     spec = schedule.spec
-    units = name_gain_units(schedule.command)
-    gains = tuple(f"{name}{unit_after(units[name]) if name in units else ''}" for name in LAW_GAINS)
+    units, names = name_gain_units(schedule.command), list(schedule.controllers[0].gains)
+    gains = tuple(f"{name}{unit_after(units[name]) if name in units else ''}" for name in names)
     head = (f"{schedule.over}{unit_after(schedule.unit)}", *gains, "bandwidth Hz", "Ms", "Mt", "limits")
     rows = tuple(
         (
             f"{point:g}",
-            *(f"{controller.gains[name]:.4g}" for name in LAW_GAINS),
+            *(f"{controller.gains[name]:.4g}" for name in names),
             format_number(controller.achieved.bandwidth_hz, missing="none"),
             f"{controller.achieved.ms:.3f}",
             f"{controller.achieved.mt:.3f}",

@@ -1,0 +1,73 @@
+"""Python code that computes with numbers, written down as C: operations are recorded in the order they are done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A number in the C code: its name, and the trace that it belongs to."""
+
+    trace: Trace
+    text: str
+
+    def __add__(self, other: Any) -> Term:
+        return self.trace.combine(self, "+", other)
+
+    def __radd__(self, other: Any) -> Term:
+        return self.trace.combine(other, "+", self)
+
+    def __sub__(self, other: Any) -> Term:
+        return self.trace.combine(self, "-", other)
+
+    def __rsub__(self, other: Any) -> Term:
+        return self.trace.combine(other, "-", self)
+
+    def __mul__(self, other: Any) -> Term:
+        return self.trace.combine(self, "*", other)
+
+    def __rmul__(self, other: Any) -> Term:
+        return self.trace.combine(other, "*", self)
+
+    def __truediv__(self, other: Any) -> Term:
+        return self.trace.combine(self, "/", other)
+
+    def __rtruediv__(self, other: Any) -> Term:
+        return self.trace.combine(other, "/", self)
+
+    def __neg__(self) -> Term:
+        return self.trace.keep(f"-{self.text}", [self.text])
+
+
+@dataclass(slots=True)
+class Trace:
+    """The operations so far, each a constant of C with the names that it is made of."""
+
+    number: Callable[[float], str]  # writes a number as C has it
+    lines: dict[str, tuple[str, list[str]]] = field(default_factory=dict)
+
+    def combine(self, left: Any, sign: str, right: Any) -> Term:
+        """Record an operation."""
+        texts = [self.write(side) for side in (left, right)]
+        return self.keep(f"{texts[0]} {sign} {texts[1]}", texts)
+
+    def keep(self, expression: str, parts: list[str]) -> Term:
+        """Record an expression under a name of its own."""
+        name = f"t{len(self.lines) + 1}"
+        self.lines[name] = (expression, parts)
+        return Term(self, name)
+
+    def write(self, value: Any) -> str:
+        """Return a term or a number as C has it."""
+        return value.text if isinstance(value, Term) else self.number(float(value))
+
+    def list_needed(self, results: Iterable[str]) -> list[str]:
+        """Return the lines that some results need, in order."""
+        needed = set(results)
+        for name in reversed(self.lines):
+            if name in needed:
+                needed.update(self.lines[name][1])
+        return [f"const real {name} = {text};" for name, (text, _) in self.lines.items() if name in needed]

@@ -1,0 +1,165 @@
+"""A scheduled law with every part: standing still it is the plain law of its gains, and in C it is what Python has.
+
+The plain law is another realisation (balanced, its integrators a chain), and runs by other code.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import GainTable, Notch, Prefilter, ScheduledController, realise, tune_schedule
+from seaopt.control.laws.structures import Gains, SpeedLoop
+from seaopt.control.running.force_run import close_loop
+from seaopt.control.scheduling.runnable_schedule import make_runnable
+from seaopt.errors import ControlError
+from seaopt.files import to_json
+from tests.c_code import CompiledSchedule
+from tests.schedules import read_knee
+
+TS, POINTS = 1e-3, (0.0, 0.7, 1.15)
+PID = {
+    "k_p": [57.0, 90.0, 161.0], "k_i": [4297.0, 6000.0, 11236.0], "k_d": [0.95, 1.4, 2.45], "T_f": [1e-3, 2e-3, 3e-3],
+    "k_r": [55.0, 88.0, 156.0], "c": [0.63, 0.4, 0.2],
+}  # fmt: skip
+NOTCH = {"notch_frequency_hz": [60.0, 70.0, 90.0], "notch_width": [0.3, 0.4, 0.5], "notch_depth": [0.1, 0.2, 0.5]}
+FIRST = {"prefilter_corner_hz": [30.0, 40.0, 50.0]}
+SECOND = FIRST | {"prefilter_damping": [0.7, 0.8, 0.9]}
+INNER, INTEGRAL = {"k_v": [3.0, 4.0, 5.0], "k_ff": [1.0, 1.2, 1.5]}, {"T_v": [0.05, 0.06, 0.08]}
+SPEED, ENCODER = SpeedLoop(differenced=False), SpeedLoop(differenced=True)
+LAWS = {
+    "pid": ({}, None),
+    "notch": (NOTCH, None),
+    "first-order prefilter": (FIRST, None),
+    "notch and prefilter": (NOTCH | SECOND, None),
+    "cascade": (INNER, SPEED),
+    "cascade of two integrals on an encoder": (INNER | INTEGRAL, ENCODER),
+    "cascade with notch and prefilter": (INNER | INTEGRAL | NOTCH | SECOND, ENCODER),
+    "cascade without an outer integral": (INNER | INTEGRAL | {"k_i": [0.0] * 3}, SPEED),
+}
+
+
+def make_table(gains, speed):
+    return GainTable(
+        over="phi", unit="rad", points=np.array(POINTS), structure="pid" if speed is None else "cascade",
+        gains={name: np.array(row) for name, row in (PID | gains).items()}, sample_time_s=TS, speed=speed,
+    )  # fmt: skip
+
+
+def make_signals(speed, samples=1200):
+    """Return references and readings that take the law to its limit and back."""
+    rng = np.random.default_rng(5)
+    references, readings = rng.normal(size=samples), rng.normal(size=(samples, 1 if speed is None else 2))
+    references[: samples // 2] += 4.0
+    return references, readings * [1.0, 0.01][: readings.shape[1]]
+
+
+@pytest.mark.parametrize(("place", "limit"), [(0.0, None), (0.3, None), (0.7, None), (0.7, 600.0)])
+@pytest.mark.parametrize("name", LAWS)
+def test_standing_still_it_is_the_plain_law_saturated_too(name, place, limit):
+    gains, speed = LAWS[name]
+    table = make_table(gains, speed)
+    law = Gains.from_names(table.interpolate(place), speed=speed).law(table.structure, TS)
+    scheduled, plain = make_runnable(table, limit=limit), realise(law, command_limit=limit)
+    state, other = scheduled.reset(place=place), plain.reset()
+    commands = np.zeros((1200, 2))
+    for row, r, y in zip(commands, *make_signals(speed), strict=True):
+        row[0], state = scheduled.step(state, float(r), y, place)
+        row[1], other = plain.step(other, float(r), float(y[0]) if y.size == 1 else y)
+    np.testing.assert_allclose(*commands.T, atol=1e-12 * np.max(np.abs(commands)))
+    assert limit is None or 0.3 < np.mean(np.abs(commands[:, 1]) == limit) < 0.95
+
+
+@pytest.mark.parametrize("name", [name for name in LAWS if "without" not in name])
+def test_a_reset_continues_from_its_command_and_stays_at_rest(name):
+    gains, speed = LAWS[name]
+    law = make_runnable(make_table(gains, speed))
+    resting = [2.0] if speed is None else [2.0, 0.3 * speed.differenced]
+    state = law.reset(2.0, np.array(resting), 0.3, 25.0)
+    for _ in range(50):
+        command, state = law.step(state, 2.0, np.array(resting), 0.3)
+        assert command == pytest.approx(25.0, rel=1e-9)
+
+
+def test_corners_are_lines_as_the_filter_has_them():
+    table = make_table(NOTCH, None)
+    middle = np.tan(np.pi * TS * np.array(NOTCH["notch_frequency_hz"][:2])).mean()
+    assert np.tan(np.pi * TS * table.interpolate(0.35)["notch_frequency_hz"]) == pytest.approx(middle, rel=1e-12)
+
+
+def test_half_a_notch_and_gains_of_a_cascade_without_its_signal_are_refused():
+    with pytest.raises(ControlError, match="notch_width"):
+        make_table({"notch_frequency_hz": [60.0] * 3, "notch_depth": [0.5] * 3}, None)
+    with pytest.raises(ControlError, match="k_ff, k_v"):
+        make_table(INNER, None)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_change_of_a_law_without_a_rule_for_it_is_not_bounded(name):
+    gains, speed = LAWS[name]
+    change = make_table(gains, speed).bound_change(0.0, 0.7, np.array([1.0, 10.0]))
+    assert np.all(np.isinf(change)) == (speed is not None or "notch_width" in gains)
+
+
+@pytest.fixture(scope="module", params=["notch and prefilter", "cascade"])
+def schedule(request):
+    """Return a tuned schedule."""
+    if request.param == "cascade":
+        plant, over, points = so.plants.rotary(link="locked"), "k_s", (250.0, 300.0)
+        spec = so.ControllerSpec(
+            measured=("tau_s", "thetad_m"), structure="cascade", bandwidth_hz=15, max_sensitivity=1.6, reserve=0.03,
+            current_limit_A=2.0, prefilter=Prefilter(),
+        )  # fmt: skip
+        return tune_schedule(plant, plant.defaults, spec, over, points)
+    spec = so.ControllerSpec(
+        measured="tau", bandwidth_hz=30, max_sensitivity=1.6, reserve=0.03, current_limit_A=5.0,
+        notch=Notch(frequency_hz=120.0, width=0.4, depth=0.5), prefilter=Prefilter(order="second_order"),
+    )  # fmt: skip
+    stand, _, values = read_knee()
+    return tune_schedule(stand, values, spec, "phi", (0.0, 0.5))
+
+
+def test_on_the_plant_it_is_the_linear_loop_of_its_point(schedule):
+    """With the variable at a point, from rest, far from the command's limit; the law reads all of its signals."""
+    controller, point = schedule.controllers[0], schedule.points[0]
+    plant, values = controller.design
+    law, references = schedule.runnable(), np.full(300, 1e-3)
+    run = close_loop(
+        lambda state, r, y: law.step(state, r, y, point), law.reset(place=point), plant,
+        plant.complete(values).drop_conditions(), references, measured=controller.signals, delay_samples=1, rtol=1e-8,
+    )  # fmt: skip
+    expected, _ = controller.close(plant, values).simulate(references)
+    np.testing.assert_allclose(run.force, expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+def test_every_limit_holds_at_the_points_and_between(schedule):
+    assert schedule.met, schedule
+
+
+def test_a_file_of_it_reads_back_the_same(schedule):
+    written = to_json(schedule.to_dict())
+    again = ScheduledController.from_dict(json.loads(written), *schedule.design)
+    assert to_json(again.to_dict()) == written
+
+
+@pytest.mark.parametrize(("precision", "share"), [("double", 0.0), ("float", 2e-3)])
+def test_in_c_every_command_is_pythons(schedule, precision, share, compiler, tmp_path):
+    law, compiled = schedule.runnable(), CompiledSchedule(compiler, tmp_path, schedule, precision)
+    rng, several = np.random.default_rng(3), law.table.order.measured > 1
+    scale = 0.02 if several else 1.0
+    references, readings = 3.0 * scale * rng.normal(size=2000), scale * rng.normal(size=(2000, 1 + several))
+    references[800:1200] += 40.0 * scale
+    low, high = schedule.points
+    places = low + (high - low) * (0.5 + 0.7 * np.sin(np.arange(2000) / 150.0))
+    places[300:320], places[700] = np.nan, np.inf
+    references[50], readings[51:55, -1] = np.nan, np.inf
+    start = (0.5, np.full(readings.shape[1], 0.2), np.nan, 1.0)
+    state, pairs = law.reset(*start), np.zeros((2000, 2))
+    compiled.reset(*start)
+    for pair, r, y, place in zip(pairs, references, readings, places, strict=True):
+        pair[0], state = law.step(state, float(r), y, float(place))
+        pair[1] = compiled.step(float(r), y, float(place))
+        assert (compiled.law.held, compiled.law.misplaced) == (state.held, state.misplaced)
+    np.testing.assert_allclose(*pairs.T, rtol=0.0, atol=share * law.limit)
+    assert 0.1 < np.mean(np.abs(pairs[:, 0]) == law.limit) < 0.9
