@@ -284,11 +284,13 @@ class VirtualTable(SensorsTable):
 
 
 class ResampleTable(StrictTable):
-    """A uniform clock that a log is interpolated to, by lines where no rule is given."""
+    """A uniform clock that a log is interpolated to: where no rule is given by lines, a held input by means."""
 
     rate_hz: Number = key("Sample rate of the uniform clock.", gt=0, le=1e9)
     rule: AlignTable | Literal["restamp"] | None = key(
-        'How; linear where left out, "restamp" for samples that were taken evenly.', default=None
+        'How; where left out the mean over each period of inputs with hold = "zero", and linear; "restamp" for samples '
+        "that were taken evenly.",
+        default=None,
     )
     bridge_s: Number | None = key("Longest step of time that is interpolated across.", default=None, gt=0)
 

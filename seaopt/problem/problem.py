@@ -441,7 +441,10 @@ def _resample(log: Log, table: ExperimentTable) -> Log:
         return log.restamp()
     if resample.rule == "restamp":
         return log.restamp(rate_hz=resample.rate_hz)
-    return log.resample(rate_hz=resample.rate_hz, rule=make_rule(resample.rule), bridge_s=resample.bridge_s)
+    rule, steps = make_rule(resample.rule), list(table.inputs) if table.hold == "zero" else []
+    return log.resample(
+        rate_hz=resample.rate_hz, rule=rule, steps=steps if rule is None else (), bridge_s=resample.bridge_s
+    )
 
 
 def _make_method(table: FitTable) -> Method:

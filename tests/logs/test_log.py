@@ -66,6 +66,32 @@ def test_holding_takes_the_latest_sample():
     assert log.resample(rate_hz=1, rule=Nearest(tolerance_s=0.2))["F1"].tolist() == [1.0, 2.0, 3.0, 4.0]
 
 
+def test_steps_keep_their_area_on_a_new_clock():
+    """A command that is held between uneven samples moves as much as on its own clock; against a sum on a fine one."""
+    rng, period = np.random.default_rng(1), 1 / 800
+    t = np.arange(800) * period + np.append(0.0, 6e-5 * rng.uniform(-1, 1, 799))
+    command = np.cumsum(rng.normal(size=t.size))
+    even = make(t, I=command, F1=sine(t)).resample(rate_hz=800, steps=("I",))
+    fine = even.time[:-1, None] + (np.arange(2000) + 0.5) * period / 2000
+    truth = command[np.searchsorted(t, fine, side="right") - 1].mean(axis=1)
+    np.testing.assert_allclose(even["I"][:-1], truth, atol=2e-3)
+    np.testing.assert_allclose(even["F1"], np.interp(even.time, t, sine(t)), atol=1e-12)
+    assert "I as the mean of its steps" in even.notes[-1]
+
+
+def test_steps_are_lines_across_a_lost_sample_and_missing_where_they_are_missing():
+    t, values = np.delete(np.arange(50) / 50, [10, 11]), np.delete(np.arange(50.0), [10, 11])
+    values[20] = np.nan
+    even = make(t, I=values).resample(rate_hz=50, steps=("I",), bridge_s=0.1)
+    assert np.flatnonzero(np.isnan(even["I"])).tolist() == [22]
+    np.testing.assert_allclose(np.delete(even["I"], 22), np.delete(np.arange(50.0), 22), atol=1e-9)
+
+
+def test_steps_name_channels():
+    with pytest.raises(LogError, match='steps names "i"; known: I'):
+        make(np.arange(50) / 50, I=np.zeros(50)).resample(rate_hz=50, steps=("i",))
+
+
 def test_gaps_stay_gaps(gapped):
     even = gapped.resample(rate_hz=900)
     assert len(even.gaps) == 1

@@ -106,6 +106,18 @@ resample = { rate_hz = 400, rule = "restamp" }
     np.testing.assert_allclose(np.diff(experiment.log.time), 1 / 400)
 
 
+def test_a_held_input_is_averaged_over_the_periods_of_a_new_clock(problem, tmp_path):
+    rng = np.random.default_rng(0)
+    t, command = T + np.append(0.0, 2e-4 * rng.uniform(-1, 1, 399)), rng.normal(size=400)
+    rows = "".join(f"{at:.9f},{a:.9f},{np.cos(at):.9f}\n" for at, a in zip(t, command, strict=True))
+    (tmp_path / "late.csv").write_text("t [s],I [A],F1 [N]\n" + rows)
+    keys = 'log = "late.csv"\ninputs = { I = "I [A]" }\noutputs = { F1 = "F1 [N]" }\nresample = { rate_hz = 400 }\n'
+    (held,), (lines,) = problem(keys).experiments(), problem(keys + 'hold = "first"').experiments()
+    area = np.interp(held.log.time, t, np.append(0.0, np.cumsum(np.diff(t) * command[:-1])))
+    np.testing.assert_allclose(held.log["I"][:-1], 400 * np.diff(area), atol=1e-5)
+    np.testing.assert_allclose(lines.log["I"], np.interp(lines.log.time, t, command), atol=1e-5)
+
+
 def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):
     path = tmp_path / "problem.toml"
     path.write_bytes(b"\xef\xbb\xbf" + b'schema = 1\n[plant.a]\nkind = "high_impedance"\n')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -196,7 +196,9 @@ class Log:
         """Faults of the data, and what they excite: see `seaopt.logs.assess_quality`."""
         return assess_quality(self)
 
-    def resample(self, *, rate_hz: float, rule: Rule | None = None, bridge_s: float | None = None) -> Log:
+    def resample(
+        self, *, rate_hz: float, rule: Rule | None = None, steps: Sequence[str] = (), bridge_s: float | None = None
+    ) -> Log:
         """Interpolate the log to a uniform clock.
 
         Parameters
@@ -206,6 +208,9 @@ class Log:
         rule : Linear, Hold or Nearest, optional
             Linear if left out. A line between samples is a low-pass filter: it attenuates by 0.9 dB at a quarter of the
             sample rate and 3.9 dB at half.
+        steps : sequence of str, optional
+            Channels that keep their value until the next sample, as a command does: each new sample is the mean over
+            its period, so that what is commanded moves as far. A line through them is 30 times as far off.
         bridge_s : float, optional
             Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out, or twice
             the steps that are usual where their lengths vary. A log sampled at irregular times may need a longer one,
@@ -229,7 +234,9 @@ class Log:
         ([0.0, 1.0, 2.0, 3.0, 4.0], ('resampled from 10 Hz to 10 Hz by Linear(max_gap_s=inf)',))
         """
         longest = self.gap_s if bridge_s is None else bridge_s
-        return self.with_values(*resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, longest_s=longest))
+        return self.with_values(
+            *resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, steps=steps, longest_s=longest)
+        )
 
     def restamp(self, *, rate_hz: float | None = None) -> Log:
         """Replace rounded or late timestamps by the uniform clock behind them; samples are not changed.

@@ -5,10 +5,12 @@ Neither bridges a gap: the segments between gaps keep their places, and no sampl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError, require_number
+from seaopt.errors import LogError, require_number, suggestion
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule
 from seaopt.logs.quality.clock import GAP, advise_clock, sample_rate_hz, split_at_gaps, timestamp_resolution
 from seaopt.signals import Recording
@@ -18,6 +20,7 @@ PARTS = 20  # of a log, whose medians tell the rate at which the timestamps run
 MOST_DRIFT = 5e-3  # of a stated rate, as of a ceramic resonator: a sampling clock that is further off has another rate
 RESOLVED = 5.0  # standard deviations of the drift's slope: less is jitter
 MOST_RESAMPLED = 100  # samples that interpolation may make of one
+ROUNDING = 1e-6  # of a period, within which times are the same
 LEAST_RATE = 0.8  # of the log's rate; below it interpolation would fold what is above the new Nyquist frequency
 
 HOW_TO_BRIDGE = "bridge_s interpolates across longer ones"
@@ -25,7 +28,9 @@ HOW_TO_BRIDGE = "bridge_s interpolates across longer ones"
 Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]
 
 
-def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None, longest_s: float) -> Resampled:
+def resample(
+    log: Recording, period: float, *, rate_hz: float, rule: Rule | None, steps: Sequence[str], longest_s: float
+) -> Resampled:
     """Return time and channels on a uniform clock, and a note: see `Log.resample`. `longest_s`: of a step that is
     interpolated across. Raises LogError: the rate is not positive, or would alias, or no segment is long enough.
     """
@@ -48,6 +53,9 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
             f"log.resample(rate_hz={round_rate:g}).decimate({every})",
             keys=[{"resample": {"rate_hz": round_rate}, "decimate": every}],
         )
+    for name in steps:
+        if name not in log.signals:
+            raise LogError(f'{log.source}: steps names "{name}"; {suggestion(name, log.signals)}')
     time = log.time
     if (time[-1] - time[0]) * rate_hz > MOST_RESAMPLED * time.size:
         raise LogError(
@@ -64,10 +72,16 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
             continue
         new_time.append(grid)
         for name, parts in new_values.items():
-            parts.append(chosen(grid, time[segment], log.signals[name].values[segment]))
+            values = log.signals[name].values[segment]
+            if name in steps:
+                parts.append(_average_steps(grid, time[segment], values, period, rate_hz))
+            else:
+                parts.append(chosen(grid, time[segment], values))
     if not new_time:
         raise LogError(f"{log.source}: no segment without a gap holds 2 samples at {rate_hz:g} Hz; {HOW_TO_BRIDGE}")
     note = f"resampled from {old_rate_hz:.6g} Hz to {rate_hz:g} Hz by {chosen}"
+    if steps:
+        note += f", {', '.join(steps)} as the mean of its steps over each period"
     if gaps:
         times = "1 step of time is" if gaps == 1 else f"{gaps} steps of time are"
         note += f"; {times} longer than {longest_s:.3g} s and stay gaps: {HOW_TO_BRIDGE}"
@@ -80,6 +94,35 @@ def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) 
     first = np.ceil((time[0] - origin) * rate_hz - rounding)
     last = np.floor((time[-1] - origin) * rate_hz + rounding)
     return np.clip(origin + np.arange(first, last + 1) / rate_hz, time[0], time[-1])
+
+
+def _average_steps(
+    grid: Float[np.ndarray, " m"],
+    time: Float[np.ndarray, " n"],
+    values: Float[np.ndarray, " n"],
+    period: float,
+    rate_hz: float,
+) -> Float[np.ndarray, " m"]:
+    """Return a signal that keeps each value until the next sample as its mean over each of the grid's periods, so that
+    what it drives moves as far. Across a lost sample, where the step is not known, it is a line.
+    """
+    lost = np.maximum(np.round(np.diff(time) / period).astype(np.int64) - 1, 0)
+    inner = [
+        time[row] + np.arange(1, lost[row] + 1) * (time[row + 1] - time[row]) / (lost[row] + 1)
+        for row in np.flatnonzero(lost)
+    ]
+    starts = np.sort(np.concatenate([time, *inner]))
+    levels = np.interp(starts, time, values)
+    edges = np.append(grid, grid[-1] + 1.0 / rate_hz)
+    widths = np.diff(np.append(starts, max(edges[-1], starts[-1])))
+
+    def integrate(steps: Float[np.ndarray, " k"]) -> Float[np.ndarray, " m"]:
+        area = np.append(0.0, np.cumsum(widths * steps))
+        return np.diff(np.interp(edges, np.append(starts, starts[-1] + widths[-1]), area))
+
+    missing = np.isnan(levels)
+    means = integrate(np.where(missing, 0.0, levels)) * rate_hz
+    return np.where(integrate(missing.astype(np.float64)) * rate_hz > ROUNDING, np.nan, means)
 
 
 def restamp(
