@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.options import option
 from seaopt.records import record
 from seaopt.units import mechanics_of
 
@@ -30,86 +31,62 @@ def _one(p: Any) -> float:
 
 @record(eq=False)
 class Actuation:
-    """The input that a controller commands, and the effort that it makes.
+    """The input that a controller commands, and the effort that it makes."""
 
-    Parameters
-    ----------
-    input : str
-        The commanded input, the first of the plant's.
-    effort : callable ``p -> expression``
-        The effort at the spring that one unit of the input makes.
-    unit : str
-        Of the effort: N or N m.
-    efficiency : str or None
-        The parameter that scales the effort by the losses of the transmission.
-    speed : callable ``(x, p) -> expression``, optional
-        What the effort moves: effort times speed is the power that the motor makes. It gives the back-EMF.
-    largest : callable ``p -> expression``, optional
-        The largest magnitude of the input that acts; more of it changes nothing, as of a duty above 1.
-    """
-
-    input: str
-    effort: Expression
-    unit: str = "N"
-    efficiency: str | None = None
-    speed: StateExpression | None = None
-    largest: Expression | None = None
+    input: str = option("The input that a controller commands, the first of the plant's.")
+    effort: Expression = option("Force or torque at the spring that one unit of it makes, in terms of the parameters.")
+    unit: str = option("Of the effort: N, or N m.", default="N")
+    efficiency: str | None = option(
+        "Parameter that is the transmission's efficiency, which scales the effort.", default=None
+    )
+    speed: StateExpression | None = option(
+        "Speed on which the effort works, in terms of states and parameters: effort times speed is the power that the "
+        "motor makes, which gives the back-EMF.",
+        default=None,
+    )
+    largest: Expression | None = option(
+        "End of the command's range, 1 for a duty: more of it changes nothing.", default=None
+    )
 
 
 @record
 class Sensing:
-    """Regulated and sensed signals: names of outputs, or of states.
+    """Regulated and sensed signals: names of outputs, or of states."""
 
-    Parameters
-    ----------
-    regulated : tuple of str
-        Forces or torques at the spring or behind it, the first the one that is regulated as a rule; load cells read
-        them.
-    motor_position, motor_speed, link_position : str or None
-        What encoders on either side of the spring read.
-    from_encoders : tuple of str
-        Outputs that a device computes from these two positions: with their errors.
-    weights : mapping of output to callable ``p -> {encoder: expression}``
-        How much such an output moves with each encoder, where that is no longer its slope: behind a filter.
-    still : tuple of str
-        Outputs that stay at zero, as the motion of a link does that is held.
-    """
-
-    regulated: tuple[str, ...]
-    motor_position: str | None = None
-    motor_speed: str | None = None
-    link_position: str | None = None
-    from_encoders: tuple[str, ...] = ()
+    regulated: tuple[str, ...] = option(
+        "Forces or torques at the spring or behind it that may be controlled, the first as a rule; load cells read "
+        "them.",
+        default=(),
+    )
+    motor_position: str | None = option("Output or state that an encoder on the motor reads.", default=None)
+    motor_speed: str | None = option("The same of its speed.", default=None)
+    link_position: str | None = option("Output or state that an encoder on the link reads.", default=None)
+    from_encoders: tuple[str, ...] = option(
+        "Outputs that a device computes from these two positions, with their errors.", default=()
+    )
+    # By output, a function of p: how much it moves with each encoder, where that is not its slope: behind a filter.
     weights: Mapping[str, Callable[[Any], Mapping[str, Any]]] = field(
         default_factory=dict[str, Callable[[Any], Mapping[str, Any]]], repr=False
     )
-    still: tuple[str, ...] = ()
+    still: tuple[str, ...] = option("Outputs that stay at zero, as the motion of a link does that is held.", default=())
 
 
 @record(eq=False)
 class SeriesSpring:
-    """The elastic element.
+    """The elastic element."""
 
-    Parameters
-    ----------
-    deflection : callable ``(x, p) -> expression``
-        How far it is compressed or twisted.
-    unit : str
-        Of the deflection: m or rad.
-    stiffness : str or None
-        The parameter that is its stiffness, where one is.
-    mass, damping : str or None
-        The derived figures that (16) of Orekhov et al. 2015 reads from a second-order response with k known.
-    play : str or None
-        The parameter that is its play, where it has some; a fit that looks for it starts more than once.
-    """
-
-    deflection: StateExpression
-    unit: str
-    stiffness: str | None = None
-    mass: str | None = None
-    damping: str | None = None
-    play: str | None = None
+    deflection: StateExpression = option("How far it is deflected, in terms of states and parameters.")
+    unit: str = option("Of the deflection: m or rad.")
+    stiffness: str | None = option("Parameter that is its stiffness, where one is.", default=None)
+    mass: str | None = option(
+        "Derived figure: what swings on the spring, which (16) of Orekhov et al. 2015 reads from a second-order "
+        "response with k known.",
+        default=None,
+    )
+    damping: str | None = option("Derived figure: its damping, read likewise.", default=None)
+    play: str | None = option(
+        "Parameter that is its play, where it has some; a fit that looks for it starts more than once.", default=None
+    )
 
 
 @record(eq=False)
@@ -134,32 +111,6 @@ class Friction:
 
     In `f` and `h` the force stands among the inputs under the friction's name, ``u.NAME``.
 
-    Parameters
-    ----------
-    velocity : callable ``(x, p) -> expression``
-    force : callable ``(velocity, p) -> expression``
-        The curve, positive where the velocity is.
-    unit : str
-        Of the force.
-    effort : callable ``p -> expression``
-        The effort at the spring that one unit of the force takes; 1 if left out.
-    slopes : callable ``p -> (flattest, steepest)``, optional
-        Bounds of the curve's slope over all velocities, negative where it falls; sampled if left out.
-    jump : callable ``(speed, p) -> expression``, optional
-        The curve without its smoothing, for speeds from zero up: what it is at zero is what holds the joint at rest.
-        A simulation in which the joint sticks, and stands still, takes it in the curve's place; a friction without one
-        is what its curve says.
-    smoothing : str, optional
-        The parameter that is the speed over which the curve is smoothed through zero: as it falls the force tends to
-        a jump at rest, and a fit lets it fall by stages.
-    loads : callable ``(x, u, p) -> {name: expression}``, optional
-        What the friction grows with, such as the torque that a gear transmits. `force`, `jump` and `slopes` find each
-        among the parameters, under its name.
-    rated : mapping of name to float
-        The largest size of each load, with which linear analysis, which knows none, takes the friction.
-    bristles : Bristles, optional
-        What gives before it slides. `force` is then the curve of steady sliding, and the force that of the bristles.
-
     Examples
     --------
     A gear that rubs by a tenth of the torque that the motor gives it:
@@ -174,16 +125,39 @@ class Friction:
     1.2
     """
 
-    velocity: StateExpression
-    force: Callable[[Any, Any], Any]
-    unit: str = "N"
-    effort: Expression = _one
-    slopes: Callable[[Any], tuple[Any, Any]] | None = None
-    jump: Callable[[Any, Any], Any] | None = None
-    smoothing: str | None = None
-    loads: Callable[[Any, Any, Any], Mapping[str, Any]] | None = None
-    rated: Mapping[str, float] = field(default_factory=dict[str, float])
-    bristles: Bristles | None = None
+    velocity: StateExpression = option("The velocity that it opposes, in terms of states and parameters.")
+    force: Callable[[Any, Any], Any] = option(
+        "The force, in terms of v, the velocity, and the parameters: a curve, positive where the velocity is."
+    )
+    unit: str = option("Of the force: N, or N m.", default="N")
+    effort: Expression = option("Effort at the spring that one unit of the force takes.", default=_one)
+    slopes: Callable[[Any], tuple[Any, Any]] | None = option(
+        "Flattest and steepest slope of the curve over all velocities, negative where it falls; sampled if left out.",
+        default=None,
+    )
+    jump: Callable[[Any, Any], Any] | None = option(
+        "The curve without its smoothing, for speeds from zero up: what it is at zero is what holds the joint at rest. "
+        "A simulation in which the joint sticks takes it in the curve's place; a friction without one is its curve.",
+        default=None,
+    )
+    smoothing: str | None = option(
+        "Parameter that is the speed over which the curve is smoothed through zero. As it falls the force tends to a "
+        "jump at rest, and a fit lets it fall by stages.",
+        default=None,
+    )
+    loads: Callable[[Any, Any, Any], Mapping[str, Any]] | None = option(
+        "What it grows with, by name, such as the torque that a gear transmits, in terms of states, inputs and "
+        "parameters: the other formulas find it among the parameters.",
+        default=None,
+    )
+    rated: Mapping[str, float] = option(
+        "The largest size of each load, with which linear analysis, which knows none, takes the friction.",
+        default_factory=dict[str, float],
+    )
+    bristles: Bristles | None = option(
+        "What gives before it slides: `force` is then the curve of steady sliding, and the force that of the bristles.",
+        default=None,
+    )
 
     def force_at(self, x: Any, u: Any, p: Any) -> Any:
         """Return the force of a state, inputs and parameters."""
@@ -231,37 +205,29 @@ def put_behind(frictions: Mapping[str, Friction], find_inputs: Callable[[Any, An
 
 @record(eq=False)
 class Port:
-    r"""Where the world touches an actuator: at one of its links, which moves or is held.
+    """Where the world touches an actuator: at one of its links, which moves or is held."""
 
-    Parameters
-    ----------
-    motion : str or None
-        The output that is the port's position; None where the plant has it held.
-    coordinate, rate : str or None
-        The states of the link alone, which the plant with the port held does not have.
-    effort : str or None
-        The input that is the world's force or torque along the motion, where the plant has one.
-    payload : tuple of str
-        The parameters that grow when the link carries more.
-    held : callable ``() -> Plant``, optional
-        Makes the same actuator with this port held.
-    drive : str or None
-        The state of the drive that the spring adds to the motion, and `ratio` (``p -> expression``, 1 if left out) by
-        how much: with the port held at y, the held plant counts that state from -ratio y.
-    probe : callable ``() -> Plant``, optional
-        Makes the same actuator with its other links held and a bare inertia on this one, for the impedance at the
-        port. That plant's first port has motion and coordinate in one, the effort, and the inertia as its payload.
-    """
-
-    motion: str | None = None
-    coordinate: str | None = None
-    rate: str | None = None
-    effort: str | None = None
-    payload: tuple[str, ...] = ()
-    held: PlantMaker | None = None
-    drive: str | None = None
-    ratio: Expression = _one
-    probe: PlantMaker | None = None
+    motion: str | None = option(
+        "Output that is the port's position; left out where the plant has it held.", default=None
+    )
+    coordinate: str | None = option(
+        "State of the link alone, which the plant with the port held has not.", default=None
+    )
+    rate: str | None = option("State: the rate of that.", default=None)
+    effort: str | None = option(
+        "Input: the world's force or torque along the motion, where there is one.", default=None
+    )
+    payload: tuple[str, ...] = option("Parameters that grow when the link carries more.", default=())
+    drive: str | None = option("State of the motor that the spring adds to the motion.", default=None)
+    ratio: Expression = option(
+        "By how much: with the port held at y, the held plant counts that state from -ratio y.", default=_one
+    )
+    held: PlantMaker | None = option("The same actuator with this port held.", default=None)
+    probe: PlantMaker | None = option(
+        "The same actuator with its other links held and a bare inertia on this one, for the impedance there: its "
+        "first port has motion and coordinate in one, the effort, and the inertia as its payload.",
+        default=None,
+    )
 
 
 def change_ports(ports: Iterable[Port], change: Callable[..., Any], *arguments: Any) -> tuple[Port, ...]:
@@ -329,18 +295,8 @@ class Sampling:
 
 @record
 class Mode:
-    """A mode whose frequency one parameter sets, so that an uncertainty may be given as a range of that frequency.
+    """A mode whose frequency one parameter sets, so that an uncertainty may be given as a range of that frequency."""
 
-    Parameters
-    ----------
-    name : str
-        Of the frequency in ranges, ending in ``_hz``.
-    parameter : str
-        That sets it; more of it lowers the frequency.
-    state : str
-        That takes most part in it.
-    """
-
-    name: str
-    parameter: str
-    state: str
+    name: str = option("Name of the frequency in ranges, ending in _hz.")
+    parameter: str = option("Parameter that sets it; more of it lowers the frequency.")
+    state: str = option("State that moves most in it.")

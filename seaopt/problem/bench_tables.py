@@ -10,11 +10,10 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, String
 from seaopt.bench import Chirp, Multisine, Noise, Sensors
 from seaopt.documents import Flag, Number, Whole
 from seaopt.logs import Counter
-from seaopt.plants import Difference
-from seaopt.problem.option_tables import StrictTable, key, table_of
+from seaopt.plants import Actuation, Difference, Friction, Mode, Port, Sensing, SeriesSpring
+from seaopt.problem.option_tables import Formula, Name, StrictTable, key, table_of
 
 NotNegative = Annotated[Number, Field(ge=0)]
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=64)]
 PlantOrResponse = Annotated[str, StringConstraints(pattern=r"^(frf:)?[A-Za-z][A-Za-z0-9_-]*$", max_length=68)]
 
 
@@ -44,15 +43,6 @@ class PlantTable(BaseModel):
     kind: str = key("high_impedance, moving_output, two_link, rotary, winding, or one of an installed package.")
 
 
-Formula = Annotated[
-    Annotated[str, Strict()] | Number,
-    Field(
-        description="Numbers, names, + - * / ^, brackets, sin, cos, tan, tanh, exp, log, sqrt, abs, min, max, atan2, "
-        "if_else(a > b, then, else), pi."
-    ),
-]
-
-
 class DefaultTable(StrictTable):
     """A parameter of a plant of the user's own, with what it is where [parameters] does not say."""
 
@@ -70,71 +60,28 @@ class DerivedTable(StrictTable):
     unit: str = key("SI.")
 
 
-class ActuationTable(StrictTable):
+class ActuationTable(table_of(Actuation)):
     """What a controller commands, and the effort that one unit of it makes, of the parameters."""
 
-    input: str = key("The input that a controller commands.")
-    effort: Formula = key("Force or torque that one unit of it makes, in terms of the parameters.")
-    unit: str = key("N, or N m.", default="N")
-    efficiency: str | None = key("Parameter that is the transmission's efficiency.", default=None)
-    speed: Formula | None = key("Speed on which the effort works, in terms of states and parameters.", default=None)
-    largest: Formula | None = key("End of the command's range: 1 for a duty.", default=None)
 
-
-class SensingTable(StrictTable):
+class SensingTable(table_of(Sensing, leave_out=("still",))):
     """Regulated and sensed signals: names of outputs, or of states."""
 
-    regulated: list[str] = key("Forces or torques that may be controlled.", default=[])
-    motor_position: str | None = key("Output or state.", default=None)
-    motor_speed: str | None = key("Output or state.", default=None)
-    link_position: str | None = key("Output or state.", default=None)
-    from_encoders: list[str] = key("Outputs that a device computes from the encoders.", default=[])
 
-
-class SpringTable(StrictTable):
+class SpringTable(table_of(SeriesSpring, leave_out=("play",))):
     """The elastic element; its deflection is of states and parameters."""
 
-    deflection: Formula = key("Deflection in terms of states and parameters.")
-    unit: str = key("m or rad.")
-    stiffness: str | None = key("Parameter.", default=None)
-    mass: str | None = key("Derived figure: what swings on the spring.", default=None)
-    damping: str | None = key("Derived figure.", default=None)
 
-
-class PortTable(StrictTable):
+class PortTable(table_of(Port)):
     """Where the world touches the plant; `held` and `probe` are other plants of the file."""
 
-    motion: str | None = key("Output that is the link's motion.", default=None)
-    coordinate: str | None = key("State.", default=None)
-    rate: str | None = key("State.", default=None)
-    effort: str | None = key("Input: the external force or torque.", default=None)
-    payload: list[str] = key("Parameters that are the link's own.", default=[])
-    drive: str | None = key("State of the motor.", default=None)
-    ratio: Formula = key("Motion of the motor for that of the link.", default=1.0)
-    held: Name | None = key("Plant of this file in which the port is held.", default=None)
-    probe: Name | None = key("Plant of this file with a bare inertia on the port.", default=None)
 
-
-class FrictionTable(StrictTable):
+class FrictionTable(table_of(Friction, leave_out=("bristles",))):
     """A dissipative force: of v, the velocity that it opposes, of the parameters, and of loads that it grows with."""
 
-    velocity: Formula = key("The velocity that it opposes, in terms of states.")
-    force: Formula = key("The force, in terms of v, the velocity, and the parameters.")
-    unit: str = key("N, or N m.", default="N")
-    effort: Formula = key("Effort at the actuation for one unit of the force.", default=1.0)
-    slopes: tuple[Formula, Formula] | None = key("Flattest and steepest slope of the curve.", default=None)
-    jump: Formula | None = key("Jump of the force where the velocity changes its sign.", default=None)
-    smoothing: str | None = key("Parameter: speed over which the curve is rounded.", default=None)
-    loads: dict[str, Formula] = key("Efforts that it grows with, by name.", default={})
-    rated: dict[str, Number] = key("Sizes of these loads at which the slopes hold.", default={})
 
-
-class ModeTable(StrictTable):
+class ModeTable(table_of(Mode)):
     """A mode whose frequency one parameter sets."""
-
-    name: str = key("Name of the range that sets it.")
-    parameter: str = key("Parameter that sets it.")
-    state: str = key("State that moves most in it.")
 
 
 class EquationsTable(StrictTable):

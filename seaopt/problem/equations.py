@@ -212,7 +212,7 @@ class _Texts:
         if role is None:
             return None
         fields = {name: tuple(value) if isinstance(value, list) else value for name, value in role}
-        loads = fields.get("loads", ())
+        loads = fields.get("loads") or ()
         functions = {name: self.take(f"{place}.{name}", fields[name], ARGUMENTS[name], loads) for name in formulas}
         return kind(**fields | functions | others)
 
@@ -274,7 +274,7 @@ def _check_names(table: EquationsTable) -> None:
             if name in RESERVED or name == TIME:
                 what = "the time" if name == TIME else "a function or constant"
                 raise PlantError(f"{place} has the name of {what} of the equations; rename it")
-            if any(name in role.loads for role in table.friction.values()):
+            if any(name in (role.loads or ()) for role in table.friction.values()):
                 raise PlantError(f"{place} has the name of a friction's load; rename one")
             if name == VELOCITY and table.friction and group in ("parameters", "definitions"):
                 raise PlantError(f"{place} has the name of the velocity in a friction's force and jump; rename it")

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, is_dataclass
 from functools import cache, reduce
 from operator import or_
 from typing import Annotated, Any, dataclass_transform, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, create_model
 
 from seaopt.documents import Flag, Number, Whole
 from seaopt.options import Option, list_options, split_union
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=64)]
+Formula = Annotated[
+    Annotated[str, Strict()] | Number,
+    Field(
+        description="Numbers, names, + - * / ^, brackets, sin, cos, tan, tanh, exp, log, sqrt, abs, min, max, atan2, "
+        "if_else(a > b, then, else), pi."
+    ),
+]
 
 
 def key(text: str, *, default: Any = ..., **limits: Any) -> Any:
@@ -40,6 +49,8 @@ def table_of(record: type[Any], name: str = "", leave_out: Collection[str] = ())
             default = list(default) if isinstance(default, tuple) else default
         if option.switch:
             kind, default = Flag | kind, False
+        if callable(default):  # what a function gives where it is left out
+            default = default(None)
         extra: Any = {"unit": option.unit} if option.unit else None
         keys[field.name] = (
             kind,
@@ -70,11 +81,22 @@ def _as_written(kind: Any, option: Option) -> Any:
         return Flag
     if is_dataclass(kind):
         return table_of(kind)
+    if origin is Callable:
+        return _as_formula(*inner)
     if origin is tuple:
         return tuple[tuple(part if part is Ellipsis else _as_written(part, option) for part in inner)]
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return dict[str, _as_written(inner[1], option)]
     return kind
+
+
+def _as_formula(takes: Any, returned: Any) -> Any:
+    """Return the type of a function in a file: a formula, or several; of one that makes a plant, the plant's name."""
+    if not takes:
+        return Name
+    if get_origin(returned) is tuple:
+        return tuple[tuple(Formula for _ in get_args(returned))]
+    return dict[str, Formula] if get_origin(returned) is Mapping else Formula
 
 
 def make_record(record: type[Any], table: BaseModel, **others: Any) -> Any:
