@@ -21,7 +21,6 @@ import seaopt as so
 from seaopt.control import Impedance, MPCSpec, add_impedance, force_mpc, sweep, tune_schedule
 from seaopt.estimation import bootstrap
 from seaopt.executors import Processes
-from seaopt.robustness import certify_mpc, certify_schedule
 
 Job = Callable[[Executor | None], object]
 RUNS = 2
@@ -52,15 +51,14 @@ def make_sweep() -> Job:
 def make_schedule() -> Job:
     spec = so.ControllerSpec(structure="pd", bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25)
     schedule, ranges = tune_schedule(STAND, THOR, spec, "k", [5e5, 6e5]), {"J": (3.2e-6, 3.4e-6)}
-    return lambda executor: certify_schedule(
-        schedule, {"stand": STAND}, THOR, ranges=ranges, samples=20, executor=executor
-    )
+    return lambda executor: so.certify(schedule, {"stand": STAND}, THOR, ranges=ranges, samples=20, executor=executor)
 
 
 def make_plan() -> Job:
     mpc, ranges = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20)), {"J": (2e-6, 5e-6)}
-    return lambda executor: certify_mpc(
-        mpc, {"stand": STAND}, THOR, ranges=ranges, samples=100, runs=20, sensor_std=1.0, executor=executor
+    sensors = so.Sensors(noise_std={"F1": 1.0})
+    return lambda executor: so.certify(
+        mpc, {"stand": STAND}, THOR, ranges=ranges, samples=100, runs=20, sensors=sensors, executor=executor
     )
 
 

@@ -28,9 +28,10 @@ from seaopt.estimation import bootstrap
 from seaopt.executors import Processes, Shared, _restore
 from seaopt.files import to_json
 from seaopt.progress import ignore
-from seaopt.robustness import Budget, certify_mpc, certify_schedule
+from seaopt.robustness import Budget
 from seaopt.robustness.certificate import measured_draws
-from seaopt.robustness.certificate.measured_draws import Loops, measure_draws
+from seaopt.robustness.certificate.cases import Cases
+from seaopt.robustness.certificate.measured_draws import measure_draws
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
 from seaopt.robustness.verification import schedule_sweep
 
@@ -136,7 +137,7 @@ def certify_points(executor):
     schedule = tune_schedule(STAND, THOR, spec, "k", [5e5, 6e5])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(schedule_sweep, "PULSE_PERIODS", 1.0)
-        found = certify_schedule(
+        found = so.certify(
             schedule, {"stand": STAND}, THOR, ranges={"J": (3.2e-6, 3.4e-6)}, samples=20, executor=executor
         )  # fmt: skip
     assert found.places[0].worst["stand"][0] is STAND
@@ -147,7 +148,7 @@ def certify_points(executor):
 def certify_plan(executor):
     mpc = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
     ranges = {"J": (2e-6, 5e-6)}
-    return certify_mpc(
+    return so.certify(
         mpc, {"stand": STAND}, THOR, ranges=ranges, samples=20, runs=2, sensors=so.Sensors(noise_std={"F1": 1.0}),
         executor=executor,
     )  # fmt: skip
@@ -205,7 +206,7 @@ def test_draws_in_several_blocks(controller, monkeypatch, make):
     monkeypatch.setattr(measured_draws, "DRAW_BLOCK", 30)
     unknown = combine_uncertainty(THOR, so.ParameterSet(), {"I_p": (0.1, 2.0)}, {"swing": SWING})
     plants = {"stand": STAND, "swing": SWING}
-    loops = Shared(Loops(controller=controller, models=plants, plants=plants, unknown=unknown, bounds=None))
+    loops = Shared(Cases(controller=controller, models=plants, plants=plants, unknown=unknown, bounds=None))
 
     def measure(executor):
         return measure_draws(loops, 200, np.random.default_rng(1), executor, ignore)

@@ -58,8 +58,6 @@ from seaopt.robustness import (
     JointTuning,
     ScheduleCertificate,
     certify,
-    certify_mpc,
-    certify_schedule,
     linear_controller,
     tune_certified,
 )
@@ -388,15 +386,15 @@ def certify_problem(
         "sensors": problem.sensors.of(read),  # the file may name those of its other laws
         "executor": executor, "progress": progress,
     }  # fmt: skip
+    options |= {"bounds": Budget() if table.bounds else None, "min_friction_margin": table.min_friction_margin}
     if isinstance(controller, ScheduledController):
         assert problem.schedule is not None
-        return certify_schedule(controller, plants, source, min_rate=problem.schedule.min_rate, **options)
-    options |= {"bounds": Budget() if table.bounds else None, "min_friction_margin": table.min_friction_margin}
+        return certify(controller, plants, source, min_rate=problem.schedule.min_rate, **options)
     if problem.mpc is None:
         certificate = certify(controller, plants, source, measured=measured, **options)
     else:
         options |= {"runs": table.constrained_runs, "bound_tolerance": table.bound_tolerance}
-        certificate = certify_mpc(design_mpc(problem, source), plants, source, **options)
+        certificate = certify(design_mpc(problem, source), plants, source, **options)
     unread = [name for name in problem.sensors.names if name not in read]
     if not unread:
         return certificate

@@ -6,9 +6,9 @@ from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
-from seaopt.robustness.certificate.predictive import certify_mpc, linear_controller
+from seaopt.robustness.certificate.predictive import linear_controller
 from seaopt.robustness.certificate.requirement import Requirement
-from seaopt.robustness.certificate.scheduled import PlaceCertificate, ScheduleCertificate, certify_schedule
+from seaopt.robustness.certificate.scheduled import ScheduleCertificate
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value
@@ -24,9 +24,9 @@ from seaopt.robustness.verification.verification import Verification, verify
 
 __all__ = [
     "BatchFigures", "Bracket", "Budget", "Certificate", "ConstrainedRuns", "JointTuning", "LargeSignal",
-    "MonteCarlo", "Outcome", "Phase", "PlaceCertificate", "PlantMargins", "Requirement", "Round", "Scenario",
+    "MonteCarlo", "Outcome", "Phase", "PlantMargins", "Requirement", "Round", "Scenario",
     "ScheduleCertificate", "Simulated", "StabilityMap", "StretchBound", "Sweep", "Uncertainty", "Verification",
-    "Witness", "Worst", "batch_figures", "bracket", "certify", "certify_mpc", "certify_schedule", "check_ranges",
+    "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges",
     "combine_uncertainty", "coupled_stability", "default_scenarios", "failure_bound", "large_signal",
     "linear_controller", "place_value", "plant_margins", "run_simulations", "sweep_schedule", "tune_certified",
     "verify",

@@ -75,8 +75,9 @@ def _draw_sensitivity(schedule: ScheduledController, certificate: ScheduleCertif
     if certificate is None:
         rows = [(place.value, place.ms) for place in schedule.between]
     else:
-        rows = [(place.value, place.ms) for place in certificate.places]
-        worst = [(place.value, place.worst_ms) for place in certificate.places if place.worst_ms is not None]
+        places = list(zip(certificate.values, certificate.places, strict=True))
+        rows = [(value, max(loop.ms for loop in place.plants.values())) for value, place in places]
+        worst = [(value, max(case.ms for case in place.worst.values())) for value, place in places]
         axis.plot(*zip(*worst, strict=True), "^", color=VERMILION, markersize=4, label="worst case found")
         proved: dict[tuple[float, float], float] = {}
         for stretch in certificate.stretches:  # of every plant

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import field, replace
 from functools import partial
@@ -33,7 +33,7 @@ from seaopt.robustness.certificate.compensation import CompensationDraws, descri
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
-from seaopt.robustness.certificate.requirement import DESIGN_PLANT, LIMIT_CYCLE, Requirement, require_at_most
+from seaopt.robustness.certificate.requirement import LIMIT_CYCLE, Requirement, require_at_most
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
@@ -56,7 +56,6 @@ NO_NOISE = (
     "{ noise_std = ... } in [robustness]"
 )
 NO_MODEL = "nothing drawn or simulated: measured points alone, without a model"
-DESIGN_NAMES = ("design", DESIGN_PLANT)  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
     "disk_margin", "noise_gain", "spectral_radius",
@@ -90,7 +89,7 @@ class Certificate(Result, Worded):
         The results of `with_simulation`; None where `certify` was told to leave them out.
     steps : Verification, str or None
         The simulated steps that every plant is judged by; the reason where they cannot be simulated, or need not be,
-        as there is no model.
+        as there is no model; None between the points of a schedule.
     cycles : mapping of name to tuple of FoundCycle
         Of each model whose friction is not shown to be harmless, or whose play makes some: limit cycles predicted and
         simulated.
@@ -108,6 +107,8 @@ class Certificate(Result, Worded):
         What the controller's outer loop renders, where it has one.
     constrained : ConstrainedRuns or None
         Of predictive control: runs with its limits active; all else is of its linear region.
+    place : (str, float) or None
+        Of a schedule, its variable and the value at which it stands still.
     remarks : tuple of str
         What is found once, one sentence each: a delay of the fit that the controller does not count on; with friction,
         the bandwidth at amplitudes of use.
@@ -136,6 +137,7 @@ class Certificate(Result, Worded):
     compensation_draws: Mapping[str, CompensationDraws] = field(default_factory=dict[str, CompensationDraws])
     impedance: CertifiedImpedance | None = None
     constrained: ConstrainedRuns | None = None
+    place: tuple[str, float] | None = None
     remarks: tuple[str, ...] = ()
     drawn_ms: Mapping[str, Float[np.ndarray, " n"]] = field(
         default_factory=dict[str, Float[np.ndarray, " n"]], repr=False
@@ -150,6 +152,14 @@ class Certificate(Result, Worded):
     def linear_models(self) -> dict[str, Plant]:
         """The plants whose loops are measured: one with friction is there sliding and stuck."""
         return split_friction(self.models, self.parameters, [varied.name for varied in self.varied])
+
+    @property
+    def simulated_models(self) -> Plants:
+        """The models that are simulated. Where a plant moves a schedule's variable, a law that is frozen there is not
+        what runs.
+        """
+        over = "" if self.place is None else self.place[0]
+        return {name: plant for name, plant in self.models.items() if over not in plant.states}
 
     def with_simulation(
         self,
@@ -193,7 +203,7 @@ class Certificate(Result, Worded):
             raise ControlError("nothing can be simulated without a model; design the controller on one")
         simulations = run_simulations(
             self.controller,
-            self.models,
+            self.simulated_models,
             self.parameters,
             draws=self.list_draws(),
             sensors=sensors,
@@ -205,8 +215,7 @@ class Certificate(Result, Worded):
         )
         runs = simulations.verification
         rows = require_runs(simulations.left_out["simulation"] if runs is None else runs)
-        requirements = (*self._drop_runs(), *rows)
-        return replace(self, simulated=simulations, requirements=requirements)
+        return replace(self, simulated=simulations, requirements=(*self._drop_runs(), *self._place_rows(rows)))
 
     def with_steps(
         self,
@@ -226,7 +235,7 @@ class Certificate(Result, Worded):
         try:
             steps: Verification | str = verify(
                 self.controller,
-                self.models,
+                self.simulated_models,
                 self.parameters,
                 scenarios=step_scenarios,
                 draws=self.list_draws(),
@@ -238,7 +247,7 @@ class Certificate(Result, Worded):
             )
         except SeaoptError as error:
             steps = str(error)
-        shown_of = {name: self.shows_friction_harmless(name) for name in self.models}
+        shown_of = {name: self.shows_friction_harmless(name) for name in self.simulated_models}
         seek = partial(_seek_cycles, Shared((self.controller, self.models, self.parameters)))
         cycles: dict[str, tuple[FoundCycle, ...]] = {}
         for name, found in zip(shown_of, map_ordered(seek, shown_of.items(), executor), strict=True):
@@ -252,7 +261,12 @@ class Certificate(Result, Worded):
             if cycle.predicted is not None and cycle.lasts
         )
         others = (row for row in self._drop_runs() if row.name != LIMIT_CYCLE)
-        return replace(self, steps=steps, cycles=cycles, requirements=(*others, *lasting, *require_runs(steps)))
+        rows = self._place_rows((*lasting, *require_runs(steps)))
+        return replace(self, steps=steps, cycles=cycles, requirements=(*others, *rows))
+
+    def _place_rows(self, rows: Iterable[Requirement]) -> Iterator[Requirement]:
+        """Yield rows with the value at which a schedule's variable stands."""
+        return (replace(row, place=self.place) for row in rows)
 
     def _drop_runs(self) -> tuple[Requirement, ...]:
         """Return what is required besides simulated runs, which are played again."""
@@ -284,19 +298,24 @@ class Certificate(Result, Worded):
                 for state in split_friction({name: model}, self.parameters, varied)
                 if state in self.worst and self.worst[state].parameters
             ]
-            for name, model in self.models.items()
+            for name, model in self.simulated_models.items()
         }
 
     @classmethod
     def from_dict(
-        cls, content: Mapping[str, Any], controller: Controller, models: Plants, parameters: ParameterSet
+        cls,
+        content: Mapping[str, Any],
+        controller: Controller,
+        models: Plants,
+        parameters: ParameterSet,
+        place: tuple[str, float] | None = None,
     ) -> Certificate:
         """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated. Raises
         FileError: a field is missing or malformed, it was edited or written by hand, or nothing is required in it.
         """
         from seaopt.robustness.certificate.stored import build_certificate  # deferred, as pydantic takes long to import
 
-        return build_certificate(content, controller, models, parameters)
+        return build_certificate(content, controller, models, parameters, place)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/2), with its digest."""

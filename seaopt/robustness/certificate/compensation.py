@@ -40,9 +40,12 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import output_function
+from seaopt.progress import Progress
 from seaopt.records import record
+from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
 from seaopt.robustness.certificate.friction import MARGIN_DRAWS, find_least_margin
-from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws
+from seaopt.robustness.certificate.measured_draws import judge_draws
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_least, require_at_most
 from seaopt.robustness.uncertainty.worst import place_values
 
 FRICTION_COMPENSATION = "friction_compensation"
@@ -69,6 +72,28 @@ class CompensationDraws:
         return f"over draws, it is shown for {self.shown} of {self.samples}{where}"
 
 
+def measure_compensation(survey: Survey, _: Progress) -> Evidence:
+    """Return whether the loop stays stable with what is compensated, on every plant and over draws."""
+    cases, controller, shared = survey.cases, survey.cases.controller, survey.shared
+    samples, rng, executor = survey.samples, survey.rng, survey.executor
+    margins = find_nominal_compensation(controller, cases.models, cases.unknown.nominal)
+    draws = find_compensation_at_draws(shared, margins, samples, rng, executor)
+    gravity = find_gravity_cases(shared, samples, rng, executor)
+    ripple = find_ripple_cases(shared, samples, rng, executor)
+    return Evidence(
+        requirements=(
+            *compensation_requirements(controller, margins, draws),
+            *eigenvalue_requirements(controller, cases.models, gravity, ripple),
+        ),
+        fields={"compensation": margins, "compensation_draws": draws},
+    )
+
+
+COMPENSATION = Check(
+    measure=measure_compensation, applies=lambda survey: survey.cases.controller.compensation is not None
+)
+
+
 def compensates_speed(controller: Controller) -> bool:
     """Tell whether a controller compensates friction from a measured speed, which is a feedback."""
     compensation = controller.compensation
@@ -87,7 +112,7 @@ def find_nominal_compensation(
 
 
 def find_compensation_at_draws(
-    loops: Shared[Loops],
+    cases: Shared[Cases],
     nominal: Mapping[str, CompensationMargin],
     samples: int,
     rng: np.random.Generator,
@@ -97,11 +122,11 @@ def find_compensation_at_draws(
     enough, count = {name: margin for name, margin in nominal.items() if margin.shown}, min(samples, MARGIN_DRAWS)
     if not enough or not count:
         return {}
-    draws = loops.value.unknown.list_draws(count, rng)
+    draws = cases.value.unknown.list_draws(count, rng)
     margins: dict[str, CompensationDraws] = {}
     for name, nominal_margin in enough.items():
         judge = partial(_find_margins, nominal_margin.multiplier)
-        shown, margin, parameters = find_least_margin(judge, _take_slope, loops, name, draws, executor)
+        shown, margin, parameters = find_least_margin(judge, _take_slope, cases, name, draws, executor)
         margins[name] = CompensationDraws(
             samples=count, shown=shown, least_slope=_take_slope(margin), parameters=parameters
         )
@@ -112,10 +137,10 @@ def _take_slope(margin: CompensationMargin) -> float:
     return margin.slope
 
 
-def _find_margins(first: str, loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[CompensationMargin]:
+def _find_margins(first: str, cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[CompensationMargin]:
     """Return the margins of one plant at draws, a multiplier tried first."""
     return find_compensation_margins(
-        loops.value.controller, loops.value.models[name], loops.value.place(name, draws), first=first
+        cases.value.controller, cases.value.models[name], cases.value.place(name, draws), first=first
     )
 
 
@@ -158,44 +183,44 @@ Measure = Callable[[Controller, Plant, ParameterSet, Draw], EigenvalueCase]
 
 
 def find_gravity_cases(
-    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
+    cases: Shared[Cases], samples: int, rng: np.random.Generator, executor: Executor | None = None
 ) -> dict[str, EigenvalueCase]:
     """Return how fast each plant's link runs away at most with its weight compensated; none of held links."""
-    compensation = loops.value.controller.compensation
+    compensation = cases.value.controller.compensation
     term = None if compensation is None else compensation.gravity
     if term is None:
         return {}
-    models = loops.value.models
+    models = cases.value.models
     moving = [name for name, model in models.items() if model.port is not None and term.reads in model.outputs]
-    return _find_worst(measure_gravity, loops, moving, samples, rng, executor)
+    return _find_worst(measure_gravity, cases, moving, samples, rng, executor)
 
 
 def find_ripple_cases(
-    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None = None
+    cases: Shared[Cases], samples: int, rng: np.random.Generator, executor: Executor | None = None
 ) -> dict[str, EigenvalueCase]:
     """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without."""
-    compensation = loops.value.controller.compensation
+    compensation = cases.value.controller.compensation
     if compensation is None or compensation.ripple is None:
         return {}
-    return _find_worst(measure_ripple, loops, loops.value.models, samples, rng, executor)
+    return _find_worst(measure_ripple, cases, cases.value.models, samples, rng, executor)
 
 
 def _find_worst(
     measure: Measure,
-    loops: Shared[Loops],
+    cases: Shared[Cases],
     names: Collection[str],
     samples: int,
     rng: np.random.Generator,
     executor: Executor | None,
 ) -> dict[str, EigenvalueCase]:
     """Return the worst case of some plants, among the nominal parameters and draws."""
-    draws = [{}, *loops.value.unknown.list_draws(min(samples, EIGENVALUE_DRAWS), rng)]
+    draws = [{}, *cases.value.unknown.list_draws(min(samples, EIGENVALUE_DRAWS), rng)]
     judge = partial(_measure_draws, measure)
-    return {name: choose_worst(judge_draws(judge, loops, name, draws, executor)) for name in names}
+    return {name: choose_worst(judge_draws(judge, cases, name, draws, executor)) for name in names}
 
 
-def _measure_draws(measure: Measure, loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[EigenvalueCase]:
-    at = loops.value
+def _measure_draws(measure: Measure, cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[EigenvalueCase]:
+    at = cases.value
     return [measure(at.controller, at.models[name], at.unknown.nominal, draw) for draw in draws]
 
 
@@ -297,3 +322,65 @@ def _read_position(plant: Plant, params: ParameterSet, output: str) -> float:
     values = plant.complete(params)
     x, u = find_rest(plant, values)
     return float(output_function(plant)(0.0, x, u, values.vector)[list(plant.outputs).index(output)])
+
+
+def compensation_requirements(
+    controller: Controller, margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
+) -> list[Requirement]:
+    """Return that stability is shown with friction compensated from the speed, at nominal values and over draws. Where
+    it is, or is not, says the largest fraction of Coulomb friction that is shown at the compensation's speed.
+    """
+    friction = None if controller.compensation is None else controller.compensation.friction
+    rows: list[Requirement] = []
+    for name, margin in margins.items():
+        drawn, value, draw = draws.get(name), margin.slope, None
+        said = [f"{margin.multiplier}; {margin.shift} at {margin.frequency_hz:.4g} Hz" if value else margin.multiplier]
+        if drawn is not None and drawn.least_slope < value:
+            value, draw, said = drawn.least_slope, DrawnAt(parameters=drawn.parameters), []
+        if friction is not None and value:
+            said.append(f"shown up to {value / margin.asked * friction.fraction:.3g} of the friction")
+        rows.append(
+            require_at_least(
+                FRICTION_COMPENSATION,
+                value,
+                margin.asked,
+                unit=controller.command.mechanics.damping,
+                plant=name,
+                draw=draw,
+                text="; ".join(said),
+            )
+        )
+    return rows
+
+
+def eigenvalue_requirements(
+    controller: Controller,
+    models: Mapping[str, Plant],
+    gravity: Mapping[str, EigenvalueCase],
+    ripple: Mapping[str, EigenvalueCase],
+) -> list[Requirement]:
+    """Return that neither a weight nor a ripple compensated makes a loop grow, at nominal values and over draws."""
+    terms, cases = controller.compensation, list[tuple[str, str, EigenvalueCase, str]]()
+    if terms is not None and terms.gravity is not None:
+        compensated = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
+        for name, case in gravity.items():
+            port = models[name].port
+            unit = "" if port is None else models[name].states[str(port.coordinate)]
+            cases.append((GRAVITY_COMPENSATION, name, case, f"{compensated}, at {case.at:.3g} {unit}".rstrip()))
+    if terms is not None and terms.ripple is not None:
+        unit = f"{controller.command.effort_unit}/{terms.ripple.unit}"
+        cases += [
+            (RIPPLE_COMPENSATION, name, case, f"over the slopes, at {case.at:.3g} {unit}")
+            for name, case in ripple.items()
+        ]
+    return [
+        require_at_most(
+            requirement,
+            case.radius,
+            1.0 + NEUTRAL,
+            plant=plant,
+            draw=DrawnAt(parameters=case.parameters),
+            text=f"the largest eigenvalue, {text}",
+        )
+        for requirement, plant, case, text in cases
+    ]

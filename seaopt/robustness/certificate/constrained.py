@@ -15,7 +15,6 @@ beyond that distribution.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import field, replace
 from functools import partial
 from typing import Any
@@ -28,15 +27,16 @@ from seaopt.codec import to_content
 from seaopt.control import Controller, ForceMPC, ForceRun, MPCStep, close_loop
 from seaopt.control.loops.sampled_plant import DELAYS, conditions, find_delay, read_conditions, whole_samples
 from seaopt.control.mpc.active_set import UNFINISHED
-from seaopt.errors import ControlError, SeaoptError, require_seed
+from seaopt.errors import SeaoptError
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import deflection_row, output_function
-from seaopt.progress import Progress, count_off, ignore
+from seaopt.progress import Progress, count_off
 from seaopt.records import Result, record
-from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.certificate.cases import Survey
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_floor
@@ -53,6 +53,8 @@ JUDGED_PERIODS = 8.0  # of the bandwidth that the last phase lasts besides, in w
 SLOWEST = 0.5  # of the bandwidth: slower rings, of the linear law, are looked for in its own simulations
 LAST_SHARE, SETTLED = 0.2, 0.1  # of a phase, over which the force is off by at most this share of the step
 RUNAWAY, GROWTH = 3.0, 1.5  # times what the limits hold; second half of the last phase over its first
+CONSTRAINED_FAILURES, CONSTRAINED_PROBABILITY = "constrained_failures", "constrained_failure_probability"
+RUN_SECONDS = 0.35  # that a run on a plant takes as a rule
 DIVERGED, OVER_BOUND, UNSETTLED, RINGS = "diverged", "over a bound", "not settled", "ringing"
 
 
@@ -341,23 +343,12 @@ class _Case:
         return worst, signal
 
 
-def run_constrained(
-    mpc: ForceMPC,
-    law: Controller,
-    plants: Mapping[str, Plant],
-    unknown: Uncertainty,
-    *,
-    runs: int,
-    seed: int,
-    confidence: float,
-    tolerance: float,
-    sensors: Sensors,
-    command_step: float,
-    executor: Executor | None = None,
-    progress: Progress = ignore,
-) -> ConstrainedRuns:
-    """Draw and simulate runs with limits active, each on every plant; `law` is the same in its linear region."""
-    rng = np.random.default_rng([require_seed(seed, ControlError), CONSTRAINED_STREAM])
+def run_constrained(survey: Survey, mpc: ForceMPC, progress: Progress) -> ConstrainedRuns:
+    """Draw and simulate runs with limits active, each on every plant; the survey's law is its linear region."""
+    law, plants, unknown = survey.cases.controller, survey.cases.models, survey.cases.unknown
+    runs, seed, sensors = survey.options.runs, survey.options.seed, survey.sensors or Sensors()
+    tolerance, command_step = survey.options.bound_tolerance, survey.options.command_step
+    rng = np.random.default_rng([seed, CONSTRAINED_STREAM])
     drawn = unknown.values(unknown.draw(runs, rng))
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name not in DELAYS}
     parts: list[_RunDraw] = []
@@ -366,7 +357,7 @@ def run_constrained(
         reference, disturbance = _draw_references(mpc, rng)
         parts.append(_RunDraw(draw=draw, seed=seed + k, reference=reference, disturbance=disturbance))
     bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, command_step=command_step)
-    played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, executor)
+    played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, survey.executor)
     kinds: list[str] = []
     failed_run, outcomes = dict[str, Any](), list[_Outcome]()
     for k in count_off(range(runs), "limits active, run", progress):
@@ -396,8 +387,8 @@ def run_constrained(
         over_bound=kinds.count(OVER_BOUND),
         not_settled=kinds.count(UNSETTLED),
         ringing=kinds.count(RINGS),
-        confidence=confidence,
-        failure_probability_bound=failure_bound(runs, failures, confidence),
+        confidence=survey.options.confidence,
+        failure_probability_bound=failure_bound(runs, failures, survey.options.confidence),
         bound_tolerance=tolerance,
         largest_violation=max(outcome.violation for outcome in outcomes),
         largest_ring=max(outcome.ring for outcome in outcomes),
@@ -486,3 +477,22 @@ def _measure_ring(mpc: ForceMPC, run: ForceRun) -> Oscillation:
 
 def _has(plant: Plant, name: str) -> bool:
     return name in plant.outputs or name in plant.states or (name.startswith("spring_") and plant.spring is not None)
+
+
+def require_constrained(runs: ConstrainedRuns, max_failure_probability: float | None) -> tuple[Requirement, ...]:
+    """Return what the runs with limits active require."""
+    failures = require_at_most(
+        CONSTRAINED_FAILURES,
+        float(runs.failures),
+        0.0,
+        plant=runs.plant,
+        scenario="limits active",
+        draw=DrawnAt(parameters=runs.parameters, number=runs.run, seed=runs.seed),
+        text=runs.text or format_count(runs.runs, "run"),
+        remedy=runs.remedy,
+    )
+    if max_failure_probability is None:
+        return (failures,)
+    text = f"{format_count(runs.failures, 'failure')} in {format_count(runs.runs, 'run')}"
+    bound = runs.failure_probability_bound
+    return failures, require_at_most(CONSTRAINED_PROBABILITY, bound, max_failure_probability, text=text)

@@ -23,10 +23,15 @@ from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
+from seaopt.progress import Progress
 from seaopt.records import record
-from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws, select_own
+from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
+from seaopt.robustness.certificate.measured_draws import judge_draws, select_own
+from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, DrawnAt, Requirement, require_at_least
 
 MARGIN_DRAWS = 100  # at most so many are looked at
+SECONDS = 0.3  # that a plant takes as a rule
+NO_FRICTION = "no friction: any margin holds"
 Margin = TypeVar("Margin", FrictionMargin | None, CompensationMargin)
 
 
@@ -50,6 +55,19 @@ class FrictionDraws:
         return f"{head}, the least up to {self.factor:.3g} times its own{where}"
 
 
+def measure_friction(survey: Survey, progress: Progress) -> Evidence:
+    """Return for how steep a friction stability is shown on every plant, and what is required of that."""
+    progress("friction at the draws", 0.0)
+    controller, least = survey.cases.controller, survey.min_friction_margin
+    margins = find_nominal_margins(controller, survey.cases.models, survey.cases.unknown.nominal)
+    draws = find_margins_at_draws(survey.shared, margins, survey.samples, survey.rng, least, survey.executor)
+    rows = friction_requirements(margins, draws, least, controller.command.mechanics.damping)
+    return Evidence(requirements=rows, fields={"friction": margins, "friction_draws": draws})
+
+
+FRICTION = Check(measure=measure_friction, seconds=lambda survey: SECONDS * len(survey.cases.plants))
+
+
 def find_nominal_margins(
     controller: Controller, models: Mapping[str, Plant], params: ParameterSet
 ) -> dict[str, FrictionMargin]:
@@ -59,7 +77,7 @@ def find_nominal_margins(
 
 
 def find_margins_at_draws(
-    loops: Shared[Loops],
+    cases: Shared[Cases],
     nominal: Mapping[str, FrictionMargin],
     samples: int,
     rng: np.random.Generator,
@@ -67,11 +85,11 @@ def find_margins_at_draws(
     executor: Executor | None = None,
 ) -> dict[str, FrictionDraws]:
     """Return margins at draws, of plants whose nominal margin is shown or enough, or that rub at draws alone."""
-    unknown, count = loops.value.unknown, min(samples, MARGIN_DRAWS)
+    unknown, count = cases.value.unknown, min(samples, MARGIN_DRAWS)
     varied = [row.name for row in unknown.varied()]
     enough = {
         name: nominal.get(name)
-        for name, model in loops.value.models.items()
+        for name, model in cases.value.models.items()
         if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
     }
     if not count or not enough:
@@ -80,7 +98,7 @@ def find_margins_at_draws(
     margins: dict[str, FrictionDraws] = {}
     for name, nominal_margin in enough.items():
         judge = partial(_find_margins, nominal_margin)
-        shown, margin, parameters = find_least_margin(judge, _take_slope, loops, name, draws, executor)
+        shown, margin, parameters = find_least_margin(judge, _take_slope, cases, name, draws, executor)
         margins[name] = FrictionDraws(
             samples=count,
             shown=shown,
@@ -101,19 +119,19 @@ def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool
 
 
 def find_least_margin(
-    judge: Callable[[Shared[Loops], str, Sequence[Draw]], Sequence[Margin]],
+    judge: Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Margin]],
     slope: Callable[[Margin], float],
-    loops: Shared[Loops],
+    cases: Shared[Cases],
     name: str,
     draws: Sequence[Draw],
     executor: Executor | None,
 ) -> tuple[int, Margin, dict[str, float]]:
     """Return for how many draws of one plant stability is shown, the margin of the least slope, and its draw."""
-    of_plant = select_own(loops, name, draws)
+    of_plant = select_own(cases, name, draws)
     distinct = {
         tuple(draw.items()): draw for draw in of_plant
     }  # draws that vary what this plant does not have are one loop
-    judged = judge_draws(judge, loops, name, list(distinct.values()), executor)
+    judged = judge_draws(judge, cases, name, list(distinct.values()), executor)
     of_draw = dict(zip(distinct, judged, strict=True))
     margins = [of_draw[tuple(draw.items())] for draw in of_plant]
     least = int(np.argmin([slope(margin) for margin in margins]))
@@ -121,9 +139,29 @@ def find_least_margin(
 
 
 def _find_margins(
-    nominal: FrictionMargin | None, loops: Shared[Loops], name: str, draws: Sequence[Draw]
+    nominal: FrictionMargin | None, cases: Shared[Cases], name: str, draws: Sequence[Draw]
 ) -> list[FrictionMargin | None]:
     """Return the margins of one plant at draws, the multiplier that served at the nominal parameters tried first."""
     first, least = ("", 0.0) if nominal is None else (nominal.multiplier, 1.0 if nominal.shown else 0.0)
-    at = loops.value
+    at = cases.value
     return find_friction_margins(at.controller, at.models[name], at.place(name, draws), first, least)
+
+
+def friction_requirements(
+    margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None, unit: str
+) -> list[Requirement]:
+    """Return that stability is shown for friction as steep as asked, nominal and drawn; infinite without friction."""
+    if least is None:
+        return []
+
+    require = partial(require_at_least, MIN_FRICTION_MARGIN, limit=least, unit=unit)
+    rows: list[Requirement] = []
+    for name in dict.fromkeys((*margins, *draws)):
+        margin, drawn = margins.get(name), draws.get(name)
+        nominal = np.inf if margin is None else margin.least_slope
+        if drawn is not None and drawn.least_slope < nominal:
+            rows.append(require(value=drawn.least_slope, plant=name, draw=DrawnAt(parameters=drawn.parameters)))
+        else:
+            text = NO_FRICTION if margin is None else f"{margin.multiplier} at {margin.frequency_hz:.4g} Hz"
+            rows.append(require(value=nominal, plant=name, text=text))
+    return rows or [require(value=np.inf, text=NO_FRICTION)]

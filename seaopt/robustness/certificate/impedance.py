@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,14 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
-from seaopt.robustness.certificate.measured_draws import Draw, Loops, judge_draws
+from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
+from seaopt.robustness.certificate.measured_draws import judge_draws
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.worst import place_values
-from seaopt.robustness.verification.impedance_steps import ImpedanceStep, play_impedance_steps
+from seaopt.robustness.verification.impedance_steps import AT_REST, ImpedanceStep, play_impedance_steps
 
 IMPEDANCE_DRAWS = 100  # at most so many are looked at
+SECONDS = 0.05  # that a draw takes as a rule
 
 
 @record
@@ -88,6 +92,23 @@ class CertifiedImpedance:
         ]
 
 
+def measure_impedance(survey: Survey, progress: Progress) -> Evidence:
+    """Return what the outer loop renders, over draws too where it is safe at the nominal parameters."""
+    cases = survey.cases
+    impedance = certify_impedance(cases.controller, cases.models, cases.unknown.nominal)
+    if impedance is not None and impedance.safe:
+        drawn = draw_impedance(survey.shared, survey.samples, survey.rng, survey.executor, progress)
+        impedance = replace(impedance, draws=drawn)
+    return Evidence(requirements=impedance_requirements(impedance), fields={"impedance": impedance})
+
+
+IMPEDANCE = Check(
+    measure=measure_impedance,
+    seconds=lambda survey: SECONDS * min(survey.samples, IMPEDANCE_DRAWS),
+    applies=lambda survey: survey.cases.controller.outer is not None,
+)
+
+
 def certify_impedance(
     controller: Controller,
     models: Mapping[str, Plant],
@@ -128,22 +149,22 @@ def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
 
 
 def draw_impedance(
-    loops: Shared[Loops],
+    cases: Shared[Cases],
     samples: int,
     rng: np.random.Generator,
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> ImpedanceDraws | None:
     """Judge the impedance of a controller's outer loop at draws; None where it has none, or nothing is drawn."""
-    count, at = min(samples, IMPEDANCE_DRAWS), loops.value
+    count, at = min(samples, IMPEDANCE_DRAWS), cases.value
     if at.controller.outer is None or not count:
         return None
     name, draws = _find_plant(at.controller, at.models), at.unknown.list_draws(count, rng)
-    cases = judge_draws(_judge_states, loops, name, draws, executor)
+    judged = judge_draws(_judge_states, cases, name, draws, executor)
     stable = passive = 0
     least, worst = np.inf, dict[str, float]()
     for draw in count_off(draws, "impedance, draw", progress):
-        rests, margin = next(cases)
+        rests, margin = next(judged)
         stable += rests
         passive += margin > 0.0
         if margin < least:
@@ -151,12 +172,12 @@ def draw_impedance(
     return ImpedanceDraws(samples=count, stable=stable, passive=passive, margin=float(least), parameters=worst)
 
 
-def _judge_states(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[tuple[bool, float]]:
+def _judge_states(cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[tuple[bool, float]]:
     """Return whether the link rests by itself, sliding and stuck, and the least margin, at every draw."""
-    controller, unknown = loops.value.controller, loops.value.unknown
+    controller, unknown = cases.value.controller, cases.value.unknown
     assert controller.outer is not None
     varied = [row.name for row in unknown.varied()]
-    states = split_friction({name: loops.value.models[name]}, unknown.nominal, varied).values()
+    states = split_friction({name: cases.value.models[name]}, unknown.nominal, varied).values()
     judged: list[tuple[bool, float]] = []
     for draw in draws:
         placed = ((state, place_values(state, unknown.nominal, draw)) for state in states)
@@ -173,3 +194,59 @@ def _judge(controller: Controller, plant: Plant, params: ParameterSet, impedance
     margin, _ = port.worst(impedance, link.load.damping, port.angles())
     radius = close_link(link, outer.velocity_filter_s).radius(impedance.stiffness, impedance.damping)
     return float(radius) <= GROWING, float(margin) if port.held_stable() else -np.inf
+
+
+def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
+    """Return what is required of an impedance, friction sliding and stuck: a stable link in any environment."""
+    if impedance is None:
+        return []
+    called, unit, plant = impedance.rendering.called, impedance.rendering.outer.place_unit, impedance.plant
+    rows: list[Requirement] = []
+    for state, rendered in (("", impedance.rendering), ("stuck", impedance.stuck)):
+        if rendered is None:
+            continue
+        breaking = "" if rendered.breaking is None else f"; {rendered.breaking.describe(called)}"
+        rows += [
+            Requirement(
+                name="impedance_stable",
+                limit=1.0,
+                value=rendered.spectral_radius,
+                met=rendered.stable,
+                plant=plant,
+                state=state,
+                text="the link with nothing on it",
+            ),
+            Requirement(
+                name="impedance_damper",
+                limit=rendered.link_damping,
+                value=rendered.needed_damper,
+                met=rendered.passive,
+                unit=called.damping,
+                plant=plant,
+                state=state,
+                text=f"{called.damping} at the link that make it passive, and its own{breaking}",
+            ),
+        ]
+    drawn = impedance.draws
+    if drawn is not None:
+        rows.append(
+            require_at_most(
+                "impedance_draws",
+                float(drawn.samples - min(drawn.stable, drawn.passive)),
+                0.0,
+                plant=plant,
+                draw=DrawnAt(parameters=drawn.parameters),
+                text=f"stable in {drawn.stable} of {drawn.samples} draws and passive in {drawn.passive}",
+            )
+        )
+    return rows + [
+        require_at_most(
+            "impedance_rest",
+            step.moving,
+            AT_REST,
+            plant=plant,
+            scenario=f"step of x_0 by {step.size:.3g} {unit}",
+            text=step.describe(unit),
+        )
+        for step in impedance.steps
+    ]

@@ -30,8 +30,9 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import Result, record
+from seaopt.robustness.certificate.cases import CONFIDENCE, check_numbers, pose_cases
 from seaopt.robustness.certificate.certificate import Certificate
-from seaopt.robustness.certificate.certify import CONFIDENCE, certify, check_numbers, pose_loops
+from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.measured_draws import measure_draws, search_worst
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
@@ -244,11 +245,11 @@ def breaks_at_draws(
     controller: Controller, plants: Plants, parameters: Source, ranges: Ranges, others: ParameterSet
 ) -> bool:
     """Tell whether a law breaks Ms, Mt or stability at a few of `certify`'s draws, or in a search from them."""
-    loops = Shared(pose_loops(controller, plants, parameters, ranges, others))
-    if not loops.value.unknown.size:
+    cases = Shared(pose_cases(controller, plants, parameters, ranges, others))
+    if not cases.value.unknown.size:
         return False
-    _, drawn, _ = measure_draws(loops, LOOKED_AT, np.random.default_rng(LOOK_STREAM), None, ignore)
-    worst, _ = search_worst(loops, drawn, None, ignore)
+    _, drawn, _ = measure_draws(cases, LOOKED_AT, np.random.default_rng(LOOK_STREAM), None, ignore)
+    worst, _ = search_worst(cases, drawn, None, ignore)
     least = {True: 1.0 + LIMIT_ROUNDING, False: UNSTABLE}
     return any(case.severity > least[case.limited] for case in worst.values())
 

@@ -9,47 +9,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.control import Controller
 from seaopt.executors import Shared, map_ordered
-from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
 from seaopt.progress import Progress, divide
 from seaopt.records import record
-from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
+from seaopt.robustness.bounds.bracket import Bracket, bracket
+from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
+from seaopt.robustness.certificate.requirement import UNSTABLE_LOOP, DrawnAt, Requirement, Spot, require_at_most
 from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures
-from seaopt.robustness.uncertainty.draws import Column, Points, Uncertainty
+from seaopt.robustness.uncertainty.draws import Column, Points
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, count_failures
 from seaopt.robustness.uncertainty.rows import join_rows, take_rows
-from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, find_failures, severities
+from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, UNSTABLE, find_failures, severities
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, find_worst, measure_worst, place_values
 
 DRAWS_PER_BLOCK = 50_000
 DRAWS_KEPT = 5000  # of which Ms is kept, to be drawn
 WORST_KEPT = 64  # worst draws kept of each plant
 DRAWS_PER_PART = 4  # of those that are judged one by one
+DRAW, SEARCH, BOUND = 1.5e-4, 0.3, 0.4  # seconds that each draw, search and bound of a plant takes as a rule
+WITNESS_REMEDY = "tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
-Draw = Mapping[str, float]
 Case = TypeVar("Case")
-
-
-@record(eq=False)
-class Loops:
-    """A controller on its plants, their uncertainty, and how much work to spend on bounds."""
-
-    controller: Controller
-    models: Mapping[str, Plant]  # as they are, with their friction
-    plants: Mapping[str, Plant]  # without friction that sticks: sliding or stuck
-    unknown: Uncertainty
-    bounds: Budget | None = None
-
-    def place(self, name: str, draws: Sequence[Draw]) -> list[ParameterSet]:
-        """Return the parameters of the model of a name at draws."""
-        return [place_values(self.models[name], self.unknown.nominal, draw) for draw in draws]
 
 
 @record(eq=False)
@@ -65,11 +52,39 @@ class _Tally:
         return take_rows(both, np.argsort(both.severity)[::-1][:WORST_KEPT])
 
 
+def measure_uncertainty(survey: Survey, progress: Progress) -> Evidence:
+    """Return what the draws say, and the worst cases from them and a search."""
+    drawing, searching = divide(progress, *_list_seconds(survey))
+    failed, drawn, drawn_ms = measure_draws(survey.shared, survey.samples, survey.drawing, survey.executor, drawing)
+    worst, brackets = search_worst(survey.shared, drawn, survey.executor, searching)
+    options = survey.options
+    counts, by_spot = count_failures(failed, options.seed, options.confidence), name_worst(survey, worst)
+    rows = () if survey.place else draw_requirements(counts, by_spot, options.max_failure_probability)
+    return Evidence(
+        requirements=rows,
+        fields={"monte_carlo": counts, "worst": worst, "brackets": brackets, "drawn_ms": drawn_ms},
+    )
+
+
+def name_worst(survey: Survey, worst: Mapping[str, Worst]) -> dict[Spot, Worst]:
+    """Return the worst case of each plant by where it is."""
+    spots = survey.cases.spots
+    return {spots[name]._replace(place=survey.place): case for name, case in worst.items()}
+
+
+def _list_seconds(survey: Survey) -> tuple[float, float]:
+    plants, bounded = len(survey.cases.plants), survey.cases.bounds is not None
+    return DRAW * survey.samples * plants, (SEARCH + BOUND * bounded) * plants
+
+
+DRAWS = Check(measure=measure_uncertainty, seconds=lambda survey: sum(_list_seconds(survey)), applies=lambda _: True)
+
+
 def measure_draws(
-    loops: Shared[Loops], samples: int, rng: np.random.Generator, executor: Executor | None, progress: Progress
+    cases: Shared[Cases], samples: int, rng: np.random.Generator, executor: Executor | None, progress: Progress
 ) -> tuple[Bool[np.ndarray, "3 _"], dict[str, Float[np.ndarray, "_ k"]], dict[str, Float[np.ndarray, " _"]]]:
     """Draw and measure in blocks: which draws fail on some plant, the worst of each plant, and Ms of the first."""
-    controller, plants, unknown = loops.value.controller, loops.value.plants, loops.value.unknown
+    controller, plants, unknown = cases.value.controller, cases.value.plants, cases.value.unknown
     none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
     tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
     failed = [np.zeros((3, 0), dtype=bool)]
@@ -79,7 +94,7 @@ def measure_draws(
     for size in sizes:
         points = unknown.draw(size, rng)
         failed.append(np.zeros((3, size), dtype=bool))
-        for name, batch in _measure_block(loops, unknown.values(points), size, executor, next(hooks)):
+        for name, batch in _measure_block(cases, unknown.values(points), size, executor, next(hooks)):
             failed[-1] |= find_failures(controller, batch)
             first.setdefault(name, batch.ms[:DRAWS_KEPT])
             tallies[name] = [
@@ -91,19 +106,19 @@ def measure_draws(
 
 
 def _measure_block(
-    loops: Shared[Loops],
+    cases: Shared[Cases],
     values: Mapping[str, Float[np.ndarray, " _"]],
     size: int,
     executor: Executor | None,
     progress: Progress,
 ) -> Iterator[tuple[str, BatchFigures]]:
     """Yield the figures of every plant at draws, which are cut where no executor has a say in it."""
-    names, slices = list(loops.value.plants), [slice(k, k + DRAW_BLOCK) for k in range(0, size, DRAW_BLOCK)]
+    names, slices = list(cases.value.plants), [slice(k, k + DRAW_BLOCK) for k in range(0, size, DRAW_BLOCK)]
     threads = 2 if executor is None else 1
     parts = (
         (name, {key: column[piece] for key, column in values.items()}, threads) for name in names for piece in slices
     )
-    measured = map_ordered(partial(_measure_part, loops), parts, executor)
+    measured = map_ordered(partial(_measure_part, cases), parts, executor)
     for number, name in enumerate(names):
         pieces: list[BatchFigures] = []
         for k, piece in enumerate(slices):
@@ -113,21 +128,21 @@ def _measure_block(
         yield name, join_rows(pieces)
 
 
-def _measure_part(loops: Shared[Loops], part: tuple[str, Mapping[str, Column], int]) -> BatchFigures:
+def _measure_part(cases: Shared[Cases], part: tuple[str, Mapping[str, Column], int]) -> BatchFigures:
     """Return the figures of one plant at some draws."""
     name, values, threads = part
-    measured = loops.value
+    measured = cases.value
     return batch_figures(measured.controller, measured.plants[name], measured.unknown.nominal, values, threads=threads)
 
 
 def search_worst(
-    loops: Shared[Loops], drawn: Mapping[str, Float[np.ndarray, "_ k"]], executor: Executor | None, progress: Progress
+    cases: Shared[Cases], drawn: Mapping[str, Float[np.ndarray, "_ k"]], executor: Executor | None, progress: Progress
 ) -> tuple[dict[str, Worst], dict[str, Bracket]]:
     """Return the worst case found of every plant, from its worst draws, and the bounds where they are asked for."""
     worst: dict[str, Worst] = {}
     brackets: dict[str, Bracket] = {}
-    searched = map_ordered(partial(_search_plant, loops), drawn.items(), executor)
-    for number, (name, plant) in enumerate(loops.value.plants.items()):
+    searched = map_ordered(partial(_search_plant, cases), drawn.items(), executor)
+    for number, (name, plant) in enumerate(cases.value.plants.items()):
         progress(f"worst case, plant {number + 1} of {len(drawn)}", number / len(drawn))
         case, bounded = next(searched)
         worst[name] = case.on(plant)
@@ -136,34 +151,87 @@ def search_worst(
     return worst, brackets
 
 
-def _search_plant(loops: Shared[Loops], part: tuple[str, Points]) -> tuple[Worst, Bracket | None]:
+def _search_plant(cases: Shared[Cases], part: tuple[str, Points]) -> tuple[Worst, Bracket | None]:
     """Return the worst case found of one plant, from its worst draws, and the bounds where they are asked for."""
     name, drawn = part
-    controller, plant, unknown = loops.value.controller, loops.value.plants[name], loops.value.unknown
+    controller, plant, unknown = cases.value.controller, cases.value.plants[name], cases.value.unknown
     worst = find_worst(controller, plant, unknown, drawn)
-    if loops.value.bounds is None:
+    if cases.value.bounds is None:
         return worst, None
-    bounded = bracket(controller, plant, unknown, worst, loops.value.bounds)
+    bounded = bracket(controller, plant, unknown, worst, cases.value.bounds)
     if bounded.parameters:
         worst = combine_worst([worst, measure_worst(controller, plant, unknown.nominal, bounded.parameters)])
     return worst, bounded
 
 
-def select_own(loops: Shared[Loops], name: str, draws: Sequence[Draw]) -> list[dict[str, float]]:
+def select_own(cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[dict[str, float]]:
     """Return of draws what the model of a name has of them."""
-    model, nominal = loops.value.models[name], loops.value.unknown.nominal
+    model, nominal = cases.value.models[name], cases.value.unknown.nominal
     names = [key for key in draws[0] if key in place_values(model, nominal, draws[0])] if draws else []
     return [{key: draw[key] for key in names} for draw in draws]
 
 
 def judge_draws(
-    judge: Callable[[Shared[Loops], str, Sequence[Draw]], Sequence[Case]],
-    loops: Shared[Loops],
+    judge: Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Case]],
+    cases: Shared[Cases],
     name: str,
     draws: Sequence[Draw],
     executor: Executor | None,
 ) -> Iterator[Case]:
     """Yield what a judgement makes of every draw on the plant of a name, in order; it gets some draws at a time."""
     parts = (draws[k : k + DRAWS_PER_PART] for k in range(0, len(draws), DRAWS_PER_PART))
-    for cases in map_ordered(partial(judge, loops, name), parts, executor):
-        yield from cases
+    for judged in map_ordered(partial(judge, cases, name), parts, executor):
+        yield from judged
+
+
+def draw_requirements(
+    result: MonteCarlo, worst: Mapping[Spot, Worst], max_failure_probability: float | None = None
+) -> list[Requirement]:
+    """Return what the draws require; where none fails, that the worst case found by search does not either."""
+    bound = _require_bound(result, max_failure_probability)
+    if not result.samples:
+        return bound
+    spot, case = max(worst.items(), key=lambda found: found[1].severity)
+    size = f"has Ms {case.witness.ms:.4g}, Mt {case.witness.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
+    rows = [
+        require_at_most(
+            "monte_carlo_failures",
+            float(result.failures),
+            0.0,
+            draw=DrawnAt(parameters=case.parameters),
+            text=f"the worst case {size}",
+            remedy=WITNESS_REMEDY if result.failures else "",
+            **spot._asdict(),
+        )
+    ]
+    if not result.failures:
+        rows += [_require_worst(key, case) for key, case in worst.items() if case.limited or case.severity >= UNSTABLE]
+    return rows + bound
+
+
+def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
+    """Return that the stated failure probability is low enough, where that is asked for."""
+    if limit is None:
+        return []
+    value = result.failure_probability_bound if result.samples else 1.0
+    fewest = int(np.ceil(np.log(1.0 - result.confidence) / np.log1p(-limit))) if limit < 1.0 else 1
+    text, remedy = f"{result.failures} failures in {result.samples} draws", ""
+    if not result.samples:
+        text, remedy = "nothing is uncertain, so that nothing was drawn", "give a fit, prior_std or ranges"
+    elif value > limit:
+        remedy = f"{fewest} draws without a failure would do"
+    return [require_at_most("max_failure_probability", value, limit, text=text, remedy=remedy)]
+
+
+def _require_worst(spot: Spot, case: Worst) -> Requirement:
+    """Return how much of the limits the worst case uses: 1 is all of it."""
+    unstable = case.severity >= UNSTABLE
+    row = require_at_most(
+        "worst_case",
+        np.inf if unstable else case.severity,
+        1.0,
+        draw=DrawnAt(parameters=case.parameters),
+        text=UNSTABLE_LOOP if unstable else "",
+        **spot._asdict(),
+    )
+    return row if row.met else replace(row, remedy=WITNESS_REMEDY)

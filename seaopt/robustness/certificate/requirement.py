@@ -20,6 +20,7 @@ KEPT_TO = 1e-3  # share of a limit by which a row that is read may be beyond it:
 MIN_FRICTION_MARGIN = "min_friction_margin"
 SPECTRAL_RADIUS = "spectral_radius"  # of which a plant that is unstable fails
 LIMIT_CYCLE = "limit_cycle"
+UNSTABLE_LOOP = "the loop is UNSTABLE"
 DESIGN_PLANT = "design plant"  # whose own limits are judged
 
 

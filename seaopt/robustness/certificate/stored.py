@@ -21,8 +21,8 @@ from seaopt.plants.friction import split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
-from seaopt.robustness.certificate.certificate import DESIGN_NAMES, NO_MODEL, Certificate
-from seaopt.robustness.certificate.certify import split_states
+from seaopt.robustness.certificate.cases import DESIGN_NAMES, Cases
+from seaopt.robustness.certificate.certificate import NO_MODEL, Certificate
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
     CompensationDraws,
@@ -32,9 +32,9 @@ from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
 from seaopt.robustness.certificate.requirement import KEPT_TO, DrawnAt, Requirement
-from seaopt.robustness.certificate.scheduled import PlaceCertificate, ScheduleCertificate, Standing, list_held
+from seaopt.robustness.certificate.scheduled import ScheduleCertificate
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, Varied
+from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
@@ -47,7 +47,6 @@ from seaopt.robustness.verification.schedule_sweep import Sweep
 from seaopt.robustness.verification.verification import Verification, make_stages
 
 FILE, SCHEDULE_FILE, CERTIFY_AGAIN = "robustness.json", "schedule_robustness.json", "certify again"
-OF_ALL_PLACES = ("monte_carlo_failures", "worst_case", "limits_between_points")  # not of a place's own
 OLDER_TOLERANCE = 0.5  # of a bandwidth, of which older files do not say whether a law was tuned for it
 
 
@@ -179,7 +178,11 @@ def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
 
 
 def build_certificate(
-    content: Mapping[str, Any], controller: Controller, models: Mapping[str, Plant], parameters: ParameterSet
+    content: Mapping[str, Any],
+    controller: Controller,
+    models: Mapping[str, Plant],
+    parameters: ParameterSet,
+    place: tuple[str, float] | None = None,
 ) -> Certificate:
     """Return the certificate of a robustness.json, as `Certificate.from_dict` does."""
     stored = read_certificate(content)
@@ -199,6 +202,7 @@ def build_certificate(
         worst = {name: content["plants"][name]["worst"] for name in linear}
         certificate = Certificate(
             requirements=requirements,
+            place=place,
             plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
             margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
             worst={
@@ -238,18 +242,18 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     draws = {name: (certificate.parameters, *drawn) for name, drawn in certificate.list_draws().items()}
 
     def restore(rows: Mapping[str, Any], sensors: Sensors | None, command_step: float) -> Verification | None:
-        stages = make_stages(certificate.controller, certificate.models, sensors, command_step)
+        stages = make_stages(certificate.controller, certificate.simulated_models, sensors, command_step)
         return Verification.from_dict(rows, stages, draws, FILE, CERTIFY_AGAIN) if "rows" in rows else None
 
     devices = (None, 0.0) if runs is None else (runs.sensors, runs.command_step)
+    steps = restore(stored.steps, *devices) if "rows" in stored.steps else stored.steps.get("left_out")
     cycles = {
         name: friction.limit_cycles
         for name, friction in stored.friction.items()
+        if steps is not None and name in certificate.simulated_models
         if friction.limit_cycles or not certificate.shows_friction_harmless(name)
     }
-    steps = restore(stored.steps, *devices)
-    left_out = str(stored.steps.get("left_out", ""))
-    certificate = replace(certificate, steps=left_out if steps is None else steps, cycles=cycles)
+    certificate = replace(certificate, steps=steps, cycles=cycles)
     if played is None:
         return certificate
     simulated = Simulated(
@@ -260,39 +264,12 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     return replace(certificate, simulated=simulated)
 
 
-@record
-class _StoredCase:
-    """The parameters of a worst case at one value of the variable, and of the largest Ms and Mt there."""
-
-    parameters: dict[str, float]
-    largest: dict[str, dict[str, float]]
-
-    @property
-    def cases(self) -> list[Mapping[str, float]]:
-        """All of these parameters."""
-        return [self.parameters, *self.largest.values()]
-
-
-@record(eq=False)
-class _StoredPlace:
-    """The variable standing at one value, as a file holds it."""
-
-    value: float
-    point: bool
-    worst: Mapping[str, _StoredCase]
-    draws: int
-    unstable: int
-    over_ms: int
-    over_mt: int
-    simulated: Mapping[str, Any] | None
-
-
 @record(eq=False)
 class _StoredSchedule:
     """A schedule_robustness.json."""
 
     requirements: list[StoredRequirement]
-    places: tuple[_StoredPlace, ...]
+    places: tuple[Mapping[str, Any], ...]
     monte_carlo: MonteCarlo
     stretches: tuple[StretchBound, ...]
     sweeps: Mapping[str, tuple[Sweep, ...]]
@@ -300,55 +277,25 @@ class _StoredSchedule:
 
 
 def build_schedule_certificate(
-    content: Mapping[str, Any], schedule: ScheduledController, standing: Standing
+    content: Mapping[str, Any], schedule: ScheduledController, cases: Mapping[float, Cases]
 ) -> ScheduleCertificate:
     """Return the certificate of a schedule_robustness.json, as `ScheduleCertificate.from_dict` does."""
     stored = from_content(_StoredSchedule, content, SCHEDULE_FILE, remedy=CERTIFY_AGAIN)
-    rows = read_requirements(stored.requirements, SCHEDULE_FILE)
-    if tuple(place.value for place in stored.places) != standing.values:
-        raise FileError(f"{SCHEDULE_FILE}: places are at other values than the schedule's; {CERTIFY_AGAIN}")
-    try:
-        places = tuple(
-            _build_place(place, schedule, standing.models, unknown, rows)
-            for place, unknown in zip(stored.places, standing.unknowns, strict=True)
+    if len(stored.places) != len(cases):
+        raise FileError(
+            f"{SCHEDULE_FILE}: has {len(stored.places)} places, and the schedule {len(cases)}; {CERTIFY_AGAIN}"
         )
-    except KeyError as error:  # of what the model leaves open: the names of plants
-        raise FileError(f"{SCHEDULE_FILE}: a worst case has no {error}; {CERTIFY_AGAIN}") from error
     return ScheduleCertificate(
         schedule=schedule,
-        places=places,
+        places=tuple(
+            build_certificate(place, posed.controller, posed.models, posed.unknown.nominal, (schedule.over, value))
+            for place, (value, posed) in zip(stored.places, cases.items(), strict=True)
+        ),
         monte_carlo=stored.monte_carlo,
         stretches=stored.stretches,
         sweeps=stored.sweeps,
         motions=stored.motions,
-        requirements=rows,
-    )
-
-
-def _build_place(
-    stored: _StoredPlace,
-    schedule: ScheduledController,
-    models: Mapping[str, Plant],
-    unknown: Uncertainty,
-    rows: Sequence[Requirement],
-) -> PlaceCertificate:
-    controller, plants, nominal = schedule.at(stored.value), split_states(models, unknown), unknown.nominal
-    held = list_held(schedule, models, stored.value)
-    return PlaceCertificate(
-        value=stored.value,
-        point=stored.point,
-        plants={name: controller.close(plant, nominal).figures() for name, plant in plants.items()},
-        worst={
-            name: _measure_again(controller, plants[name], nominal, case.cases) for name, case in stored.worst.items()
-        },
-        draws=stored.draws,
-        unstable=stored.unstable,
-        over_ms=stored.over_ms,
-        over_mt=stored.over_mt,
-        requirements=tuple(
-            row for row in rows if row.place == (schedule.over, stored.value) and row.name not in OF_ALL_PLACES
-        ),
-        simulated=build_certificate(stored.simulated, controller, held, nominal) if stored.simulated else None,
+        requirements=read_requirements(stored.requirements, SCHEDULE_FILE),
     )
 
 

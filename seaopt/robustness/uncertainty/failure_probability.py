@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import fields, replace
 
 import numpy as np
 from jaxtyping import Bool
@@ -78,6 +79,14 @@ def count_failures(failed: Bool[np.ndarray, "3 n"], seed: int, confidence: float
     return MonteCarlo(
         samples=samples, failures=failures, seed=seed, confidence=confidence, failure_probability_bound=bound, **counts
     )
+
+
+def join_counts(parts: Sequence[MonteCarlo]) -> MonteCarlo:
+    """Return what draws say that were counted apart, of one seed and confidence."""
+    names, first = ("samples", "failures", "unstable", "over_ms", "over_mt"), parts[0]
+    totals = {name: sum(getattr(part, name) for part in parts) for name in names}
+    bound = failure_bound(totals["samples"], totals["failures"], first.confidence)
+    return replace(first, failure_probability_bound=bound, **totals)
 
 
 def format_draws(draws: MonteCarlo) -> str:

@@ -26,7 +26,7 @@ from seaopt.plants.parts import wrapped
 from seaopt.problem import read_problem
 from seaopt.problem.stages import assess_problem, list_plants
 from seaopt.robustness import batch_figures, bracket, combine_uncertainty
-from seaopt.robustness.certificate.certify import find_own_drive
+from seaopt.robustness.certificate.cases import find_own_drive
 from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
 from seaopt.robustness.verification.environments import attach_environment
 from seaopt.robustness.verification.large_signal import large_signal

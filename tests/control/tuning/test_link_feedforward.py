@@ -19,7 +19,7 @@ from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, FileError, SeaoptError
 from seaopt.files import to_json
 from seaopt.problem import read_problem
-from seaopt.robustness.certificate.certify import Budget
+from seaopt.robustness import Budget
 from tests.c_code import CompiledLaw
 from tests.control.tuning import test_measured
 

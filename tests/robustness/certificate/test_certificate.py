@@ -18,8 +18,8 @@ from seaopt.errors import ControlError
 from seaopt.files import seal, to_json
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
-from seaopt.robustness.certificate.certify import _digest
-from seaopt.robustness.certificate.requirements import friction_requirements
+from seaopt.robustness.certificate.cases import digest_laws
+from seaopt.robustness.certificate.friction import friction_requirements
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges
 from tests.laws import scaled
 from tests.words import flatten
@@ -270,7 +270,7 @@ def test_another_law_meets_other_draws(controller, stand, thor):
         so.certify(law, {"stand": stand}, thor, ranges={"eta": (0.9, 1.0)}, samples=1, seed=seed, simulations=False)
         for law, seed in ((controller, 1), (controller, 1), (controller, 2), (softer, 1))
     ]
-    assert len({_digest(controller), _digest(softer)}) == 2
+    assert len({digest_laws(controller), digest_laws(softer)}) == 2
     assert repr(points[0]) == repr(points[1])
     assert points[0].monte_carlo != points[2].monte_carlo
 

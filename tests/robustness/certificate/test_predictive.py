@@ -15,7 +15,7 @@ from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
-from seaopt.robustness import certify_mpc, linear_controller
+from seaopt.robustness import linear_controller
 
 TS = 1e-3
 SPEED_LIMIT = {"qd": (-0.08, 0.08)}
@@ -30,7 +30,7 @@ def mpc(stand, thor):
 
 @pytest.fixture(scope="module")
 def certificate(mpc, stand, thor):
-    return certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=200, runs=2)
+    return so.certify(mpc, {"stand": stand}, thor, ranges=HERE, samples=200, runs=2)
 
 
 def find_ms(mpc, params, inertia):
@@ -81,7 +81,7 @@ def test_runs_that_keep_everything_pass_with_the_bound_of_clopper_and_pearson(ce
 
 def test_a_motor_much_stronger_than_its_model_fails_and_its_run_can_be_played_again(mpc, stand, thor):
     strong = {"K_tau": (1.45 * thor["K_tau"].value, 1.5 * thor["K_tau"].value)}
-    failed = certify_mpc(mpc, {"stand": stand}, thor, ranges=strong, samples=1, runs=1, max_failure_probability=0.5)
+    failed = so.certify(mpc, {"stand": stand}, thor, ranges=strong, samples=1, runs=1, max_failure_probability=0.5)
     runs = failed.constrained
     assert not failed.passed and runs.failures == 1 and runs.failure_probability_bound == 1.0
     broken = {row.name for row in failed.requirements if not row.met}
@@ -99,16 +99,16 @@ def test_a_drives_delay_is_in_the_linear_region_in_the_runs_and_in_the_draws(sta
     """1.32 samples of it: the figures are those of the plan, and runs fail where they are drawn with ten."""
     spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=20.0, drive_delay_s=1.32e-3)
     mpc = force_mpc(stand, thor, spec)
-    near = certify_mpc(mpc, {"stand": stand}, thor, ranges={"drive_delay_s": (1.3e-3, 1.34e-3)}, samples=50, runs=1)
+    near = so.certify(mpc, {"stand": stand}, thor, ranges={"drive_delay_s": (1.3e-3, 1.34e-3)}, samples=50, runs=1)
     assert near.passed
     assert near.plants["stand"].ms == pytest.approx(mpc.achieved.ms, rel=1e-9)
     assert not any("drive_delay_s is not drawn" in note for note in near.constrained.left_out)
-    far = certify_mpc(mpc, {"stand": stand}, thor, ranges={"drive_delay_s": (0.01, 0.011)}, samples=1, runs=1)
+    far = so.certify(mpc, {"stand": stand}, thor, ranges={"drive_delay_s": (0.01, 0.011)}, samples=1, runs=1)
     assert far.constrained.failures == 1 and "drive_delay_s" in far.constrained.parameters
 
 
 def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, stand, thor):
-    late = certify_mpc(mpc, {"stand": stand}, thor, ranges={"delay_s": (9e-3, 10e-3)}, samples=1, runs=1)
+    late = so.certify(mpc, {"stand": stand}, thor, ranges={"delay_s": (9e-3, 10e-3)}, samples=1, runs=1)
     assert late.constrained.failures == 1 and not late.passed
     assert late.constrained.diverged + late.constrained.not_settled == 1
     assert "fit delay_s or narrow" in late.constrained.remedy
@@ -117,7 +117,7 @@ def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, 
 def test_a_bound_that_noise_breaks_on_the_design_plant_itself_is_named_with_the_room_it_needs(stand, thor):
     spec = MPCSpec(current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, bounds={"qd": (-0.05, 0.05)})
     tight = force_mpc(stand, thor, spec)
-    runs = certify_mpc(
+    runs = so.certify(
         tight, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, sensors=so.Sensors(noise_std={"F1": 3.0})
     ).constrained
     assert runs.over_bound == 1 and "on the design plant with its own parameters too" in runs.remedy
@@ -130,7 +130,7 @@ def test_iterations_are_named_where_a_run_has_no_plan(stand, thor):
         current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, bounds={"qd": (-0.05, 0.05)},
         max_iterations=1,
     )  # fmt: skip
-    runs = certify_mpc(force_mpc(stand, thor, spec), {"stand": stand}, thor, ranges=HERE, samples=1, runs=2).constrained
+    runs = so.certify(force_mpc(stand, thor, spec), {"stand": stand}, thor, ranges=HERE, samples=1, runs=2).constrained
     assert runs.failures and runs.remedy.startswith("a larger max_iterations in [mpc]: ")
 
 
@@ -164,36 +164,36 @@ def test_a_law_whose_estimate_trusts_a_coarse_reading_rings_and_is_not_met(stand
     swings = {q: [np.ptp(simulate_rounded(mpc, thor, r, q)[-160:]) / 2 for r in (777.0, 1234.5)] for q in (0.0, 5.0)}
     assert max(swings[0.0]) < 0.01 and max(swings[5.0]) > 50.0
     coarse, options = so.Sensors(quantisation={"F1": 5.0}), {"ranges": HERE, "samples": 1, "runs": 6}
-    found = certify_mpc(mpc, {"stand": stand}, thor, sensors=coarse, **options)
+    found = so.certify(mpc, {"stand": stand}, thor, sensors=coarse, **options)
     runs = found.constrained
     assert not found.passed and 0 < runs.ringing <= runs.failures
     assert runs.largest_ring > 7.5 and f"{runs.largest_ring:.3g} N" in str(runs)
     assert runs.remedy.startswith("finer sensors") and "does not die out" in runs.text
     again = so.Certificate.from_dict(json.loads(to_json(found.to_dict())), found.controller, {"stand": stand}, thor)
     assert again.constrained == runs and again.runs.rows == found.runs.rows
-    ideal = certify_mpc(mpc, {"stand": stand}, thor, **options)
+    ideal = so.certify(mpc, {"stand": stand}, thor, **options)
     assert ideal.passed and ideal.constrained.largest_ring < 0.01
     options |= {"runs": 1, "seed": 14}  # a run that swings half as much in the end as just before
-    fading = certify_mpc(mpc, {"stand": stand}, thor, sensors=coarse, **options).constrained
+    fading = so.certify(mpc, {"stand": stand}, thor, sensors=coarse, **options).constrained
     assert fading.ringing == 1 and fading.remedy.startswith("finer sensors")
 
 
 def test_what_a_run_swings_is_its_peak(mpc, stand, thor):
     """By the simulation of this test, of other steps and with the quantum as coarse."""
     coarse = so.Sensors(quantisation={"F1": 20.0})
-    runs = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=3, sensors=coarse).constrained
+    runs = so.certify(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=3, sensors=coarse).constrained
     force = [simulate_rounded(mpc, thor, r, 20.0, 0.6)[-160:] for r in (777.0, 1234.5)]
     assert 0.0 < max(np.ptp(one) / 2 for one in force) <= runs.largest_ring
 
 
 def test_devices_that_keep_a_run_from_settling_are_named(mpc, stand, thor):
     short = so.Sensors(saturation={"F1": 100.0})
-    runs = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, sensors=short).constrained
+    runs = so.certify(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, sensors=short).constrained
     assert runs.not_settled == 1 and "more range" in runs.remedy
 
 
 def test_what_an_amplifier_rounds_reaches_the_steps_of_the_linear_region_too(mpc, stand, thor):
-    rough = certify_mpc(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, command_step=2.0)
+    rough = so.certify(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, command_step=2.0)
     assert all(stage.command_step == 2.0 for stage in rough.runs.stages.values())
     assert 0.0 < rough.constrained.largest_ring < 0.5 * 2.0 * abs(mpc.static_gain)
 
@@ -202,7 +202,7 @@ def test_what_an_amplifier_rounds_reaches_the_steps_of_the_linear_region_too(mpc
 def test_of_friction_no_sensors_are_asked_for_that_no_step_would_have(stand, thor):
     rubbing = thor.update(f_c=20.0)
     law = force_mpc(stand, rubbing, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
-    found = certify_mpc(
+    found = so.certify(
         law, {"stand": stand}, rubbing, ranges=HERE, samples=1, runs=1, sensors=so.Sensors(noise_std={"F1": 2.0})
     )
     assert not any("give certify(sensors" in note for note in found.notes)
@@ -217,4 +217,4 @@ def test_it_comes_back_from_its_file(certificate, mpc, stand, thor):
 def test_what_cannot_be_is_said_in_one_line(mpc, stand, thor):
     for options, said in (({"runs": 0}, "runs = 0"), ({"bound_tolerance": -1.0}, "bound_tolerance = -1")):
         with pytest.raises(ControlError, match=said):
-            certify_mpc(mpc, {"stand": stand}, thor, **options)
+            so.certify(mpc, {"stand": stand}, thor, **options)

@@ -13,7 +13,7 @@ import seaopt as so
 from seaopt.control import MPCSpec, force_mpc
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
-from seaopt.robustness import certify_mpc, run_simulations, verify
+from seaopt.robustness import run_simulations, verify
 from seaopt.robustness.verification import impedance_steps, large_signal, limit_cycles, scenarios, verification
 from tests.laws import scaled
 from tests.words import flatten
@@ -160,7 +160,7 @@ def test_a_sensor_of_nothing_that_is_read_is_refused(controller, linear, stand, 
         lambda: so.certify(controller, {"stand": stand}, thor, sensors=wrong),
         lambda: linear.with_simulation(sensors=wrong),
         lambda: verify(controller, {"stand": stand}, thor, sensors=wrong),
-        lambda: certify_mpc(mpc, {"stand": stand}, thor, sensors=wrong),
+        lambda: so.certify(mpc, {"stand": stand}, thor, sensors=wrong),
     ):
         with pytest.raises(ControlError, match=f'{kind} of "F_1".*F1'):
             certify()

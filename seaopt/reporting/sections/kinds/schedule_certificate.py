@@ -7,7 +7,7 @@ from seaopt.reporting.sections.data import Commands, Section, Table, Verdict, li
 from seaopt.reporting.sections.kinds.certificate import explain_failure
 from seaopt.robustness import ScheduleCertificate
 from seaopt.robustness.certificate.requirement import group_failures
-from seaopt.robustness.certificate.requirements import MOTION_RATE
+from seaopt.robustness.certificate.scheduled import MOTION_RATE
 from seaopt.units import unit_after
 
 
@@ -40,16 +40,15 @@ def judge(certificate: ScheduleCertificate, commands: Commands) -> Verdict:
 def describe(certificate: ScheduleCertificate) -> list[Section]:
     """Return the figures at every value of the schedule's variable, the draws, and the findings."""
     rows: list[tuple[str, ...]] = []
-    for place in certificate.places:
-        failed = place.unstable + place.over_ms + place.over_mt
+    for value, place in zip(certificate.values, certificate.places, strict=True):
         rows.append(
             (
-                f"{place.value:.4g}",
-                "point" if place.point else "between",
-                f"{place.ms:.3f}",
+                f"{value:.4g}",
+                "point" if value in certificate.schedule.points else "between",
+                f"{max(figures.ms for figures in place.plants.values()):.3f}",
                 f"{max(figures.mt for figures in place.plants.values()):.3f}",
-                "" if place.worst_ms is None else f"{place.worst_ms:.3f}",
-                f"{failed} of {place.draws}",
+                f"{max(case.ms for case in place.worst.values()):.3f}",
+                f"{place.monte_carlo.failures} of {place.monte_carlo.samples}",
             )
         )
     variable = f"{certificate.schedule.over}{unit_after(certificate.schedule.unit)}"

@@ -1,0 +1,173 @@
+"""Limits of a law's figures: on the design plant, on every plant at the nominal parameters, on measured points."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.control import Controller, LoopFigures
+from seaopt.control.laws.delay import warn_delays
+from seaopt.control.laws.limits import BY_NAME, MeasuredLoop, PortFigures, Scope
+from seaopt.control.laws.passivity import measure_port
+from seaopt.control.laws.verdict import judge
+from seaopt.control.loops.measured.figures import measure_discs
+from seaopt.control.loops.measured.loop import DiscLoop
+from seaopt.control.loops.port import port_of
+from seaopt.control.loops.sampled_plant import DRIVE_DELAY
+from seaopt.frequency import MeasuredResponse
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import friction_states, has_friction
+from seaopt.progress import Progress
+from seaopt.robustness.certificate.cases import Cases, Check, Evidence, Survey
+from seaopt.robustness.certificate.requirement import (
+    DESIGN_PLANT,
+    KEPT_TO,
+    MIN_FRICTION_MARGIN,
+    SPECTRAL_RADIUS,
+    UNSTABLE_LOOP,
+    Requirement,
+    Spot,
+)
+from seaopt.robustness.uncertainty.plant_margins import plant_margins
+from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
+from seaopt.robustness.verification.scenarios import STEP_SHARES
+
+PASSIVE = "passive_band_hz"
+AMPLITUDES = 9  # looked at for the remark on bandwidth
+
+
+def measure_nominal(survey: Survey, _: Progress) -> Evidence:
+    """Judge every loop at the nominal parameters; the design plant by its own limits too, where the law was tuned."""
+    cases, controller, nominal = survey.cases, survey.cases.controller, survey.cases.unknown.nominal
+    assert controller.design is not None
+    design, values = controller.design
+    of_design = values.with_parameters(
+        *(nominal[name] for name in nominal if name in {*design.parameters, DRIVE_DELAY})
+    )
+    varied = [row.name for row in cases.unknown.varied()]
+    figures = {name: controller.close(plant, nominal).figures() for name, plant in cases.plants.items()}
+    return Evidence(
+        requirements=(
+            *(design_requirements(controller, design, of_design, varied) if survey.point else ()),
+            *(row for name, spot in cases.spots.items() for row in plant_requirements(controller, spot, figures[name])),
+        ),
+        fields={
+            "plants": figures,
+            "margins": {name: plant_margins(controller, plant, nominal) for name, plant in cases.plants.items()},
+        },
+        remarks=(*warn_delays(controller.spec, design, survey.source), *_remark_amplitude(cases, design)),
+    )
+
+
+def measure_responses(survey: Survey, _: Progress) -> Evidence:
+    """Judge the loop on every measured response; a law that was designed on one by all limits on the first."""
+    controller, measured = survey.cases.controller, survey.measured
+    rows: list[Requirement] = []
+    if controller.design is None:
+        rows += measured_requirements(controller, *next(iter(measured.items())), "design plant")
+    for name, response in measured.items():
+        rows += measured_requirements(controller, name, response)
+    return Evidence(requirements=rows, remarks=tuple(_remark_measured(controller, measured)))
+
+
+NOMINAL = Check(measure=measure_nominal)
+MEASURED = Check(measure=measure_responses, applies=lambda survey: bool(survey.measured))
+
+
+def design_requirements(
+    controller: Controller, plant: Plant, values: ParameterSet, varied: Collection[str] = ()
+) -> list[Requirement]:
+    """Return what is required of the design plant at the nominal `values`; of one that is stuck only some limits."""
+    states = friction_states(plant) if has_friction(plant, values, varied) else {"": plant}
+    figures = {state: controller.close(variant, values).figures() for state, variant in states.items()}
+    (state, achieved), *stuck = figures.items()
+    band, port = controller.spec.passive_band_hz, None
+    if band is not None and controller.design is not None:
+        held = port_of(states[state], controller.delay(values), controller.signals, controller.command.per_effort)
+        port = measure_port(held, controller.law, controller.compute_delay_samples, band)
+    rows = _judge(controller, controller.measure("", achieved, port), "design plant", Spot(DESIGN_PLANT, state))
+    for other, loop in stuck:
+        measured = controller.measure("", loop)
+        rows += _judge(controller, measured, "design plant", Spot(DESIGN_PLANT, other), stuck=True)
+    if band is None or port is None:
+        return rows
+    return [_place_passive(row, port, band) if row.name == PASSIVE else row for row in rows]
+
+
+def plant_requirements(controller: Controller, spot: Spot, figures: LoopFigures) -> list[Requirement]:
+    """Return what is required of every plant at the nominal parameters, but for friction margins."""
+    return [
+        replace(row, text="" if figures.stable or row.name != SPECTRAL_RADIUS else UNSTABLE_LOOP)
+        for row in _judge(controller, controller.measure("", figures), "every plant", spot)
+        if row.name != MIN_FRICTION_MARGIN
+    ]
+
+
+def measured_requirements(
+    controller: Controller, name: str, measured: MeasuredResponse, scope: Scope = "every plant"
+) -> list[Requirement]:
+    """Return the limits of a scope on a measured response, of every response in the discs."""
+    plant = controller.spec.see_response(measured, controller.command)
+    figures = DiscLoop(plant=plant, law=controller.law).figures(controller.spec.bandwidth_hz)
+    on = f"on measured points, at {100 * measured.confidence:.4g} %"
+    if scope == "every plant":
+        rows = plant_requirements(controller, Spot(name), figures)
+    else:
+        rows = _judge(controller, controller.measure(name, figures), scope, Spot(name))
+    return [replace(row, text=f"{on}; {row.text}" if row.text else on) for row in rows]
+
+
+def _judge(
+    controller: Controller, loop: MeasuredLoop, scope: Scope, spot: Spot, *, stuck: bool = False
+) -> list[Requirement]:
+    return [
+        Requirement(
+            name=verdict.limit.requirement or verdict.limit.name,
+            limit=verdict.allowed,
+            value=verdict.value,
+            met=verdict.met,
+            sense=verdict.limit.symbol,
+            tolerance=max(verdict.limit.tolerance, KEPT_TO),
+            unit=loop.unit(verdict.limit),
+            **spot._asdict(),
+        )
+        for verdict in judge(controller.spec, loop, scope, stuck=stuck)
+    ]
+
+
+def _place_passive(row: Requirement, port: PortFigures, band: tuple[float, float]) -> Requirement:
+    """Return the row with where in the passive band the port is least passive, and what to do where it is not."""
+    text = f"Re Z/|Z| at {port.at_hz:.4g} Hz, of {band[0]:g} to {band[1]:g} Hz"
+    if row.met:
+        return replace(row, text=text)
+    remedy = BY_NAME[PASSIVE].remedy if port.held_stable else "the loop grows with its link held"
+    return replace(row, text=text, remedy=remedy)
+
+
+def _remark_measured(controller: Controller, measured: Mapping[str, MeasuredResponse]) -> Iterator[str]:
+    """Yield on which measured points the law was judged, and under what assumptions."""
+    for response in measured.values():
+        plant = controller.spec.see_response(response, controller.command)
+        yield str(measure_discs(plant, controller.law, controller.spec.bandwidth_hz))
+
+
+def _remark_amplitude(cases: Cases, plant: Plant) -> tuple[str, ...]:
+    """Say which bandwidth the design plant has at amplitudes of use, where friction makes it depend on them. They are
+    shares of the force that the current limit holds at rest, those of the simulated steps.
+    """
+    controller, nominal = cases.controller, cases.unknown.nominal
+    name = next(name for name, model in cases.models.items() if model is plant)
+    rest, sliding = controller.force_limit(0.0), controller.achieved.bandwidth_hz
+    if rest is None or sliding is None or not has_friction(plant, nominal):
+        return ()
+    low, high = STEP_SHARES[0], STEP_SHARES[-1]
+    bands = predict_bandwidths(controller, plant, nominal, rest * np.geomspace(low, high, AMPLITUDES))
+    reached = [band for band in bands if band is not None]
+    at = f"at {100 * low:g} to {100 * high:g} % of the current"
+    if not reached:
+        return (f"{name}: bandwidth {sliding:.3g} Hz sliding; below {sliding / SLOWEST_STUCK:.2g} Hz {at}",)
+    least = f"{min(reached):.3g}" if len(reached) == len(bands) else f"less than {min(reached):.3g}"
+    return (f"{name}: bandwidth {sliding:.3g} Hz sliding; between {least} and {max(reached):.3g} Hz {at}, predicted",)
