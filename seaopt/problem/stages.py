@@ -394,7 +394,7 @@ def certify_problem(
         certificate = certify(controller, plants, source, measured=measured, **options)
     else:
         options |= {"runs": table.constrained_runs, "bound_tolerance": table.bound_tolerance}
-        certificate = certify(design_mpc(problem, source), plants, source, **options)
+        certificate = certify(design_mpc(problem, source), plants, source, measured=measured, **options)
     unread = [name for name in problem.sensors.names if name not in read]
     if not unread:
         return certificate

@@ -174,7 +174,10 @@ def bracket(
         while search.arcs.box.size and search.count < budget.boxes and time.perf_counter() < end:
             if not np.all(np.isfinite(search.lower)) or (search.count and not search.within.size):
                 break  # a plant is unstable, or there is nothing to halve
+            first, boxes = not search.count, search.boxes
             _step(search)
+            if first and not np.all(np.isfinite(search.arcs.s)):
+                _check_digits(controller, plant, search.within, boxes)
         search.stable &= bool(np.all(_measure(search, search.boxes.centre)))
     except ControlError as error:
         return Bracket(
@@ -221,7 +224,6 @@ def _start(
 ) -> _BranchAndBound:
     within = build_region(plant, replace(unknown, nominal=controller.delay(unknown.nominal)))
     boxes = within.cover(controller.sample_time_s)
-    _check_digits(controller, plant, within, boxes)
     hardness = _measure_hardness(controller, plant, within, boxes)
     while boxes.centre.shape[0] < BOX_BLOCK and np.sum(hardness * boxes.radius[0]) > EASY:
         axis = int(np.argmax(hardness * boxes.radius[0]))

@@ -73,7 +73,8 @@ class Certificate(Result, Worded):
         At the nominal parameters. A plant with friction is there twice, as NAME sliding and NAME stuck, here and in
         what follows by plant.
     margins : mapping of name to PlantMargins
-        Every margin at the nominal parameters, with the perturbation that exhausts it.
+        Every margin at the nominal parameters, with the perturbation that exhausts it; empty between the points of a
+        schedule.
     worst : mapping of name to Worst
         The worst that the draws, and a search from the worst of them, found: each is a pair (plant, parameters), so
         that `tune(..., robust_to=certificate.worst)` accepts them.
@@ -327,7 +328,7 @@ class Certificate(Result, Worded):
                 "requirements": [row.to_dict() for row in self.requirements],
                 "plants": {
                     name: {key: getattr(figures, key) for key in _REPORTED}
-                    | self.margins[name].to_dict()
+                    | (self.margins[name].to_dict() if name in self.margins else {})
                     | {"worst": self._worst_dict(name)}
                     for name, figures in self.plants.items()
                 },
@@ -368,7 +369,12 @@ class Certificate(Result, Worded):
                     f"{varied.high:.4g}, so that no draw is like the nominal plant"
                 )
         draws = self.monte_carlo
-        if draws.samples and not draws.failures and draws.failure_probability_bound > UNINFORMATIVE_BOUND:
+        if (
+            self.place is None
+            and draws.samples
+            and not draws.failures
+            and draws.failure_probability_bound > UNINFORMATIVE_BOUND
+        ):
             yield f"so few draws say little: a failure probability below {draws.failure_probability_bound:.2g}"
         yield from self.controller.lifted_notes
         if self.models and not self.controller.spec.allowed(BY_NAME["max_reference_peak"]):

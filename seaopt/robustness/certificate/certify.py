@@ -42,10 +42,10 @@ from seaopt.robustness.certificate.compensation import COMPENSATION
 from seaopt.robustness.certificate.constrained import RUN_SECONDS, require_constrained, run_constrained
 from seaopt.robustness.certificate.friction import FRICTION
 from seaopt.robustness.certificate.impedance import IMPEDANCE
-from seaopt.robustness.certificate.limits import MEASURED, NOMINAL
+from seaopt.robustness.certificate.limits import MEASURED, NOMINAL, measured_requirements
 from seaopt.robustness.certificate.measured_draws import DRAWS, draw_requirements, name_worst
 from seaopt.robustness.certificate.predictive import linear_controller
-from seaopt.robustness.certificate.requirement import Spot
+from seaopt.robustness.certificate.requirement import Requirement, Spot
 from seaopt.robustness.certificate.scheduled import (
     BOUND,
     SWEEP,
@@ -151,7 +151,8 @@ def certify(  # pyright: ignore[reportInconsistentOverload]  # of which keywords
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     measured : mapping of name to MeasuredResponse, optional
         Measured frequency responses on which stability, Ms, Mt and disk margin are required too, of every response in
-        the discs. Draws and simulations are of the models. Of a controller designed on a measured response the first
+        the discs; of a schedule with the law where the parameters have its variable. Draws and simulations are of the
+        models. Of a controller designed on a measured response the first
         is that one, on which all limits are required; nothing is drawn or simulated.
     executor : concurrent.futures.Executor, optional
         Where parts of the work are done (`seaopt.executors`); here, if left out. The result is the same, bit for bit.
@@ -228,7 +229,9 @@ def certify(  # pyright: ignore[reportInconsistentOverload]  # of which keywords
         executor=executor,
     )
     if isinstance(subject, ScheduledController):
-        return _certify_schedule(subject, _list_surveys(subject, pose_places(subject, **posing), pose), progress)
+        rows = _require_responses(subject, others, parameters, measured or {})
+        surveys = _list_surveys(subject, pose_places(subject, **posing), partial(pose, measured={}))
+        return _certify_schedule(subject, surveys, rows, progress)
     cases, rng = pose_cases(law, **posing), np.random.default_rng([seed, CERTIFICATE_STREAM, digest_laws(law)])
     survey = pose(shared=Shared(cases), drawing=rng, rng=rng, steps=bool(cases.models))
     measuring, running = divide(progress, sum(_list_seconds(survey)), RUN_SECONDS * runs * len(cases.models) * plans)
@@ -328,8 +331,30 @@ def _list_surveys(schedule: ScheduledController, places: Mapping[float, Cases], 
     ]
 
 
+def _require_responses(
+    schedule: ScheduledController,
+    others: ParameterSet | None,
+    parameters: Source,
+    measured: Mapping[str, MeasuredResponse],
+) -> list[Requirement]:
+    """Return the limits on measured responses, with the law where the parameters have the schedule's variable: each
+    response stands at one value of it.
+    """
+    if not measured:
+        return []
+    fitted = parameters.parameters if isinstance(parameters, Fit) else parameters
+    values, over = (others or ParameterSet()).with_parameters(*fitted.values()), schedule.over
+    if over not in values:
+        raise ControlError(
+            f"measured: a response stands at one value of {over}, which is not given; give {over} among the parameters"
+        )
+    law, place = schedule.at(values[over].value), (over, values[over].value)
+    rows = (row for name, response in measured.items() for row in measured_requirements(law, name, response))
+    return [replace(row, place=place) for row in rows]
+
+
 def _certify_schedule(
-    schedule: ScheduledController, surveys: Sequence[Survey], progress: Progress
+    schedule: ScheduledController, surveys: Sequence[Survey], of_responses: Sequence[Requirement], progress: Progress
 ) -> ScheduleCertificate:
     """Certify a schedule at each of its places, and between them."""
     first, options = surveys[-1], surveys[0].options
@@ -362,6 +387,7 @@ def _certify_schedule(
         monte_carlo=draws,
         requirements=(
             *(row for place in places for row in place.requirements),
+            *of_responses,
             *stretches.requirements,
             *draw_requirements(draws, worst, options.max_failure_probability),
             *sweeps.requirements,

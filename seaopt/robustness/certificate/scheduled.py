@@ -131,12 +131,19 @@ class ScheduleCertificate(Result, Worded):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Proof, assumption, sweeps, motions, and what is remarked at the points, one sentence each."""
+        """Proof, assumption, sweeps, motions, and the notes of all places, else of the points, one sentence each."""
         unit, over = self.rate_unit, self.schedule.over
         swept = (f"{name}: {describe_sweeps(sweeps, unit)}" for name, sweeps in self.sweeps.items())
         moved = (f"{name}: {describe_motion(motion, over, unit)}" for name, motion in self.motions.items())
-        remarks = (remark for place in self.places for remark in place.remarks)
-        return (self.proof, self.assumption, *swept, *moved, *dict.fromkeys(remarks))
+        said = dict(zip(self.values, (place.notes for place in self.places), strict=True))
+        shared = [note for note in next(iter(said.values())) if all(note in notes for notes in said.values())]
+        at_points = (
+            f"{over} = {value:g}: {note}"
+            for value in self.schedule.points
+            for note in said[value]
+            if note not in shared
+        )
+        return (self.proof, self.assumption, *swept, *moved, *shared, *at_points)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of schedule_robustness.json (schema seaopt/schedule_robustness/2)."""

@@ -204,7 +204,11 @@ def build_certificate(
             requirements=requirements,
             place=place,
             plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
-            margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
+            margins={
+                name: plant_margins(controller, plant, parameters)
+                for name, plant in linear.items()
+                if "nu_gap" in content["plants"][name]
+            },
             worst={
                 name: _measure_again(controller, plant, parameters, stored.plants[name].worst.cases)
                 for name, plant in linear.items()

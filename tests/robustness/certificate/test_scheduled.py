@@ -17,11 +17,13 @@ from seaopt.progress import ignore
 from seaopt.robustness import ScheduleCertificate
 from seaopt.robustness.certificate import scheduled
 from seaopt.robustness.certificate.cases import CertifyOptions, Survey, add_design
+from seaopt.robustness.certificate.certify import _require_responses
 from seaopt.robustness.certificate.friction import FRICTION
 from seaopt.robustness.certificate.scheduled import pose_places, require_motion, require_rate
 from seaopt.robustness.verification import limit_cycles, schedule_sweep, verification
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
+from seaopt.simulation import Clock
 from tests.schedules import POINTS, read_knee, tune_knee
 from tools.golden import compare
 
@@ -194,6 +196,29 @@ def test_a_motion_slower_than_the_rate_asked_is_not_met():
     for least in (None, 1.0):
         rings = require_motion(replace(slow, fault="rings"), "phi", "rad/s", least)
         assert not rings.met and rings.value == 0.0
+
+
+def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parameters_have():
+    """A response measured without error, by the lever's equations: Ms is the largest of the measured points."""
+    stand, _, values = read_knee()
+    schedule, there = tune_knee(), values.update(phi=0.2)
+    v, f, ts = {name: values[name].value for name in values}, np.arange(0.5, 300.0, 0.5), 1e-3
+    held = expm(np.array([[0.0, 1.0, 0.0], [-v["k"], -v["b"], 1.0], [0.0, 0.0, 0.0]]) / [[1.0], [v["M"]], [1.0]] * ts)
+    z = np.exp(2j * np.pi * f * ts)
+    per_newton = np.linalg.solve(z[:, None, None] * np.eye(2) - held[:2, :2], np.tile(held[:2, 2:], (f.size, 1, 1)))
+    response = v["L_a"] * np.cos(0.2) * v["k"] * per_newton[:, 0, 0]
+    measured = so.MeasuredResponse(
+        name="chirp", plant=stand, source="I", output="tau", clock=Clock(period=ts, hold="zero", delay_s=0.0),
+        frequency_hz=f, response=v["K_f"] * response, radius=0.0 * f, confidence=0.95, averages=np.full(f.size, 100),
+    )  # fmt: skip
+    rows = {row.name: row for row in _require_responses(schedule, None, there, {"frf:chirp": measured})}
+    g, q = schedule.at(0.2).gains, 1.0 / z
+    slope = (1.0 - q) / (g["T_f"] + ts - g["T_f"] * q)
+    law = g["k_p"] + g["k_i"] * ts / 2 * (1.0 + q) / (1.0 - q) + g["k_d"] * slope
+    assert rows["max_sensitivity"].place == ("phi", 0.2)
+    assert rows["max_sensitivity"].value == pytest.approx(np.max(np.abs(1.0 / (1.0 + response * law * q))), rel=2e-3)
+    with pytest.raises(ControlError, match="one value of phi, which is not given"):
+        _require_responses(schedule, None, so.ParameterSet(), {"frf:chirp": measured})
 
 
 def test_a_range_of_what_it_is_over_is_refused():
