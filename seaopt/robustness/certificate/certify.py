@@ -39,12 +39,16 @@ from seaopt.robustness.certificate.cases import (
 )
 from seaopt.robustness.certificate.certificate import NO_MODEL, Certificate
 from seaopt.robustness.certificate.compensation import COMPENSATION
-from seaopt.robustness.certificate.constrained import RUN_SECONDS, require_constrained, run_constrained
+from seaopt.robustness.certificate.constrained import (
+    RUN_SECONDS,
+    linear_controller,
+    require_constrained,
+    run_constrained,
+)
 from seaopt.robustness.certificate.friction import FRICTION
 from seaopt.robustness.certificate.impedance import IMPEDANCE
 from seaopt.robustness.certificate.limits import MEASURED, NOMINAL, measured_requirements
 from seaopt.robustness.certificate.measured_draws import DRAWS, draw_requirements, name_worst
-from seaopt.robustness.certificate.predictive import linear_controller
 from seaopt.robustness.certificate.requirement import Requirement, Spot
 from seaopt.robustness.certificate.scheduled import (
     BOUND,
