@@ -301,6 +301,8 @@ class Session:
         made_from, expected = content["made_from"], digest_sources(self.problem, stage, self.folder)
         changed = {name for name in {*expected, *made_from} - {CONTENT} if expected.get(name) != made_from.get(name)}
         if changed - {ROBUSTNESS}:
+            if stage == "fit" and (lines := self.folder / EXPLAINED).exists():
+                again = f"if fit --explain made it, put the lines of {lines} into {self.problem.source}; else {again}"
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         if changed:
             note = f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one"
@@ -327,6 +329,8 @@ class Session:
         result = fit_problem(self.problem, self.experiments(), progress=fitting)
         if self.explain and (found := find_explanation(result)) is not None:
             result = self._explain(found, result)
+        else:
+            (self.folder / EXPLAINED).unlink(missing_ok=True)  # of another fit
         self.results["fit"] = result
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})

@@ -56,6 +56,9 @@ def test_what_is_found_is_added_and_fitted(problem, seaopt):
     lines = tomllib.loads((out / "explained.toml").read_text(encoding="utf-8"))
     assert lines["plant"]["stand"]["parts"] == ["hardening"]
     assert lines["parameters"]["k_3"]["free"]
+    other = seaopt("validate", problem, problem.parent / "log.csv", "-o", out)
+    assert other.returncode == 2
+    assert f"put the lines of {out / 'explained.toml'} into {problem}" in other.stderr
     # A file with these lines is the problem that the folder's fit is of.
     text = problem.read_text(encoding="utf-8").replace('link = "locked"', 'link = "locked"\nparts = ["hardening"]')
     value = lines["parameters"]["k_3"]["value"]

@@ -49,6 +49,7 @@ def test_round_trip_keeps_every_digit(tmp_path):
         ("", LogError, "empty"),
         ("time [s],cur,F1 [N]\n", LogError, "0 rows"),
         ("time [s],cur,F1[N]\n0,1,2\n1,1,2\n", LogError, 'did you mean "F1\\[N\\]"'),
+        ("time [s],cur.,F1 [N]\n0,1,2\n1,1,2\n", LogError, 'write column = "cur."'),
         ("time [s],cur,F1 [N],F1 [N]\n0,1,2,2\n1,1,2,2\n", LogError, "2 columns are named"),
         ("time [s],cur,F1 [N]\n0,1,2\n1,x,2\n", LogError, 'line 3: "x" in column "cur"'),
         ("time [s],cur,F1 [N]\n0,1,2\n1,1,2,9\n", LogError, "cannot be read as CSV"),

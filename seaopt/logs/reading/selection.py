@@ -197,7 +197,7 @@ def find_column(sources: Sequence[Source], name: str, column: Column) -> FileCol
         raise LogError(f'{name}: file = "{column.file}" is none of those read; give one of {paths}')
     hits = [(source, field) for source in places for field in _match_fields(source, column.column)]
     if not hits:
-        raise LogError(f"{_list_paths(places)}: {_explain_missing(places, name, column.column)}")
+        raise LogError(f"{_list_paths(places)}: {_explain_missing(places, name, column)}")
     if len(hits) > 1 and hits[0][0] is hits[1][0]:
         raise LogError(f'{hits[0][0].path}: {len(hits)} columns are named "{column.column}"; rename all but one')
     if len(hits) > 1:
@@ -219,8 +219,9 @@ def _match_fields(source: Source, column: str | int) -> list[Field]:
     return [field for number, field in numbered if number == column]
 
 
-def _explain_missing(places: Sequence[Source], name: str, column: str | int) -> str:
+def _explain_missing(places: Sequence[Source], name: str, asked: Column) -> str:
     """Return what to do about a column that is not there, or about a header that several columns have."""
+    column = asked.column
     fields = [field for source in places for field in source.fields]
     if isinstance(column, int):
         return f"no column {column} for {name}; the file has {len(fields)}: {_list_names([f.name for f in fields])}"
@@ -232,7 +233,8 @@ def _explain_missing(places: Sequence[Source], name: str, column: str | int) -> 
     names = [field.name for field in fields]
     near = get_close_matches(column, names, n=1, cutoff=0.6)
     listed = f"seaopt inspect {shlex.quote(str(places[0].path))} --list"
-    how = f' write {name} = "{near[0]}"' if near else f"; list them: {listed}"
+    key = name if asked == Column(column=column) else "column"  # its unit and scale stay
+    how = f' write {key} = "{near[0]}"' if near else f"; list them: {listed}"
     return f'no column "{column}" for {name}; {suggest_names(column, names)}{how}'
 
 
