@@ -70,7 +70,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from itertools import zip_longest
 from typing import Any, Literal, NamedTuple
 
@@ -185,6 +185,15 @@ class Nominal:
         return cls(
             kept=np.concatenate([np.zeros(lead + plant.delay_samples), left / np.sum(left)]), inverse=tuple(inverse)
         )
+
+    def scaled(self, gain: float) -> Nominal:
+        """Return the same of a plant whose inverse has another gain, `inverse_gain`."""
+        return replace(self, inverse=(*self.inverse[:-1], TransferFunction(num=np.array([gain]), den=np.ones(1))))
+
+    @property
+    def inverse_gain(self) -> float:
+        """The number among the factors of the inverse, the last one."""
+        return float(self.inverse[-1].num[0])
 
     @property
     def static_inverse(self) -> float:

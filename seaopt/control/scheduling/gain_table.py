@@ -24,7 +24,7 @@ The real part of 1 - q is not negative, so that this derivative is largest where
         + \max k_d \; h\,|T_f'|\,\max \Big|\frac{\partial D}{\partial T_f}\Big|
 
 holds at every frequency for the whole stretch, which `bound_change` returns over :math:`|C_y(\bar s)|`. There is no
-such rule yet for a notch and a cascade, whose change is not bounded.
+such rule yet for a notch, an observer and a cascade, whose change is not bounded.
 """
 
 from __future__ import annotations
@@ -44,17 +44,19 @@ from seaopt.control.laws.structures import (
     PREFILTER,
     PREFILTER_DAMPING,
     PREFILTER_ORDERS,
+    DisturbanceObserver,
     Gains,
+    Nominal,
     SpeedLoop,
     Structure,
     evaluate_terms,
 )
 from seaopt.control.loops.law import Law
-from seaopt.control.scheduling.step_order import StepOrder
+from seaopt.control.scheduling.step_order import INVERSE_GAIN, StepOrder
 from seaopt.errors import ControlError
 from seaopt.records import record
 
-STRUCTURES = ("pd", "pid", CASCADE)  # whose gains can be interpolated
+STRUCTURES = ("pd", "pid", "pid_dob", CASCADE)  # whose gains can be interpolated
 CORNERS = {NOTCH_GAINS[0]: "notch_w", PREFILTER: "prefilter_w"}  # tan(pi f T_s) of a frequency in Hz
 MOST_POINTS = 100
 
@@ -71,11 +73,13 @@ class GainTable:
         Its values, ascending.
     gains : mapping of name to array, shape (n,)
         k_p, k_i, k_d, T_f, k_r and c at these; and those of a notch, a prefilter and a cascade, where there are such.
-    structure : {"pd", "pid", "cascade"}
+    structure : {"pd", "pid", "pid_dob", "cascade"}
     sample_time_s : float
         Seconds.
     speed : SpeedLoop, optional
         What a cascade's speed loop reads.
+    nominals : tuple of Nominal
+        The nominal plant of a pid_dob's observer at each point, the same but for its gain.
 
     Raises
     ------
@@ -103,6 +107,7 @@ class GainTable:
     structure: Structure
     sample_time_s: float
     speed: SpeedLoop | None = None
+    nominals: tuple[Nominal, ...] = ()
 
     def __post_init__(self) -> None:
         check_points(self.over, self.points)
@@ -116,8 +121,16 @@ class GainTable:
         for name, values in self.gains.items():
             if np.shape(values) != self.points.shape or not np.all(np.isfinite(values)):
                 raise ControlError(f"{name} of a schedule: give {self.points.size} finite numbers, one per point")
+        for nominal in self.nominals:
+            parts = zip(nominal.inverse, self.nominals[0].inverse[:-1], strict=False)
+            same = all(np.array_equal(a.num, b.num) and np.array_equal(a.den, b.den) for a, b in parts)
+            if not same or not np.array_equal(nominal.kept, self.nominals[0].kept) or nominal.kept[0]:
+                raise ControlError(
+                    "the observers of a schedule have different nominal plants, or one that follows the command at "
+                    "once, and what they keep would change its meaning from point to point; tune the schedule again"
+                )
         integrates = np.asarray(self.gains["k_i"]) > 0.0
-        if np.any(integrates) and not np.all(integrates):
+        if not self.nominals and np.any(integrates) and not np.all(integrates):
             at = ", ".join(f"{value:g}" for value in self.points[~integrates])
             raise ControlError(
                 f"k_i is 0 at {self.over} = {at} and not elsewhere: what was integrated would stay in the command "
@@ -129,7 +142,7 @@ class GainTable:
         optional = [name for name in (PREFILTER, PREFILTER_DAMPING) if name in self.gains]
         optional += NOTCH_GAINS if set(NOTCH_GAINS) & set(self.gains) else ()
         inner = () if self.speed is None else (*INNER_GAINS, *(("T_v",) if "T_v" in self.gains else ()))
-        return [*LAW_GAINS, *inner, *optional]
+        return [*LAW_GAINS, *inner, *optional, *(("T_q",) if self.nominals else ())]
 
     @property
     def order(self) -> StepOrder:
@@ -144,7 +157,7 @@ class GainTable:
     @property
     def integrates(self) -> bool:
         """Whether the law integrates."""
-        return self.structure != "pd" and bool(self.gains["k_i"][0] > 0.0)
+        return self.structure != "pd" and bool(np.any(self.gains["k_i"]))
 
     def find_stretch(self, value: float) -> tuple[int, float]:
         """Return the point below a value and the share of the way to the next; at the ends beyond them."""
@@ -166,10 +179,17 @@ class GainTable:
         i, t = self.find_stretch(value)
         return {name: float(row[i] + t * (row[i + 1] - row[i])) for name, row in {**self.columns, **more}.items()}
 
+    def find_gains(self, value: float) -> Gains:
+        """Return the gains at a value with what else the law is made of."""
+        numbers, observer = self.interpolate(value), None
+        if self.nominals:
+            nominal = self.nominals[0].scaled(self.find_numbers(value)[INVERSE_GAIN])
+            observer = DisturbanceObserver(nominal=nominal, T_q=numbers["T_q"])
+        return Gains.from_names(numbers, observer, self.speed)
+
     def law(self, value: float) -> Law:
         """Return the law while the variable stands at a value."""
-        gains = Gains.from_names(self.interpolate(value), speed=self.speed)
-        return gains.law(self.structure, self.sample_time_s).balanced()
+        return self.find_gains(value).law(self.structure, self.sample_time_s).balanced()
 
     def bound_change(self, low: float, high: float, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return what abs(C_y(s)/C_y(middle) - 1) stays below for every s from low to high, at frequencies in Hz.
@@ -178,7 +198,7 @@ class GainTable:
         """
         if np.any((self.points > low) & (self.points < high)):
             raise ControlError(f"a stretch from {low:g} to {high:g} has a point of the table in it; end it there")
-        if self.speed is not None or NOTCH_GAINS[0] in self.gains:
+        if self.speed is not None or self.nominals or NOTCH_GAINS[0] in self.gains:
             return np.full(f.size, np.inf)
         ts, half = self.sample_time_s, 0.5 * (high - low)
         first, last, middle = (self.interpolate(value) for value in (low, high, 0.5 * (low + high)))
@@ -204,16 +224,19 @@ def _find_order(table: GainTable) -> StepOrder:
         notch=NOTCH_GAINS[0] in table.gains,
         speed=table.speed,
         speed_integrates="T_v" in table.gains,
+        nominal=table.nominals[0] if table.nominals else None,
     )
 
 
 @lru_cache(maxsize=16)
 def _list_columns(table: GainTable) -> Mapping[str, Float[np.ndarray, " n"]]:
     """Return the rows of a table with its corners warped, once."""
-    return {
+    columns = {
         CORNERS.get(name, name): np.tan(np.pi * row * table.sample_time_s) if name in CORNERS else np.asarray(row)
         for name, row in table.gains.items()
     }
+    gains = [nominal.inverse_gain for nominal in table.nominals]
+    return columns | ({INVERSE_GAIN: np.array(gains)} if gains else {})
 
 
 def refuse_structure(structure: str) -> ControlError:

@@ -161,9 +161,10 @@ def make_runnable(
     at each if left out. `command`: name and unit of the input that is commanded. Raises ControlError: a number is out
     of range.
     """
+    # An observer sees the limited command: what winds up is the integral of the law without it.
     each = [
         realise(
-            table.law(point),
+            replace(table.find_gains(point), observer=None).law(table.structure, table.sample_time_s).balanced(),
             per_effort=per_effort,
             command_limit=limit,
             tracking_time_s=tracking_time_s,

@@ -271,8 +271,8 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
     """Return the gains of controllers at points. Raises ControlError: they cannot be interpolated; rates differ."""
     first = controllers[0]
     for point, controller in zip(points, controllers, strict=True):
-        gains, speed = controller.gains, controller.speed_loop
-        made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, speed=speed)
+        gains, speed, observer = controller.gains, controller.speed_loop, controller.observer
+        made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, observer, speed)
         if set(gains) != set(first.gains) or not made or not made.makes(controller.law, controller.spec.structure):
             raise ControlError(
                 f"the controller at {over} = {point:g} is more than its gains, or has other parts than that at "
@@ -294,6 +294,7 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
         structure=first.spec.structure,
         sample_time_s=first.sample_time_s,
         speed=first.speed_loop,
+        nominals=tuple(each.observer.nominal for each in controllers if each.observer is not None),
     )
 
 
@@ -305,8 +306,7 @@ def freeze(
     """
     plant, params = design[0], place_variable(*design, table.over, value)
     task = make_task(plant, plant.complete(params), spec, place_plants(others, table.over, value))
-    numbers, law = table.interpolate(value), table.law(value)
-    gains = Gains.from_names(numbers, speed=table.speed)
+    gains, law = table.find_gains(value), table.law(value)
 
     def describe(task: Task) -> Controller:
         loops = task.measure_law(
@@ -314,7 +314,7 @@ def freeze(
             filter_samples=gains.T_f / table.sample_time_s if gains.k_d else math.inf,
             integral_rad_s=gains.integral_rad_s if table.integrates else math.inf,
         )
-        return describe_law(task, law, loops, (plant, params), gains=numbers)
+        return describe_law(task, law, loops, (plant, params), gains=table.interpolate(value), observer=gains.observer)
 
     frozen = describe(task)
     band = frozen.achieved.bandwidth_hz

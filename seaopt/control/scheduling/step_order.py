@@ -42,11 +42,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from seaopt.control.laws.structures import PREFILTER_DAMPING, PREFILTER_ORDERS, PrefilterOrder, SpeedLoop
+import numpy as np
+
+from seaopt.control.laws.structures import PREFILTER_DAMPING, PREFILTER_ORDERS, Nominal, PrefilterOrder, SpeedLoop
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
 Numbers = Mapping[str, Any]
 SHARE = "anti_windup"  # T_s/(T_t + T_s), among the numbers of a place
+INVERSE_GAIN = "inverse_gain"  # of the nominal plant's inverse, there
 
 
 @record
@@ -59,6 +63,7 @@ class StepOrder:
     notch: bool = False
     speed: SpeedLoop | None = None  # of a cascade
     speed_integrates: bool = False
+    nominal: Nominal | None = None  # of an observer, but for the gain of its inverse
 
     @property
     def measured(self) -> int:
@@ -73,6 +78,14 @@ class StepOrder:
         if self.speed is not None:
             x |= {"position": readings[1]} if self.speed.differenced else {}
             x |= {"speed_integral": 0.0} if self.speed_integrates else {}
+        if self.nominal is not None:
+            x |= {"lag_1": 0.0, "lag_2": 0.0} | dict.fromkeys(self._list_efforts(), 0.0)
+            seen = readings[0]
+            for i, part in enumerate(self.nominal.inverse[:-1], start=1):
+                given, seen = seen, seen * float(np.sum(part.num) / np.sum(part.den))
+                later = 0.0
+                for number, (b, a) in reversed(list(enumerate(_pair_coefficients(part), start=1))):
+                    x[f"inverse_{i}_{number}"] = later = (b * given - a * seen) + later
         filters = {"prefilter": reference} if self.prefilter else {}
         if self.notch:
             filters |= {"notch_reference": reference} | {f"notch_{i}": y for i, y in enumerate(readings, start=1)}
@@ -80,17 +93,27 @@ class StepOrder:
             x |= {name: value} if self._is_first_order(name) else {f"{name}_band": 0.0, name: value}
         return x
 
+    def _list_efforts(self) -> list[str]:
+        """Return the names of the last efforts, the newest first."""
+        return [] if self.nominal is None else [f"effort_{i}" for i in range(1, self.nominal.kept.size)]
+
     def _is_first_order(self, name: str) -> bool:
         return name == "prefilter" and self.prefilter == PREFILTER_ORDERS[0]
 
     def continue_from(self, g: Numbers, effort: Any, reference: Any, readings: Sequence[Any]) -> dict[str, Any]:
         """Return the states at rest from which the next effort is one that was, where something integrates."""
         x = self.rest(reference, readings)
-        outer = "speed_integral" if self.speed_integrates else "integral"
+        outer, scale = "speed_integral" if self.speed_integrates else "integral", 1.0
+        if self.nominal is not None:  # both lags rest, or the second makes the effort where nothing else can
+            x |= dict.fromkeys(self._list_efforts(), effort)
+            lag = g["T_q"] + self.sample_time_s
+            gap = self._evaluate(g, x, reference, readings)[3]["lag_1"] * (lag / self.sample_time_s)
+            x |= {"lag_1": gap, "lag_2": gap if self.integrates else 0.0}
+            outer, scale = (outer, 1.0) if self.integrates else ("lag_2", lag / g["T_q"])
         if self.speed_integrates and self.integrates:  # what the speed loop integrates rests
             x["integral"] = -self._evaluate(g, x, reference, readings)[1]
         if outer in x:
-            x[outer] = effort - self._evaluate(g, x, reference, readings)[0]
+            x[outer] = (effort - self._evaluate(g, x, reference, readings)[0]) * scale
         return x
 
     def step(
@@ -108,6 +131,8 @@ class StepOrder:
             pull = inner * excess
         if self.integrates:
             after["integral"] = (x["integral"] + 2.0 * half) + pull
+        efforts = self._list_efforts()
+        after |= dict(zip(efforts, (applied, *(x[name] for name in efforts[:-1])), strict=False))
         return effort, applied, {name: after[name] for name in x}
 
     def _evaluate(
@@ -137,6 +162,8 @@ class StepOrder:
         if self.integrates:
             effort = (effort + x["integral"]) + half
         effort = effort + (g["k_d"] * alpha) * rate
+        if self.nominal is not None:
+            effort = effort + self._observe(g, x, after, y)
         if self.speed is None:
             return effort, 0.0, half, after
         (speed,) = further
@@ -147,6 +174,32 @@ class StepOrder:
         if self.speed_integrates:
             effort = (effort + (0.5 * ts / g["T_v"]) * into_speed) + x["speed_integral"]
         return effort, into_speed, half, after
+
+    def _observe(self, g: Numbers, x: Numbers, after: dict[str, Any], y: Any) -> Any:
+        """Return what an observer adds to the effort, and put down its next states."""
+        assert self.nominal is not None
+        for i, part in enumerate(self.nominal.inverse[:-1], start=1):
+            pairs = [*_pair_coefficients(part), (0.0, 0.0)]
+            names = [f"inverse_{i}_{number}" for number in range(1, len(pairs))]
+            seen = float(part.num[0]) * y + x[names[0]] if names else float(part.num[0]) * y
+            for name, (b, a), later in zip(names, pairs, (*names[1:], ""), strict=False):
+                after[name] = (b * y - a * seen) + x[later] if later else b * y - a * seen
+            y = seen
+        gap = -g[INVERSE_GAIN] * y
+        for weight, name in zip(self.nominal.kept[1:].tolist(), self._list_efforts(), strict=True):
+            gap = gap + weight * x[name] if weight else gap
+        lag = 1.0 / (g["T_q"] + self.sample_time_s)
+        short, pole = self.sample_time_s * lag, g["T_q"] * lag
+        after["lag_1"] = pole * x["lag_1"] + short * gap
+        after["lag_2"] = pole * x["lag_2"] + short * after["lag_1"]
+        return after["lag_2"]
+
+
+def _pair_coefficients(part: TransferFunction) -> list[tuple[float, float]]:
+    """Return numerator and denominator from the first power of q on, in pairs."""
+    count = max(part.num.size, part.den.size)
+    num, den = (np.pad(side, (0, count - side.size)).tolist() for side in (part.num, part.den))
+    return list(zip(num[1:], den[1:], strict=True))
 
 
 def _filter(x: Numbers, after: dict[str, Any], name: str, u: Any, w: Any, damping: Any) -> tuple[Any, Any]:

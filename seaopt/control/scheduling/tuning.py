@@ -72,7 +72,8 @@ def tune_schedule(
     params : Fit or ParameterSet
         Its parameters.
     spec : ControllerSpec
-        Limits, the same at every point; the structure "pd", "pid" or "cascade", with notch and prefilter or without.
+        Limits, the same at every point; the structure "pd", "pid", "pid_dob" or "cascade", with or without a notch and
+        a prefilter.
     over : str
         The variable: a state that is measured, such as an angle, at which the plants are linearised; or a parameter
         that is known while the law runs, such as a load.
@@ -126,9 +127,11 @@ def tune_schedule(
         make_task(plant, plant.complete(at_point), point_spec, at_points, draws)
         for (at_point, at_points), point_spec in zip(placed, _specify(spec, places, bandwidths_hz), strict=True)
     ]
+    tasks = [_share_nominal(task, tasks[len(tasks) // 2]) for task in tasks]
     controllers: list[Controller] = []
     for (at_point, at_points), task, (x, loops) in zip(placed, tasks, _choose_chain(tasks, progress), strict=True):
-        if _breaks_limits(task, loops):  # what blocks, and what is possible instead, is for the tuner to say
+        # What blocks, and what is possible instead, is for the tuner to say; its observer would have another plant.
+        if task.nominal is None and _breaks_limits(task, loops):
             controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws))
         else:
             controllers.append(make_controller(task, x, loops, (plant, at_point)))
@@ -177,6 +180,14 @@ def _specify(spec: ControllerSpec, points: Any, bandwidths_hz: Sequence[float] |
             f"bandwidths_hz has {len(bandwidths_hz)} values and points {len(points)}; give one per point"
         )
     return [replace(spec, bandwidth_hz=band) for band in bandwidths_hz]
+
+
+def _share_nominal(task: Task, other: Task) -> Task:
+    """Return a task whose observer has another's nominal plant, but for its gain: the same states at every point."""
+    if task.nominal is None or other.nominal is None:
+        return task
+    gain = other.nominal.inverse_gain * task.nominal.static_inverse / other.nominal.static_inverse
+    return replace(task, nominal=other.nominal.scaled(gain))
 
 
 def _choose_chain(tasks: Sequence[Task], progress: Progress) -> Chain:

@@ -205,7 +205,7 @@ class TestTuneSchedule:
         stand, _, values = plants
         spec = so.ControllerSpec(measured="tau", bandwidth_hz=30)
         for changed, over, what in (
-            ({"structure": "pid_dob"}, "phi", "pid_dob"),
+            ({"structure": "custom"}, "phi", "custom"),
             ({}, "ph", "phi"),
             ({}, "delay_s", "delay"),
         ):

@@ -102,7 +102,7 @@ def test_the_change_of_a_law_without_a_rule_for_it_is_not_bounded(name):
     assert np.all(np.isinf(change)) == (speed is not None or "notch_width" in gains)
 
 
-@pytest.fixture(scope="module", params=["notch and prefilter", "cascade"])
+@pytest.fixture(scope="module", params=["notch and prefilter", "cascade", "observer", "observer and notch"])
 def schedule(request):
     """Return a tuned schedule."""
     if request.param == "cascade":
@@ -112,10 +112,12 @@ def schedule(request):
             current_limit_A=2.0, prefilter=Prefilter(),
         )  # fmt: skip
         return tune_schedule(plant, plant.defaults, spec, over, points)
+    parts = {"structure": "pid_dob"} if "observer" in request.param else {"prefilter": Prefilter(order="second_order")}
+    if "notch" in request.param:
+        parts["notch"] = Notch(frequency_hz=120.0, width=0.4, depth=0.5)
     spec = so.ControllerSpec(
-        measured="tau", bandwidth_hz=30, max_sensitivity=1.6, reserve=0.03, current_limit_A=5.0,
-        notch=Notch(frequency_hz=120.0, width=0.4, depth=0.5), prefilter=Prefilter(order="second_order"),
-    )  # fmt: skip
+        measured="tau", bandwidth_hz=30, max_sensitivity=1.6, reserve=0.03, current_limit_A=5.0, **parts
+    )
     stand, _, values = read_knee()
     return tune_schedule(stand, values, spec, "phi", (0.0, 0.5))
 
@@ -131,6 +133,62 @@ def test_on_the_plant_it_is_the_linear_loop_of_its_point(schedule):
     )  # fmt: skip
     expected, _ = controller.close(plant, values).simulate(references)
     np.testing.assert_allclose(run.force, expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+def test_an_observer_sees_the_limited_command(schedule):
+    """Q and Q/P_n multiplied out, as difference equations of the test's own, beside those of the pid"""
+    controller, point = schedule.controllers[0], schedule.points[0]
+    if controller.observer is None or schedule.table.order.notch:
+        pytest.skip("another law")
+    law, g, n = schedule.runnable(), controller.gains, 900
+    q, inverse = controller.observer.filters(TS)
+    limit, rng = law.limit / law.per_effort, np.random.default_rng(8)
+    references, readings = rng.normal(size=n) + 30.0 * (np.arange(n) < 450), rng.normal(size=n)
+    share = law.anti_windup[0]
+
+    def filtered(part, given, before, k):
+        top = sum(b * given[k - i] for i, b in enumerate(part.num) if k >= i and b)
+        return top - sum(a * before[k - i] for i, a in enumerate(part.den) if 0 < i <= k)
+
+    applied, known, seen = np.zeros(n), np.zeros(n), np.zeros(n)
+    total = x_r = x_y = 0.0
+    state, commands = law.reset(place=point), np.zeros(n)
+    for k, (r, y) in enumerate(zip(references, readings, strict=True)):
+        half = g["k_i"] * TS * (r - y) / 2
+        rate = (g["c"] * (r - x_r) - (y - x_y)) / (g["T_f"] + TS)
+        v = g["k_r"] * r - g["k_p"] * y + total + half + g["k_d"] * rate
+        known[k], seen[k] = filtered(q, applied, known, k), filtered(inverse, readings, seen, k)
+        effort = v + known[k] - seen[k]
+        applied[k] = min(max(effort, -limit), limit)
+        total += 2 * half + share * (applied[k] - effort)
+        x_r += TS / (g["T_f"] + TS) * (r - x_r)
+        x_y += TS / (g["T_f"] + TS) * (y - x_y)
+        commands[k], state = law.step(state, float(r), float(y), point)
+    np.testing.assert_allclose(commands, applied * law.per_effort, atol=1e-9 * law.limit)
+    assert 0.1 < np.mean(np.abs(commands) == law.limit) < 0.9
+
+
+def test_standing_still_a_tuned_one_is_its_controllers_law(schedule):
+    """Between the points too, an observer's with the gain of its nominal plant on a line."""
+    law, rng = schedule.runnable(limit=np.inf), np.random.default_rng(4)
+    low, high = schedule.points
+    for place in (low, 0.6 * low + 0.4 * high):
+        plain = realise(schedule.at(place).law, per_effort=law.per_effort)
+        state, other, pairs = law.reset(place=place), plain.reset(), np.zeros((800, 2))
+        for pair in pairs:
+            r, y = rng.normal(), 0.3 * rng.normal(size=law.table.order.measured)
+            pair[0], state = law.step(state, r, y, place)
+            pair[1], other = plain.step(other, r, y if y.size > 1 else float(y[0]))
+        np.testing.assert_allclose(*pairs.T, atol=1e-11 * np.max(np.abs(pairs)))
+
+
+def test_a_tuned_one_rests_where_it_is_reset(schedule):
+    law, resting = schedule.runnable(), np.zeros(schedule.table.order.measured)
+    resting[0] = 2.0
+    state = law.reset(2.0, resting, schedule.points[0], 1.25)
+    for _ in range(40):
+        command, state = law.step(state, 2.0, resting, schedule.points[0])
+        assert command == pytest.approx(1.25, rel=1e-9)
 
 
 def test_every_limit_holds_at_the_points_and_between(schedule):
