@@ -95,25 +95,32 @@ class CompiledSchedule:
         assert done.returncode == 0, done.stderr
         real = ctypes.c_double if precision == "double" else ctypes.c_float
 
+        law = schedule.runnable()
+        heat = (
+            *((name, ctypes.c_double) for name in ("rise_winding", "rise_case", "limit")),
+            ("derated", ctypes.c_int),
+        )
+        gate = (("refused", ctypes.c_ulong), ("measurement_Nm", real), ("known", ctypes.c_int))
+
         class Law(ctypes.Structure):
             _fields_ = (
-                ("x", real * len(schedule.runnable().reset().x)), ("place", real), ("current_A", real),
-                ("held", ctypes.c_ulong), ("misplaced", ctypes.c_ulong), ("status", ctypes.c_int),
+                ("x", real * len(law.reset().x)), ("current_A", real), ("held", ctypes.c_ulong),
+                ("status", ctypes.c_int), ("place", real), ("misplaced", ctypes.c_ulong),
+                *(heat if options.get("derate") else ()),
+                *(gate if options.get("gate") else ()),
             )  # fmt: skip
 
-        self.law, self.library, count = Law(), ctypes.CDLL(str(library)), schedule.table.order.measured
-        read = real if count == 1 else ctypes.POINTER(real)
-        self.pack = (lambda y: float(np.ravel(y)[0])) if count == 1 else (lambda y: (real * count)(*y))
-        self.library.law_step.argtypes = [ctypes.POINTER(Law), real, read, real]
+        self.law, self.library = Law(), ctypes.CDLL(str(library))
+        self.library.law_step.argtypes = [ctypes.POINTER(Law), *[real] * (2 + law.measured)]
         self.library.law_step.restype = real
-        self.library.law_reset.argtypes = [ctypes.POINTER(Law), real, read, real, real]
+        self.library.law_reset.argtypes = [ctypes.POINTER(Law), *[real] * (3 + law.measured)]
         self.library.law_init(ctypes.byref(self.law))
 
     def step(self, reference, measurement, place):
-        return self.library.law_step(ctypes.byref(self.law), reference, self.pack(measurement), place)
+        return self.library.law_step(ctypes.byref(self.law), reference, *np.ravel(measurement), place)
 
     def reset(self, reference, measurement, place, command):
-        self.library.law_reset(ctypes.byref(self.law), reference, self.pack(measurement), place, command)
+        self.library.law_reset(ctypes.byref(self.law), reference, *np.ravel(measurement), place, command)
 
 
 class CompiledMPC(LoadedMPC):

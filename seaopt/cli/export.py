@@ -48,8 +48,8 @@ def export_controller(
     if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
-        options["derate"] = read_guard(content, derate_margin_K) or True
-    options["gate"] = choose_gate(content, gate or {}, options)
+        options["derate"] = read_guard(_take_first(content), derate_margin_K) or True
+    options["gate"] = choose_gate(_take_first(content), gate or {}, options)
     failed = _list_broken_requirements(path, certificate)
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
@@ -91,6 +91,11 @@ def export_controller(
     return met
 
 
+def _take_first(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a controller.json as it is, and of a schedule its first controller, whose guards are those of all."""
+    return content["controllers"][0] if is_schedule(content) else content
+
+
 def choose_gate(
     content: Mapping[str, Any], gate: Mapping[str, Any], options: Mapping[str, Any]
 ) -> PlausibilityGate | Literal[False] | None:
@@ -110,10 +115,6 @@ def choose_gate(
         low, high = (float(end) for end in ends.split(":"))
     except ValueError:
         raise ProblemError(f"--gate {ends}: is not a range; type --gate LOW:HIGH, such as -4000:4000") from None
-    if is_schedule(content):
-        raise ProblemError(
-            "--gate: is not exported with a schedule; leave it out, and check the reading before the step"
-        )
     try:
         spec = GateSpec(range_N=(low, high), **typed)
     except ControlError as error:
@@ -158,7 +159,7 @@ def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -
         return ""
     from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
-    stored = read_controller(content["controllers"][0] if is_schedule(content) else content)
+    stored = read_controller(_take_first(content))
     return find_raised_limit(stored["command"], stored["spec"], limits[0])
 
 

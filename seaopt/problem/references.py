@@ -101,8 +101,6 @@ def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         ("controller.prefilter", law.prefilter is not None),
         ("controller.link_feedforward", law.link_feedforward is not False),
         ("controller.compensate", bool(law.compensate)),
-        ("controller.gate", law.gate is not None),
-        ("controller.derate", law.derate),
         ("impedance", table.impedance is not None),
         ("robustness.retune", robustness is not None and robustness.retune),
         ("expect.controller", expect is not None and expect.controller is not None),

@@ -191,7 +191,7 @@ def tune_problem(
     spec, draws = settle_delays(problem.spec, problem.design_plant, source)[0], problem.draws(source)
     values, schedule, table = problem.values(source), problem.schedule, problem.robustness
     if schedule is not None:
-        return tune_schedule(
+        tuned = tune_schedule(
             problem.design_plant,
             values,
             spec,
@@ -202,6 +202,7 @@ def tune_problem(
             draws=draws,
             progress=progress,
         )
+        return _guard_schedule(problem, tuned)
     rounds = table.retune
     if not rounds:
         tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
@@ -254,13 +255,7 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
         else:
             impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
         controller = add_impedance(controller, plant, values, impedance, name=outer.plant)
-    derate = problem.controller_table.derate
-    if derate and controller.heat_guard is None:
-        raise ProblemError(
-            f"{problem.source}: controller.derate: nothing is known of the motor's heat; give the design plant the "
-            "part thermal and a current to command, or leave it out"
-        )
-    controller = replace(controller, gate=_make_gate(problem, controller), derate=derate)
+    controller = _guard(problem, controller)
     tables = problem.controller_table.compensation
     kinds = {"friction": CompensateFriction, "gravity": CompensateGravity, "ripple": CompensateRipple}
     terms = {name: make_record(kind, table) for name, kind in kinds.items() if (table := getattr(tables, name))}
@@ -268,6 +263,25 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
         return controller
     link = tables.gravity and tables.gravity.plant
     return add_compensation(controller, **terms, link=(problem.plants[link], values) if link else None)
+
+
+def _guard(problem: Problem, controller: Controller) -> Controller:
+    """Return a controller with the problem's gate and heat guard."""
+    derate = problem.controller_table.derate
+    if derate and controller.heat_guard is None:
+        raise ProblemError(
+            f"{problem.source}: controller.derate: nothing is known of the motor's heat; give the design plant the "
+            "part thermal and a current to command, or leave it out"
+        )
+    return replace(controller, gate=_make_gate(problem, controller), derate=derate)
+
+
+def _guard_schedule(problem: Problem, schedule: ScheduledController) -> ScheduledController:
+    """Return a schedule with the problem's guards, the gate that of the point where the plant moves the furthest."""
+    guarded = [_guard(problem, controller) for controller in schedule.controllers]
+    gates = [controller.gate for controller in guarded if controller.gate is not None]
+    widest = max(gates, key=lambda gate: gate.max_step_N, default=None)
+    return replace(schedule, controllers=tuple(replace(each, gate=widest) for each in guarded))
 
 
 def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> PlausibilityGate | None:

@@ -43,6 +43,20 @@ def test_tune_writes_a_schedule_that_export_takes(knee, seaopt):
 
 
 @pytest.mark.slow
+def test_a_schedule_has_the_gate_of_its_file_at_every_point_and_in_c(knee, seaopt, text):
+    gated = text.replace("[controller.schedule]", "[controller.gate]\nrange_N = [-200, 200]\n\n[controller.schedule]")
+    (knee / "knee.toml").write_text(gated, encoding="utf-8")
+    assert seaopt("tune", "knee.toml").returncode == 0
+    content = json.loads((knee / "out" / "schedule.json").read_text(encoding="utf-8"))
+    first, second = (each["guards"]["gate"] for each in content["controllers"])
+    assert first == second and first["range_N"] == [-200.0, 200.0]
+    assert seaopt("export", "out", "--c", "c", "--name", "knee").returncode == 0
+    assert "A reading is believed" in (knee / "c" / "knee.h").read_text(encoding="utf-8")
+    assert seaopt("export", "out", "--c", "d", "--name", "knee", "--no-gate").returncode == 0
+    assert "A reading is believed" not in (knee / "d" / "knee.h").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
 def test_a_whole_run_is_met_and_its_report_has_the_schedule(knee, seaopt):
     out = seaopt("run", "knee.toml")
     assert out.returncode == 0, out.stdout

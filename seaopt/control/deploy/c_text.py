@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from seaopt.control.laws.command import Command
 from seaopt.control.laws.delay import describe_delays
 from seaopt.errors import ControlError
 
@@ -85,6 +86,11 @@ def _make_environment() -> Environment:
         undefined=StrictUndefined,
         loader=PackageLoader("seaopt.control.deploy"),
     )
+
+
+def name_unit(command: Command) -> str:
+    """Return the unit of the reference as a part of names in C."""
+    return re.sub("[^A-Za-z0-9]+", "_per_", command.reference_unit.replace(" ", "")).strip("_")
 
 
 def describe_timing(stored: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,9 +9,8 @@ about 6e-8 abs(x)/(k_i T_s) (x: the integral's part of the force): take double w
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal
@@ -26,6 +25,7 @@ from seaopt.control.deploy.c_text import (
     describe_timing,
     identifier,
     literal,
+    name_unit,
     render,
     strip_markup,
 )
@@ -42,6 +42,7 @@ from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SI
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, FileError, require_type
 from seaopt.files import check_folder, write_text
@@ -76,7 +77,7 @@ def export(
     ----------
     controller : Controller, ScheduledController or mapping
         The controller, or the content of its controller.json; or of a schedule.json, of which NAME.h and NAME.c are
-        written, without gate and derating (`seaopt.control.deploy.schedule_export`).
+        written (`seaopt.control.deploy.schedule_export`).
     folder : path
         For NAME.h, NAME.c, NAME_gains.h and NAME_gains.m; created if it does not exist.
     precision : {"double", "float"}
@@ -131,40 +132,42 @@ def export(
     if isinstance(controller, Mapping) and fit_met is None:
         fit_met = controller.get("fit_met", True) is True
     content = controller.to_dict() if isinstance(controller, ScheduledController) else controller
+    law: RunnableLaw | RunnableSchedule
     if isinstance(content, Mapping) and is_schedule(content):
-        if gate or derate:
-            raise ControlError(
-                f"{'gate' if gate else 'derate'}: is not exported with a schedule; leave it out, and check "
-                "the reading, or lower the command's limit, before the step"
-            )
         law, stored = read_runnable(content, limit, tracking_time_s)
-        templates, missed = SCHEDULE_TEMPLATES, "; ".join(content["broken"])
-        met, kind, words = content["feasible"], "schedule", describe_schedule(content, law, stored, precision)
-        numbers: dict[str, dict[str, Any]] = {}
+        figures, heat = list[str](), read_guard(content["controllers"][0])
+        templates, missed, met, kind = SCHEDULE_TEMPLATES, "; ".join(content["broken"]), content["feasible"], "schedule"
     else:
         stored, figures, heat = _read(content)
-        derate = stored["derate"] if derate is None else derate
         templates, missed, met, kind = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"
-        heat = derate if isinstance(derate, HeatGuard) else heat
-        if derate and heat is None:
-            raise ControlError(
-                "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that "
-                "is commanded a current"
-            )
-        command = stored["command"]
         law = realise(
             stored["law"],
-            per_effort=command.per_effort,
-            command_limit=choose_limit(command, stored["spec"], limit),
-            command=(command.input, command.unit),
+            per_effort=stored["command"].per_effort,
+            command_limit=choose_limit(stored["command"], stored["spec"], limit),
+            command=(stored["command"].input, stored["command"].unit),
             tracking_time_s=tracking_time_s,
-            gate=stored["gate"] if gate is None else (gate or None),
-            heat=heat if derate else None,
             compensation=stored["compensation"],
         )
-        words = _describe(stored, law) | {"achieved": figures}
-        writers = {".m": repr, ".h": literal(precision), ".c": literal(precision)}
-        numbers = {suffix: _numbers(stored, law, write, precision) for suffix, write in writers.items()}
+    heat = derate if isinstance(derate, HeatGuard) else heat
+    derate = stored["derate"] if derate is None else derate
+    if derate and heat is None:
+        raise ControlError(
+            "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that "
+            "is commanded a current"
+        )
+    law = replace(law, gate=stored["gate"] if gate is None else (gate or None), heat=heat if derate else None)
+    words = _describe(stored, law) | {
+        "achieved": figures,
+        "feasible": met,
+        "kind": kind,
+        "blocking": strip_markup(missed),
+    }
+    writers = {".m": repr, ".h": literal(precision), ".c": literal(precision)}
+    numbers = {
+        suffix: _write_numbers(stored, law, write, precision)
+        | (describe_schedule(law, stored, write) if isinstance(law, RunnableSchedule) else _numbers(stored, law, write))
+        for suffix, write in writers.items()
+    }
     if not met and not allow_infeasible:
         raise ControlError(f"the {kind} misses {missed}; tune one that does not, or allow an infeasible one")
     context = words | {
@@ -242,7 +245,7 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
     return [f"{whence}: {', '.join(parts) or 'nothing that was measured'}."]
 
 
-def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
+def _describe(stored: Mapping[str, Any], law: RunnableLaw | RunnableSchedule) -> dict[str, Any]:
     """Return what the files say in words."""
     command = stored["command"]
     return {
@@ -252,15 +255,11 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
         "command": {name: strip_markup(getattr(command, name)) for name in ("word", "unit", "effort_unit")},
         "symbol": command.symbol,
         "LIMIT": command.limit_symbol,
-        "suffix": re.sub("[^A-Za-z0-9]+", "_per_", command.reference_unit.replace(" ", "")).strip("_"),
+        "suffix": name_unit(command),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
         **describe_timing(stored),
-        "feasible": stored["met"],
-        "blocking": strip_markup(join_labels(stored["active_constraints"])),
         "limited": math.isfinite(law.command_limit),
-        "order": law.c.size,
-        "storage": max(law.c.size, 1),
-        "integrators": law.integrators,
+        "scheduled": isinstance(law, RunnableSchedule),
         "gated": law.gate is not None,
         "heated": law.heat is not None,
         "outer_units": {}
@@ -286,34 +285,14 @@ def _list_signals(stored: Mapping[str, Any]) -> tuple[str, ...]:
     return stored["reads"] or list_names(stored["spec"].measured)
 
 
-def _numbers(
-    stored: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str], precision: Precision
+def _write_numbers(
+    stored: Mapping[str, Any], law: RunnableLaw | RunnableSchedule, number: Callable[[float], str], precision: Precision
 ) -> dict[str, Any]:
-    """Return the numbers as text; a law without states is given one that stays zero."""
-
-    def row(values: Iterable[float]) -> str:
-        return ", ".join(number(float(value)) for value in values) or number(0.0)
-
-    per_reference, per_measurement = law.rest()
-    transfer_functions = multiply_out(stored["law"], stored["link"])
-    b, d, rest = (
-        np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
-    )
+    """Return what surrounds any law as text: what it reads, limits, guards, terms, outer loop."""
     others = [strip_markup(name) for name in _list_signals(stored)[1:]]
-    added = law.compensation or Compensation(sample_time_s=law.sample_time_s)
-    at_rest = added.gravity, added.ripple if law.integrators else None  # without an integral no effort is set
-    units = name_gain_units(stored["command"])
+    added = stored["compensation"] or Compensation(sample_time_s=law.sample_time_s)
     largest = float(LARGEST_NUMBER[precision])
     return {
-        "a": [row(values) for values in law.a] or [number(0.0)],
-        "b_reference": row(law.b_reference),
-        "b_measurement": row(b[0]),
-        "c": row(law.c),
-        "d_reference": number(law.d_reference),
-        "d_measurement": number(float(d[0, 0])),
-        "anti_windup": row(law.anti_windup),
-        "rest_reference": row(per_reference),
-        "rest_measurement": row(rest[0]),
         "more": [
             {
                 "output": name,
@@ -321,11 +300,8 @@ def _numbers(
                 "symbol": f"read_{name}",
                 "argument": f"{name}_given",
                 "minus": f" - C_{name} {name}",
-                "b": row(b[i]),
-                "d": number(float(d[i, 0])),
-                "rest": row(rest[i]),
             }
-            for i, name in enumerate(map(identifier, others), start=1)
+            for name in map(identifier, others)
         ],
         "largest": number(LARGEST),
         "effort_limit": number(min(law.force_limit_N, largest)),
@@ -337,11 +313,6 @@ def _numbers(
         "heat": {} if law.heat is None else {name: repr(value) for name, value in asdict(law.heat).items()},
         "hottest": "" if law.heat is None else f"{law.heat.ambient + law.heat.allowed_rise:g}",
         "ambient": "" if law.heat is None else f"{law.heat.ambient:g}",
-        "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
-        "gains": [
-            {"name": identifier(key), "value": number(float(value)), "unit": units.get(key, "-")}
-            for key, value in stored["gains"].items()
-        ],
         "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
         "friction": {} if added.friction is None else _write_friction(added.friction, added.sample_time_s, number),
         "gravity": {} if added.gravity is None else _write_gravity(added.gravity, number),
@@ -349,15 +320,55 @@ def _numbers(
         "further": [
             {"output": name, "symbol": f"read_{identifier(name)}"} for name in added.reads if name not in others
         ],
+    }
+
+
+def _numbers(stored: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str]) -> dict[str, Any]:
+    """Return the numbers of one law as text; a law without states is given one that stays zero."""
+
+    def row(values: Iterable[float]) -> str:
+        return ", ".join(number(float(value)) for value in values) or number(0.0)
+
+    per_reference, per_measurement = law.rest()
+    transfer_functions = multiply_out(stored["law"], stored["link"])
+    b, d, rest = (
+        np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
+    )
+    others = list(map(identifier, _list_signals(stored)[1:]))
+    added = law.compensation or Compensation(sample_time_s=law.sample_time_s)
+    at_rest = added.gravity, added.ripple if law.integrators else None  # without an integral no effort is set
+    units = name_gain_units(stored["command"])
+    return {
+        "order": law.c.size,
+        "storage": max(law.c.size, 1),
+        "integrators": law.integrators,
+        "a": [row(values) for values in law.a] or [number(0.0)],
+        "b_reference": row(law.b_reference),
+        "b_measurement": row(b[0]),
+        "c": row(law.c),
+        "d_reference": number(law.d_reference),
+        "d_measurement": number(float(d[0, 0])),
+        "anti_windup": row(law.anti_windup),
+        "rest_reference": row(per_reference),
+        "rest_measurement": row(rest[0]),
+        "columns_of": {
+            name: {"b": row(b[i]), "d": number(float(d[i, 0])), "rest": row(rest[i])}
+            for i, name in enumerate(others, start=1)
+        },
+        "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
+        "gains": [
+            {"name": identifier(key), "value": number(float(value)), "unit": units.get(key, "-")}
+            for key, value in stored["gains"].items()
+        ],
         "resets": [
             f"read_{identifier(name)}"
             for name in dict.fromkeys(term.reads for term in at_rest if term is not None)
-            if name not in others
+            if identifier(name) not in others
         ],
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
             for key, tf in zip(
-                ("reference", "measurement", *(f"measurement_{identifier(name)}" for name in others)),
+                ("reference", "measurement", *(f"measurement_{name}" for name in others)),
                 transfer_functions,
                 strict=True,
             )

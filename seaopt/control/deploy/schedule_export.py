@@ -8,16 +8,14 @@ finite is replaced by the last that was, or by the table's `fallback` where ther
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from seaopt.control.deploy.c_text import LARGEST_NUMBER, Precision, describe_timing, identifier, literal, strip_markup
+from seaopt.control.deploy.c_text import identifier, name_unit, strip_markup
 from seaopt.control.deploy.trace import Term, Trace
 from seaopt.control.laws.command import name_gain_units
-from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.realisation import choose_limit
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.loops.sampled_plant import list_names
@@ -27,7 +25,7 @@ from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
 from seaopt.control.scheduling.step_order import SHARE
 from seaopt.errors import FileError
 
-SCHEDULE_TEMPLATES = {"{}.h": "schedule.h.jinja", "{}.c": "schedule.c.jinja"}
+SCHEDULE_TEMPLATES = {"{}.h": "law.h.jinja", "{}.c": "law.c.jinja"}
 WARPED = "tan(pi f T)"  # the unit of a corner in the table, in words
 
 
@@ -75,29 +73,17 @@ def read_runnable(
 
 
 def describe_schedule(
-    content: Mapping[str, Any], law: RunnableSchedule, first: Mapping[str, Any], precision: Precision
+    law: RunnableSchedule, first: Mapping[str, Any], number: Callable[[float], str]
 ) -> dict[str, Any]:
-    """Return words and numbers of the files."""
-    command, spec, table = first["command"], first["spec"], law.table
-    number, largest = literal(precision), float(LARGEST_NUMBER[precision])
-    units = name_gain_units(command) | dict.fromkeys(CORNERS.values(), WARPED)
+    """Return words and numbers of the table, and the step traced."""
+    table = law.table
+    units = name_gain_units(first["command"]) | dict.fromkeys(CORNERS.values(), WARPED)
     rows = {**table.columns, SHARE: law.anti_windup}
-    most = law.limit / law.per_effort
+    signals = [f"read_{identifier(name)}" for name in (first["reads"] or list_names(first["spec"].measured))[1:]]
     return {
-        **_trace(law, list(rows), number),
-        "structure": table.structure,
-        "measured": strip_markup(", ".join(list_names(spec.measured))),
-        "effort": command.mechanics.word,
-        "command": {key: strip_markup(getattr(command, key)) for key in ("word", "unit", "effort_unit")},
-        "symbol": command.symbol,
-        "LIMIT": command.limit_symbol,
-        "per_effort_unit": command.per_effort_unit,
-        "rate_hz": f"{1.0 / table.sample_time_s:.10g}",
-        **describe_timing(first),
-        "feasible": content["feasible"],
-        "broken": [strip_markup(limit) for limit in content["broken"]],
-        "limited": math.isfinite(law.limit),
-        "integrates": table.integrates or "T_v" in table.gains,
+        **_trace(law, f"reference_{name_unit(first['command'])}", list(rows), signals, number),
+        "integrators": table.integrates or "T_v" in table.gains,
+        "resets": (),
         "over": strip_markup(table.over),
         "over_unit": strip_markup(table.unit),
         "place": f"at_{identifier(table.over)}",
@@ -108,39 +94,35 @@ def describe_schedule(
         "columns": [f"{key}{f' [{units[key]}]' if key in units else ''}" for key in rows],
         "rows": [", ".join(number(float(row[i])) for row in rows.values()) for i in range(table.points.size)],
         "fallback": number(law.fallback),
-        "period": number(table.sample_time_s),
-        "largest": number(LARGEST),
-        "effort_limit": number(min(most, largest)),
-        "command_limit": number(min(law.limit, largest)),
-        "per_effort": number(law.per_effort),
     }
 
 
-def _trace(law: RunnableSchedule, columns: list[str], number: Callable[[float], str]) -> dict[str, Any]:
+def _trace(
+    law: RunnableSchedule, asked: str, columns: list[str], signals: list[str], number: Callable[[float], str]
+) -> dict[str, Any]:
     """Return step and reset as lines of C, and what they are given and keep."""
-    order, count = law.table.order, law.table.order.measured
-    states = list(order.rest(0.0, [0.0] * count))
+    order = law.table.order
+    states = list(order.rest(0.0, [0.0] * order.measured))
 
-    def begin() -> tuple[Trace, dict[str, Term], dict[str, Term], Term, list[Term]]:
+    def begin(reference: str, reading: str) -> tuple[Trace, dict[str, Term], dict[str, Term], Term, list[Term]]:
         trace = Trace(number)
         gains = {name: Term(trace, f"g[{i}]") for i, name in enumerate(columns)}
         x = {name: Term(trace, f"law->x[{i}]") for i, name in enumerate(states)}
-        readings = ["measurement"] if count == 1 else [f"measurement[{i}]" for i in range(count)]
-        return trace, gains, x, Term(trace, "reference"), [Term(trace, text) for text in readings]
+        return trace, gains, x, Term(trace, reference), [Term(trace, text) for text in (reading, *signals)]
 
-    trace, gains, x, reference, readings = begin()
+    trace, gains, x, reference, readings = begin(asked, "reading")
     effort, applied, after = order.step(
-        gains, x, reference, readings, lambda effort: trace.keep(f"limited({effort.text}, EFFORT_LIMIT)", [effort.text])
+        gains, x, reference, readings, lambda effort: trace.keep(f"limited({effort.text}, most)", [effort.text])
     )
     results = [trace.write(value) for value in (effort, applied, *after.values())]
     step = trace.list_needed(results)
-    trace, gains, x, reference, readings = begin()
+    trace, gains, x, reference, readings = begin("reference", "measurement")
     start = order.continue_from(gains, Term(trace, "effort"), reference, readings)
     starts = [trace.write(value) for value in start.values()]
     return {
+        "order": len(states),
+        "storage": len(states),
         "states": states,
-        "several": count > 1,
-        "signals": count,
         "step_lines": step,
         "unlimited": results[0],
         "applied": results[1],

@@ -16,11 +16,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.laws.plausibility import LARGEST, is_number
+from seaopt.control.laws.plausibility import LARGEST, GateState, PlausibilityGate, is_number
 from seaopt.control.laws.realisation import Reading, RunnableLaw, realise
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.step_order import SHARE
 from seaopt.errors import ControlError, require_number
+from seaopt.plants.motor.heat_guard import COLD, HeatGuard
 from seaopt.records import record
 from seaopt.units import show_command
 
@@ -41,6 +42,10 @@ class ScheduleState:
         Samples in a row that were not used because a number in them was not finite.
     misplaced : int
         Samples in a row without a finite scheduling variable.
+    gate : GateState
+        What the plausibility gate, where there is one, has seen.
+    heat : (float, float)
+        Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
     """
 
     x: Mapping[str, float]
@@ -48,6 +53,8 @@ class ScheduleState:
     command: float = 0.0
     held: int = 0
     misplaced: int = 0
+    gate: GateState = GateState()
+    heat: tuple[float, float] = COLD
 
 
 @record(eq=False)
@@ -68,6 +75,8 @@ class RunnableSchedule:
         The command's largest magnitude, in its unit; infinite where there is no limit.
     command : (str, str)
         Name and unit of the input that is commanded.
+    gate, heat : PlausibilityGate, HeatGuard, optional
+        As those of `seaopt.control.laws.realisation.RunnableLaw`.
     """
 
     table: GainTable
@@ -76,6 +85,28 @@ class RunnableSchedule:
     per_effort: float
     limit: float
     command: tuple[str, str] = ("I", "A")
+    gate: PlausibilityGate | None = None
+    heat: HeatGuard | None = None
+
+    @property
+    def measured(self) -> int:
+        """How many signals it reads, besides the scheduling variable."""
+        return self.table.order.measured
+
+    @property
+    def sample_time_s(self) -> float:
+        """Of the table."""
+        return self.table.sample_time_s
+
+    @property
+    def command_limit(self) -> float:
+        """The limit, by the name that `RunnableLaw` has for it."""
+        return self.limit
+
+    @property
+    def force_limit_N(self) -> float:
+        """The effort at the limit."""
+        return self.limit / self.per_effort
 
     def __repr__(self) -> str:
         table = self.table
@@ -116,10 +147,11 @@ class RunnableSchedule:
         if not abs(command) <= self.limit:
             limit = show_command(self.limit, *self.command)
             raise ControlError(f"command = {command:g} is above the limit of {limit}; lower it")
+        seen = self.gate.start(readings[0]) if self.gate is not None and measurement is not None else GateState()
         missing = not is_number(place)
         at = self.fallback if missing else place
         x = order.continue_from(self.table.find_numbers(at), command / self.per_effort, reference, readings)
-        return ScheduleState(x=x, place=at, command=command, misplaced=int(missing))
+        return ScheduleState(x=x, place=at, command=command, misplaced=int(missing), gate=seen)
 
     def step(
         self, state: ScheduleState, reference: float, measurement: Reading, place: float
@@ -127,23 +159,36 @@ class RunnableSchedule:
         """Return the command of this sample, and the next state.
 
         A sample whose reference or measurement is not finite (or beyond 1e15), or what would follow from them, is not
-        used: the last command is held, the state stays, and `held` counts.
+        used: the last command is held, the state stays, and `held` counts. Gate and heat guard act as in `RunnableLaw`.
         """
         missing, readings = not is_number(place), np.ravel(measurement).tolist()
-        at = state.place if missing else place
-        misplaced, most = state.misplaced + 1 if missing else 0, self.limit / self.per_effort
+        at, misplaced = state.place if missing else place, state.misplaced + 1 if missing else 0
+        limit = self.limit if self.heat is None else min(self.limit, self.heat.limit(state.heat))
+        following = self._decide(replace(state, place=at, misplaced=misplaced), reference, readings, limit)
+        if self.heat is None:
+            return following.command, following
+        command = min(max(following.command, -limit), limit)  # one that is held or taken to zero, too
+        return command, replace(following, command=command, heat=self.heat.warm(state.heat, command))
+
+    def _decide(self, state: ScheduleState, reference: float, readings: list[float], limit: float) -> ScheduleState:
+        """Return the next state, its command within a limit."""
+        most = limit / self.per_effort
+        if self.gate is not None:
+            readings[0], seen = self.gate.screen(state.gate, readings[0])
+            state = replace(state, gate=seen)
+            if seen.fault:
+                return replace(state, command=self.gate.ramp(state.command, self.table.sample_time_s))
         with np.errstate(all="ignore"):
             effort, applied, x = self.table.order.step(
-                self.table.find_numbers(at, **{SHARE: self.anti_windup}),
+                self.table.find_numbers(state.place, **{SHARE: self.anti_windup}),
                 state.x,
                 reference,
                 readings,
                 lambda effort: min(max(effort, -most), most),
             )
         if not (all(map(is_number, (reference, *readings))) and all(map(math.isfinite, (effort, *x.values())))):
-            return state.command, replace(state, place=at, held=state.held + 1, misplaced=misplaced)
-        command = min(max(applied * self.per_effort, -self.limit), self.limit)
-        return command, ScheduleState(x=x, place=at, command=command, misplaced=misplaced)
+            return replace(state, held=state.held + 1)
+        return replace(state, x=x, command=min(max(applied * self.per_effort, -limit), limit), held=0)
 
 
 def make_runnable(

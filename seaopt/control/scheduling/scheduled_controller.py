@@ -207,7 +207,7 @@ class ScheduledController(Result, Worded):
         )
 
     def runnable(self, *, limit: float | None = None, tracking_time_s: float | None = None) -> RunnableSchedule:
-        """Return the law ready to run.
+        """Return the law ready to run, with the guards of its first controller.
 
         Parameters
         ----------
@@ -216,14 +216,16 @@ class ScheduledController(Result, Worded):
         tracking_time_s : float, optional
             Of the anti-windup.
         """
-        return make_runnable(
+        first = self.controllers[0]
+        law = make_runnable(
             self.table,
             per_effort=self.command.per_effort,
-            limit=self.controllers[0].command_limit if limit is None else self.command.limit(limit),
+            limit=first.command_limit if limit is None else self.command.limit(limit),
             fallback=self.fallback,
             tracking_time_s=tracking_time_s,
             command=(self.command.input, self.command.unit),
         )
+        return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of schedule.json (schema seaopt/schedule/2)."""

@@ -2,16 +2,19 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.control import PlausibilityGate, ScheduledController
 from seaopt.control.deploy.schedule_export import read_runnable
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
+from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import CompiledSchedule
-from tests.schedules import tune_knee
+from tests.schedules import read_knee, tune_knee
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +95,48 @@ def test_a_limit_above_that_of_the_design_is_stated(tmp_path, schedule, limit, s
     assert ("It was designed with a limit of 5 A" in (tmp_path / "force_law.h").read_text()) == stated
 
 
-def test_a_gate_is_refused(tmp_path, schedule):
-    with pytest.raises(ControlError, match="derate"):
+GATE = PlausibilityGate(range_N=(-8.0, 8.0), max_step_N=9.0, max_held=6, ramp_A_per_s=20.0)
+HEAT = HeatGuard(
+    a_11=0.985, a_12=0.01, a_21=0.001, a_22=0.9989, b_1=0.08, b_2=1e-4, resistance=0.6, slope=0.002,
+    allowed_rise=40.0, share=0.02, ambient=21.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("guards", [{"gate": GATE}, {"derate": HEAT}, {"gate": GATE, "derate": HEAT}])
+def test_guards_act_as_in_python(compiler, tmp_path, schedule, samples, guards):
+    references, measurements, place = (row.copy() for row in samples)
+    measurements[400:404], measurements[2900:2908] = [math.nan, 1e9, -1e16, math.inf], math.nan
+    compiled = CompiledSchedule(compiler, tmp_path, schedule, **guards)
+    law = replace(schedule.runnable(), gate=guards.get("gate"), heat=guards.get("derate"))
+    state, pairs, statuses = law.reset(), [], set()
+    for row in zip(references, measurements, place, strict=True):
+        command, state = law.step(state, *row)
+        pairs.append((compiled.step(*row), command))
+        assert (compiled.law.held, compiled.law.misplaced, compiled.law.place) == (
+            state.held,
+            state.misplaced,
+            state.place,
+        )
+        statuses.add(compiled.law.status)
+    got, expected = np.array(pairs).T
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+    assert np.mean(np.abs(expected) > 0.0) > 0.5
+    if "gate" in guards:
+        assert statuses == {0, 1, 2}
+        assert expected[-1] == 0.0  # a fault, until a reset
+    if "derate" in guards:
+        assert compiled.law.rise_winding == pytest.approx(state.heat[0], rel=1e-10)
+        assert compiled.law.limit < 5.0
+
+
+def test_what_nothing_is_known_of_is_not_derated(tmp_path, schedule):
+    with pytest.raises(ControlError, match="thermal"):
         so.export(schedule, tmp_path, derate=True)
+
+
+def test_a_schedule_keeps_the_guards_of_its_file(schedule):
+    guarded = replace(schedule, controllers=tuple(replace(each, gate=GATE) for each in schedule.controllers))
+    assert guarded.runnable().gate == GATE
+    content = json.loads(to_json(guarded.to_dict()))
+    stand, _, values = read_knee()
+    assert ScheduledController.from_dict(content, stand, values).runnable().gate == GATE
