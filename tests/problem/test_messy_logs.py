@@ -157,6 +157,31 @@ def test_columns_can_be_named_by_their_roles(tmp_path, held):
     assert experiment.log.rate_hz == pytest.approx(RATE)
 
 
+def test_a_current_in_steps_of_its_converter_is_asked_for_their_size(tmp_path, held):
+    """Not as an angle's steps of a turn; headers as a German drive writes them."""
+    t, of = held
+    steps = np.round(of["I"] / 0.01)
+    columns = {"t [s]": t, "Stromsollwert (Inkr.)": steps, "Motorlage (Inkr.)": np.round(1e3 * of["theta_m"])}
+    path = write_csv(tmp_path / "log.csv", columns | {"Federmoment [N cm]": 100 * of["tau_s"]})
+    answers = {"counts:Stromsollwert (Inkr.)": "0.01", "counts:Motorlage (Inkr.)": f"{2000 * np.pi}"}
+    proposal = propose([path], answers, tmp_path)
+    assert 'One step of "Stromsollwert (Inkr.)", in A' in [question.text for question in proposal.questions]
+    (experiment,) = read_back(tmp_path, proposal)
+    np.testing.assert_allclose(experiment.log["I"], 0.01 * steps, rtol=1e-9)
+    np.testing.assert_allclose(experiment.log["theta_m"], of["theta_m"], atol=6e-4)
+    assert "counts of Stromsollwert (Inkr.)" in propose([path], {}, tmp_path).guessed
+
+
+def test_a_column_that_only_some_logs_have_can_be_named(tmp_path, held):
+    t, of = held
+    bare = {"t [s]": t, "a1": of["I"], "a2": of["tau_s"]}
+    paths = [write_csv(tmp_path / "held.csv", bare), write_csv(tmp_path / "free.csv", bare | {"a3": of["theta_m"]})]
+    named = {"I": "a1", "tau_s": "a2", "theta_m": "a3"}
+    proposal = propose(paths, {}, tmp_path, columns=named, units={"theta_m": "rad"})
+    first, second = read_back(tmp_path, proposal)
+    assert (set(first.outputs), set(second.outputs)) == ({"tau_s"}, {"tau_s", "theta_m"})
+
+
 @pytest.mark.parametrize(
     ("columns", "units", "words"),
     [

@@ -115,6 +115,7 @@ def propose(
     interview, stated = Interview(answers), Stated(columns=columns or {}, units=units or {})
     reading, looking = divide(progress, READING, LOOKING)
     surveys = [_survey(path, interview, stated) for path in count_off(logs, "reading log", reading)]
+    stated.check(surveys)
     turns, doubt = is_rotary([column for survey in surveys for column in survey.columns])
     if stated.rotary is not None:
         turns = stated.rotary
@@ -155,7 +156,6 @@ def propose(
 def _survey(path: Path, interview: Interview, stated: Stated) -> LogSurvey:
     key = f"time:{path.name}"
     survey = survey_log(path, stated.clock or interview.answers.get(key), stated.unit_of)
-    stated.check(survey)
     if stated.clock is not None:
         survey = replace(survey, clocks=(stated.clock,))
     if len(survey.clocks) > 1 and survey.clock is not None:
@@ -307,7 +307,11 @@ def _ask_units(roles: Assignment, interview: Interview, stated: Stated) -> tuple
         if why:
             text = f'Unit of "{column.name}" ({DESCRIPTIONS[role]})?'
             unit = interview.ask(f"unit:{column.name}", text, unit, why, UNITS.get(role, ("rad", "deg", COUNTS)))
-        if unit == COUNTS:
+        si = UNITS_OF.get(OF_INPUT.get(role) or OF_OUTPUT[role], "")
+        if unit == COUNTS and si != "rad":
+            text, why = f'One step of "{column.name}", in {si}', "full scale over its steps; take it from the manual"
+            unit, scales[role] = si, interview.number(f"counts:{column.name}", text, 1e-3, why)
+        elif unit == COUNTS:
             turn = interview.number(
                 f"counts:{column.name}", f'Steps of "{column.name}" for a whole turn', 4096.0, "a common encoder's"
             )

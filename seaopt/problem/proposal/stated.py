@@ -58,13 +58,15 @@ class Stated:
         turning = any(role in ROTARY_OUTPUTS for role in self.columns)
         return turning or (False if any(role in LINEAR_OUTPUTS for role in self.columns) else None)
 
-    def check(self, survey: LogSurvey) -> None:
-        """Refuse (LogError) columns that a log does not have, or that do not vary."""
-        names: Sequence[str] = [column.name for column in survey.columns]
+    def check(self, surveys: Sequence[LogSurvey]) -> None:
+        """Refuse (LogError) columns that no log has, or that do not vary where a log has them."""
         for role, column in self.columns.items():
-            if role == "time" or column in names:
+            names = [[each.name for each in survey.columns] for survey in surveys]
+            if role == "time" or any(column in each for each in names):
                 continue
-            why = survey.left_out.get(column)
-            if why is not None:
-                raise LogError(f'{survey.name}: column "{column}", named as {role}, is no signal: {why}; name another')
-            raise LogError(f'{survey.name}: no column "{column}" for {role}; {suggestion(column, names)}')
+            for survey in surveys:
+                if (why := survey.left_out.get(column)) is not None:
+                    where = f'{survey.name}: column "{column}", named as {role}'
+                    raise LogError(f"{where}, is no signal: {why}; name another")
+            first = surveys[0].name
+            raise LogError(f'{first}: no column "{column}" for {role}; {suggestion(column, names[0])}')

@@ -17,7 +17,7 @@ from seaopt.logs import contents
 from seaopt.logs.formats import Field, open_source
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
-from seaopt.problem.proposal.vocabulary import Header, is_named_time, read_header
+from seaopt.problem.proposal.vocabulary import Header, is_count, is_named_time, read_header
 from seaopt.records import record
 from seaopt.units import factor, is_unit
 
@@ -110,7 +110,7 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
         command = f"seaopt inspect {shlex.quote(str(path))} --list"
         raise LogError(f"{path}: holds no column of numbers; list what it holds with {command}")
     stated = {name: (units or {}).get(name, field.unit) for name, field in numeric.items()}
-    odd = any(unit and not is_unit(unit) and name.endswith(")") for name, unit in stated.items())
+    odd = any(unit and not is_unit(unit) and not is_count(unit) and name.endswith(")") for name, unit in stated.items())
     headers = {name: _read_header(name, unit, odd=odd) for name, unit in stated.items()}
     raw = _read_raw(path, numeric)
     times = [name for name, header in headers.items() if _is_time(header, raw[name])]

@@ -36,7 +36,7 @@ QUANTITY_WORDS: dict[Quantity, frozenset[str]] = {
         "sample", "samples", "no", "nr",
     }),
 }  # fmt: skip
-PLACE_WORDS = frozenset({"pos", "position", "enc", "encoder", "q", "x", "y", "coordinate", "geber"})
+PLACE_WORDS = frozenset({"pos", "position", "lage", "enc", "encoder", "q", "x", "y", "coordinate", "geber"})
 SIDE_WORDS: dict[Side, frozenset[str]] = {
     "spring": frozenset({
         "spring", "feder", "sea", "s", "deflection", "defl", "compression", "auslenkung", "federweg", "sensor", "taus",
@@ -83,6 +83,9 @@ UNITS_OF: dict[Quantity, str] = {
     "length": "m",
 }  # fmt: skip
 COUNTS = "counts"
+COUNT_UNITS = frozenset(
+    {"counts", "count", "ticks", "cnt", "inc", "incr", "increments", "ink", "inkr", "inkremente", "lsb", "steps"}
+)
 # Of a unit that is there: what it measures.
 _QUANTITY_OF: dict[str, Quantity] = {
     "s": "time", "A": "current", "V": "voltage", "N": "force", "N m": "torque", "rad": "angle", "m": "length",
@@ -142,6 +145,11 @@ def is_m_open(header: Header) -> bool:
     return header.unit == "m" and read_header(header.name, metres=False).quantity == "angle"
 
 
+def is_count(unit: str) -> bool:
+    """Tell whether a header's unit is the steps of an encoder or a converter."""
+    return unit.strip().lower().rstrip(".") in COUNT_UNITS
+
+
 def is_named_time(name: str) -> bool:
     """Tell whether the first word of a name is a time's, whatever follows."""
     words = split_words(re.split(r"[./]", name)[-1])
@@ -159,7 +167,7 @@ def _clean_unit(unit: str | None) -> str:
     if unit is None or not unit.strip():
         return ""
     text = unit.strip()
-    if text.lower() in ("counts", "count", "ticks", "cnt", "inc", "increments", "inkremente", "lsb", "steps"):
+    if is_count(text):
         return COUNTS
     if text.lower() in ("%", "pct", "percent", "prozent"):
         return "percent"
