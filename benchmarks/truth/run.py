@@ -2,10 +2,12 @@
 
 Each case is an actuator of `actuators.py` with none, one or two effects that the fitted model lacks. It is fitted as
 its user would fit it: friction that sticks, a free delay, values off by up to a factor of two; to one log at full
-amplitude, or (--logs 2) to that and one at half of it. A fit is *bad* where it is met and has a parameter both 3 % off
-and outside 4 standard deviations of its 95 % interval, that of noise and model. Each fit runs in a process of its own
-with a bound on its processor time. The table is printed, and with --json FILE every case is kept; --read FILE prints
-the table of one that was kept.
+amplitude, or (--logs 2) to that and one at half of it. A fit that is not met is made again as it advises, up to three
+times: with the parts that `seaopt fit --explain` would add, or with the log at half the amplitude that it asks for. A
+fit is *bad* where it is met and has a parameter both 3 % off and outside 4 standard deviations of its 95 % interval,
+that of noise and model. Each case runs in a process of its own with a bound on its processor time; no new ones begin
+after --minutes of it together. Tables are printed, and with --json FILE every case is kept; --read FILE... prints the
+tables of what was kept.
 """
 
 from __future__ import annotations
@@ -15,10 +17,10 @@ import json
 import resource
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,7 @@ FREE = {True: ("J", "b_r", "k", "f_c", "eta"), False: ("J_m", "b_r", "k_s", "f_c
 SILENT = {"efficiency", "stand"}  # what no such log can tell: only words can warn
 BAD_SHARE, BAD_STDS, QUANTILE = 0.03, 4.0, 1.959964
 AMPLITUDES = (1.0, 0.5)  # of the largest, of the first and the second log
+ROUNDS = 3  # of advice that is followed
 LEAST = 2e-4  # of a value, below which no std is believed: widths are over that, or over the noise's std
 KNOWN = 0.2  # half the width of an interval over its value
 
@@ -51,9 +54,10 @@ def draw_cases(count: int, rng: np.random.Generator, *, locked: bool) -> Iterato
 
 
 def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: float) -> dict[str, Any]:
-    """Return what a fit says of an actuator's logs, and what is true."""
+    """Return what a fit says of an actuator's logs, and what is true, round by round of following its advice."""
     resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + limit_s), resource.RLIM_INFINITY))
     import seaopt as so
+    from seaopt.problem.explained import find_explanation
 
     rng, kind = np.random.default_rng(seed), KINDS[actuator.kind]
     base = so.plants.high_impedance() if kind.linear else so.plants.rotary(link=actuator.link)
@@ -63,19 +67,45 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
     guess = {name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free}
     params = plant.defaults.update(**known | guess).free(*free)
     delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
-    experiments = []
-    for k, amplitude in enumerate(AMPLITUDES[:logs]):
-        readings = actuator.record(seconds=seconds, amplitude=amplitude, seed=seed + SEEDS * k)
+
+    def record(k: int) -> so.Experiment:
+        readings = actuator.record(seconds=seconds, amplitude=AMPLITUDES[k], seed=seed + SEEDS * k)
         log = so.Log.from_arrays(**readings).restamp(rate_hz=RATE_HZ)
         outputs = tuple(name for name in readings if name not in ("time", "I"))
-        experiments.append(so.Experiment(plant=plant, log=log, outputs=outputs, delay_s=delay))
-    started = time.process_time()
-    fit = so.fit(experiments, params)
-    fitted = fit.to_dict()["parameters"]
+        return so.Experiment(plant=plant, log=log, outputs=outputs, delay_s=delay, name=f"log{k}")
+
+    experiments = [record(k) for k in range(logs)]
+    rounds, advice = list[dict[str, Any]](), "as it is"
+    while True:
+        started = time.process_time()
+        fit = so.fit(experiments, params)
+        rounds.append({"advice": advice, "cpu_s": round(time.process_time() - started, 2)} | describe(fit, known, free))
+        if fit.met or len(rounds) > ROUNDS:
+            break
+        # As `seaopt fit --explain` does; then the log that the verdict asks for.
+        found = find_explanation(fit)
+        if found is not None:
+            advice = f"with {', '.join(found.parts)}"
+            for part in found.parts:
+                plant = so.plants.add_part(plant, part)
+            params = plant.defaults.with_parameters(*params.values()).update(**found.frees, **found.fixed)
+            params = params.free(*found.frees)
+            experiments = [replace(experiment, plant=plant) for experiment in experiments]
+        elif len(experiments) == 1 and any(error.kind == "excess" for error in fit.errors):
+            advice = "with a log at half the amplitude"
+            experiments.append(record(1))
+        else:
+            break
+    return rounds[-1] | {"rounds": rounds, "cpu_s": round(sum(each["cpu_s"] for each in rounds), 2)}
+
+
+def describe(fit: Any, known: Mapping[str, float], free: Sequence[str]) -> dict[str, Any]:
+    """Return what a fit says of its parameters, beside what is true, and its findings."""
+    content = fit.to_dict()
+    fitted = content["parameters"]
     return {
         "met": fit.met,
         "status": fit.status,
-        "cpu_s": round(time.process_time() - started, 2),
         "parameters": {
             name: {
                 "true": known[name],
@@ -86,7 +116,7 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
             for name in free
             if fitted[name]["std"] is not None
         },
-        "excess": max(each.get("excess") or 0.0 for row in fit.to_dict()["outputs"].values() for each in row.values()),
+        "excess": max(each.get("excess") or 0.0 for row in content["outputs"].values() for each in row.values()),
         "findings": [f"{finding.severity} {finding.kind} {finding.where}" for finding in fit.findings],
     }
 
@@ -94,7 +124,8 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
 def run_case(job: tuple[Actuator, int, float, int, float]) -> dict[str, Any]:
     """Return a case's row; what its process did not live to say is a row, too."""
     actuator, seed, *_, limit_s = job
-    context = get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["seaopt"])
     row: dict[str, Any] = asdict(actuator) | {"seed": seed}
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_send, args=(sender, *job))
@@ -103,13 +134,14 @@ def run_case(job: tuple[Actuator, int, float, int, float]) -> dict[str, Any]:
     try:
         return row | receiver.recv()
     except EOFError:
-        return row | {"met": False, "status": f"not done in {limit_s:g} s", "cpu_s": limit_s, "parameters": {}}
+        late = {"met": False, "status": f"not done in {limit_s:g} s", "cpu_s": limit_s, "process_s": limit_s}
+        return row | late | {"parameters": {}, "findings": [], "rounds": []}
     finally:
         process.join()
 
 
 def _send(sender: Any, *job: Any) -> None:
-    sender.send(fit_case(*job))
+    sender.send(fit_case(*job) | {"process_s": time.process_time()})
 
 
 def is_bad(row: dict[str, Any]) -> bool:
@@ -149,12 +181,48 @@ def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
             f"{sum(map(is_bad, done)):9d} {cover(done):>7s} {sum(known):6d} {width:>6s} {late:9d} "
             f"{np.median([row['cpu_s'] for row in group]):9.1f}"
         )
+    yield from summarise_rounds(rows)
+    yield from summarise_obstacles(rows)
+
+
+def summarise_rounds(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield how many fits were met after each round of advice, and what the rounds were."""
+    yield f"\n{'round':34s} made  met  bad of met  median s"
+    for number in range(ROUNDS + 1):
+        made = [row["rounds"][number] for row in rows if len(row["rounds"]) > number]
+        for advice in sorted({each["advice"] for each in made}):
+            group = [each for each in made if each["advice"] == advice]
+            met = [each for each in group if each["met"]]
+            seconds = np.median([each["cpu_s"] for each in group])
+            line = f"{number} {advice:32s} {len(group):4d} {len(met):4d}"
+            yield f"{line} {sum(map(is_bad, met)):11d} {seconds:9.1f}"
+
+
+def summarise_obstacles(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield which errors keep fits from met in the end, alone and with others, and how good those fits are."""
+    yield f"\n{'what keeps fits from met':26s} fits  alone  bad if met  all in 95 % and known"
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for row in rows:
+        if row["met"]:
+            continue
+        kinds = {finding.split()[1] for finding in row["findings"] if finding.startswith("error")}
+        kinds |= {row["status"]} - {"converged"}
+        good = all(is_known(p) and is_inside(p) for p in row["parameters"].values())
+        for kind in kinds or {"no error"}:
+            counts[kind] += Counter(fits=1, alone=len(kinds) == 1, bad=is_bad(row), good=good)
+    for kind, count in sorted(counts.items(), key=lambda pair: -pair[1]["fits"]):
+        yield f"{kind:26s} {count['fits']:4d} {count['alone']:6d} {count['bad']:11d} {count['good']:21d}"
 
 
 def cover(rows: list[dict[str, Any]]) -> str:
     """Return how many of the 95 % intervals hold the truth, in percent."""
-    inside = [abs(p["value"] - p["true"]) <= QUANTILE * p["std"] for row in rows for p in row["parameters"].values()]
+    inside = [is_inside(p) for row in rows for p in row["parameters"].values()]
     return f"{100 * np.mean(inside):.0f} %" if inside else "-"
+
+
+def is_inside(parameter: dict[str, float]) -> bool:
+    """Tell whether a 95 % interval holds the truth."""
+    return abs(parameter["value"] - parameter["true"]) <= QUANTILE * parameter["std"]
 
 
 def is_known(parameter: dict[str, float]) -> bool:
@@ -166,10 +234,12 @@ def main() -> None:
     """Run the cases that the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fits", type=int, default=90)
+    parser.add_argument("--first", type=int, default=0, help="of a seed's cases, that is fitted first")
+    parser.add_argument("--minutes", type=float, default=180.0, help="of processor time, after which no case begins")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=15.0, help="length of each log")
     parser.add_argument("--limit", type=float, default=60.0, help="processor time of a fit, s")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--logs", type=int, default=1, choices=(1, 2), help="2: a second one at half the amplitude")
     parser.add_argument("--locked", action="store_true", help="links held: no pendulums, whose fits take long")
     parser.add_argument("--json", type=Path)
@@ -179,19 +249,27 @@ def main() -> None:
         kept = [row for file in options.read for row in json.loads(file.read_text())]
         print("\n".join(summarise(kept)))
         return
-    cases = list(draw_cases(options.fits, np.random.default_rng(options.seed), locked=options.locked))
+    cases = list(draw_cases(options.first + options.fits, np.random.default_rng(options.seed), locked=options.locked))
     jobs = [
         (case, 1000 * options.seed + k, options.seconds, options.logs, options.limit) for k, case in enumerate(cases)
-    ]
+    ][options.first :]
     rows: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(run_case, jobs):
+
+    def run(job: tuple[Actuator, int, float, int, float]) -> dict[str, Any] | None:
+        return None if sum(row["process_s"] for row in rows) > 60.0 * options.minutes else run_case(job)
+
+    with ThreadPoolExecutor(options.workers) as pool:
+        for row in pool.map(run, jobs):
+            if row is None:
+                break
             rows.append(row)
             effects = ", ".join(row["effects"]) or "nothing missing"
+            errors = {finding.split()[1] for finding in row["findings"] if finding.startswith("error")}
             verdict = "BAD" if row["met"] and is_bad(row) else "met" if row["met"] else row["status"]
+            end = f"{verdict} {', '.join(sorted(errors))} [{'; '.join(r['advice'] for r in row['rounds'][1:])}]"
+            number = options.first + len(rows)
             print(
-                f"{len(rows):4d} {row['kind']:7s} {row['link']:9s} {effects:30s} {row['cpu_s']:6.1f} s  {verdict}",
-                flush=True,
+                f"{number:4d} {row['kind']:7s} {row['link']:9s} {effects:30s} {row['cpu_s']:6.1f} s  {end}", flush=True
             )
             if options.json:
                 options.json.write_text(json.dumps(rows, indent=1))
