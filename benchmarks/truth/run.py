@@ -91,12 +91,21 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
             params = plant.defaults.with_parameters(*params.values()).update(**found.frees, **found.fixed)
             params = params.free(*found.frees)
             experiments = [replace(experiment, plant=plant) for experiment in experiments]
+        elif better := find_better(fit):
+            advice = f"from another {', '.join(better)}"
+            params = params.update(**better).free(*better)
         elif len(experiments) == 1 and any(error.kind == "excess" for error in fit.errors):
             advice = "with a log at half the amplitude"
             experiments.append(record(1))
         else:
             break
     return rounds[-1] | {"rounds": rounds, "cpu_s": round(sum(each["cpu_s"] for each in rounds), 2)}
+
+
+def find_better(fit: Any) -> dict[str, float]:
+    """Return the values that a fit's errors say parameters should have: free ones to start from, or fixed ones."""
+    asked = {name: value for error in fit.errors for name, (value, _) in error.preferred.items()}
+    return {name: value for name, value in asked.items() if name in fit.parameters}
 
 
 def describe(fit: Any, known: Mapping[str, float], free: Sequence[str]) -> dict[str, Any]:
@@ -114,9 +123,10 @@ def describe(fit: Any, known: Mapping[str, float], free: Sequence[str]) -> dict[
                 "std": (fitted[name]["ci95"][1] - fitted[name]["ci95"][0]) / (2.0 * QUANTILE),
             }
             for name in free
-            if fitted[name]["std"] is not None
+            if name in known and fitted[name]["std"] is not None
         },
         "excess": max(each.get("excess") or 0.0 for row in content["outputs"].values() for each in row.values()),
+        "silent": {effect.part: list(effect.shifts) for effect in fit.silent},
         "findings": [f"{finding.severity} {finding.kind} {finding.where}" for finding in fit.findings],
     }
 

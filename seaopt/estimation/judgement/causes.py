@@ -25,6 +25,7 @@ from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.settle import ROUGH_ITERATIONS, Solved, settle_roughly, sharpen
 from seaopt.formatting import join_words
+from seaopt.parameters import QUANTILE
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
@@ -220,7 +221,8 @@ def _weigh(
     for name in fit.covariance.names:
         old = fit.parameters[name]
         away = abs(values.get(name, old.value) - old.value)
-        if away > max(MOVED_STDS * (old.std or 0.0), MOVED_SHARE * abs(old.value)):
+        inside = max(MOVED_STDS * (old.std or 0.0), QUANTILE * (old.total_std or 0.0))
+        if away > max(inside, MOVED_SHARE * abs(old.value)):
             moved.append((away / max(abs(old.value), 1e-300), name))
     effects = [f"takes {100.0 * (1.0 - left):.3g} % of a residual's power away"] if left < 1.0 - 1e-3 else []
     if moved:

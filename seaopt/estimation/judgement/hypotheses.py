@@ -107,6 +107,11 @@ HYPOTHESES = (
         fixed=lambda s: {"sigma_1": 0.0},
     ),
     Hypothesis(
+        effect="the current lags its command",
+        part="current_loop",
+        starts=lambda s: [{"current_loop_hz": 300.0}],
+    ),
+    Hypothesis(
         effect="the stand gives",
         part="stand",
         starts=lambda s: [{"c_t": 0.02 / s.stiffness}] if s.stiffness else [],

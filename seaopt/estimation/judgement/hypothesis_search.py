@@ -3,8 +3,8 @@
 The excess is a residual's rms over the noise of its sensor, of the output where it is most, over the samples that are
 fitted and over those that are held out: what follows the one part alone explains neither. Large misfits bend what one
 step predicts: a spring that hardens ranked sixth by its step, and was the cause. So each hypothesis takes several,
-from the fit's values; one that does not help is left soon. None is taken that leaves the excess high, however much
-of it it takes: friction that grows with the load takes a part of nearly everything. Where one does not suffice the
+from the fit's values; one that does not help is left soon. None is taken that leaves the excess high, unless it takes
+98 % of its power: friction that grows with the load takes a part of nearly everything. Where one does not suffice the
 best three are joined with each other, and then with every other one, two in all.
 
 What this may cost is counted in evaluations of the problem, so that the same log has the same answer on any machine.
@@ -35,9 +35,11 @@ from seaopt.records import record
 
 ASKS = 1.5  # times its noise a residual is before anything is looked for
 REMOVED = 3.0  # times its noise that a hypothesis may leave
+NEARLY = 1.0 / 7.0  # of the excess that it may leave besides: 98 % of the power is removed
 HALF = 0.5  # of the excess power that one has to take
 TIED = 1.05  # times the least excess, up to which hypotheses are as good
 ROUND, ROUNDS = 4, 5  # iterations of a refit between two looks at whether it helps, and how many looks
+MOST_ROUNDS = 15  # where each of them halves the power that is left
 HELPS = 0.02  # of a residual's power, that a round has to take from some output
 BASES = 3  # hypotheses, the best, beside which each other one is tried
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
@@ -181,7 +183,7 @@ def _refit(change: Change, old: FitProblem, fitted: Evaluation) -> Refit | None:
         return None
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
     least = _measure_powers(fitted)
-    for number in range(ROUNDS):
+    for number in range(MOST_ROUNDS):
         # The smaller the residual has become, the finer must be the steps.
         problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
         solution = minimise(problem, evaluation, unknowns.low, unknowns.high, decrement=NEAR, max_iterations=ROUND)
@@ -193,6 +195,8 @@ def _refit(change: Change, old: FitProblem, fitted: Evaluation) -> Refit | None:
         before_round, powers = powers, _measure_powers(evaluation)
         comes_near = number == 0 and np.any(powers < HALF * before_round)  # a start may be far from the fit
         if np.all(powers > (1.0 - HELPS) * np.minimum(least, before_round)) and not comes_near:
+            break
+        if number >= ROUNDS - 1 and not np.any(powers < HALF * before_round):
             break
         least = np.minimum(least, powers)
     excess = _measure_excess(problem, evaluation.z)
@@ -241,7 +245,7 @@ def _judge(refits: Sequence[Refit], first: float) -> Search:
     able = [
         refit
         for refit in refits
-        if refit.excess <= REMOVED
+        if refit.excess <= max(REMOVED, NEARLY * first)
         and _takes_half(first, refit.excess)
         and (refit in single or (best_single > ASKS and _takes_half(best_single, refit.excess)))
     ]

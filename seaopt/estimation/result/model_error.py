@@ -9,7 +9,8 @@ of all unknowns and E the columns of those that are wanted
           \qquad g_A = \sum_{t \in A} \tilde J_t^T r_t, \qquad H_A = \sum_{t \in A} \tilde J_t^T \tilde J_t .
 
 - b, the noise: the largest of the std for white residuals, of that for coloured ones (`covariance`), and of what the
-  scores :math:`\tilde J_t^T r_t` vary by within 0.1 s (Newey and West, Econometrica 55, 1987); at least 0.02 % where the residual is more than noise.
+  scores :math:`\tilde J_t^T r_t` vary by within 0.1 s (Newey and West, Econometrica 55, 1987); at least 0.02 % where
+  the residual is more than noise.
 - j, parts of the log: without one of 8 contiguous parts the estimates move by :math:`d_k = -(S - H_k)^{-1} g_k`
   (a jackknife of one step: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982);
   :math:`v = \tfrac78 \sum (d_k - \bar d)^2` and :math:`j^2 = \max(0, v - b^2)`. Where few parts have all the
