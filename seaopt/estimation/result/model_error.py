@@ -10,7 +10,7 @@ of all unknowns and E the columns of those that are wanted
 
 - b, the noise: the largest of the std for white residuals, of that for coloured ones (`covariance`), and of what the
   scores :math:`\tilde J_t^T r_t` vary by within 0.1 s (Newey and West, Econometrica 55, 1987); at least 0.02 % where
-  the residual is more than noise.
+  the residual is more than noise, and as little as a clock of quartz is off by where it is not.
 - j, parts of the log: without one of 8 contiguous parts the estimates move by :math:`d_k = -(S - H_k)^{-1} g_k`
   (a jackknife of one step: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982);
   :math:`v = \tfrac78 \sum (d_k - \bar d)^2` and :math:`j^2 = \max(0, v - b^2)`. Where few parts have all the
@@ -50,6 +50,7 @@ ENVELOPE_S = 0.25
 APART = 3.0  # standard deviations from which halves differ
 INDEPENDENT = 80.0  # values of a model's error
 LEAST_SHARE = 2e-4  # of a value, below which no std is believed where a residual is more than noise
+CLOCK = 2e-5  # of a value: what a clock of quartz is off by
 SCATTER = 3.0  # standard deviations by which the jackknife of a log whose information is in few parts may scatter
 CHANCE = 4.0  # over sqrt(N), the share of a residual's power by which its noise is misjudged: two std of that estimate
 SEEN = 1e-3  # of the whole log's information: what a part has less of it does not show
@@ -104,7 +105,7 @@ def estimate_model_error(
     noisy = np.maximum.reduce([variance, white, np.diag(scores)])
     inflation = noisy / np.maximum(np.diag(inverse), 1e-300)
     noise_alone = max(excess.values()) <= LITTLE
-    b2 = noisy if noise_alone else np.maximum(noisy, (LEAST_SHARE * z[stated]) ** 2)
+    b2 = np.maximum(noisy, ((CLOCK if noise_alone else LEAST_SHARE) * z[stated]) ** 2)
     return ModelError(
         names=names,
         excess=excess,

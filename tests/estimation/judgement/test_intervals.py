@@ -94,7 +94,7 @@ def test_logs_that_agree_leave_the_intervals_alone():
     result = fit(record_log(1.0, 0.0, 1, name="full"), record_log(0.5, 0.0, 2, name="half"))
     assert result.met and not result.findings
     parameter = result.parameters["a"]
-    assert parameter.total_std <= 1.2 * max(parameter.std, 2e-4 * parameter.value)
+    assert parameter.total_std <= 1.2 * parameter.std
 
 
 def test_a_value_that_is_known_only_roughly_is_named(thor):

@@ -52,13 +52,13 @@ def test_nothing_missing_leaves_nothing(signals):
 
 
 def test_the_least_share_is_for_residuals_that_are_more_than_noise(signals):
-    """A noise of 1e-4 tells a of 2 to 4e-7: that stands where nothing is missing, and 0.02 % where a drift is."""
+    """A noise of 1e-4 tells a of 2 to 4e-7: a clock's error is more, and 0.02 % stands where a drift is missing."""
     u, w, e = signals
     for missing in (0.0, 1e-3):
         fit, error = regress(u, w, (2.0 + missing * np.sign(np.arange(N) - N / 2)) * u + 3.0 * w + 1e-4 * e)
         assert (error.excess["log.y"] > 1.5) is (missing > 0.0)
         total = float(np.sqrt((fit.covariance.matrix + error.colour)[0, 0]))
-        assert total == pytest.approx(2e-4 * 2.0 if missing else 1e-4 / np.sqrt(u @ u), rel=0.2)
+        assert total == pytest.approx(2.0 * (2e-4 if missing else 2e-5), rel=0.01)
 
 
 def test_parts_are_those_of_a_jackknife_done_by_hand(signals):
@@ -141,7 +141,7 @@ def test_a_gap_several_logs_and_a_robust_loss_are_taken(signals):
         fit = so.fit(benches, params, loss=loss)
         assert fit.met
         for parameter in fit.parameters.values():
-            assert parameter.total_std < 1.6 * max(parameter.std, 2e-4 * abs(parameter.value))
+            assert parameter.total_std < 1.6 * parameter.std
 
 
 def cover(count):
