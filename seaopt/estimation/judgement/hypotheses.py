@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -189,6 +190,13 @@ def change_plants(
         params=params.with_parameters(*added),
         starts=starts,
     )
+
+
+@cache
+def list_freed() -> frozenset[str]:
+    """Return the names of the parameters that hypotheses free."""
+    sizes = Sizes(**{each.name: 1.0 for each in fields(Sizes)})
+    return frozenset(name for hypothesis in HYPOTHESES for start in hypothesis.starts(sizes) for name in start)
 
 
 def measure_sizes(fit: Fit) -> Sizes:

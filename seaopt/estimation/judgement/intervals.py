@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from seaopt.estimation.judgement.hypotheses import list_freed
 from seaopt.estimation.judgement.second_log import FAR, find_excess, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.shapes import Signal
@@ -52,12 +53,14 @@ def find_excesses(fit: Fit) -> Iterator[FitFinding]:
 
 def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
     """Yield free parameters whose interval is wider than a design can use. One that may be zero, as a friction that a
-    plant need not have, is known well enough where it hardly does anything.
+    plant need not have, is known well enough where it hardly does anything; how large an effect is that hypotheses
+    bring does not have to be known, as long as the actuator's values are.
     """
     if fit.status != "converged":
         return
     plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
     smoothing = {name for plant in plants for name in list_smoothing(plant)}
+    effects = list_freed()
     for name in fit.covariance.names:
         parameter = fit.parameters[name]
         if parameter.known is None or parameter.known <= ROUGH or not parameter.identified or parameter.at_bound:
@@ -70,7 +73,7 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
         if may_be_zero and half * error.effect[error.names.index(name)] <= UNSEEN:
             continue
         yield FitFinding(
-            severity="error",
+            severity="warning" if name in effects else "error",
             kind="rough",
             where=name,
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "

@@ -9,6 +9,9 @@ import pytest
 
 import seaopt as so
 from seaopt.estimation.judgement.hypothesis_search import ASKS, NEARLY, REMOVED
+from seaopt.estimation.judgement.intervals import find_rough
+from seaopt.estimation.result.model_error import ModelError
+from seaopt.estimation.result.widening import widen
 from tests.actuator_logs import integrate
 
 RATE_HZ, STEPS = 400.0, 4
@@ -116,6 +119,18 @@ def test_hypotheses_are_compared_on_what_was_held_out():
     )
     assert fit(log, holdout=0.2).hypotheses[0].outcome == "adopted"
     assert all(trial.excess > REMOVED for trial in fit(other, holdout=0.2).hypotheses)
+
+
+def test_how_large_an_effect_is_may_be_known_roughly_and_a_stiffness_may_not():
+    plant = so.plants.add_part(so.plants.rotary(link="locked"), "current_loop")
+    params = plant.defaults.update(**TRUTH, current_loop_hz=500.0).free("current_loop_hz")
+    result = fit(record(seconds=2.0, lag_s=1.0 / (2.0 * math.pi * 200.0)), plant, params=params)
+    assert result.met
+    names = result.covariance.names
+    stds = [0.3 * result.parameters[name].value * (name in ("current_loop_hz", "k_s")) for name in names]
+    error = ModelError(names=names, excess={}, effect=np.ones(len(names)))
+    rough = find_rough(widen(result, np.diag(np.square(stds))), error)
+    assert {finding.where: finding.severity for finding in rough} == {"current_loop_hz": "warning", "k_s": "error"}
 
 
 def test_two_effects_are_named_together():
