@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from seaopt.estimation.judgement.hypotheses import list_freed
-from seaopt.estimation.judgement.second_log import FAR, find_excess, has_two_amplitudes
+from seaopt.estimation.judgement.second_log import FAR, SECOND, find_excess, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.findings import FitFinding
@@ -25,6 +25,7 @@ ROUGH = 0.2  # half of the width of an interval over its value, beyond which a v
 UNSEEN = 0.02  # of an output's spread: what may be zero is known well enough where half its interval does less
 BLOCKS, EVENT = 64, 0.1  # of a log: in so many blocks an input moves or rests; and the longest event, as a share
 MOVES = 0.01  # of the block in which an input moves the most
+READING = 0.05  # of a constant, up to which what is white about it is a reading's noise
 
 
 def find_excesses(fit: Fit) -> Iterator[FitFinding]:
@@ -82,27 +83,49 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
 
 
 def find_single_event(experiments: Sequence[Experiment]) -> Iterator[FitFinding]:
-    """Yield that one step is all that happens, which nothing refutes: any model follows one step with some values."""
-    if len(experiments) != 1:
+    """Yield that one step is all that happens, in one log or in several alike: any model follows it with some values,
+    which nothing refutes.
+    """
+    if len({experiment.plant.name for experiment in experiments}) > 1:
         return
-    (experiment,) = experiments
-    shares = [_measure_activity(values) for values in input_samples(experiment.plant, experiment.log)]
-    moving = [share for share in shares if share > 0.0]
-    if moving and max(moving) <= EVENT:
-        yield FitFinding(
-            severity="error",
-            kind="event",
-            where=experiment.name,
-            text="its inputs move once and rest: one step tests no model, and other values follow it as well; record "
-            "one that moves throughout, or several steps of several sizes, or fit more logs",
-        )
+    sizes = [_measure_event(experiment) for experiment in experiments]
+    alike = [size for size in sizes if size is not None]
+    if len(alike) < len(sizes) or not np.any(alike):
+        return
+    if np.any(np.min(alike, axis=0) < SECOND * np.max(alike, axis=0)):
+        return
+    yield FitFinding(
+        severity="error",
+        kind="event",
+        where=", ".join(experiment.name for experiment in experiments),
+        text="its inputs move once and rest: one step tests no model, however often it is logged, and other values "
+        "follow it as well; record steps of several sizes, or an input that moves throughout",
+    )
 
 
-def _measure_activity(values: Signal) -> float:
+def _measure_event(experiment: Experiment) -> list[float] | None:
+    """Return how far each input moves where all move once, from their values before the log, zero, where they are
+    constant; None where one moves for longer.
+    """
+    plant, sizes = experiment.plant, list[float]()
+    for name, values in zip(plant.inputs, input_samples(plant, experiment.log), strict=True):
+        if name == plant.clock:
+            continue
+        steps = np.diff(values)
+        if steps.size < 2 * BLOCKS:
+            return None
+        middle, noise = float(np.mean(values)), float(np.std(values))
+        if noise <= READING * abs(middle) and np.var(steps) >= noise**2:  # a reading that is white about a constant
+            sizes.append(abs(middle))
+            continue
+        if _measure_activity(steps) > EVENT:
+            return None
+        sizes.append(float(np.ptp(values)))
+    return sizes
+
+
+def _measure_activity(steps: Signal) -> float:
     """Return which part of a log an input moves in, from its first move to its last; 0 where it never moves."""
-    steps = np.diff(values[np.isfinite(values)])
-    if steps.size < 2 * BLOCKS:
-        return 0.0
     power = np.array([float(np.sum(block**2)) for block in np.array_split(steps, BLOCKS)])
     power -= float(np.median(power))  # of a reading's noise
     moving = np.flatnonzero(power > MOVES * np.max(power))

@@ -101,7 +101,7 @@ def judge(
         *_find_noiseless(fit, minimum),
         *find_excesses(fit),
         *find_rough(fit, error),
-        *find_single_event(fit.experiments),
+        *find_single_event((*fit.experiments, *validation)),
         *find_other_minimum(fit),
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum).items() if test.p < DOUBTFUL}
