@@ -100,8 +100,10 @@ def _say_silent(fit: Fit) -> Iterator[str]:
     for each in fit.silent:
         moves: dict[str, list[str]] = {}
         for name, shift in each.shifts.items():
-            percent = 100.0 * shift * each.size / abs(fit.parameters[name].value)
-            moves.setdefault(f"{abs(percent):.2g} % {'more' if percent > 0.0 else 'less'}", []).append(name)
+            parameter, moved = fit.parameters[name], abs(shift * each.size)
+            of_value = f"{100.0 * moved / abs(parameter.value):.2g} %" if parameter.value else f"{moved:.3g}"
+            unit = "" if parameter.value else unit_after(parameter.unit)
+            moves.setdefault(f"{of_value}{unit} {'more' if shift * each.size > 0.0 else 'less'}", []).append(name)
         would = " and ".join(f"{join_words(names)} would be {by}" for by, names in moves.items())
         yield (
             f"Such logs cannot tell whether {each.effect}: with {each.parameter} = {each.size:.3g}"
