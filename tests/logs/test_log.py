@@ -79,12 +79,12 @@ def test_steps_keep_their_area_on_a_new_clock():
     assert "I as the mean of its steps" in even.notes[-1]
 
 
-def test_steps_are_lines_across_a_lost_sample_and_missing_where_they_are_missing():
+def test_steps_are_lines_across_a_lost_sample_and_missing_where_more_are_missing_than_is_bridged():
     t, values = np.delete(np.arange(50) / 50, [10, 11]), np.delete(np.arange(50.0), [10, 11])
-    values[20] = np.nan
-    even = make(t, I=values).resample(rate_hz=50, steps=("I",), bridge_s=0.1)
-    assert np.flatnonzero(np.isnan(even["I"])).tolist() == [22]
-    np.testing.assert_allclose(np.delete(even["I"], 22), np.delete(np.arange(50.0), 22), atol=1e-9)
+    values[20:24] = np.nan
+    even = make(t, I=values).resample(rate_hz=50, steps=("I",), bridge_s=0.07)
+    assert np.flatnonzero(np.isnan(even["I"])).tolist() == [22, 23, 24, 25]
+    np.testing.assert_allclose(np.delete(even["I"], np.s_[22:26]), np.delete(np.arange(50.0), np.s_[22:26]), atol=1e-9)
 
 
 def test_steps_name_channels():
@@ -108,6 +108,21 @@ def test_a_missing_sample_stays_missing():
     values[20] = np.nan
     even = make(np.arange(50) / 50, F1=values).resample(rate_hz=100)
     assert np.flatnonzero(np.isnan(even["F1"])).tolist() == [39, 40, 41]
+
+
+def test_rows_that_devices_fill_in_turn_are_joined_where_a_bridge_is_declared():
+    """Each channel has its own samples, on lines between them, and at the ends what is next to them."""
+    t = np.arange(2000) / 1000
+    rows = np.arange(t.size)
+    log = make(t, F1=np.where(rows % 2 == 0, sine(t), np.nan), F2=np.where(rows % 4 == 1, sine(t), np.nan))
+    assert np.isnan(log.resample(rate_hz=1000)["F1"]).sum() == 1000
+    joined = log.resample(rate_hz=1000, bridge_s=0.0045)
+    np.testing.assert_allclose(joined["F1"], sine(t), atol=2e-2)
+    np.testing.assert_array_equal(joined["F1"][::2], sine(t)[::2])
+    assert np.abs(joined["F2"][1:-3] - sine(t)[1:-3]).max() < 1e-3 and np.isfinite(joined["F2"][0])
+    assert np.isnan(log.resample(rate_hz=1000, bridge_s=0.003)["F2"]).sum() > 1490
+    faults = [fault for fault in log.quality.findings if fault.kind == "missing"]
+    assert [fault.keys[0]["resample"]["bridge_s"] for fault in faults] == [0.0025, 0.0045]
 
 
 def test_restamping_straightens_rounded_timestamps_and_touches_no_sample():

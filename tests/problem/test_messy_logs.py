@@ -85,6 +85,30 @@ def test_two_tables_side_by_side_are_brought_to_the_faster_clock(tmp_path, held)
     np.testing.assert_allclose(log["tau_s"], np.interp(log.time, slow, torque), rtol=1e-6, atol=1e-9)
 
 
+def test_rows_that_devices_fill_in_turn_are_joined(tmp_path, held):
+    t, of = held
+    rows = np.arange(t.size)
+    current, torque = (np.where(rows % 2 == first, of[name], np.nan) for first, name in ((0, "I"), (1, "tau_s")))
+    write_csv(tmp_path / "turns.csv", {"t [s]": t, "I [A]": current, "tau_s [Nm]": torque})
+    proposal = propose([tmp_path / "turns.csv"], {}, tmp_path)
+    assert "bridge_s" in proposal.text
+    (experiment,) = read_back(tmp_path, proposal)
+    np.testing.assert_allclose(experiment.log["I"][::2], of["I"][::2], atol=1e-6)
+    assert np.all(np.isfinite(experiment.log["I"]))
+
+
+@pytest.mark.parametrize("every", [4, 7])
+def test_noise_of_a_sensor_on_a_clock_of_its_own_is_that_of_its_readings(tmp_path, held, every):
+    t, of = held
+    own, noise = t[::every], np.random.default_rng(0).normal(scale=0.05, size=t[::every].size)
+    pad = np.full(t.size - own.size, np.nan)
+    columns = {"t_cell [s]": np.append(own, pad), "tau_s [Nm]": np.append(of["tau_s"][::every] + noise, pad)}
+    write_csv(tmp_path / "cell.csv", {"t_drive [s]": t, "I [A]": of["I"], **columns})
+    text = propose([tmp_path / "cell.csv"], {}, tmp_path).text
+    measured = float(text.split("noise_std = { tau_s = ")[1].split(" ")[0])
+    assert 0.03 < measured < 0.3  # of lines between them: 0.002
+
+
 def test_two_clocks_of_a_matlab_file_are_brought_together(tmp_path, held):
     t, of = held
     slow = np.arange(0.1, 5.9, 1 / 150.0)

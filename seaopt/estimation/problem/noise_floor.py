@@ -6,8 +6,9 @@ difference has six times its variance, so that an output's noise is at least
 .. math:: s = \sqrt{\overline{(r_{t-1} - 2 r_t + r_{t+1})^2} / 6}
 
 (differences as of von Neumann, Ann. Math. Statist. 12, 1941), and at least what its quantisation makes, a step over
-the root of 12, which a slow signal shows in no difference. The noise that a user states counts where the sensor's is
-coloured, as behind a filter. The excess, the residual's rms over that noise, is 1 to 1.1 of right models.
+the root of 12, which a slow signal shows in no difference. Of an output that was interpolated from a slower clock the
+differences are over so many samples as lie between two readings. The noise that a user states counts where the sensor's
+is coloured, as behind a filter. The excess, the residual's rms over that noise, is 1 to 1.1 of right models.
 
 Both are of the residuals as they are fitted: in the band, and as the loss weighs them.
 """
@@ -17,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
@@ -28,6 +30,9 @@ from seaopt.records import record
 
 STATED = 5.0  # times the noise between neighbours that a stated one counts for: more is a weight, not a sensor's noise
 
+COARSE = 8.0  # steps of a reading that an output moves by: fewer lie on lines by chance
+STRAIGHT = 1e-9  # of an output's range: a second difference that is rounding
+MOST_BENDS, MOST_BETWEEN, FEWEST_MOVES = 0.7, 64, 200  # share of samples off a line, readings' distance, samples
 ROUNDING = 1e-6  # of the spread: less than that is no sensor's noise
 
 
@@ -67,7 +72,8 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
         count[o] = sum(int(np.count_nonzero(part)) for part in used)
         power = sum(float(np.sum(loss.slope(part) ** 2)) for part in residuals.weighted_of(name))
         rms[o] = np.sqrt(power / max(count[o], 1.0))
-        seconds = [np.diff(loss.slope(part * (gain / sigma)), 2) for part in residuals.raw_of(name)]
+        apart = max(map(_count_between, output.measured), default=1)
+        seconds = [_take_second(loss.slope(part * (gain / sigma)), apart) for part in residuals.raw_of(name)]
         seconds = [part[np.isfinite(part)] for part in seconds]
         neighbours = float(np.sqrt(np.mean(np.concatenate(seconds) ** 2) / 6.0)) if any(map(len, seconds)) else 0.0
         step = find_quantisation(np.concatenate(output.measured)) / np.sqrt(12.0) * gain / sigma
@@ -75,6 +81,22 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
         rounding = ROUNDING * output.spread * gain / sigma
         noise[o] = max(neighbours, step, min(stated, STATED * neighbours), rounding)
     return NoiseFloor(noise=noise, rms=rms, count=count)
+
+
+def _take_second(values: Float[np.ndarray, " n"], apart: int) -> Float[np.ndarray, " _"]:
+    """Return the second differences over samples so far apart."""
+    return values[2 * apart :] - 2.0 * values[apart:-apart] + values[: -2 * apart]
+
+
+def _count_between(measured: Float[np.ndarray, " _"]) -> int:
+    """Return how many samples lie between two readings at most, of an output on lines between them; 1 of any other."""
+    first, second = np.abs(np.diff(measured)[1:]), np.diff(measured, 2)
+    moving = np.isfinite(second) & (first > 0.0)
+    if np.count_nonzero(moving) < FEWEST_MOVES or np.median(first[moving]) < COARSE * find_quantisation(measured):
+        return 1
+    straight = np.abs(second[moving]) <= STRAIGHT * np.ptp(measured[np.isfinite(measured)])
+    bends = 1.0 - float(np.mean(straight))
+    return 1 if bends > MOST_BENDS else min(int(np.ceil(2.0 / max(bends, 1e-3))), MOST_BETWEEN)
 
 
 def _weigh_gaussian(loss: Loss) -> float:

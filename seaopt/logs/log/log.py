@@ -214,7 +214,8 @@ class Log:
         bridge_s : float, optional
             Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out, or twice
             the steps that are usual where their lengths vary. A log sampled at irregular times may need a longer one,
-            or it falls apart into short segments.
+            or it falls apart into short segments. If given, a channel whose samples are so far apart, with others
+            missing between them, is interpolated across these, too.
 
         Returns
         -------
@@ -235,7 +236,15 @@ class Log:
         """
         longest = self.gap_s if bridge_s is None else bridge_s
         return self.with_values(
-            *resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, steps=steps, longest_s=longest)
+            *resampling.resample(
+                self,
+                self.period,
+                rate_hz=rate_hz,
+                rule=rule,
+                steps=steps,
+                longest_s=longest,
+                hole_s=bridge_s or 0.0,
+            )
         )
 
     def restamp(self, *, rate_hz: float | None = None) -> Log:

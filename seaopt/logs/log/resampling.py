@@ -29,10 +29,18 @@ Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], s
 
 
 def resample(
-    log: Recording, period: float, *, rate_hz: float, rule: Rule | None, steps: Sequence[str], longest_s: float
+    log: Recording,
+    period: float,
+    *,
+    rate_hz: float,
+    rule: Rule | None,
+    steps: Sequence[str],
+    longest_s: float,
+    hole_s: float = 0.0,
 ) -> Resampled:
     """Return time and channels on a uniform clock, and a note: see `Log.resample`. `longest_s`: of a step that is
-    interpolated across. Raises LogError: the rate is not positive, or would alias, or no segment is long enough.
+    interpolated across; `hole_s`: the same of the samples that a channel has. Raises LogError: the rate is not
+    positive, or would alias, or no segment is long enough.
     """
     chosen = rule if rule is not None else Linear()
     if not isinstance(chosen, Hold | Linear | Nearest):
@@ -72,7 +80,7 @@ def resample(
             continue
         new_time.append(grid)
         for name, parts in new_values.items():
-            values = log.signals[name].values[segment]
+            values = fill_holes(time[segment], log.signals[name].values[segment], hole_s)
             if name in steps:
                 parts.append(_average_steps(grid, time[segment], values, period, rate_hz))
             else:
@@ -86,6 +94,23 @@ def resample(
         times = "1 step of time is" if gaps == 1 else f"{gaps} steps of time are"
         note += f"; {times} longer than {longest_s:.3g} s and stay gaps: {HOW_TO_BRIDGE}"
     return np.concatenate(new_time), {name: np.concatenate(parts) for name, parts in new_values.items()}, note
+
+
+def fill_holes(
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], longest_s: float
+) -> Float[np.ndarray, " n"]:
+    """Return a channel whose missing samples are on the line between those beside them, where these are at most so far
+    apart; at an end they are what is next to them. Devices that write at times of their own leave such holes.
+    """
+    present = np.flatnonzero(np.isfinite(values))
+    if present.size in (0, values.size) or longest_s <= 0.0:
+        return values
+    after = np.searchsorted(present, np.arange(values.size))
+    late = time[present[np.minimum(after, present.size - 1)]]
+    early = time[present[np.maximum(after - 1, 0)]]
+    apart = np.maximum(late - time, 0.0) + np.maximum(time - early, 0.0)
+    line = np.interp(time, time[present], values[present])
+    return np.where(np.isnan(values) & (apart <= longest_s), line, values)
 
 
 def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) -> Float[np.ndarray, " m"]:

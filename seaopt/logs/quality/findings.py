@@ -25,6 +25,8 @@ Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 MAX_PLACES = 20  # that a finding lists
 COARSE_LEVELS, FINE_LEVELS = 32, 4096  # in a channel's range: a warning below the one, no finding above the other
+MOST_BRIDGED = 50  # missing samples in a row of a device with times of its own
+PART = 0.1  # of a log: where no more of it is without holes, they are everywhere
 LEAST_CORRELATION = 0.3  # correlation above which a lag is one
 
 
@@ -121,9 +123,12 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
             f"{name} lacks {format_count(missing.samples, 'sample')} of {time.size}; in an output they have no weight; "
             "an input must have none"
         )
-        start, stop = _find_longest_without(missing, time)
-        text += f": cut the log to its longest part without, log.between({start:g}, {stop:g})"
-        keys = ({"slice_s": [start, stop]},)
+        keys = _advise_on_holes(missing, time)
+        if "resample" in keys:
+            text += f": a device with times of its own; log.resample(**{keys['resample']}) joins what it has"
+        else:
+            text += f": cut the log to its longest part without, log.between({', '.join(map(str, keys['slice_s']))})"
+        keys = (keys,)
         yield fault(missing, kind="missing", severity="warning", unit=unit, sentence=text, keys=keys)
     if beyond.size:
         count = format_count(beyond.size, "sample")
@@ -186,6 +191,19 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
             f"{max(channel.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it "
             "(band_hz)",
         )
+
+
+def _advise_on_holes(missing: RowRanges, time: Float[np.ndarray, " n"]) -> Mapping[str, Any]:
+    """Return the keys of a problem file for a log with missing samples: holes that are short and everywhere are
+    bridged, else the log is cut.
+    """
+    start, stop = _find_longest_without(missing, time)
+    longest = int(np.max(missing.lengths))
+    if longest > MOST_BRIDGED or (stop - start) > PART * np.ptp(time):
+        return {"slice_s": [start, stop]}
+    period = float(np.median(np.diff(time)))
+    rate_hz, bridge_s = (float(f"{value:.3g}") for value in (1.0 / period, (longest + 1.5) * period))
+    return {"resample": {"rate_hz": rate_hz, "bridge_s": bridge_s}}
 
 
 def _find_longest_without(runs: RowRanges, time: Float[np.ndarray, " n"]) -> tuple[float, float]:

@@ -228,6 +228,12 @@ def _describe_clock(log: DescribedLog) -> list[tuple[str, str]]:
         return rows
     if clock.repeated.size:
         rows.append(('duplicates = "first"', f"{clock.repeated.size} times occur twice"))
+    driver = log.roles.columns.get(log.roles.input)
+    hole = 0 if driver is None else driver.hole
+    if hole and not clock.jitter_max > JITTER_LIMIT * clock.period:
+        rate = float(f"{clock.rate_hz:.3g}")
+        settings = f"rate_hz = {rate:.10g}, bridge_s = {(hole + 1.5) / rate:.3g}"
+        rows.append((f"resample = {{ {settings} }}", "the input is in some rows only, with the others between them"))
     if clock.jitter_max > JITTER_LIMIT * clock.period:
         if clock.rounded_only:
             rows.append(('resample = "restamp"', "the timestamps are rounded"))

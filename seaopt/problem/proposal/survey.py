@@ -15,7 +15,9 @@ from seaopt.errors import LogError, suggestion
 from seaopt.formatting import join_words
 from seaopt.logs import contents
 from seaopt.logs.formats import Field, open_source
+from seaopt.logs.log.resampling import fill_holes
 from seaopt.logs.quality.faults import find_quantisation
+from seaopt.logs.quality.findings import MOST_BRIDGED
 from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
 from seaopt.problem.proposal.vocabulary import Header, is_count, is_named_time, read_header
 from seaopt.records import record
@@ -38,6 +40,8 @@ class SurveyedColumn:
     # the column of its own times, or the format's own clock, where they are not the log's: `values` are then
     # interpolated to that
     clock: str = ""
+    readings: Float[np.ndarray, " m"] | None = None  # before they were interpolated, if they were
+    hole: int = 0  # the largest number of rows that were empty in turn, and interpolated
 
     @property
     def name(self) -> str:
@@ -58,13 +62,14 @@ class SurveyedColumn:
     @property
     def noise(self) -> float:
         """Standard deviation of what changes from sample to sample: third differences remove what is smooth."""
-        third = np.diff(self.values[np.isfinite(self.values)], 3)
+        read = self.values if self.readings is None else self.readings
+        third = np.diff(read[np.isfinite(read)], 3)
         return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0)) if third.size else 0.0
 
     @property
     def quantum(self) -> float:
         """The step whose multiples the samples are; 0 where there is none."""
-        return find_quantisation(self.values)
+        return find_quantisation(self.values if self.readings is None else self.readings)
 
     @property
     def whole(self) -> bool:
@@ -122,7 +127,7 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
     chosen, members = next(iter(groups.items()))
     if not chosen:
         chosen = next((name for name in members if runs_on(raw[name])), None)
-    columns = {name: SurveyedColumn(header=headers[name], values=raw[name]) for name in members}
+    columns = {name: _fill_column(headers[name], raw[name], name == chosen) for name in members}
     overlap = None
     if chosen is not None:
         others = {other: names for other, names in groups.items() if other and other != chosen}
@@ -157,6 +162,17 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
         overlap_s=overlap,
         clock_units={column.clock: _read_unit(column.clock, headers, raw) for column in moving if column.clock},
     )
+
+
+def _fill_column(header: Header, values: Float[np.ndarray, " n"], is_clock: bool) -> SurveyedColumn:
+    """Return a column; one that has samples only in some rows, all over the log, with lines between them."""
+    present = np.flatnonzero(np.isfinite(values))
+    holes = np.diff(present) - 1
+    if is_clock or not np.any(holes) or np.max(holes) > MOST_BRIDGED:
+        return SurveyedColumn(header=header, values=values)
+    rows = np.arange(values.size, dtype=float)
+    filled = fill_holes(rows, values, MOST_BRIDGED + 1.0)
+    return SurveyedColumn(header=header, values=filled, readings=values[present], hole=int(np.max(holes)))
 
 
 def _read_header(name: str, unit: str | None, *, odd: bool) -> Header:
@@ -251,7 +267,7 @@ def _move_to_clock(
             if name != other:
                 good = there & np.isfinite(raw[name])
                 values = np.interp(time, own[good], raw[name][good], np.nan, np.nan) if np.any(good) else raw[name]
-                moved[name] = SurveyedColumn(header=headers[name], values=values, clock=other)
+                moved[name] = SurveyedColumn(header=headers[name], values=values, clock=other, readings=raw[name][good])
     return moved, (low, high) if low < high else None
 
 

@@ -90,3 +90,13 @@ def test_the_floor_does_not_depend_on_the_scale_of_the_weights():
     problem, z = pose(noise(0.3) + 0.5 * SLOW)
     other = replace(problem, experiments=tuple(replace(e, sigma=7.0 * e.sigma) for e in problem.experiments))
     assert measure_excess(other, z)["log.y"] == pytest.approx(measure_excess(problem, z)["log.y"], rel=1e-12)
+
+
+@pytest.mark.parametrize(("between", "shift"), [(4, 0.0), (4, 0.3), (10, 0.0)])
+def test_an_output_on_lines_between_slower_readings_has_their_noise(between, shift):
+    """Its neighbours are on one line, whose second differences are no noise: a right model had five times it."""
+    rows = np.arange(N)
+    own = np.arange(-between, N + between, between) + shift
+    error = np.random.default_rng(1).normal(scale=0.3, size=own.size)
+    excess = measure_excess(*pose(np.interp(rows, own, 2.0 * np.sin(own * 2e-3) + error) - 2.0 * SLOW))
+    assert excess["log.y"] == pytest.approx(1.0, abs=0.3)
