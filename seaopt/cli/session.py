@@ -363,7 +363,7 @@ class Session:
         if as_json:
             content = {"schema": "seaopt/validation/1", "log": str(log), "fit_met": fitted.met}
             sys.stdout.write(to_json(content | comparison.to_dict() | {"outputs": score.to_dict()}))
-            return comparison.met is not False
+            return comparison.met is True
         if not fitted.met:
             self.say(f"warning: scored {UNMET}: {fitted.verdict}")
         console = Terminal()
@@ -374,7 +374,7 @@ class Session:
             console.say(repr(comparison))
         if amount == "verbose":
             console.say(repr(fitted))
-        return comparison.met is not False
+        return comparison.met is True
 
     def _frf(self, tell: Progress) -> None:
         if not self.problem.table.experiment:

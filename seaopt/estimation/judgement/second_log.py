@@ -40,6 +40,7 @@ from seaopt.records import Result, Worded, record
 SECOND = 0.75  # of the larger amplitude, up to which another log is a second amplitude
 APART = 3.0  # standard deviations from which the values of logs differ
 FAR = 3.0  # excess from which intervals of one log hold no more
+MORE = 2.0  # times the excess of the fit's logs, that another log may have
 
 
 def compare_logs(fit: Fit, validation: Sequence[Experiment] = ()) -> Fit:
@@ -76,12 +77,23 @@ class LogComparison(Result, Worded):
         Those of the fit, with std of noise and model together.
     amplitudes : tuple of float
         Of the fit's logs of the same plant.
+    excess : float
+        The residual of the fit over its sensors' noise, on its logs of the same plant.
+    fit_met : bool
+        Whether the fit is met, without which nothing is.
     """
 
     name: str
     log: LogValues
     values: Mapping[str, tuple[float, OrInfinite]]
     amplitudes: tuple[float, ...] = ()
+    excess: float = 1.0
+    fit_met: bool = True
+
+    @property
+    def explained(self) -> bool:
+        """Whether the model, with values of the log's own, leaves little more of it than the fit leaves of its logs."""
+        return self.log.excess <= max(FAR, MORE * self.excess)
 
     @property
     def distances(self) -> dict[str, float]:
@@ -94,8 +106,12 @@ class LogComparison(Result, Worded):
 
     @property
     def met(self) -> bool | None:
-        """Whether no value differs by more than 3 standard deviations; None where the log determines them not."""
-        return max(self.distances.values(), default=0.0) <= APART if self.log.determined else None
+        """Whether no value differs by more than 3 standard deviations, of a fit that is met and a log that its model
+        explains; None where the log determines them not.
+        """
+        if not self.log.determined:
+            return None
+        return self.fit_met and self.explained and max(self.distances.values(), default=0.0) <= APART
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict, the values of both and their distances."""
@@ -104,6 +120,8 @@ class LogComparison(Result, Worded):
             "amplitude": self.log.amplitude,
             "amplitudes_fitted": list(self.amplitudes),
             "excess": self.log.excess,
+            "excess_fitted": self.excess,
+            "fit_met": self.fit_met,
             "values": {
                 name: {
                     "fit": self.values[name][0],
@@ -134,7 +152,8 @@ def compare_with_log(
     Returns
     -------
     LogComparison
-        Prints itself; `met` where no value differs by more than 3 standard deviations.
+        Prints itself; `met` where the fit is, no value differs by more than 3 standard deviations, and the model
+        explains the log.
 
     Raises
     ------
@@ -159,6 +178,8 @@ def compare_with_log(
         log=log,
         values={name: (fit.parameters[name].value, fit.parameters[name].total_std or 0.0) for name in log.values},
         amplitudes=tuple(spread for spread in spreads if spread is not None),
+        excess=max((each.excess or 0.0 for row in rows for each in row.values()), default=0.0),
+        fit_met=fit.met,
     )
 
 

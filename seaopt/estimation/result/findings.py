@@ -77,8 +77,8 @@ def state_guesses(guessed: Sequence[str]) -> str:
 
 
 def order_findings(findings: Iterable[FitFinding]) -> tuple[FitFinding, ...]:
-    """Return findings with the errors first, and the notes last."""
-    return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+    """Return findings with the errors first, and the notes last; of each severity a cause first, as it is the cure."""
+    return tuple(sorted(findings, key=lambda each: (SEVERITIES.index(each.severity), each.kind != "cause")))
 
 
 def find_guesses(guessed: Sequence[str]) -> tuple[FitFinding, ...]:

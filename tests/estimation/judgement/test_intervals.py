@@ -86,6 +86,10 @@ def test_another_log_contradicts_values_that_it_would_not_give():
     assert comparison.met is False and comparison.distances["a"] > 3.0
     assert comparison.amplitudes[0] == pytest.approx(2.0 * comparison.log.amplitude, rel=0.1)
     assert "contradicts the fit" in repr(comparison) and "0.4" in repr(comparison)
+    alike = compare_with_log(result, record_log(1.0, 0.05, 7))
+    assert max(alike.distances.values()) < 3.0 and alike.met is False and "on a fit that is not met" in repr(alike)
+    strange = compare_with_log(fit(record_log(1.0, 0.0, 6)), record_log(1.0, 0.05, 8))
+    assert strange.met is False and "times its sensor's noise is left" in repr(strange)
     agrees = compare_with_log(fit(record_log(1.0, 0.0, 6)), same)
     assert agrees.met and "its own values are the fit's" in repr(agrees)
 

@@ -35,7 +35,7 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     errors = [(each.text, each.where) for each in fit.errors]
     if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
         errors.insert(0, (fit.message, ""))
-    reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit.errors))
+    reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit.findings))
     again = f"correct the file, then type {commands.fit}" if commands.fit else ""
     return Verdict(
         met=False,
@@ -252,11 +252,11 @@ def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
         yield Reason(what=what, where=text, count=1 + len(named[MOST_PLACES:]))
 
 
-def _list_cures(errors: Sequence[FitFinding]) -> tuple[str, ...]:
+def _list_cures(findings: Sequence[FitFinding]) -> tuple[str, ...]:
     """Return the lines to write for the likely cause that is named first. What is not told from zero is not to be
     freed: a search for how sharp friction is takes long and ends nowhere.
     """
-    cause = next((finding for finding in errors if finding.kind == "cause" and finding.preferred), None)
+    cause = next((finding for finding in findings if finding.kind == "cause" and finding.preferred), None)
     if cause is None:
         return ()
     apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}

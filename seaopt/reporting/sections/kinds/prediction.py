@@ -21,19 +21,27 @@ def judge(result: ModelledOutputs | LogComparison, commands: Commands) -> Verdic
     if comparison.met:
         within = format_number(max(distances.values(), default=0.0), 2)
         return Verdict(met=True, text=f"{comparison.name}: its own values are the fit's, within {within} std")
+    reasons = list[Reason]()
+    if not comparison.fit_met:
+        reasons.append(Reason(what="the fit", where="is not met, and its values are not to be used"))
+    if not comparison.explained:
+        left = f"{comparison.log.excess:.3g} times its sensor's noise is left with values of its own"
+        reasons.append(Reason(what="the model", where=f"{left}, {comparison.excess:.3g} on the logs of the fit"))
     apart = sorted((name for name, each in distances.items() if each > APART), key=lambda name: -distances[name])
+    reasons += [
+        Reason(
+            what=name,
+            where=f"{comparison.log.values[name][0]:.4g} by this log alone, {comparison.values[name][0]:.4g} by the "
+            f"fit: {distances[name]:.2g} std apart{_describe_amplitude(comparison)}",
+        )
+        for name in apart
+    ]
+    agrees = comparison.explained and not apart
     return Verdict(
         met=False,
-        text=f"{comparison.name}: contradicts the fit",
-        reasons=tuple(
-            Reason(
-                what=name,
-                where=f"{comparison.log.values[name][0]:.4g} by this log alone, {comparison.values[name][0]:.4g} by "
-                f"the fit: {distances[name]:.2g} std apart{_describe_amplitude(comparison)}",
-            )
-            for name in apart
-        ),
-        next=("fit both logs: values of one model then have the interval that both allow",),
+        text=f"{comparison.name}: {'its values agree, on a fit that is not met' if agrees else 'contradicts the fit'}",
+        reasons=tuple(reasons),
+        next=("fit both logs: values of one model then have the interval that both allow",) if apart else (),
     )
 
 
