@@ -25,11 +25,11 @@ is the motor's, and the units are N m and rad):
     smooths the curve of describing functions alone.
 ``hysteresis``
     A spring of the stiffness k_h beside the main one, which gives way at a deflection y_h of its own: Bouc's and Wen's
-    law (Wen, J. Eng. Mech. Div. 102(2), 1976) of exponent one with beta = gamma = 1/(2 y_h),
-    :math:`\dot z = \dot\delta - (\dot\delta |z| + |\dot\delta| z)/(2 y_h)` and :math:`F = \dots + k_h z`. So it unloads
-    elastically, the stiffness stays from k to k + k_h, and :math:`k_h z (\dot\delta - \dot z) \ge 0` is lost, whatever
-    the motion. Elements of Maxwell's that slip at once instead have a tangent that jumps, over which derivatives of a
-    simulation step; here it has corners only where the motion turns. Over a cycle from -A to A it loses
+    law (Wen, J. Eng. Mech. Div. 102(2), 1976) of the exponent n_h, with beta = gamma,
+    :math:`\dot z = \dot\delta - \tfrac12 (\dot\delta + |\dot\delta| \operatorname{sgn} z) |z/y_h|^{n_h}` and
+    :math:`F = \dots + k_h z`. So it unloads elastically, the stiffness stays from k to k + k_h, and
+    :math:`k_h z (\dot\delta - \dot z) \ge 0` is lost, whatever the motion. The larger n_h, the more at once it
+    slips, as an element of Maxwell's does, whose tangent jumps. With n_h = 1 a cycle from -A to A loses
     :math:`2 k_h [2 y_h (A - z_0) - z_0^2/2]`, with :math:`z_0 = y_h [1 - W(e^{1 - 2 A/y_h})]`, Lambert's W.
 ``backlash``
     Play of total width :math:`2 g_b` in series with the spring: the spring sees
@@ -123,6 +123,9 @@ Part = Literal[
     "thermal",
 ]
 
+SHARPNESS = declare("n_h", 1.0, "-", 1.0, "how much at once it gives way, an exponent")
+LEAST_SHARE = 1e-6  # of y_h that it is deflected by at least, for its logarithm
+
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "stribeck": (
         declare("f_s", 0.0, "N", 0.0, "breakaway friction at the screw", (0, 100000)),
@@ -148,6 +151,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "hysteresis": (
         declare("k_h", 0.0, "N/m", 0.0, "stiffness of the spring that gives way"),
         declare("y_h", 1e-4, "m", 1e-12, "deflection at which it gives way"),
+        SHARPNESS,
     ),
     "backlash": (
         declare("g_b", 2e-5, "m", 0.0, "half of the play", (0, 0.1)),
@@ -288,7 +292,8 @@ def lugre_rate(parts: Sequence[str], z: Any, speed: Any, p: Any) -> Any:
 
 def hysteresis_rate(z: Any, speed: Any, p: Any) -> Any:
     """Return the rate of the deflection z of the spring that gives way, at a rate of the main spring's deflection."""
-    return speed - (speed * ca.fabs(z) + ca.fabs(speed) * z) / (2.0 * p.y_h)
+    share = ca.fmax(ca.fabs(z) / p.y_h, LEAST_SHARE) ** p.n_h
+    return speed - 0.5 * (speed + ca.fabs(speed) * ca.sign(z)) * share
 
 
 @record

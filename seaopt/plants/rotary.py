@@ -28,7 +28,7 @@ from seaopt.plants.actuator import (
     make_plant,
 )
 from seaopt.plants.motor import effects
-from seaopt.plants.parts import INSIDE, PARTS, Part, check_parts
+from seaopt.plants.parts import INSIDE, PARTS, SHARPNESS, Part, check_parts
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import GRAVITY
 from seaopt.plants.roles import Port, Recipe, Sensing
@@ -74,6 +74,7 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
     "hysteresis": (
         declare("k_h", 0.0, "N m/rad", 0.0, "stiffness of the spring that gives way"),
         declare("y_h", 5e-3, "rad", 1e-12, "deflection at which it gives way"),
+        SHARPNESS,
     ),
     "backlash": (
         declare("g_b", 5e-4, "rad", 0.0, "half of the play, at the spring", (0, 1)),

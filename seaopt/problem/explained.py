@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from seaopt.documents import check_table
@@ -25,7 +26,8 @@ def find_explanation(fit: Fit) -> HypothesisTrial | None:
 
 def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:
     """Return the problem with a hypothesis that was tried, and the lines of its file that are then other ones. The
-    parts go to every plant that is fitted. Raises SeaoptError: a plant does not take them.
+    parts go to every plant that is fitted, and its fit starts from the refit's values. Raises SeaoptError: a plant does
+    not take them.
     """
     content = problem.table.model_dump(by_alias=True, exclude_unset=True, mode="json")
     fitted = [table.plant for table in problem.table.experiment if table.use == "fit"]
@@ -42,7 +44,9 @@ def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:
     content["parameters"] = {**content.get("parameters", {}), **values}
     lines += ["[parameters]", *(f"{name} = {_write(value)}" for name, value in values.items())]
     table = check_table(ProblemTable, content, problem.source, error=ProblemError)
-    return make_problem(table, problem.source, problem.folder), "\n".join(lines)
+    made = make_problem(table, problem.source, problem.folder)
+    start = {name: value for name, value in trial.parameters.items() if name in made.parameters}
+    return replace(made, parameters=made.parameters.update(**start)), "\n".join(lines)
 
 
 def _round(value: float) -> float:

@@ -179,15 +179,15 @@ def _weigh_hypotheses(
 ) -> Iterator[Cause]:
     """Yield what hypotheses about what the model lacks are worth, each with the part that brings it."""
     for refit in hypotheses:
-        added = join_words([f"{name} = {refit.values[name]:.4g}" for name in refit.change.frees])
+        added = join_words([f"{name} = {value:.4g}" for name, value in {**refit.frees, **refit.fixed}.items()])
         parts = join_words(refit.change.parts)
         word = "part" if len(refit.change.parts) == 1 else "parts"
         candidate = Candidate(
-            where=", ".join(refit.change.frees),
+            where=", ".join(refit.frees),
             experiments=refit.change.experiments,
             params=refit.change.params,
             says=f"{refit.change.effect}; add {word} {parts}, with {added}",
-            frees=dict.fromkeys(refit.change.frees, 0.0),
+            frees=dict.fromkeys(refit.frees, 0.0),
         )
         cause = _weigh(fit, candidate, refit.problem, refit.evaluation, before, colour, poor=False)
         if cause is not None:

@@ -8,7 +8,7 @@ such as play, have no slope there, and start from a size that actuators have.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import field, fields, replace
 from functools import cache
 
 import casadi as ca
@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.ripple_search import find_ripple
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
@@ -41,20 +43,26 @@ class Sizes:
     friction: float  # dry friction
     deflection: float  # of the spring
     stiffness: float
+    ripple: Mapping[str, float] = field(default_factory=dict[str, float])  # of the residual, over the motor's position
+
+
+SIZES = tuple(each.name for each in fields(Sizes) if each.name != "ripple")
 
 
 @record(eq=False)
 class Hypothesis:
     """What a model may lack: in words, the part that brings it, and from which values of its own a refit starts.
 
-    Those that it frees are the first of each start; `fixed` are chosen once. `usual` is of what logs often do not show
-    at all: a size that actuators have, with a spring of that stiffness (`silence`).
+    Those that it frees are the first of each start; `fixed` are chosen once. What is `searched` is free in the refit
+    alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `usual` is of what logs
+    often do not show at all: a size that actuators have, with a spring of that stiffness (`silence`).
     """
 
     effect: str
     part: str
     starts: Callable[[Sizes], Starts]
     fixed: Callable[[Sizes], Mapping[str, float]] = lambda sizes: {}
+    searched: tuple[str, ...] = ()
     usual: Callable[[float], float] | None = None
 
 
@@ -65,6 +73,12 @@ def _zero(*names: str) -> Callable[[Sizes], Starts]:
 def _rise_at_rest(s: Sizes) -> Starts:
     """Return breakaway friction above what slides, over a slow and over a fast fall."""
     return [{"f_s": 1.4 * s.friction, "v_st": share * s.speed} for share in (0.03, 0.2) if s.friction and s.speed]
+
+
+def _slip_in_spring(s: Sizes) -> Starts:
+    """Return a spring that gives way at a tenth of the deflection, gradually and nearly at once."""
+    start = {"k_h": 0.05 * s.stiffness, "y_h": 0.1 * s.deflection}
+    return [{**start, "n_h": sharpness} for sharpness in (1.0, 4.0)] if s.deflection else []
 
 
 # In the order in which they are tried, those that are the quickest to refit first.
@@ -99,14 +113,17 @@ HYPOTHESES = (
     Hypothesis(
         effect="the spring loses energy in each cycle",
         part="hysteresis",
-        starts=lambda s: [{"k_h": 0.05 * s.stiffness, "y_h": 0.1 * s.deflection}] if s.deflection else [],
+        starts=_slip_in_spring,
+        searched=("n_h",),
     ),
     Hypothesis(
         effect="the joint gives way before it slips",
         part="lugre",
-        starts=lambda s: [{"sigma_0": 50.0 * s.friction / s.travel}] if s.friction and s.travel else [],
-        fixed=lambda s: {"sigma_1": 0.0},
+        starts=lambda s: [{"sigma_0": 50.0 * s.friction / s.travel, "sigma_1": 0.0}] if s.friction and s.travel else [],
     ),
+    Hypothesis(effect="the motor cogs", part="cogging", starts=lambda s: [s.ripple] if s.ripple else []),
+    Hypothesis(effect="the supply sags", part="supply_sag", starts=_zero("R_b")),
+    Hypothesis(effect="the servo's firmware acts late", part="servo_delay", starts=lambda s: [{"T_v": 1e-3}]),
     Hypothesis(
         effect="the current lags its command",
         part="current_loop",
@@ -195,19 +212,21 @@ def change_plants(
 @cache
 def list_freed() -> frozenset[str]:
     """Return the names of the parameters that hypotheses free."""
-    sizes = Sizes(**{each.name: 1.0 for each in fields(Sizes)})
+    sizes = Sizes(**dict.fromkeys(SIZES, 1.0), ripple=dict.fromkeys(("a_g", "b_g", "n_g"), 1.0))
     return frozenset(name for hypothesis in HYPOTHESES for start in hypothesis.starts(sizes) for name in start)
 
 
 def measure_sizes(fit: Fit) -> Sizes:
     """Return how large things are, of the largest experiment: by a simulation of each with the fit's values."""
-    rows = [_measure(experiment, fit) for experiment in fit.experiments]
-    return Sizes(**{each.name: max(getattr(row, each.name) for row in rows) for each in fields(Sizes)})
+    residuals = fit.require_minimum("measure_sizes").residuals()
+    rows = [_measure(experiment, fit, residuals) for experiment in fit.experiments]
+    largest = {name: max(getattr(row, name) for row in rows) for name in SIZES}
+    return Sizes(**largest, ripple=next((row.ripple for row in rows if row.ripple), {}))
 
 
-def _measure(experiment: Experiment, fit: Fit) -> Sizes:
+def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment) -> Sizes:
     plant, log = experiment.plant, experiment.log
-    longest = max(log.segments, key=lambda segment: segment.stop - segment.start)  # no gap is simulated over
+    number, longest = max(enumerate(log.segments), key=lambda pair: pair[1].stop - pair[1].start)  # no gap is crossed
     log = log.between(*(log.time[[longest.start, longest.stop - 1]] - log.time[0]))
     params = plant.complete(experiment.apply_own(fit.parameters))
     run = simulate(plant, params, log, rtol=SIMULATED)
@@ -222,6 +241,11 @@ def _measure(experiment: Experiment, fit: Fit) -> Sizes:
     read = ca.Function("sizes", [plant.x, plant.u, plant.p], [ca.vertcat(*rows)])
     states, inputs = (np.stack([run[name] for name in names]) for names in (plant.states, plant.inputs))
     current, speed, deflection = np.array(read(states, inputs, params.vector))
+    ripple: Mapping[str, float] = {}
+    position, left = plant.sensing and plant.sensing.motor_position, residuals[experiment.name]
+    if position and position in plant.states and len(left.segments) == len(experiment.log.segments):
+        posed = next(e for e in fit.require_minimum("_measure").problem.experiments if e.name == experiment.name)
+        ripple = find_ripple(posed, left, fit.parameters, run[position], number)
     dry = 0.0 if friction is None or friction.jump is None else friction.jump(0.0, friction.add_rated(values))
     return Sizes(
         current=_find_largest(current),
@@ -230,6 +254,7 @@ def _measure(experiment: Experiment, fit: Fit) -> Sizes:
         friction=float(ca.DM(dry)),
         deflection=_find_largest(deflection),
         stiffness=getattr(values, spring.stiffness) if spring and spring.stiffness else 0.0,
+        ripple=ripple,
     )
 
 

@@ -61,22 +61,35 @@ class Refit:
         return self.problem.unknowns.by_name(self.evaluation.z)
 
     @property
+    def frees(self) -> dict[str, float]:
+        """What its parts free, with values."""
+        searched = {name for hypothesis in self.change.hypotheses for name in hypothesis.searched}
+        return {name: self.values[name] for name in self.change.frees if name not in searched}
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """What is chosen for its parts, with values."""
+        return {
+            **{name: self.values[name] for name in self.change.frees if name not in self.frees},
+            **self.change.fixed,
+        }
+
+    @property
     def proposal(self) -> str:
         """The lines of a problem file that add its parts to a plant NAME, with their parameters."""
-        recipe, values = self.change.experiments[0].plant.recipe, self.values
+        recipe = self.change.experiments[0].plant.recipe
         parts = dict.fromkeys((*(recipe.parts if recipe else ()), *self.change.parts))
-        rows = [f"{name} = {{ value = {values[name]:.4g}, free = true }}" for name in self.change.frees]
-        rows += [f"{name} = {value:.4g}" for name, value in self.change.fixed.items()]
+        rows = [f"{name} = {{ value = {value:.4g}, free = true }}" for name, value in self.frees.items()]
+        rows += [f"{name} = {value:.4g}" for name, value in self.fixed.items()]
         listed = ", ".join(f'"{part}"' for part in parts)
         return "\n".join(["[plant.NAME]", f"parts = [{listed}]", "[parameters]", *rows])
 
     @property
     def python(self) -> str:
         """The calls that add them to a plant and its parameters."""
-        change, values = self.change, {**self.values, **self.change.fixed}
-        given = ", ".join(f"{name}={values[name]:.4g}" for name in (*change.frees, *change.fixed))
-        free = ", ".join(f'"{name}"' for name in change.frees)
-        lines = [f'plant = so.plants.add_part(plant, "{part}")' for part in change.parts]
+        given = ", ".join(f"{name}={value:.4g}" for name, value in {**self.frees, **self.fixed}.items())
+        free = ", ".join(f'"{name}"' for name in self.frees)
+        lines = [f'plant = so.plants.add_part(plant, "{part}")' for part in self.change.parts]
         lines += [f"params = plant.defaults.with_parameters(*params.values()).update({given}).free({free})"]
         return "\n".join(lines)
 
@@ -259,16 +272,16 @@ def _judge(refits: Sequence[Refit], first: float) -> Search:
 
 
 def _state(refit: Refit, outcome: Outcome, first: float) -> HypothesisTrial:
-    change, values = refit.change, refit.values
+    change = refit.change
     return HypothesisTrial(
         effect=change.effect,
         parts=change.parts,
         outcome=outcome,
         excess_before=first,
         excess=refit.excess,
-        frees={name: values[name] for name in change.frees},
-        fixed=change.fixed,
-        parameters={name: values[name] for name in refit.problem.shared_names},
+        frees=refit.frees,
+        fixed=refit.fixed,
+        parameters={name: refit.values[name] for name in refit.problem.shared_names},
         evaluations=refit.evaluations,
         proposal=refit.proposal,
         python=refit.python,
