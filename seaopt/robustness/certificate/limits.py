@@ -50,6 +50,7 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
     varied = [row.name for row in cases.unknown.varied()]
     figures = {name: controller.close(plant, nominal).figures() for name, plant in cases.plants.items()}
     stated = cases.plants if survey.point else {}  # of margins nothing is required, and some take long
+    amplitudes = _remark_amplitude(cases, design) if survey.point else ()
     return Evidence(
         requirements=(
             *(design_requirements(controller, design, of_design, varied) if survey.point else ()),
@@ -59,7 +60,7 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
             "plants": figures,
             "margins": {name: plant_margins(controller, plant, nominal) for name, plant in stated.items()},
         },
-        remarks=(*warn_delays(controller.spec, design, survey.source), *_remark_amplitude(cases, design)),
+        remarks=(*warn_delays(controller.spec, design, survey.source), *amplitudes),
     )
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 
-from seaopt.control import Controller
+from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.command import describe_cascade, name_gain_units
 from seaopt.control.laws.verdict import join_labels, list_design_figures
 from seaopt.control.loops.law import describe_integrators
@@ -35,11 +36,16 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
 
 def _name_bandwidths(controller: Controller) -> str:
     """Return the bandwidth asked, and where friction makes two of it the one that is left while it sticks."""
-    asked = f"{controller.spec.bandwidth_hz:g} Hz"
-    stuck = [] if controller.design is None else [*controller.measure_states().values()][1:]
+    asked, stuck = f"{controller.spec.bandwidth_hz:g} Hz", _measure_stuck(controller)
     if not stuck:
         return asked
-    return f"{asked} sliding and {format_number(stuck[0].bandwidth_hz, missing='none')} Hz stuck"
+    return f"{asked} sliding and {format_number(stuck[0][1].bandwidth_hz, missing='none')} Hz stuck"
+
+
+@lru_cache(maxsize=1)  # verdict and sections of a controller are written one after the other
+def _measure_stuck(controller: Controller) -> list[tuple[str, LoopFigures]]:
+    """Return the figures of the design plant where its friction sticks, by state; none without friction."""
+    return [] if controller.design is None else [*controller.measure_states().items()][1:]
 
 
 def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[str, ...]:
@@ -176,8 +182,7 @@ def _describe_friction(controller: Controller) -> Iterator[str]:
         limit = "" if asked is None else f" (asked {asked:g})"
         slope = f"{format_number(loop.friction_slope)} {loop.slope_unit}"
         yield f"Friction margin {slope}{limit}: {controller.friction.describe()}."
-    _, *stuck = controller.measure_states().items()
-    for state, figures in stuck:
+    for state, figures in _measure_stuck(controller):
         bandwidth = format_number(figures.bandwidth_hz, missing="none")
         yield (
             "These figures are of the sliding design plant, on which the bandwidth is placed;"
