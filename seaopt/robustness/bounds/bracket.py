@@ -269,9 +269,11 @@ def _check_digits(controller: Controller, plant: Plant, within: Region, boxes: B
 
 
 def _measure_hardness(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> Float[np.ndarray, " k"]:
-    """Return what each coordinate adds to the root of the models' remainders, which is nearly linear in its width."""
-    if not within.size:
-        return np.zeros(0)
+    """Return what each coordinate adds to the root of the models' remainders, which is nearly linear in its width. A
+    single one has nothing to be compared with.
+    """
+    if within.size < 2:
+        return np.zeros(within.size)
     width = boxes.radius[0]
     alone = Boxes(centre=np.repeat(boxes.centre[:1], within.size, axis=0), radius=TRIAL * np.diag(width))
     model = enclose_plant(controller, plant, within, alone).denominator

@@ -176,7 +176,7 @@ def find_worst(controller: Controller, plant: Plant, unknown: Uncertainty, drawn
     values = unknown.values(points)
     figures = batch_figures(controller, plant, unknown.nominal, values)
     rows = [int(np.argmax(severities(controller, figures, by))) for by in (LARGEST_MS, LARGEST_MT)]
-    largest = [{name: float(column[row]) for name, column in values.items()} for row in rows]
+    largest = [{name: float(column[row]) for name, column in values.items()} for row in dict.fromkeys(rows)]
     return combine_worst([measure_worst(controller, plant, unknown.nominal, at) for at in largest])
 
 
