@@ -16,13 +16,16 @@ from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import realise
 from seaopt.control.loops.compensation.ripple_term import RippleTerm
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.running import closed_loop
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
+from seaopt.control.running.outer_run import enclose_law
 from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import STRICT
 from tests.laws import law_of
 
 TS, SAMPLES, PER_EFFORT = 1e-3, 400, 0.01
+STRUCTURES = 80  # each compiles a loop of its own
 HOT = {"a_11": 0.985, "a_12": 0.01, "a_21": 0.001, "a_22": 0.9989, "b_1": 0.02, "b_2": 1e-5}
 
 
@@ -35,132 +38,139 @@ def make_plant():
     )  # fmt: skip
 
 
-def draw_law(rng):
+def draw_law(shape, rng):
     """Return a law of 0 to 2 integrators and 0 to 3 stable poles, of one measured signal or two."""
-    pole = rng.uniform(-0.5, 0.98, rng.integers(0, 4))
-    den = np.atleast_1d(np.poly([*np.ones(rng.integers(0, 3)), *pole]))
+    den = np.atleast_1d(np.poly([*np.ones(shape.integers(0, 3)), *rng.uniform(-0.5, 0.98, shape.integers(0, 4))]))
     ahead, back = (
         50 * np.atleast_1d(np.poly(rng.uniform(-0.6, 0.99, den.size - 1))) * rng.uniform(0.5, 2.0) for _ in range(2)
     )
     law = law_of(back, den, reference=(ahead, den))
-    if rng.random() < 0.5:
+    if shape.random() < 0.5:
         more = rng.normal(size=law.c.size) * np.abs(law.b[:, 1])
         more[: law.integrators] *= 0.1
         law = replace(law, b=np.column_stack([law.b, more]), d=np.append(law.d, rng.normal()))
     return law
 
 
-def draw_terms(rng):
+def draw_terms(shape, rng, outer):
     """Return compensation of some of friction, gravity and ripple; None for none of them."""
-    source = rng.choice(["reference", "speed"])
+    source = "speed" if outer or shape.random() < 0.5 else "reference"
     friction = FrictionTerm(
-        effort=rng.uniform(10, 80), speed=0.02, speed_unit="m/s", fraction=0.8, source=str(source),
+        effort=rng.uniform(10, 80), speed=0.02, speed_unit="m/s", fraction=0.8, source=source,
         reads="q" if source == "speed" else "", velocity_per_rate=0.01 if source == "speed" else 1e-5,
     )  # fmt: skip
-    gravity = GravityTerm(
-        coefficients=tuple(rng.normal(size=rng.integers(1, 5)) * 50),
-        low=-1.0,
-        high=1.5,
-        reads="x",
-        unit="m",
-        fraction=1.0,
-    )
-    cycles = tuple(sorted({int(n) for n in rng.integers(1, 8, 3)}))
+    coefficients = tuple(rng.normal(size=shape.integers(1, 5)) * 50)
+    gravity = GravityTerm(coefficients=coefficients, low=-1.0, high=1.5, reads="x", unit="m", fraction=1.0)
+    cycles = tuple(sorted({int(n) for n in shape.integers(1, 8, 3)}))
     cos, sin = (tuple(rng.normal(size=len(cycles)) * 20) for _ in range(2))
     ripple = RippleTerm(cycles=cycles, cos=cos, sin=sin, period=0.7, reads="q", unit="m", fraction=1.0)
     terms = {"friction": friction, "gravity": gravity, "ripple": ripple}
-    kept = {name: term for name, term in terms.items() if rng.random() < 0.5}
+    kept = {name: term for name, term in terms.items() if shape.random() < 0.5}
     return Compensation(sample_time_s=TS, **kept) if kept else None
 
 
-def draw_runnable(rng):
-    """Return a law, and the same with random parts and limit."""
+def draw_part(number, rng):
+    """Return a law, the same with random parts and limit, and its outer loop or None; `number`: of its structure."""
+    shape = np.random.default_rng(number)
+    outer = OuterLoop(
+        stiffness=rng.uniform(100, 2000), damping=rng.uniform(0, 20), velocity_filter_s=rng.choice([0.0, 0.004]),
+        direction=float(rng.choice([-1.0, 1.0])), sample_time_s=TS, place_unit="m",
+    )  # fmt: skip
+    outer = outer if shape.random() < 0.3 else None
     gate = PlausibilityGate(range_N=(-2e3, 2e3), max_step_N=300.0, max_held=int(rng.integers(0, 7)), ramp_A_per_s=90.0)
     heat = HeatGuard(**HOT, resistance=0.6, slope=0.002, allowed_rise=rng.uniform(20, 90), share=0.02, ambient=21.0)
-    source = draw_law(rng)
-    return source, realise(
-        source, per_effort=PER_EFFORT, command_limit=rng.choice([None, 4.0, 9.0]), compensation=draw_terms(rng),
-        gate=gate if rng.random() < 0.6 else None, heat=heat if rng.random() < 0.5 else None,
+    source, terms = draw_law(shape, rng), draw_terms(shape, rng, outer)
+    law = realise(
+        source, per_effort=PER_EFFORT, command_limit=shape.choice([None, 4.0, 9.0]), compensation=terms,
+        gate=gate if shape.random() < 0.6 else None, heat=heat if shape.random() < 0.5 else None,
     )  # fmt: skip
+    return source, law, outer
 
 
-def draw_signals(rng, count):
-    """Return a reference and readings, with steps, spikes, numbers that are none, and outages."""
-    rows = lfilter([0.05], [1, -0.95], rng.normal(size=(1 + count, SAMPLES))) * 900
-    rows[0, 200:] += 800.0
-    rows[3:] *= 1e-3  # positions
-    for row in rows:
-        for at in rng.integers(5, SAMPLES, 6):
-            row[at] = rng.choice([np.nan, np.inf, -np.inf, 2e15, -3e3, 700.0])
-        first = rng.integers(SAMPLES // 2, SAMPLES)
-        row[first : first + rng.integers(1, 9)] = np.nan
-    rows[:, :2] = rng.normal(size=(1 + count, 2))
+def draw_signals(rng, names, clean):
+    """Return a reference and readings by name, with steps, spikes, numbers that are none, and outages."""
+    rows = dict(zip(["reference", *names], lfilter([0.05], [1, -0.95], rng.normal(size=(9, SAMPLES))), strict=False))
+    for name, row in rows.items():
+        row *= 0.9 if name in "qx" or (name == "reference" and clean) else 900.0
+        row[200:] += 0.8 * (name == "reference") * (1.0 if clean else 1e3)
+        if not clean or name in clean:
+            row[rng.integers(5, SAMPLES, 6)] = rng.choice([np.nan, np.inf, -np.inf, 2e15, -3e3, 700.0], 6)
+            first = rng.integers(SAMPLES // 2, SAMPLES)
+            row[first : first + rng.integers(1, 9)] = np.nan
+        row[:2] = [0.0, 0.1 * rng.normal()]  # an outer loop takes the first position for one at rest
     return rows
 
 
-def play_python(law, reference, readings):
+def play_python(law, reference, measured, further):
     state, commands = law.reset(), []
-    for r, row in zip(reference.tolist(), readings.T, strict=True):
-        measured = float(row[0]) if law.measured == 1 else row[: law.measured]
-        command, state = law.step(state, r, measured, row[law.measured :].tolist())
+    for k, r in enumerate(reference.tolist()):
+        read = float(measured[0][k]) if law.measured == 1 else np.array([row[k] for row in measured])
+        command, state = law.step(state, r, read, [float(row[k]) for row in further])
         commands.append(command)
     return np.array(commands)
 
 
-def export_all(compiler, laws, controller, folder):
+def export_all(compiler, parts, controller, folder):
     """Return the steps of exported laws, compiled into one library: a function of rows of inputs."""
     code = ["#include <stddef.h>"]
     command = replace(controller.command, per_effort=PER_EFFORT)
-    for number, (source, law) in enumerate(laws):
-        name, inputs = f"law{number}", 1 + law.measured + count_further(law)
+    for number, (source, law, outer) in enumerate(parts):
+        name, inputs = f"law{number}", 1 + law.measured + len(reads_of(law))
         stored = replace(
             controller, law=source, design=None, compensation=law.compensation, reads=("F", "G")[: law.measured],
-            command=command,
+            command=command, outer=outer,
         )  # fmt: skip
         limit = law.command_limit
         export(stored, folder, name=name, gate=law.gate or False, derate=law.heat or False, command_limit=limit)
-        given = ", ".join(f"in[{i}]" for i in range(inputs))
+        given = "".join(f", in[{i}]" for i in range(1, inputs))
+        asked = "in[0]" if outer is None else f"{name}_outer(&law, in[0], in[{inputs}])"
         code.append(f'#include "{name}.h"\nvoid run{number}(const double *in, size_t n, double *out) {{')
         code.append(f"    {name}_law law;\n    size_t i;\n    {name}_init(&law);")
-        code.append(f"    for (i = 0; i < n; i++, in += {inputs}) out[i] = {name}_step(&law, {given});\n}}")
+        code.append(f"    for (i = 0; i < n; i++, in += {inputs + (outer is not None)})")
+        code.append(f"        out[i] = {name}_step(&law, {asked}{given});\n}}")
     (folder / "driver.c").write_text("\n".join(code) + "\n")
     sources = [str(path) for path in sorted(folder.glob("*.c"))]
-    command = [*compiler, *STRICT, "-O0", "-shared", "-fPIC", *sources, "-o", str(folder / "laws.so")]
-    subprocess.run(command, check=True)
-    library = ctypes.CDLL(str(folder / "laws.so"))
+    subprocess.run([*compiler, *STRICT, "-O0", "-shared", "-fPIC", *sources, "-o", str(folder / "laws.so")], check=True)
+    library, pointer = ctypes.CDLL(str(folder / "laws.so")), ctypes.POINTER(ctypes.c_double)
 
     def play(number, rows):
-        rows, out = np.ascontiguousarray(rows.T), np.zeros(rows.shape[1])
-        pointer = ctypes.POINTER(ctypes.c_double)
-        getattr(library, f"run{number}")(
-            rows.ctypes.data_as(pointer), ctypes.c_size_t(out.size), out.ctypes.data_as(pointer)
-        )
+        rows, out = np.ascontiguousarray(np.array(rows).T), np.zeros(SAMPLES)
+        given, made = (array.ctypes.data_as(pointer) for array in (rows, out))
+        getattr(library, f"run{number}")(given, ctypes.c_size_t(SAMPLES), made)
         return out
 
     return play
 
 
-def count_further(law):
-    return 0 if law.compensation is None else len(law.compensation.reads)
+def reads_of(law):
+    return () if law.compensation is None else law.compensation.reads
 
 
 @pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.slow)])
 def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tuned, tmp_path, monkeypatch):
     rng, plant = np.random.default_rng(count), make_plant()
-    laws = [draw_runnable(rng) for _ in range(count)]
-    play_c = export_all(compiler, laws, tuned, tmp_path)
+    parts = [draw_part(number % STRUCTURES, rng) for number in range(count)]
+    play_c = export_all(compiler, parts, tuned, tmp_path)
     saturated, differing = 0, 0
-    for number, (_, law) in enumerate(laws):
-        reference, *noise = draw_signals(rng, law.measured + count_further(law))
-        loop = SampledLoop(plant=plant, law=law, measured=("F", "G")[: law.measured], delay_samples=0)
+    for number, (_, force_law, outer) in enumerate(parts):
+        names, law = ("F", "G")[: force_law.measured], force_law
+        fed_back = names if outer is None else (*names, "x")
+        if outer is not None:
+            law = enclose_law(force_law, outer)
+        loop = SampledLoop(plant=plant, law=law, measured=fed_back, delay_samples=0)
+        # An outer loop whose position fails goes on with its last reference, which only the exported code knows.
+        clean = () if outer is None else ("F" if law.gate else "-",)
+        signals = draw_signals(rng, loop.signals, clean)
+        reference, *noise = signals.values()
         monkeypatch.setattr(closed_loop, "_noise", lambda *_, noise=noise: np.array(noise).T[None].copy())
         run = run_loop(loop, [so.ParameterSet()], reference)
-        readings = np.array([run.outputs[name][0] for name in loop.signals]) + noise
-        commands = play_python(law, reference, readings)
+        readings = {name: run.outputs[name][0] + signals[name] for name in loop.signals}
+        measured, further = ([readings[name] for name in part] for part in (fed_back, reads_of(law)))
+        commands = play_python(law, reference, measured, further)
         scale = 1e-12 * max(1.0, np.max(np.abs(commands)))
         np.testing.assert_allclose(run.current[0], commands, rtol=0, atol=scale, err_msg=f"compiled loop, law {number}")
-        found = play_c(number, np.vstack([reference, readings]))
-        np.testing.assert_allclose(found, commands, rtol=0, atol=scale, err_msg=f"C, law {number}")
+        inputs = [reference, *measured[: len(names)], *further, *measured[len(names) :]]
+        np.testing.assert_allclose(play_c(number, inputs), commands, rtol=0, atol=scale, err_msg=f"C, law {number}")
         saturated += bool(np.any(np.abs(commands) >= law.command_limit * (1 - 1e-9)))
         differing += np.unique(commands).size > SAMPLES // 2
     assert saturated > 0.15 * count
