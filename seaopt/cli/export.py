@@ -61,6 +61,11 @@ def export_controller(
             f"warning: this limit is above the one that the controller was {what} with, {limit}: its {says} nothing "
             "about larger commands; raise the limit in the problem file, then tune and certify again"
         )
+    if failed is not None and (typed := _list_typed(content, options)):
+        Terminal(stderr=True).wrap(
+            f"warning: {' and '.join(typed)} of this export: the certificate's simulated runs are of the law as the "
+            "problem file has it; write gate and derate into its [controller], then tune and certify again"
+        )
     if json:
         result = {
             "schema": "seaopt/export/1",
@@ -89,6 +94,17 @@ def export_controller(
     for note in content.get("notes") or () if amount == "verbose" else ():
         console.wrap(f"note: {note}", indent=2)
     return met
+
+
+def _list_typed(content: Mapping[str, Any], options: Mapping[str, Any]) -> list[str]:
+    """Return the parts of the law that options make another than that of the certificate."""
+    guards, gate = _take_first(content).get("guards") or {}, options["gate"]
+    differs = {
+        "the gate": gate or (gate is False and guards.get("gate") is not None),
+        "the heat guard": options["derate"] is not None and options["derate"] != guards.get("derate", False),
+        "the anti-windup": options["tracking_time_s"] is not None,
+    }
+    return [name for name, differ in differs.items() if differ]
 
 
 def _take_first(content: Mapping[str, Any]) -> Mapping[str, Any]:

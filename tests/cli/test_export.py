@@ -44,6 +44,20 @@ def test_a_raised_limit_of_a_controller_without_a_certificate_is_of_its_design(d
     assert "designed with, 9 A: its figures say nothing about larger commands" in " ".join(out.stderr.split())
 
 
+@pytest.mark.parametrize(
+    ("typed", "part"),
+    [
+        (("--gate", "-4000:4000", "--gate-max-step", "300"), "the gate"),
+        (("--tracking-time", "0.1"), "the anti-windup"),
+        (("--no-gate", "--no-derate"), ""),
+    ],
+)
+def test_a_law_that_is_not_the_certified_one_is_warned_of(done, seaopt, tmp_path, typed, part):
+    out = seaopt("export", done.results, "--c", tmp_path / "out", *typed)
+    assert out.returncode == 0
+    assert (f"warning: {part} of this export" in " ".join(out.stderr.split())) == bool(part)
+
+
 def one_line(out):
     assert out.returncode == 2
     (line,) = out.stderr.strip().splitlines()

@@ -289,7 +289,7 @@ def find_radius(
         signals = list(read)
         per_reference = controller.outer.direction * controller.outer.stiffness
     n = law.c.size
-    b, d = np.reshape(law.b_measurement, (n, -1)).copy(), np.ravel(law.d_measurement).copy()
+    b, d = np.reshape(law.b_measurement, (n, law.measured)).copy(), np.ravel(law.d_measurement).copy()
     for reads, _ in filter(None, (weight, ripple)):
         if reads not in signals:
             signals.append(reads)
