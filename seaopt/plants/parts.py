@@ -75,7 +75,6 @@ from types import SimpleNamespace
 from typing import Any, Literal
 
 import casadi as ca
-import numpy as np
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter, declare
@@ -83,7 +82,7 @@ from seaopt.plants import drives
 from seaopt.plants.friction import can_stick
 from seaopt.plants.motor import effects
 from seaopt.plants.motor.thermal import PARAMETERS, add_heat
-from seaopt.plants.plant import Plant
+from seaopt.plants.plant import Plant, agree
 from seaopt.plants.roles import Recipe, change_ports, put_behind
 from seaopt.plants.sensors.deflection import PARTS as SENSOR_PARTS
 from seaopt.plants.sensors.deflection import keep_weights, read_deflection
@@ -427,19 +426,7 @@ def _makes(recipe: Recipe, plant: Plant) -> bool:
         return False
     if not (made.states.keys() <= plant.states.keys() and made.outputs.keys() <= plant.outputs.keys()):
         return False
-    at = np.random.default_rng(0).uniform(0.5, 1.5, len(plant.states) + len(plant.inputs) + len(plant.parameters))
-    values: list[dict[str, float]] = []
-    for each in (made, plant):
-        x, u, p = np.split(at, np.cumsum([len(plant.states), len(plant.inputs)]))
-        x = x[[list(plant.states).index(name) for name in each.states]]
-        rows = ca.Function("rows", [each.t, each.x, each.u, each.p], [each.dynamics, each.output])(0.0, x, u, p)
-        named = zip((*each.states, *each.outputs), np.concatenate([np.array(row).ravel() for row in rows]), strict=True)
-        values.append({name: float(value) for name, value in named})
-    made_values, plant_values = values
-    return all(
-        math.isclose(value, plant_values[name], rel_tol=1e-9) or not math.isfinite(value)
-        for name, value in made_values.items()
-    )
+    return agree(made, plant)
 
 
 def list_dead_times(plant: Plant) -> tuple[str, ...]:

@@ -377,6 +377,24 @@ def output_function(plant: Plant) -> Any:
     return ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [ca.densify(plant.output)])
 
 
+def agree(first: Plant, second: Plant) -> bool:
+    """Tell whether the rates and the outputs that two plants both have are the same at one point, in which states,
+    inputs and parameters of one name have one value; what is not finite there is not judged.
+    """
+    rng, point, values = np.random.default_rng(0), dict[str, float](), list[dict[str, float]]()
+    for plant in (first, second):
+        groups = (plant.states, plant.inputs, plant.parameters)
+        x, u, p = ([point.setdefault(name, rng.uniform(0.5, 1.5)) for name in group] for group in groups)
+        rows = np.array(ca.vertcat(dynamics_function(plant)(x, u, p), output_function(plant)(0.0, x, u, p))).ravel()
+        names = [*(f"f.{name}" for name in plant.states), *(f"h.{name}" for name in plant.outputs)]
+        values.append(dict(zip(names, rows.tolist(), strict=True)))
+    return all(
+        math.isclose(value, values[1][name], rel_tol=1e-9, abs_tol=1e-12)
+        for name, value in values[0].items()
+        if name in values[1] and math.isfinite(value)
+    )
+
+
 @memo
 def jacobians(plant: Plant) -> Any:
     """Return the CasADi function (x, u, p) -> (A, B, C, D) at t = 0."""
