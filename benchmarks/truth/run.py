@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 sys.path.insert(0, str(Path(__file__).parent))
 from actuators import EFFECTS, KINDS, RATE_HZ, Actuator
@@ -183,6 +184,7 @@ def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
         groups[
             "= all that a log can show" if names and not silent else "= what no log shows" if silent else "="
         ].append(row)
+        groups["= link held" if row["link"] == "locked" else "= pendulum"].append(row)
     groups.pop("=", None)
     yield f"{'missing':26s} fits  met  bad  named  met: in 95 %  all: bad  in 95 %  known  width  not done  median s"
     for name in sorted(groups, key=lambda name: (name.startswith("="), name)):
@@ -203,6 +205,11 @@ def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
             f"{sum(map(is_bad, done)):9d} {cover(done):>7s} {sum(known):6d} {width:>6s} {late:9d} "
             f"{np.median([row['cpu_s'] for row in group]):9.1f}"
         )
+    shown = [row for row in rows if not SILENT & set(row["effects"]) and row["met"]]
+    bad = sum(map(is_bad, shown))
+    if bad < len(shown):
+        bound = 1.0 - float(scipy.special.betaincinv(len(shown) - bad, bad + 1, 0.05))
+        yield f"bad, of what a log can show: {bad} of {len(shown)} met, below {100 * bound:.2g} % at 95 % confidence"
     yield from summarise_rounds(rows)
     yield from summarise_obstacles(rows)
 
