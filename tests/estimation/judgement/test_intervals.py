@@ -90,6 +90,9 @@ def test_another_log_contradicts_values_that_it_would_not_give():
     assert max(alike.distances.values()) < 3.0 and alike.met is False and "on a fit that is not met" in repr(alike)
     strange = compare_with_log(fit(record_log(1.0, 0.0, 6)), record_log(1.0, 0.05, 8))
     assert strange.met is False and "times its sensor's noise is left" in repr(strange)
+    assert "next: fit both logs" in repr(comparison)
+    changed = compare_with_log(fit(record_log(1.0, 0.0, 6)), record_log(1.0, 0.05, 5))
+    assert changed.met is False and "at one amplitude the actuator itself differs" in " ".join(repr(changed).split())
     agrees = compare_with_log(fit(record_log(1.0, 0.0, 6)), same)
     assert agrees.met and "its own values are the fit's" in repr(agrees)
 

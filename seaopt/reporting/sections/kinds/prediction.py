@@ -8,6 +8,7 @@ from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Ver
 from seaopt.units import unit_after
 
 APART = 3.0  # standard deviations
+ALIKE = 1.2  # times an amplitude, within which another is the same
 
 
 def judge(result: ModelledOutputs | LogComparison, commands: Commands) -> Verdict | None:
@@ -41,7 +42,7 @@ def judge(result: ModelledOutputs | LogComparison, commands: Commands) -> Verdic
         met=False,
         text=f"{comparison.name}: {'its values agree, on a fit that is not met' if agrees else 'contradicts the fit'}",
         reasons=tuple(reasons),
-        next=("fit both logs: values of one model then have the interval that both allow",) if apart else (),
+        next=(_advise(comparison),) if apart else (),
     )
 
 
@@ -101,8 +102,22 @@ def _describe_comparison(comparison: LogComparison) -> list[Section]:
     ]
 
 
+def _advise(comparison: LogComparison) -> str:
+    """Return what to do about a contradiction: what a model lacks of friction, say, is the same at one amplitude."""
+    both = "fit both logs: values of one model then have the interval that both allow"
+    ratio = _compare_amplitudes(comparison)
+    if ratio is None or not 1.0 / ALIKE < ratio < ALIKE:
+        return both
+    return f"at one amplitude the actuator itself differs: another one, a changed one, or a warmer one; if not, {both}"
+
+
 def _describe_amplitude(comparison: LogComparison) -> str:
+    ratio = _compare_amplitudes(comparison)
+    return "" if ratio is None else f", at {format_number(ratio, 2)} times the amplitude"
+
+
+def _compare_amplitudes(comparison: LogComparison) -> float | None:
+    """Return the log's amplitude over the largest that was fitted; None where none is known."""
     if not comparison.amplitudes:
-        return ""
-    ratio = comparison.log.amplitude / max(max(comparison.amplitudes), 1e-300)
-    return f", at {format_number(ratio, 2)} times the amplitude"
+        return None
+    return comparison.log.amplitude / max(max(comparison.amplitudes), 1e-300)
