@@ -9,7 +9,7 @@ from typing import Any
 from seaopt.documents import check_table
 from seaopt.errors import ProblemError
 from seaopt.estimation import Fit
-from seaopt.estimation.result.trials import HypothesisTrial
+from seaopt.estimation.result.trials import HypothesisTrial, state_sticking
 from seaopt.problem.problem import Problem
 from seaopt.problem.reading import make_problem
 from seaopt.problem.schema import ProblemTable
@@ -36,7 +36,8 @@ def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:
         plant = content["plant"][name]
         plant["parts"] = list(dict.fromkeys([*plant.get("parts", []), *trial.parts]))
         listed = ", ".join(f'"{part}"' for part in plant["parts"])
-        lines += [f"[plant.{name}]", f"parts = [{listed}]"]
+        plant |= dict.fromkeys(("sticks",) if state_sticking(trial.parts) else (), False)
+        lines += [f"[plant.{name}]", f"parts = [{listed}]", *state_sticking(trial.parts)]
     values: Mapping[str, Any] = {
         **{name: {"value": _round(value), "free": True} for name, value in trial.frees.items()},
         **{name: _round(value) for name, value in trial.fixed.items()},

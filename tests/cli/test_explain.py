@@ -7,6 +7,9 @@ import tomllib
 
 import pytest
 
+from seaopt.estimation.result.trials import HypothesisTrial
+from seaopt.problem import read_problem
+from seaopt.problem.explained import adopt
 from tests.actuator_logs import write_csv
 from tests.estimation.judgement.test_hypotheses import TRUTH, record
 
@@ -39,6 +42,20 @@ def problem(tmp_path):
     path = tmp_path / "problem.toml"
     path.write_text(FILE.format(parameters="\n".join(rows)), encoding="utf-8")
     return path
+
+
+def test_bristles_are_added_to_a_plant_that_sticks(problem):
+    """They hold it by themselves, so that the file's sticks = true has to go."""
+    text = problem.read_text(encoding="utf-8").replace('link = "locked"', 'link = "locked"\nsticks = true')
+    problem.write_text(text, encoding="utf-8")
+    trial = HypothesisTrial(
+        effect="the joint gives way before it slips", parts=("lugre",), outcome="adopted", excess_before=9.0,
+        excess=1.0, frees={"sigma_0": 0.1, "sigma_1": 1e-4}, fixed={}, parameters={"k_s": 299.0}, evaluations=9,
+    )  # fmt: skip
+    found, lines = adopt(read_problem(problem), trial)
+    assert not found.plants["stand"].sticks
+    assert found.parameters["k_s"].value == 299.0
+    assert tomllib.loads(lines)["plant"]["stand"] == {"parts": ["lugre"], "sticks": False}
 
 
 def test_what_is_found_is_added_and_fitted(problem, seaopt):

@@ -25,7 +25,7 @@ from seaopt.estimation.problem.noise_floor import measure_floor
 from seaopt.estimation.problem.residual_statistics import compute_residuals
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.result.trials import HypothesisTrial, Outcome
+from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, estimate_sigma
 from seaopt.estimation.solver.step_size import choose_first_steps
@@ -82,7 +82,7 @@ class Refit:
         rows = [f"{name} = {{ value = {value:.4g}, free = true }}" for name, value in self.frees.items()]
         rows += [f"{name} = {value:.4g}" for name, value in self.fixed.items()]
         listed = ", ".join(f'"{part}"' for part in parts)
-        return "\n".join(["[plant.NAME]", f"parts = [{listed}]", "[parameters]", *rows])
+        return "\n".join(["[plant.NAME]", f"parts = [{listed}]", *state_sticking(parts), "[parameters]", *rows])
 
     @property
     def python(self) -> str:
@@ -226,8 +226,12 @@ def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float])
     return min(evaluations, key=lambda evaluation: evaluation.cost)
 
 
+@np.errstate(all="ignore")  # a run that overflows, where it is held out alone, has no finite excess
 def _measure_excess(problem: FitProblem, z: Vector) -> float:
-    """Return how many times its noise a residual is, where it is most: of the samples used and of those held out."""
+    """Return how many times its noise a residual is, where it is most: of the samples used and of those held out.
+
+    Infinite where the model runs away.
+    """
     residuals, ratios = compute_residuals(problem, z), [0.0]
     for experiment in problem.experiments:
         floor = measure_floor(experiment, residuals[experiment.name])
@@ -238,7 +242,7 @@ def _measure_excess(problem: FitProblem, z: Vector) -> float:
             squares = np.concatenate([np.where(held_out, raw**2, np.nan) for held_out, raw in pairs])
             count = np.maximum(np.count_nonzero(np.isfinite(squares), axis=0), 1)
             ratios += (np.sqrt(np.nansum(squares, axis=0) / count) / (floor.noise * experiment.sigma)).tolist()
-    return float(np.nanmax(ratios))
+    return float(np.max(np.nan_to_num(ratios, nan=np.inf)))
 
 
 def _measure_powers(evaluation: Evaluation) -> Vector:

@@ -73,7 +73,9 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
         power = sum(float(np.sum(loss.slope(part) ** 2)) for part in residuals.weighted_of(name))
         rms[o] = np.sqrt(power / max(count[o], 1.0))
         apart = max(map(_count_between, output.measured), default=1)
-        seconds = [_take_second(loss.slope(part * (gain / sigma)), apart) for part in residuals.raw_of(name)]
+        # What is held out may be far off, which is no noise.
+        raw = [np.where(mask, part, np.nan) for mask, part in zip(used, residuals.raw_of(name), strict=True)]
+        seconds = [_take_second(loss.slope(part * (gain / sigma)), apart) for part in raw]
         seconds = [part[np.isfinite(part)] for part in seconds]
         neighbours = float(np.sqrt(np.mean(np.concatenate(seconds) ** 2) / 6.0)) if any(map(len, seconds)) else 0.0
         step = find_quantisation(np.concatenate(output.measured)) / np.sqrt(12.0) * gain / sigma

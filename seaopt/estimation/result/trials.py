@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 from seaopt.codec import OrInfinite
 from seaopt.records import record
 
 Outcome = Literal["adopted", "tied", "tried"]
+
+
+def state_sticking(parts: Iterable[str]) -> list[str]:
+    """Return the line of a problem file that bristles need: they hold by themselves, not as friction that jumps."""
+    return ["sticks = false"] if "lugre" in parts else []
 
 
 @record

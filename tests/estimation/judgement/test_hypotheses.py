@@ -133,6 +133,14 @@ def test_how_large_an_effect_is_may_be_known_roughly_and_a_stiffness_may_not():
     assert {finding.where: finding.severity for finding in rough} == {"current_loop_hz": "warning", "k_s": "error"}
 
 
+def test_what_was_held_out_is_no_noise_of_the_sensor():
+    log = record()
+    late = log.time > 0.8 * log.time[-1]
+    shaken = log["tau_s"] + np.where(late, 0.5 * np.sin(2 * np.pi * 60.0 * log.time), 0.0)
+    other = so.Log.from_arrays(time=log.time, I=log["I"], tau_s=shaken, theta_m=log["theta_m"])
+    assert fit(other, holdout=0.2).outputs["log"]["tau_s"].excess == pytest.approx(1.0, abs=0.1)
+
+
 def test_two_effects_are_named_together():
     best = fit(record(harder=8.0, load=0.08)).hypotheses[0]
     assert set(best.parts) == {"hardening", "load_friction"}
