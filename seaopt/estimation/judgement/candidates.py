@@ -30,6 +30,7 @@ from seaopt.records import record
 from seaopt.units import ROTARY, mechanics_of, unit_after
 
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
+SHARPER = 0.1  # times the speed that friction is smoothed over, below which it is a jump
 SAME_EFFECT = 1e-3  # of a test's figures, by which parameters that act alike may differ
 POLE = "load_cell_hz"  # of the part that reads an output through a pole
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
@@ -121,10 +122,10 @@ def _state_value(parameter: Parameter, smooths: bool, values: Values, stds: Valu
     """Return what a parameter should have been; `smooths`: it is a speed over which friction is smoothed."""
     name, unit, value = parameter.name, unit_after(parameter.unit), values[parameter.name]
     instead = f"in place of {parameter.value:.4g}{unit}"
-    if smooths and value < 2.0 * stds[name]:
+    if smooths and value < max(2.0 * stds[name], SHARPER * parameter.value):
         return (
-            f"friction that jumps at rest more sharply than the logs resolve: {name} = {value:.1g}{unit} or "
-            f"less {instead}; let it jump, with sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"
+            f"friction that jumps at rest, or nearly: {name} = {value:.1g}{unit} or less {instead}; let it jump, with "
+            "sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"
         )
     if value in (parameter.min, parameter.max):
         way = "smaller" if value < parameter.value else "larger"

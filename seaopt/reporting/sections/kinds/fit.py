@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 from seaopt.estimation import Fit
-from seaopt.estimation.result.findings import DerivedFigure, FitFinding, LogValues
+from seaopt.estimation.result.findings import DerivedFigure, LogValues
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.parameters import Parameter
+from seaopt.plants.friction import list_smoothing
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
 from seaopt.units import unit_after
 
@@ -35,7 +36,7 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     errors = [(each.text, each.where) for each in fit.errors]
     if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
         errors.insert(0, (fit.message, ""))
-    reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit.findings))
+    reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit))
     again = f"correct the file, then type {commands.fit}" if commands.fit else ""
     return Verdict(
         met=False,
@@ -252,15 +253,17 @@ def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
         yield Reason(what=what, where=text, count=1 + len(named[MOST_PLACES:]))
 
 
-def _list_cures(findings: Sequence[FitFinding]) -> tuple[str, ...]:
+def _list_cures(fit: Fit) -> tuple[str, ...]:
     """Return the lines to write for the likely cause that is named first. What is not told from zero is not to be
-    freed: a search for how sharp friction is takes long and ends nowhere.
+    freed, nor how sharp friction is: a search for that takes long and ends nowhere.
     """
-    cause = next((finding for finding in findings if finding.kind == "cause" and finding.preferred), None)
+    cause = next((finding for finding in fit.findings if finding.kind == "cause" and finding.preferred), None)
     if cause is None:
         return ()
+    speeds = {name for experiment in fit.experiments for name in list_smoothing(experiment.plant)}
     apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
-    return tuple(filter(None, (spell_cure(name, value) for name, value in apart.items())))
+    lines = ("sticks = true in [plant.NAME]" if name in speeds else spell_cure(name, apart[name]) for name in apart)
+    return tuple(filter(None, lines))
 
 
 def spell_cure(name: str, value: float) -> str:
