@@ -89,7 +89,7 @@ def test_the_gate_of_the_problem_file_is_in_the_exported_code(tuned, folder, com
     said = compare(LoadedLaw(compiler, code, "force_law", 2, gated=True), runnable(controller, gate=controller.gate))
     held = 2 + 1 + 2 + 8 + 8 + 1  # the last after the reset, 580 N from the measurement given there
     assert [said.count(status) for status in STATUS] == [400 - held - 72, held, 72]
-    assert "readings from -3000 to 3500 N" in repr(controller)
+    assert "Readings from -3000 to 3500 N" in repr(controller)
 
 
 def test_a_gate_that_is_typed_is_in_the_exported_code(tuned, folder, compiler, seaopt):

@@ -211,7 +211,7 @@ class PlausibilityGate:
         """Return in one line which readings are believed."""
         low, high = self.range_N
         return (
-            f"readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample are "
+            f"Readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample are "
             f"believed, {self.max_held} others in a row are bridged"
         )
 

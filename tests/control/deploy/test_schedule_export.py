@@ -137,6 +137,7 @@ def test_what_nothing_is_known_of_is_not_derated(tmp_path, schedule):
 def test_a_schedule_keeps_the_guards_of_its_file(schedule):
     guarded = replace(schedule, controllers=tuple(replace(each, gate=GATE) for each in schedule.controllers))
     assert guarded.runnable().gate == GATE
+    assert "6 others in a row are bridged" in " ".join(repr(guarded).split())
     content = json.loads(to_json(guarded.to_dict()))
     stand, _, values = read_knee()
     assert ScheduledController.from_dict(content, stand, values).runnable().gate == GATE

@@ -102,12 +102,15 @@ def draw_signals(rng, names, clean):
 
 
 def play_python(law, reference, measured, further):
-    state, commands = law.reset(), []
+    """Return the commands, and the size of what is summed to them, of which rounding is."""
+    state, commands, largest = law.reset(), [], 1.0
     for k, r in enumerate(reference.tolist()):
+        largest = max(largest, PER_EFFORT * float(np.abs(law.c) @ np.abs(state.x)))
         read = float(measured[0][k]) if law.measured == 1 else np.array([row[k] for row in measured])
         command, state = law.step(state, r, read, [float(row[k]) for row in further])
         commands.append(command)
-    return np.array(commands)
+        largest = max(largest, abs(command))
+    return np.array(commands), largest
 
 
 def export_all(compiler, parts, controller, folder):
@@ -166,8 +169,8 @@ def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tune
         run = run_loop(loop, [so.ParameterSet()], reference)
         readings = {name: run.outputs[name][0] + signals[name] for name in loop.signals}
         measured, further = ([readings[name] for name in part] for part in (fed_back, reads_of(law)))
-        commands = play_python(law, reference, measured, further)
-        scale = 1e-12 * max(1.0, np.max(np.abs(commands)))
+        commands, largest = play_python(law, reference, measured, further)
+        scale = 1e-12 * largest
         np.testing.assert_allclose(run.current[0], commands, rtol=0, atol=scale, err_msg=f"compiled loop, law {number}")
         inputs = [reference, *measured[: len(names)], *further, *measured[len(names) :]]
         np.testing.assert_allclose(play_c(number, inputs), commands, rtol=0, atol=scale, err_msg=f"C, law {number}")

@@ -114,7 +114,7 @@ def describe(controller: Controller) -> list[Section]:
                 f"Active limits: {active}." if controller.met else f"{controller.explanation}.",
                 *_describe_friction(controller),
                 *_describe_forces(controller),
-                *_describe_surroundings(controller),
+                *describe_surroundings(controller),
             ),
         ),
         *list_notes("the controller", controller.notes),
@@ -203,7 +203,7 @@ def _describe_forces(controller: Controller) -> Iterator[str]:
         yield from (f"Motor: {line}." for line in controller.rating.describe())
 
 
-def _describe_surroundings(controller: Controller) -> Iterator[str]:
+def describe_surroundings(controller: Controller) -> Iterator[str]:
     """Yield what runs around the law: an outer loop, compensation, a gate."""
     if controller.outer is not None:
         yield f"{controller.outer.describe()}."

@@ -6,6 +6,7 @@ from seaopt.control import ScheduledController
 from seaopt.control.laws.command import name_gain_units
 from seaopt.formatting import format_count, format_number
 from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met
+from seaopt.reporting.sections.kinds.controller import describe_surroundings
 from seaopt.units import unit_after
 
 
@@ -53,7 +54,7 @@ def describe(schedule: ScheduledController) -> list[Section]:
             part="schedule",
             sentences=("The gains are interpolated between the points.",),
             tables=(Table(label="Gains at the points", head=head, rows=rows, align=">" * (len(head) - 1) + "<"),),
-            remarks=(_describe_between(schedule),),
+            remarks=(_describe_between(schedule), *describe_surroundings(schedule.controllers[0])),
         ),
         *list_notes("the schedule", schedule.notes),
     ]
