@@ -54,7 +54,6 @@ from seaopt.robustness.certificate.scheduled import (
     BOUND,
     SWEEP,
     ScheduleCertificate,
-    ScheduleSurvey,
     measure_stretches,
     measure_sweeps,
     pose_places,
@@ -313,7 +312,9 @@ def _certify_cases(survey: Survey, progress: Progress) -> Certificate:
     return certificate
 
 
-def _list_surveys(schedule: ScheduledController, places: Mapping[float, Cases], pose: partial[Survey]) -> list[Survey]:
+def _list_surveys(
+    schedule: ScheduledController, places: Mapping[float, Cases], pose: partial[Survey]
+) -> dict[float, Survey]:
     """Return what is to be measured at each place of a schedule. Points are simulated where the design plant holds the
     variable: a law that is frozen is not what runs on one that moves it.
     """
@@ -321,8 +322,8 @@ def _list_surveys(schedule: ScheduledController, places: Mapping[float, Cases], 
     drawing = np.random.default_rng([options.seed, digest_laws(*schedule.controllers)])
     options = replace(options, samples=-(-options.samples // len(places)))
     held = schedule.over not in schedule.design[0].states
-    return [
-        pose(
+    return {
+        value: pose(
             shared=Shared(cases),
             options=options,
             drawing=drawing,
@@ -332,7 +333,7 @@ def _list_surveys(schedule: ScheduledController, places: Mapping[float, Cases], 
             steps=held and value in schedule.points,
         )
         for (value, cases), rng in zip(places.items(), drawing.spawn(len(places)), strict=True)
-    ]
+    }
 
 
 def _require_responses(
@@ -358,32 +359,26 @@ def _require_responses(
 
 
 def _certify_schedule(
-    schedule: ScheduledController, surveys: Sequence[Survey], of_responses: Sequence[Requirement], progress: Progress
+    schedule: ScheduledController,
+    surveys: Mapping[float, Survey],
+    of_responses: Sequence[Requirement],
+    progress: Progress,
 ) -> ScheduleCertificate:
     """Certify a schedule at each of its places, and between them."""
-    first, options = surveys[-1], surveys[0].options
-    values = [survey.place[1] for survey in surveys if survey.place is not None]
-    whole = ScheduleSurvey(
-        shared=Shared((schedule, dict(first.cases.models))),
-        values=values,
-        nominal=first.cases.unknown.nominal,
-        min_rate=options.min_rate,
-        simulations=first.simulations,
-        executor=first.executor,
-    )
-    models = len(whole.shared.value[1])
-    seconds = [sum(_list_seconds(survey)) for survey in surveys]
-    *parts, proving, sweeping = divide(
-        progress, *seconds, BOUND * models * len(surveys), SWEEP * models * whole.simulations
-    )
+    *_, last = surveys.values()
+    seconds = [sum(_list_seconds(survey)) for survey in surveys.values()]
+    proof, motion = BOUND * len(surveys), SWEEP * last.simulations
+    models = len(last.cases.models)
+    *parts, proving, sweeping = divide(progress, *seconds, proof * models, motion * models)
     places: list[Certificate] = []
     worst: dict[Spot, Worst] = {}
-    for survey, value, part in zip(surveys, values, parts, strict=True):
+    for (value, survey), part in zip(surveys.items(), parts, strict=True):
         place = _certify_cases(survey, prefix(part, f"{schedule.over} = {value:.4g}"))
         worst |= name_worst(survey, place.worst)
         places.append(place)
     draws = join_counts([place.monte_carlo for place in places])
-    stretches, sweeps = measure_stretches(whole, proving), measure_sweeps(whole, sweeping)
+    stretches = measure_stretches(schedule, surveys, proving)
+    sweeps = measure_sweeps(schedule, surveys, sweeping)
     progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
     return ScheduleCertificate(
         schedule=schedule,
@@ -393,7 +388,7 @@ def _certify_schedule(
             *(row for place in places for row in place.requirements),
             *of_responses,
             *stretches.requirements,
-            *draw_requirements(draws, worst, options.max_failure_probability),
+            *draw_requirements(draws, worst, last.options.max_failure_probability),
             *sweeps.requirements,
         ),
         **stretches.fields,

@@ -20,7 +20,6 @@ elsewhere than compensated may double the slope.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
@@ -74,12 +73,10 @@ class CompensationDraws:
 
 def measure_compensation(survey: Survey, _: Progress) -> Evidence:
     """Return whether the loop stays stable with what is compensated, on every plant and over draws."""
-    cases, controller, shared = survey.cases, survey.cases.controller, survey.shared
-    samples, rng, executor = survey.samples, survey.rng, survey.executor
+    cases, controller = survey.cases, survey.cases.controller
     margins = find_nominal_compensation(controller, cases.models, cases.unknown.nominal)
-    draws = find_compensation_at_draws(shared, margins, samples, rng, executor)
-    gravity = find_gravity_cases(shared, samples, rng, executor)
-    ripple = find_ripple_cases(shared, samples, rng, executor)
+    draws = find_compensation_at_draws(survey, margins)
+    gravity, ripple = find_gravity_cases(survey), find_ripple_cases(survey)
     return Evidence(
         requirements=(
             *compensation_requirements(controller, margins, draws),
@@ -112,21 +109,17 @@ def find_nominal_compensation(
 
 
 def find_compensation_at_draws(
-    cases: Shared[Cases],
-    nominal: Mapping[str, CompensationMargin],
-    samples: int,
-    rng: np.random.Generator,
-    executor: Executor | None = None,
+    survey: Survey, nominal: Mapping[str, CompensationMargin]
 ) -> dict[str, CompensationDraws]:
     """Return the same over draws, of the plants for which it is shown at the nominal parameters."""
-    enough, count = {name: margin for name, margin in nominal.items() if margin.shown}, min(samples, MARGIN_DRAWS)
+    enough, count = {name: each for name, each in nominal.items() if each.shown}, min(survey.samples, MARGIN_DRAWS)
     if not enough or not count:
         return {}
-    draws = cases.value.unknown.list_draws(count, rng)
+    draws = survey.cases.unknown.list_draws(count, survey.rng)
     margins: dict[str, CompensationDraws] = {}
     for name, nominal_margin in enough.items():
         judge = partial(_find_margins, nominal_margin.multiplier)
-        shown, margin, parameters = find_least_margin(judge, _take_slope, cases, name, draws, executor)
+        shown, margin, parameters = find_least_margin(judge, _take_slope, survey, name, draws)
         margins[name] = CompensationDraws(
             samples=count, shown=shown, least_slope=_take_slope(margin), parameters=parameters
         )
@@ -182,41 +175,30 @@ class EigenvalueCase:
 Measure = Callable[[Controller, Plant, ParameterSet, Draw], EigenvalueCase]
 
 
-def find_gravity_cases(
-    cases: Shared[Cases], samples: int, rng: np.random.Generator, executor: Executor | None = None
-) -> dict[str, EigenvalueCase]:
+def find_gravity_cases(survey: Survey) -> dict[str, EigenvalueCase]:
     """Return how fast each plant's link runs away at most with its weight compensated; none of held links."""
-    compensation = cases.value.controller.compensation
+    compensation = survey.cases.controller.compensation
     term = None if compensation is None else compensation.gravity
     if term is None:
         return {}
-    models = cases.value.models
+    models = survey.cases.models
     moving = [name for name, model in models.items() if model.port is not None and term.reads in model.outputs]
-    return _find_worst(measure_gravity, cases, moving, samples, rng, executor)
+    return _find_worst(measure_gravity, survey, moving)
 
 
-def find_ripple_cases(
-    cases: Shared[Cases], samples: int, rng: np.random.Generator, executor: Executor | None = None
-) -> dict[str, EigenvalueCase]:
+def find_ripple_cases(survey: Survey) -> dict[str, EigenvalueCase]:
     """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without."""
-    compensation = cases.value.controller.compensation
+    compensation = survey.cases.controller.compensation
     if compensation is None or compensation.ripple is None:
         return {}
-    return _find_worst(measure_ripple, cases, cases.value.models, samples, rng, executor)
+    return _find_worst(measure_ripple, survey, survey.cases.models)
 
 
-def _find_worst(
-    measure: Measure,
-    cases: Shared[Cases],
-    names: Collection[str],
-    samples: int,
-    rng: np.random.Generator,
-    executor: Executor | None,
-) -> dict[str, EigenvalueCase]:
+def _find_worst(measure: Measure, survey: Survey, names: Collection[str]) -> dict[str, EigenvalueCase]:
     """Return the worst case of some plants, among the nominal parameters and draws."""
-    draws = [{}, *cases.value.unknown.list_draws(min(samples, EIGENVALUE_DRAWS), rng)]
+    draws = [{}, *survey.cases.unknown.list_draws(min(survey.samples, EIGENVALUE_DRAWS), survey.rng)]
     judge = partial(_measure_draws, measure)
-    return {name: choose_worst(judge_draws(judge, cases, name, draws, executor)) for name in names}
+    return {name: choose_worst(judge_draws(judge, survey, name, draws)) for name in names}
 
 
 def _measure_draws(measure: Measure, cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[EigenvalueCase]:

@@ -7,7 +7,6 @@ only where it shows too little: a margin of a draw is then a lower bound of what
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from functools import partial
 from typing import TypeVar
 
@@ -58,10 +57,10 @@ class FrictionDraws:
 def measure_friction(survey: Survey, progress: Progress) -> Evidence:
     """Return for how steep a friction stability is shown on every plant, and what is required of that."""
     progress("friction at the draws", 0.0)
-    controller, least = survey.cases.controller, survey.min_friction_margin
+    controller = survey.cases.controller
     margins = find_nominal_margins(controller, survey.cases.models, survey.cases.unknown.nominal)
-    draws = find_margins_at_draws(survey.shared, margins, survey.samples, survey.rng, least, survey.executor)
-    rows = friction_requirements(margins, draws, least, controller.command.mechanics.damping)
+    draws = find_margins_at_draws(survey, margins)
+    rows = friction_requirements(margins, draws, survey.min_friction_margin, controller.command.mechanics.damping)
     return Evidence(requirements=rows, fields={"friction": margins, "friction_draws": draws})
 
 
@@ -76,29 +75,22 @@ def find_nominal_margins(
     return {name: margin for name, margin in margins.items() if margin is not None}
 
 
-def find_margins_at_draws(
-    cases: Shared[Cases],
-    nominal: Mapping[str, FrictionMargin],
-    samples: int,
-    rng: np.random.Generator,
-    required: float | None = None,
-    executor: Executor | None = None,
-) -> dict[str, FrictionDraws]:
+def find_margins_at_draws(survey: Survey, nominal: Mapping[str, FrictionMargin]) -> dict[str, FrictionDraws]:
     """Return margins at draws, of plants whose nominal margin is shown or enough, or that rub at draws alone."""
-    unknown, count = cases.value.unknown, min(samples, MARGIN_DRAWS)
+    unknown, required, count = survey.cases.unknown, survey.min_friction_margin, min(survey.samples, MARGIN_DRAWS)
     varied = [row.name for row in unknown.varied()]
     enough = {
         name: nominal.get(name)
-        for name, model in cases.value.models.items()
+        for name, model in survey.cases.models.items()
         if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
     }
     if not count or not enough:
         return {}
-    draws = unknown.list_draws(count, rng)
+    draws = unknown.list_draws(count, survey.rng)
     margins: dict[str, FrictionDraws] = {}
     for name, nominal_margin in enough.items():
         judge = partial(_find_margins, nominal_margin)
-        shown, margin, parameters = find_least_margin(judge, _take_slope, cases, name, draws, executor)
+        shown, margin, parameters = find_least_margin(judge, _take_slope, survey, name, draws)
         margins[name] = FrictionDraws(
             samples=count,
             shown=shown,
@@ -121,17 +113,14 @@ def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool
 def find_least_margin(
     judge: Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Margin]],
     slope: Callable[[Margin], float],
-    cases: Shared[Cases],
+    survey: Survey,
     name: str,
     draws: Sequence[Draw],
-    executor: Executor | None,
 ) -> tuple[int, Margin, dict[str, float]]:
     """Return for how many draws of one plant stability is shown, the margin of the least slope, and its draw."""
-    of_plant = select_own(cases, name, draws)
-    distinct = {
-        tuple(draw.items()): draw for draw in of_plant
-    }  # draws that vary what this plant does not have are one loop
-    judged = judge_draws(judge, cases, name, list(distinct.values()), executor)
+    of_plant = select_own(survey.cases, name, draws)
+    distinct = {tuple(draw.items()): draw for draw in of_plant}  # of what this plant has, draws may not differ
+    judged = judge_draws(judge, survey, name, list(distinct.values()))
     of_draw = dict(zip(distinct, judged, strict=True))
     margins = [of_draw[tuple(draw.items())] for draw in of_plant]
     least = int(np.argmin([slope(margin) for margin in margins]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +20,7 @@ from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
-from seaopt.progress import Progress, count_off, ignore
+from seaopt.progress import Progress, count_off
 from seaopt.records import record
 from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
 from seaopt.robustness.certificate.measured_draws import judge_draws
@@ -97,8 +96,7 @@ def measure_impedance(survey: Survey, progress: Progress) -> Evidence:
     cases = survey.cases
     impedance = certify_impedance(cases.controller, cases.models, cases.unknown.nominal)
     if impedance is not None and impedance.safe:
-        drawn = draw_impedance(survey.shared, survey.samples, survey.rng, survey.executor, progress)
-        impedance = replace(impedance, draws=drawn)
+        impedance = replace(impedance, draws=draw_impedance(survey, progress))
     return Evidence(requirements=impedance_requirements(impedance), fields={"impedance": impedance})
 
 
@@ -148,19 +146,13 @@ def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
     return name
 
 
-def draw_impedance(
-    cases: Shared[Cases],
-    samples: int,
-    rng: np.random.Generator,
-    executor: Executor | None = None,
-    progress: Progress = ignore,
-) -> ImpedanceDraws | None:
+def draw_impedance(survey: Survey, progress: Progress) -> ImpedanceDraws | None:
     """Judge the impedance of a controller's outer loop at draws; None where it has none, or nothing is drawn."""
-    count, at = min(samples, IMPEDANCE_DRAWS), cases.value
+    count, at = min(survey.samples, IMPEDANCE_DRAWS), survey.cases
     if at.controller.outer is None or not count:
         return None
-    name, draws = _find_plant(at.controller, at.models), at.unknown.list_draws(count, rng)
-    judged = judge_draws(_judge_states, cases, name, draws, executor)
+    name, draws = _find_plant(at.controller, at.models), at.unknown.list_draws(count, survey.rng)
+    judged = judge_draws(_judge_states, survey, name, draws)
     stable = passive = 0
     least, worst = np.inf, dict[str, float]()
     for draw in count_off(draws, "impedance, draw", progress):

@@ -164,23 +164,22 @@ def _search_plant(cases: Shared[Cases], part: tuple[str, Points]) -> tuple[Worst
     return worst, bounded
 
 
-def select_own(cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[dict[str, float]]:
+def select_own(cases: Cases, name: str, draws: Sequence[Draw]) -> list[dict[str, float]]:
     """Return of draws what the model of a name has of them."""
-    model, nominal = cases.value.models[name], cases.value.unknown.nominal
+    model, nominal = cases.models[name], cases.unknown.nominal
     names = [key for key in draws[0] if key in place_values(model, nominal, draws[0])] if draws else []
     return [{key: draw[key] for key in names} for draw in draws]
 
 
 def judge_draws(
     judge: Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Case]],
-    cases: Shared[Cases],
+    survey: Survey,
     name: str,
     draws: Sequence[Draw],
-    executor: Executor | None,
 ) -> Iterator[Case]:
     """Yield what a judgement makes of every draw on the plant of a name, in order; it gets some draws at a time."""
     parts = (draws[k : k + DRAWS_PER_PART] for k in range(0, len(draws), DRAWS_PER_PART))
-    for judged in map_ordered(partial(judge, cases, name), parts, executor):
+    for judged in map_ordered(partial(judge, survey.shared, name), parts, survey.executor):
         yield from judged
 
 

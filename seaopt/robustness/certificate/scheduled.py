@@ -17,7 +17,6 @@ What is said, and how it is known:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -39,7 +38,7 @@ from seaopt.progress import Progress, count_off
 from seaopt.records import Result, Worded, record
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
-from seaopt.robustness.certificate.cases import Cases, Evidence, pose_cases
+from seaopt.robustness.certificate.cases import Cases, Evidence, Survey, pose_cases
 from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.requirement import Requirement, require_at_least, require_at_most
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
@@ -219,32 +218,22 @@ def pose_places(
     return places
 
 
-@record(eq=False)
-class ScheduleSurvey:
-    """A schedule on its plants, at the nominal parameters, and how what is between its values is to be looked at."""
-
-    shared: Shared[tuple[ScheduledController, dict[str, Plant]]]
-    values: Sequence[float]  # at which it is certified standing still
-    nominal: ParameterSet
-    min_rate: float | None
-    simulations: bool
-    executor: Executor | None
-
-
-def measure_stretches(survey: ScheduleSurvey, progress: Progress) -> Evidence:
+def measure_stretches(schedule: ScheduledController, surveys: Mapping[float, Survey], progress: Progress) -> Evidence:
     """Bound Ms between neighbouring values, on every plant; what the tuner found there is what is required."""
-    pairs = list(pairwise(survey.values))
-    bounds = map_ordered(partial(_bound_plants, survey.shared, survey.nominal), pairs, survey.executor)
+    pairs, (*_, last) = list(pairwise(surveys)), surveys.values()
+    shared = Shared((schedule, dict(last.cases.models)))
+    bounds = map_ordered(partial(_bound_plants, shared, last.cases.unknown.nominal), pairs, last.executor)
     stretches = tuple(bound for _ in count_off(pairs, "stretch", progress) for bound in next(bounds))
-    return Evidence(requirements=_require_limits_between(survey.shared.value[0]), fields={"stretches": stretches})
+    return Evidence(requirements=_require_limits_between(schedule), fields={"stretches": stretches})
 
 
-def measure_sweeps(survey: ScheduleSurvey, progress: Progress) -> Evidence:
+def measure_sweeps(schedule: ScheduledController, surveys: Mapping[float, Survey], progress: Progress) -> Evidence:
     """Simulate sweeps of the variable on every plant, and plants that move it themselves."""
-    (schedule, models), nominal, least = survey.shared.value, survey.nominal, survey.min_rate
+    *_, last = surveys.values()
+    models, nominal, least = last.cases.models, last.cases.unknown.nominal, last.options.min_rate
     sweeps: dict[str, tuple[Sweep, ...]] = {}
-    for name in count_off(list(models), "sweeps, plant", progress) if survey.simulations else ():
-        of_plant = sweep_schedule(schedule, name, models[name], nominal, executor=survey.executor)
+    for name in count_off(list(models), "sweeps, plant", progress) if last.simulations else ():
+        of_plant = sweep_schedule(schedule, name, models[name], nominal, executor=last.executor)
         sweeps |= {name: of_plant} if of_plant else {}
     motions: dict[str, Motion] = {}
     if sweeps:

@@ -19,6 +19,7 @@ from seaopt.robustness.certificate import scheduled
 from seaopt.robustness.certificate.cases import CertifyOptions, Survey, add_design
 from seaopt.robustness.certificate.certify import _require_responses
 from seaopt.robustness.certificate.friction import FRICTION
+from seaopt.robustness.certificate.measured_draws import measure_draws
 from seaopt.robustness.certificate.scheduled import pose_places, require_motion, require_rate
 from seaopt.robustness.verification import limit_cycles, schedule_sweep, verification
 from seaopt.robustness.verification.schedule_motion import Motion
@@ -90,6 +91,20 @@ def ask(schedule, **limits):
     return replace(
         schedule, controllers=tuple(replace(one, spec=replace(one.spec, **limits)) for one in schedule.controllers)
     )
+
+
+def test_a_draw_that_lies_on_its_limit_keeps_it():
+    """Ms one by one: a limit below the largest by half of what rounding may do is kept, by ten times that it is not."""
+    _, swing, values = read_knee()
+    plants, ranges, rng = {"swing": swing}, {"I_p": (0.33, 0.39)}, np.random.default_rng(1)
+    cases = pose_places(tune_knee(), plants, values, ranges, so.ParameterSet())[0.2]
+    drawn = cases.unknown.list_draws(4, rng)
+    largest = max(cases.controller.close(swing, values.update(phi=0.2, **draw)).figures().ms for draw in drawn)
+    for beyond, fails in ((5e-7, False), (1e-5, True)):
+        spec = replace(cases.controller.spec, max_sensitivity=float(largest / (1.0 + beyond)))
+        alone = replace(cases, controller=replace(cases.controller, spec=spec), models=plants, plants=plants)
+        failed, _, _ = measure_draws(Shared(alone), 4, np.random.default_rng(1), None, ignore)
+        assert np.any(failed[1]) == fails
 
 
 def find_radius(law, values, at, slope=0.0):
