@@ -55,6 +55,7 @@ SMALL = 1e-5  # below which a systematic residual is worth no word
 HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
+TICK = 0.1  # of a sample, by which a delay may be beyond its bound
 PUSH = 4.0  # standard deviations that a bound holds an estimate away from where the logs want it
 NOISELESS = 1e-6  # of the spread: 20 bits, and less than rounding to single precision makes of a log
 FEWEST_SAMPLES, SAMPLES_PER_UNKNOWN = 100, 15
@@ -278,14 +279,17 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
     if not at_bound:
         return
     evaluation = minimum.problem.evaluate(z)
+    # A command and its reading are not logged at one instant: a delay of none may come out as a little less.
+    periods = {e.slots.delay.index: e.period for e in minimum.problem.experiments if e.slots.delay.index is not None}
     for i in at_bound:
         name = unknowns.names[i]
         curvature = float(evaluation.hessian[i, i])
         inward = 1.0 if z[i] - unknowns.low[i] <= unknowns.high[i] - z[i] else -1.0
         push = inward * float(evaluation.gradient[i]) / math.sqrt(max(curvature, 1e-300))
+        beyond = push / math.sqrt(max(curvature, 1e-300))
         parameter = fit.parameters.get(name)
         away = parameter is not None and not parameter.at_bound
-        bad = push > PUSH or away
+        bad = (push > PUSH and beyond > TICK * periods.get(i, 0.0)) or away
         if away:
             remedy = "the farthest that a fit searches: the logs do not limit it; fix it, or give it a bound or a prior"
         elif bad:

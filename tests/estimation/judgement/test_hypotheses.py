@@ -133,6 +133,24 @@ def test_how_large_an_effect_is_may_be_known_roughly_and_a_stiffness_may_not():
     assert {finding.where: finding.severity for finding in rough} == {"current_loop_hz": "warning", "k_s": "error"}
 
 
+@pytest.mark.parametrize(("early_s", "severity"), [(5e-5, "note"), (1e-3, "error")])
+def test_a_delay_of_none_may_come_out_a_little_negative(early_s, severity):
+    """Readings that are a fiftieth of a sample early are those of a clock; a command that acts before it is given is
+    none.
+    """
+    log = record()
+    early = {name: log[name] + early_s * np.gradient(log[name], log.time) for name in ("tau_s", "theta_m")}
+    plant = so.plants.rotary(link="locked")
+    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    experiment = so.Experiment(
+        plant=plant, log=so.Log.from_arrays(time=log.time, I=log["I"], **early), outputs=("tau_s", "theta_m"),
+        name="log", initial_state="rest", delay_s=delay,
+    )  # fmt: skip
+    result = so.fit([experiment], plant.defaults.update(**TRUTH).free("J_m", "k_s", "f_c", "b_r"))
+    (bound,) = (finding for finding in result.findings if finding.kind == "bound")
+    assert (bound.where, bound.severity) == ("log.delay_s", severity)
+
+
 def test_what_was_held_out_is_no_noise_of_the_sensor():
     log = record()
     late = log.time > 0.8 * log.time[-1]
