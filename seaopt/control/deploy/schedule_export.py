@@ -102,7 +102,7 @@ def _trace(
 ) -> dict[str, Any]:
     """Return step and reset as lines of C, and what they are given and keep."""
     order = law.table.order
-    states = list(order.rest(0.0, [0.0] * order.measured))
+    states = list(law.table.states)
 
     def begin(reference: str, reading: str) -> tuple[Trace, dict[str, Term], dict[str, Term], Term, list[Term]]:
         trace = Trace(number)

@@ -30,10 +30,10 @@ the other poles of 1/(1 - Q), about as fast as Q, stay.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import NoneType
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -50,6 +50,8 @@ from seaopt.records import record
 from seaopt.units import name_command, show_command
 
 Vector = Float[np.ndarray, " n"]
+State = TypeVar("State", bound="LawState")
+Advance = Callable[[float, Any, float, float], tuple[float, float, Any]]
 Reading = float | Float[np.ndarray, " y"]  # of the measured signal, or of several, the regulated one first
 
 
@@ -87,7 +89,140 @@ class LawState:
 
 
 @record(eq=False)
-class RunnableLaw:
+class Guarded:
+    """A law as it runs, but for the law itself: its limit, and what stands around it.
+
+    Parameters
+    ----------
+    sample_time_s : float
+        Seconds.
+    per_effort : float
+        The command is this times the effort: A/N or A/(N m) of a current.
+    command_limit : float
+        The command's largest magnitude, in its unit; infinite where there is no limit.
+    gate : PlausibilityGate, optional
+        Which readings are believed.
+    command : (str, str)
+        Name and unit of the input that is commanded.
+    heat : HeatGuard, optional
+        What lowers the limit as the winding warms up.
+    compensation : Compensation, optional
+        What is added to reference and effort; it may read further outputs.
+    """
+
+    sample_time_s: float
+    per_effort: float
+    command_limit: float
+    gate: PlausibilityGate | None = None
+    command: tuple[str, str] = ("I", "A")
+    heat: HeatGuard | None = None
+    compensation: Compensation | None = None
+
+    @property
+    def measured(self) -> int:
+        """How many signals it reads."""
+        raise NotImplementedError
+
+    @property
+    def force_limit_N(self) -> float:
+        """The motor force at the limit."""
+        return self.command_limit / self.per_effort
+
+    def begin(
+        self, reference: float, measurement: Reading | None, current_A: float, readings: Sequence[float]
+    ) -> tuple[float, Reading, float, GateState]:
+        """Return reference and measurement at rest, the effort that is to be the law's, and what the gate has seen.
+        Raises ControlError: an input is not finite or beyond 1e15, the measurement is outside the gate's range, or the
+        current is above the limit.
+        """
+        for name, value in (("reference", reference), ("current_A", current_A)):
+            require_number(value, name, ControlError)
+        is_stated, measurement = measurement is not None, self._check_measurement(measurement)
+        seen = self.gate.start(float(np.ravel(measurement)[0])) if self.gate is not None and is_stated else GateState()
+        if not all(map(is_number, (reference, current_A, *np.ravel(measurement), *readings))):
+            raise ControlError(
+                f"reference = {reference:g}, measurement = {measurement}, current_A = {current_A:g}, readings = "
+                f"{list(readings)}: give finite numbers, within +-{LARGEST:g}"
+            )
+        if not abs(current_A) <= self.command_limit:
+            limit = show_command(self.command_limit, *self.command)
+            raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
+        added = 0.0
+        if self.compensation is not None:
+            reads = tuple(readings) or (0.0,) * len(self.compensation.reads)
+            reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads)
+        return reference, measurement, current_A / self.per_effort - added, seen
+
+    def _check_measurement(self, measurement: Reading | None) -> Reading:
+        """Return what was measured at rest: zero where it is left out, else as many numbers as there are signals."""
+        if self.measured == 1:
+            measurement = measurement.item() if isinstance(measurement, np.ndarray) else measurement
+            return 0.0 if measurement is None else require_number(measurement, "measurement", ControlError)
+        values = np.zeros(self.measured) if measurement is None else np.asarray(measurement, dtype=float)
+        if values.shape != (self.measured,):
+            raise ControlError(
+                f"measurement has the shape {values.shape}; give {self.measured} numbers, one per signal"
+            )
+        return values
+
+    def guard(
+        self,
+        state: State,
+        reference: float,
+        measurement: Reading,
+        readings: Sequence[float],
+        advance: Advance,
+        **noted: Any,
+    ) -> tuple[float, State]:
+        """Return the command of this sample, and the next state.
+
+        A sample with a number that is not finite (or beyond 1e15), in its inputs or in what would follow, is not used:
+        the last command is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and
+        takes the command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
+        `readings` are of the outputs that the compensation reads, in their order. `advance` is the law: of reference,
+        measurement, what is added to the effort, and its limit, the effort, what is left of it, and the next x.
+        `noted`: further fields of the next state.
+        """
+        if self.heat is None:
+            return self._decide(state, reference, measurement, readings, self.command_limit, advance, noted)
+        limit = min(self.command_limit, self.heat.limit(state.heat))
+        current, following = self._decide(state, reference, measurement, readings, limit, advance, noted)
+        current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
+        return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
+
+    def _decide(
+        self,
+        state: State,
+        reference: float,
+        measurement: Reading,
+        readings: Sequence[float],
+        limit_A: float,
+        advance: Advance,
+        noted: Mapping[str, Any],
+    ) -> tuple[float, State]:
+        """Return the command within a limit, and the next state."""
+        seen = state.gate
+        if self.gate is not None:
+            regulated, seen = self.gate.screen(seen, float(np.ravel(measurement)[0]))
+            measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
+            if seen.fault:
+                current = self.gate.ramp(state.current_A, self.sample_time_s)
+                return current, replace(state, current_A=current, gate=seen, **noted)
+        taken = all(map(is_number, (reference, *np.ravel(measurement), *readings)))
+        added, memory = 0.0, state.memory
+        with np.errstate(all="ignore"):
+            if self.compensation is not None:
+                reference, added, memory = self.compensation.step(state.memory, reference, readings)
+            force, applied, x = advance(reference, measurement, added, limit_A / self.per_effort)
+        if not (taken and math.isfinite(force) and np.isfinite(x).all()):
+            return state.current_A, replace(state, held=state.held + 1, gate=seen, **noted)
+        current = applied * self.per_effort
+        current = min(max(current, -limit_A), limit_A)  # a limit to the last bit
+        return current, replace(state, x=x, current_A=current, held=0, gate=seen, memory=memory, **noted)
+
+
+@record(eq=False)
+class RunnableLaw(Guarded):
     """F = c x + d_reference r - d_measurement y, x+ = a x + b_reference r - b_measurement y + anti_windup (sat(F) - F).
 
     Parameters
@@ -102,20 +237,6 @@ class RunnableLaw:
         How many poles at z = 1.
     tracking_time_s : float or None
         T_t; None where nothing integrates.
-    sample_time_s : float
-        Seconds.
-    per_effort : float
-        The command is this times F: A/N or A/(N m) of a current.
-    command_limit : float
-        The command's largest magnitude, in its unit; infinite where there is no limit.
-    gate : PlausibilityGate, optional
-        Which readings are believed.
-    command : (str, str)
-        Name and unit of the input that is commanded.
-    heat : HeatGuard, optional
-        What lowers the limit as the winding warms up.
-    compensation : Compensation, optional
-        What is added to reference and effort; it may read further outputs.
     """
 
     a: Float[np.ndarray, "n n"]
@@ -127,23 +248,11 @@ class RunnableLaw:
     anti_windup: Vector
     integrators: int
     tracking_time_s: float | None
-    sample_time_s: float
-    per_effort: float
-    command_limit: float
-    gate: PlausibilityGate | None = None
-    command: tuple[str, str] = ("I", "A")
-    heat: HeatGuard | None = None
-    compensation: Compensation | None = None
 
     @property
     def measured(self) -> int:
         """How many signals it reads."""
         return int(np.size(self.d_measurement))
-
-    @property
-    def force_limit_N(self) -> float:
-        """The motor force at the limit."""
-        return self.command_limit / self.per_effort
 
     def __repr__(self) -> str:
         tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
@@ -179,38 +288,12 @@ class RunnableLaw:
         compensation reads; zero if left out. Raises ControlError: an input is not finite or beyond 1e15, the
         measurement is outside the gate's range, or the current is above the limit.
         """
-        for name, value in (("reference", reference), ("current_A", current_A)):
-            require_number(value, name, ControlError)
-        is_stated, measurement = measurement is not None, self._check_measurement(measurement)
-        seen = self.gate.start(float(np.ravel(measurement)[0])) if self.gate is not None and is_stated else GateState()
-        if not all(map(is_number, (reference, current_A, *np.ravel(measurement), *readings))):
-            raise ControlError(
-                f"reference = {reference:g}, measurement = {measurement}, current_A = {current_A:g}, readings = "
-                f"{list(readings)}: give finite numbers, within +-{LARGEST:g}"
-            )
-        if not abs(current_A) <= self.command_limit:
-            limit = show_command(self.command_limit, *self.command)
-            raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
-        added = 0.0
-        if self.compensation is not None:
-            reads = tuple(readings) or (0.0,) * len(self.compensation.reads)
-            reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads)
+        reference, measurement, effort, seen = self.begin(reference, measurement, current_A, readings)
         per_reference, per_measurement = self.rest()
         x = per_reference * reference - np.dot(per_measurement, measurement)
         if self.integrators:
-            x[0] = current_A / self.per_effort - added - self._find_force(x, reference, measurement)
+            x[0] = effort - self._find_force(x, reference, measurement)
         return LawState(x=x, current_A=current_A, gate=seen, heat=heat)
-
-    def _check_measurement(self, measurement: Reading | None) -> Reading:
-        """Return what was measured at rest: zero where it is left out, else as many numbers as there are signals."""
-        if self.measured == 1:
-            return 0.0 if measurement is None else require_number(measurement, "measurement", ControlError)
-        values = np.zeros(self.measured) if measurement is None else np.asarray(measurement, dtype=float)
-        if values.shape != (self.measured,):
-            raise ControlError(
-                f"measurement has the shape {values.shape}; give {self.measured} numbers, one per signal"
-            )
-        return values
 
     def _find_force(self, x: Vector, reference: float, measurement: Reading) -> float:
         """Return the effort, not limited."""
@@ -219,45 +302,15 @@ class RunnableLaw:
     def step(
         self, state: LawState, reference: float, measurement: Reading, readings: Sequence[float] = ()
     ) -> tuple[float, LawState]:
-        """Return the command (a current in A, as a rule) of this sample, and the next state.
+        """Return the command (a current in A, as a rule) of this sample, and the next state (`Guarded.guard`)."""
 
-        A sample with a number that is not finite (or beyond 1e15), in its inputs or in what would follow, is not used:
-        the last command is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and
-        takes the command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
-        `readings` are of the outputs that the compensation reads, in their order.
-        """
-        if self.heat is None:
-            return self._decide(state, reference, measurement, readings, self.command_limit)
-        limit = min(self.command_limit, self.heat.limit(state.heat))
-        current, following = self._decide(state, reference, measurement, readings, limit)
-        current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
-        return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
-
-    def _decide(
-        self, state: LawState, reference: float, measurement: Reading, readings: Sequence[float], limit_A: float
-    ) -> tuple[float, LawState]:
-        """Return the command within a limit, and the next state."""
-        seen, most = state.gate, limit_A / self.per_effort
-        if self.gate is not None:
-            regulated, seen = self.gate.screen(seen, float(np.ravel(measurement)[0]))
-            measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
-            if seen.fault:
-                current = self.gate.ramp(state.current_A, self.sample_time_s)
-                return current, replace(state, current_A=current, gate=seen)
-        taken = all(map(is_number, (reference, *np.ravel(measurement), *readings)))
-        added, memory = 0.0, state.memory
-        with np.errstate(all="ignore"):
-            if self.compensation is not None:
-                reference, added, memory = self.compensation.step(state.memory, reference, readings)
+        def advance(reference: float, measurement: Reading, added: float, most: float) -> tuple[float, float, Vector]:
             force = self._find_force(state.x, reference, measurement) + added
             applied = min(max(force, -most), most)
             x = self.a @ state.x + self.b_reference * reference - np.dot(self.b_measurement, measurement)
-            x += self.anti_windup * (applied - force)
-        if not (taken and math.isfinite(force) and np.all(np.isfinite(x))):
-            return state.current_A, replace(state, held=state.held + 1, gate=seen)
-        current = applied * self.per_effort
-        current = min(max(current, -limit_A), limit_A)  # a limit to the last bit
-        return current, LawState(x=x, current_A=current, gate=seen, memory=memory)
+            return force, applied, x + self.anti_windup * (applied - force)
+
+        return self.guard(state, reference, measurement, readings, advance)
 
     def run(
         self,

@@ -150,6 +150,11 @@ class GainTable:
         return _find_order(self)
 
     @property
+    def states(self) -> tuple[str, ...]:
+        """What the law keeps as it runs, by name."""
+        return _list_states(self)
+
+    @property
     def columns(self) -> Mapping[str, Float[np.ndarray, " n"]]:
         """The rows of numbers that are interpolated, by the names that `StepOrder` has for them."""
         return _list_columns(self)
@@ -226,6 +231,12 @@ def _find_order(table: GainTable) -> StepOrder:
         speed_integrates="T_v" in table.gains,
         nominal=table.nominals[0] if table.nominals else None,
     )
+
+
+@lru_cache(maxsize=16)
+def _list_states(table: GainTable) -> tuple[str, ...]:
+    """Return the names of what the law of a table keeps, once."""
+    return tuple(table.order.rest(0.0, [0.0] * table.order.measured))
 
 
 @lru_cache(maxsize=16)

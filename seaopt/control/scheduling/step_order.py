@@ -117,10 +117,17 @@ class StepOrder:
         return x
 
     def step(
-        self, g: Numbers, x: Numbers, reference: Any, readings: Sequence[Any], saturate: Callable[[Any], Any]
+        self,
+        g: Numbers,
+        x: Numbers,
+        reference: Any,
+        readings: Sequence[Any],
+        saturate: Callable[[Any], Any],
+        added: Any = None,
     ) -> tuple[Any, Any, dict[str, Any]]:
-        """Return the effort, what is left of it in its limit, and the next states."""
+        """Return the effort with what is added to it, what is left of it in its limit, and the next states."""
         effort, into_speed, half, after = self._evaluate(g, x, reference, readings)
+        effort = effort if added is None else effort + added
         applied, ts, share = saturate(effort), self.sample_time_s, g[SHARE]
         excess = applied - effort
         pull = share * excess

@@ -96,7 +96,7 @@ class _Pushing:
 
     def find_push(self, rate: float, first: float) -> _Push | None:
         """Return the push that moves the variable at a rate, or as fast as it may; None where even small ones fail."""
-        size, kept, limit = first, None, self.schedule.runnable().limit
+        size, kept, limit = first, None, self.schedule.runnable().command_limit
         for _ in range(TRIES):
             try:
                 run = self.run(size)

@@ -213,7 +213,7 @@ def _run_sweep(
     ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
     left = float(np.max(np.abs(response - pulse)[ends]))
     fault = ""
-    if max(np.max(np.abs(calm.current)), np.max(np.abs(moved.current))) >= law.limit:
+    if max(np.max(np.abs(calm.current)), np.max(np.abs(moved.current))) >= law.command_limit:
         fault = "the motion takes the command to its limit"
     elif not peak <= pulses.allowed_peak:
         fault = f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"

@@ -73,7 +73,7 @@ def test_before_any_place_the_fallback_counts(compiler, tmp_path, schedule):
 
 def test_the_stored_schedule_runs_as_the_one_that_was_stored(schedule):
     law, _ = read_runnable(json.loads(to_json(schedule.to_dict())))
-    assert np.array_equal(law.anti_windup, schedule.runnable().anti_windup) and law.limit == 5.0
+    assert np.array_equal(law.anti_windup, schedule.runnable().anti_windup) and law.command_limit == 5.0
 
 
 def test_a_table_that_was_edited_or_is_not_feasible_is_not_exported(tmp_path, schedule):

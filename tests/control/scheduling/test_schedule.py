@@ -140,7 +140,7 @@ class TestRunnableSchedule:
         law = make_runnable(make_table(), limit=50.0)
         command, state = law.step(law.reset(place=0.2), 0.3, 0.1, 0.2)
         held, after = law.step(state, 0.3, math.nan, 0.4)
-        assert held == command and after.held == 1 and after.x == state.x
+        assert held == command and after.held == 1 and np.array_equal(after.x, state.x)
 
 
 @pytest.fixture(scope="module")

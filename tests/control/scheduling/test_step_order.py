@@ -142,7 +142,7 @@ def test_an_observer_sees_the_limited_command(schedule):
         pytest.skip("another law")
     law, g, n = schedule.runnable(), controller.gains, 900
     q, inverse = controller.observer.filters(TS)
-    limit, rng = law.limit / law.per_effort, np.random.default_rng(8)
+    limit, rng = law.command_limit / law.per_effort, np.random.default_rng(8)
     references, readings = rng.normal(size=n) + 30.0 * (np.arange(n) < 450), rng.normal(size=n)
     share = law.anti_windup[0]
 
@@ -164,8 +164,8 @@ def test_an_observer_sees_the_limited_command(schedule):
         x_r += TS / (g["T_f"] + TS) * (r - x_r)
         x_y += TS / (g["T_f"] + TS) * (y - x_y)
         commands[k], state = law.step(state, float(r), float(y), point)
-    np.testing.assert_allclose(commands, applied * law.per_effort, atol=1e-9 * law.limit)
-    assert 0.1 < np.mean(np.abs(commands) == law.limit) < 0.9
+    np.testing.assert_allclose(commands, applied * law.per_effort, atol=1e-9 * law.command_limit)
+    assert 0.1 < np.mean(np.abs(commands) == law.command_limit) < 0.9
 
 
 def test_standing_still_a_tuned_one_is_its_controllers_law(schedule):
@@ -219,5 +219,5 @@ def test_in_c_every_command_is_pythons(schedule, precision, share, compiler, tmp
         pair[0], state = law.step(state, float(r), y, float(place))
         pair[1] = compiled.step(float(r), y, float(place))
         assert (compiled.law.held, compiled.law.misplaced) == (state.held, state.misplaced)
-    np.testing.assert_allclose(*pairs.T, rtol=0.0, atol=share * law.limit)
-    assert 0.1 < np.mean(np.abs(pairs[:, 0]) == law.limit) < 0.9
+    np.testing.assert_allclose(*pairs.T, rtol=0.0, atol=share * law.command_limit)
+    assert 0.1 < np.mean(np.abs(pairs[:, 0]) == law.command_limit) < 0.9
