@@ -16,6 +16,7 @@ from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.candidates import Candidate, list_candidates
 from seaopt.estimation.judgement.hypothesis_search import Refit
 from seaopt.estimation.judgement.score_test import ScoreTest
+from seaopt.estimation.judgement.second_log import FAR
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import measure_spread
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
@@ -45,7 +46,9 @@ class Cause:
     where: str
     gain: float  # logarithm of its likelihood over the fit's
     solved: bool  # whether it leaves hardly anything of the residual of any output
-    material: bool  # whether it takes half of a residual's power away, or moves an estimate beyond what the fit says
+    # whether it moves an estimate beyond what the fit says, or takes half of a residual's power away: of a residual
+    # near its noise that is no reason to doubt values that stay within their intervals
+    material: bool
     preferred: Mapping[str, tuple[float, float]]  # value and std that the refit gives what it frees
     refit: Refit | None = None  # of a hypothesis about what the model lacks
     unknowns: int  # how many its refit had
@@ -194,6 +197,12 @@ def _weigh_hypotheses(
             yield replace(cause, refit=refit)
 
 
+def _is_near_noise(fit: Fit) -> bool:
+    """Tell whether no residual is so far above its sensor's noise that intervals of one log hold no more."""
+    rows = fit.outputs.values()
+    return all(figures.excess is not None and figures.excess <= FAR for row in rows for figures in row.values())
+
+
 def _weigh(
     fit: Fit,
     candidate: Candidate,
@@ -218,11 +227,13 @@ def _weigh(
     if text is None:
         return None
     moved: list[tuple[float, str]] = []
+    inside = True
     for name in fit.covariance.names:
         old = fit.parameters[name]
         away = abs(values.get(name, old.value) - old.value)
-        inside = max(MOVED_STDS * (old.std or 0.0), QUANTILE * (old.total_std or 0.0))
-        if away > max(inside, MOVED_SHARE * abs(old.value)):
+        half = QUANTILE * (old.total_std or 0.0)
+        inside = inside and away <= half
+        if away > max(MOVED_STDS * (old.std or 0.0), half, MOVED_SHARE * abs(old.value)):
             moved.append((away / max(abs(old.value), 1e-300), name))
     effects = [f"takes {100.0 * (1.0 - left):.3g} % of a residual's power away"] if left < 1.0 - 1e-3 else []
     if moved:
@@ -234,6 +245,6 @@ def _weigh(
         gain=gain,
         solved=bool(np.all(after[:, 0] < SOLVED * before[:, 0])),
         preferred={name: (values[name] - shift, stds[name]) for name, shift in candidate.frees.items()},
-        material=bool(moved) or left < HALVED or candidate.certain,
+        material=bool(moved) or candidate.certain or (left < HALVED and not (inside and _is_near_noise(fit))),
         unknowns=len(values),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,28 @@ def test_logs_that_agree_leave_the_intervals_alone():
     assert result.met and not result.findings
     parameter = result.parameters["a"]
     assert parameter.total_std <= 1.2 * parameter.std
+
+
+@pytest.mark.parametrize(("share", "missing", "met"), [(0.0, 0.02, True), (0.0, 0.06, False), (0.5, 0.02, False)])
+def test_a_cause_that_leaves_the_values_is_an_error_where_the_residual_is_far_above_noise(share, missing, met):
+    """Of y = 2 u + b w + e with b fixed at 0, least squares are off by b (w'u)/(u'u): nothing where w is across u."""
+    rng = np.random.default_rng(4)
+    u, w = (lfilter([1.0], [1.0, -0.98], rng.normal(size=N + 1000))[1000:] for _ in range(2))
+    u, w = u / np.std(u), w / np.std(w)
+    w = w - (w @ u) / (u @ u) * u + share * u
+    log = so.Log.from_arrays(time=np.arange(N) * PERIOD, u=u, w=w, y=2.0 * u + missing * w + 0.01 * rng.normal(size=N))
+    plant = replace(
+        GAIN, inputs={"u": "-", "w": "-"}, parameters={"a": "-", "b": "-"},
+        h=lambda t, x, u, p: {"y": p.a * u.u + p.b * u.w + 0 * x.z},
+    )  # fmt: skip
+    bench = so.Experiment(plant=plant, log=log, initial_state="rest", offset=False, name="log")
+    params = so.ParameterSet.of(a=(1.0, "-"), b=(0.0, "-")).free("a")
+    result = so.fit([bench], params, method=so.OutputError(search=False))
+    assert result.parameters["a"].value - 2.0 == pytest.approx(missing * share, abs=1e-3)
+    assert (result.outputs["log"]["y"].excess > 3.0) is (missing > 0.05)
+    (cause,) = (finding for finding in result.findings if finding.kind == "cause")
+    assert cause.where == "b" and cause.severity == ("warning" if met else "error")
+    assert result.met is met
 
 
 def test_a_value_that_is_known_only_roughly_is_named(thor):
