@@ -549,7 +549,7 @@ def test_a_motor_that_stands_still_time_and_again_is_offered_friction_that_stick
     proposal = knee_log(tmp_path / "sticks.csv", change=stick)
     assert any("theta_m stands still again and again: friction sticks" in note for note in proposal.notes)
     path = tmp_path / "sticks.toml"
-    taken = [line.removeprefix("# ") if "f_s =" in line or "parts =" in line else line
+    taken = [line.removeprefix("# ") if "f_s =" in line or "parts =" in line or "sticks =" in line else line
              for line in proposal.text.splitlines()]  # fmt: skip
     path.write_text("\n".join(taken), encoding="utf-8")
     problem = so.read_problem(path)

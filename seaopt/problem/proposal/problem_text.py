@@ -51,11 +51,10 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
         lines += _offer_stribeck(actuator.lines)
     for name, options in actuator.plants.items():
         lines += ["", f"[plant.{name}]", *(f"{key} = {format_toml(value)}" for key, value in options.items())]
-        lines.append("sticks = true  # friction jumps at rest")
         if sticks:
             parts = options.get("parts", [])
             assert isinstance(parts, list)
-            lines.append(f"# parts = {format_toml([*parts, 'stribeck'])}")
+            lines += [f"# parts = {format_toml([*parts, 'stribeck'])}", "# sticks = true  # friction jumps at rest"]
     names: set[str] = set()
     for log in logs:
         name = next(name for name in _number_names(log.name) if name not in names)
