@@ -33,7 +33,7 @@ from seaopt.logs import Log, write_log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
-from seaopt.problem.explained import adopt, find_explanation
+from seaopt.problem.explained import adopt, find_explanation, say_unexplained
 from seaopt.problem.problem import WRITE_ONE
 from seaopt.problem.stages import (
     assess_problem,
@@ -327,8 +327,12 @@ class Session:
         reading, fitting = divide(tell, READING, 1.0 - READING)
         reading("reading logs", 0.0)
         result = fit_problem(self.problem, self.experiments(), progress=fitting)
-        if self.explain and (found := find_explanation(result)) is not None:
-            result = self._explain(found, result)
+        if self.explain:
+            found = find_explanation(result)
+            if found is None:
+                self.say(say_unexplained(result.hypotheses))
+            else:
+                result = self._explain(found, result)
         else:
             (self.folder / EXPLAINED).unlink(missing_ok=True)  # of another fit
         self.results["fit"] = result

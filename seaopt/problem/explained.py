@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +22,22 @@ def find_explanation(fit: Fit) -> HypothesisTrial | None:
     adopted = next((trial for trial in fit.hypotheses if trial.outcome == "adopted"), None)
     tied = any(trial.outcome == "tied" for trial in fit.hypotheses)
     return None if tied else adopted
+
+
+def say_unexplained(trials: Sequence[HypothesisTrial]) -> str:
+    """Return in words why nothing was added to a problem whose fit tried these."""
+    if not trials:
+        return "nothing was tried: no residual asks for more than the model has, or it explains too little"
+    as_good = [trial for trial in trials if trial.outcome != "tried"]
+    if as_good:
+        effects = "; or ".join(f"{trial.effect} ({', '.join(trial.parts)})" for trial in as_good)
+        return f"nothing is added, for several causes explain the logs: {effects}; add the one you expect"
+    best, count = min(trials, key=lambda trial: trial.excess), len(trials)
+    return (
+        f"nothing explains the logs: of {count} causes and pairs that were tried the best, {best.effect}, leaves "
+        f"{best.excess:.3g} times the sensor's noise of {best.excess_before:.3g}; look for what is not among them, "
+        "such as a bench that shakes, another load, or a wrong unit"
+    )
 
 
 def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 
 import pytest
 
 from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.problem import read_problem
-from seaopt.problem.explained import adopt
+from seaopt.problem.explained import adopt, say_unexplained
 from tests.actuator_logs import write_csv
 from tests.estimation.judgement.test_hypotheses import TRUTH, record
 
@@ -56,6 +57,18 @@ def test_bristles_are_added_to_a_plant_that_sticks(problem):
     assert not found.plants["stand"].sticks
     assert found.parameters["k_s"].value == 299.0
     assert tomllib.loads(lines)["plant"]["stand"] == {"parts": ["lugre"], "sticks": False}
+
+
+def test_what_nothing_explains_is_said():
+    trial = HypothesisTrial(
+        effect="the spring hardens", parts=("hardening",), outcome="tried", excess_before=30.0, excess=20.0,
+        frees={"k_3": 1.0}, fixed={}, parameters={}, evaluations=9,
+    )  # fmt: skip
+    trials = (trial, replace(trial, effect="the motor cogs", excess=12.0))
+    assert "nothing was tried" in say_unexplained(())
+    assert "the best, the motor cogs, leaves 12 times the sensor's noise of 30" in say_unexplained(trials)
+    tied = tuple(replace(each, outcome="tied") for each in trials)
+    assert "the spring hardens (hardening); or the motor cogs" in say_unexplained(tied)
 
 
 def test_what_is_found_is_added_and_fitted(problem, seaopt):
