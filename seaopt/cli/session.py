@@ -19,13 +19,17 @@ from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources, name_file
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
+from seaopt.control.frontier.frontier import FRONTIER_SCHEMA
+from seaopt.control.laws.controller import CONTROLLER_SCHEMA
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, warn_delays
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
+from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, compare_with_log, warn_unidentified
 from seaopt.estimation.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
+from seaopt.estimation.result.fit_result import FIT_SCHEMA
 from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.executors import Processes
 from seaopt.files import CONTENT, check_folder, read_json, to_json, write_json, write_text
@@ -54,16 +58,18 @@ from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands, Verdict
 from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, name_guesses
 from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate, linear_controller
+from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
+from seaopt.robustness.certificate.scheduled import SCHEDULE_ROBUSTNESS_SCHEMA
 from seaopt.testing.expectations import list_expectations
 
 SCHEMAS = {
-    "fit": "seaopt/fit/2",
+    "fit": FIT_SCHEMA,
     "frf": "seaopt/frf/1",
-    "tune": "seaopt/controller/3",
-    "sweep": "seaopt/frontier/1",
-    "certify": "seaopt/robustness/2",
+    "tune": CONTROLLER_SCHEMA,
+    "sweep": FRONTIER_SCHEMA,
+    "certify": ROBUSTNESS_SCHEMA,
 }
-SCHEDULE_SCHEMAS = {"tune": "seaopt/schedule/2", "certify": "seaopt/schedule_robustness/1"}
+SCHEDULE_SCHEMAS = {"tune": SCHEDULE_SCHEMA, "certify": SCHEDULE_ROBUSTNESS_SCHEMA}
 LABELS = {
     "simulate": "simulating",
     "frf": "frequency responses",

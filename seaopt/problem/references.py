@@ -98,7 +98,6 @@ def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         )
     for key, there in (
         ('controller.structure = "mpc"', law.structure == "mpc"),
-        ("controller.prefilter", law.prefilter is not None),
         ("controller.link_feedforward", law.link_feedforward is not False),
         ("controller.compensate", bool(law.compensate)),
         ("impedance", table.impedance is not None),

@@ -151,7 +151,7 @@ def tune_schedule(
 def _check_structure(spec: ControllerSpec) -> None:
     if spec.link_feedforward is not None:
         raise ControlError(
-            "link_feedforward reads the link's motion, and a scheduled law reads one signal, what it regulates; leave "
+            "link_feedforward has the model of one link, which no schedule carries from point to point; leave "
             "link_feedforward out, or tune one law for all points: so.tune(..., draws=[{name: value}, ...])"
         )
     if spec.structure not in STRUCTURES:

@@ -130,7 +130,7 @@ HYPOTHESES = (
         starts=lambda s: [{"current_loop_hz": 300.0}],
     ),
     Hypothesis(
-        effect="the stand gives",
+        effect="the stand is compliant",
         part="stand",
         starts=lambda s: [{"c_t": 0.02 / s.stiffness}] if s.stiffness else [],
         usual=lambda stiffness: 0.04 / stiffness,

@@ -73,7 +73,7 @@ def _find_ties(fit: Fit, joint: FitProblem, evaluation: Evaluation, added: list[
     for addition in added:
         parameter, size = addition.parameter, addition.size
         i = names.index(parameter.name)
-        shift = -solve_seen(hessian[np.ix_(others, others)], hessian[others, i], SOLVED)
+        shift = -solve_seen(hessian[others][:, others], hessian[others, i], SOLVED)
         left = max(float(hessian[i, i] + hessian[i, others] @ shift), 0.0)
         moves = {names[k]: float(each) for k, each in zip(others, shift, strict=True) if names[k] in fit.parameters}
         touched = {

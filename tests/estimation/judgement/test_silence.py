@@ -71,7 +71,7 @@ def test_a_stand_in_series_is_said_to_touch_the_stiffness(linear):
     values = follow(result, "stand", 0.04 / truth)
     assert values.keys() == {name}
     assert values[name] == pytest.approx(truth, rel=3e-3)
-    assert f"told from such a log: {name} where the stand gives" in repr(result)
+    assert f"told from such a log: {name} where the stand is compliant" in repr(result)
 
 
 @pytest.mark.parametrize("linear", [False, True])
