@@ -116,6 +116,9 @@ def judge(
     refitting, trying = divide(trying, OF_HYPOTHESES, OF_CAUSES)
     evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
     search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting)
+    if search.partial is not None:
+        fit = _widen_to(fit, search.partial.parameters)
+        findings = [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
     if wrong or search.able:
         causes = find_causes(
             fit,

@@ -17,7 +17,7 @@ from tests.actuator_logs import integrate
 RATE_HZ, STEPS = 400.0, 4
 TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 5.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0, "c_s": 0.5}
 FREE = ("J_m", "b_r", "f_c", "k_s", "eta")
-NONE = dict.fromkeys(("droop", "drift", "harder", "load", "play", "one_way", "breakaway", "lag_s"), 0.0)
+NONE = dict.fromkeys(("droop", "drift", "harder", "load", "play", "one_way", "breakaway", "lag_s", "warms_s"), 0.0)
 
 
 def record(seconds=5.0, seed=0, **effects):
@@ -35,7 +35,8 @@ def record(seconds=5.0, seed=0, **effects):
 
     def rates(x, ampere):
         angle, speed, lagging = x
-        torque, cold = spring(angle, speed), 1.0 - e["drift"] * clock[0] / seconds
+        warm = 1.0 - math.exp(-clock[0] / e["warms_s"]) if e["warms_s"] else clock[0] / seconds
+        torque, cold = spring(angle, speed), 1.0 - e["drift"] * warm
         level = cold * p["f_c"] + e["load"] * abs(torque) / p["N"] + e["breakaway"] * math.exp(-((speed / 15.0) ** 2))
         rub = level * math.tanh(speed / p["v_s"]) + cold * p["b_r"] * speed + e["one_way"] * abs(speed)
         arrived = lagging if e["lag_s"] else ampere
@@ -174,6 +175,20 @@ def test_none_is_named_while_the_excess_stays_high():
     assert result.hypotheses
     assert all(trial.excess > REMOVED and trial.outcome == "tried" for trial in result.hypotheses)
     assert not any(finding.proposal for finding in result.findings)
+
+
+def test_intervals_reach_to_the_best_of_what_leaves_an_excess():
+    """Friction falls as a winding warms up, not in proportion to time as the hypothesis has it: b_r is what it ends at,
+    where the motor is fast, and f_c its mean.
+    """
+    result = fit(record(drift=0.5, warms_s=1.0))
+    best = result.hypotheses[0]
+    assert all(trial.outcome == "tried" for trial in result.hypotheses) and REMOVED < best.excess < best.excess_before
+    for name, share in (("b_r", 0.5), ("f_c", 1.0 - 0.5 * (1.0 - 0.2 * (1.0 - math.exp(-5.0))))):
+        parameter = result.parameters[name]
+        low, high = parameter.ci95
+        assert high - parameter.value >= 1.959 * abs(best.parameters[name] - parameter.value)
+        assert low < share * TRUTH[name] < high
 
 
 def test_what_takes_nearly_all_of_a_high_excess_is_named():
