@@ -333,14 +333,13 @@ class Session:
         reading, fitting = divide(tell, READING, 1.0 - READING)
         reading("reading logs", 0.0)
         result = fit_problem(self.problem, self.experiments(), progress=fitting)
+        (self.folder / EXPLAINED).unlink(missing_ok=True)  # of another fit
         if self.explain:
             found = find_explanation(result)
             if found is None:
                 self.say(say_unexplained(result.hypotheses))
             else:
                 result = self._explain(found, result)
-        else:
-            (self.folder / EXPLAINED).unlink(missing_ok=True)  # of another fit
         self.results["fit"] = result
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})

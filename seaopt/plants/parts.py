@@ -184,7 +184,6 @@ NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
     **dict.fromkeys(("servo_integral", "servo_limit", "servo_delay"), (("position_servo",),)),
     **dict.fromkeys(("supply_input", "supply_sag"), (("duty_input",),)),
     "inductance": (tuple(drives.INPUTS),),
-    "supply_input": (("duty_input",),),
 }
 LOADS = {"motor": 0.0, "output": 0.0}  # of friction that grows with them, as linear analysis takes it
 

@@ -279,3 +279,10 @@ def test_a_frame_s_clock_is_the_one_named(options, words):
 def test_columns_of_one_name_in_two_units_are_both_kept():
     log = so.Log.from_frame(pl.DataFrame({"time [s]": [0.0, 1.0], "F [N]": [1.0, 2.0], "F [kN]": [3.0, 4.0]}))
     assert {name: log[name].tolist() for name in log.signals} == {"F [N]": [1.0, 2.0], "F [kN]": [3000.0, 4000.0]}
+
+
+def test_a_held_command_keeps_its_value_over_short_holes():
+    time, command = np.arange(1000) / 1000, np.full(1000, np.nan)
+    command[::10] = np.repeat([0.0, 1.0], 5)[np.arange(100) % 10]
+    log = so.Log.from_arrays(time=time, I=command).resample(rate_hz=1000, steps=("I",), bridge_s=0.0115)
+    assert log["I"][:991] == pytest.approx(np.repeat(command[::10], 10)[:991])

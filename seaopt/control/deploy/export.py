@@ -33,7 +33,7 @@ from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_s
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
-from seaopt.control.laws.realisation import RunnableLaw, choose_limit, find_raised_limit, realise
+from seaopt.control.laws.realisation import RunnableLaw, check_guards, choose_limit, find_raised_limit, realise
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
@@ -155,7 +155,10 @@ def export(
             "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that "
             "is commanded a current"
         )
-    law = replace(law, gate=stored["gate"] if gate is None else (gate or None), heat=heat if derate else None)
+    gate = stored["gate"] if gate is None else None if gate is False else gate
+    heat = heat if derate else None
+    check_guards(gate, heat, (stored["command"].input, stored["command"].unit))
+    law = replace(law, gate=gate, heat=heat)
     words = _describe(stored, law) | {
         "achieved": figures,
         "feasible": met,

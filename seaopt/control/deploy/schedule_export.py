@@ -82,7 +82,7 @@ def describe_schedule(
     signals = [f"read_{identifier(name)}" for name in (first["reads"] or list_names(first["spec"].measured))[1:]]
     return {
         **_trace(law, f"reference_{name_unit(first['command'])}", list(rows), signals, number),
-        "integrators": table.integrates or "T_v" in table.gains,
+        "integrators": table.integrates or "T_v" in table.gains or bool(table.nominals),
         "resets": (),
         "over": strip_markup(table.over),
         "over_unit": strip_markup(table.unit),

@@ -392,6 +392,16 @@ def find_raised_limit(command: Command, spec: ControllerSpec, requested: float |
     return command.show(designed) if designed is not None and running is not None and running > designed else ""
 
 
+def check_guards(gate: object, heat: object, command: tuple[str, str]) -> None:
+    """Refuse guards that a law with such a command, by name and unit, cannot have (ControlError)."""
+    require_type(gate, (PlausibilityGate, NoneType), "gate", "give a PlausibilityGate", ControlError)
+    require_type(heat, (HeatGuard, NoneType), "heat", "give a HeatGuard", ControlError)
+    if heat is not None and command[1] != "A":
+        raise ControlError(
+            f"heat: a guard limits a current, and {command[0]} [{command[1]}] is commanded; leave it out"
+        )
+
+
 def realise(
     law: Law,
     *,
@@ -429,12 +439,7 @@ def realise(
     ControlError
         A number is out of range, or the law by itself is unstable other than by integrators.
     """
-    require_type(gate, (PlausibilityGate, NoneType), "gate", "give a PlausibilityGate", ControlError)
-    require_type(heat, (HeatGuard, NoneType), "heat", "give a HeatGuard", ControlError)
-    if heat is not None and command[1] != "A":
-        raise ControlError(
-            f"heat: a guard limits a current, and {command[0]} [{command[1]}] is commanded; leave it out"
-        )
+    check_guards(gate, heat, command)
     for name, value in (
         ("sample_time_s", law.sample_time_s),
         ("per_effort", per_effort),

@@ -275,7 +275,9 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
     for point, controller in zip(points, controllers, strict=True):
         gains, speed, observer = controller.gains, controller.speed_loop, controller.observer
         made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, observer, speed)
-        if set(gains) != set(first.gains) or not made or not made.makes(controller.law, controller.spec.structure):
+        added = controller.compensation is not None or controller.outer is not None or controller.link is not None
+        whole = made and not added and made.makes(controller.law, controller.spec.structure)
+        if set(gains) != set(first.gains) or not whole:
             raise ControlError(
                 f"the controller at {over} = {point:g} is more than its gains, or has other parts than that at "
                 f"{points[0]:g}, and only gains are interpolated; use the same structure, notch and prefilter at all "

@@ -105,7 +105,7 @@ class Search:
     def partial(self) -> HypothesisTrial | None:
         """The best trial where none removes a large excess: the truth is no nearer to the fit's values than to its."""
         best = None if self.able else next(iter(self.trials), None)
-        return best if best is not None and REMOVED < best.excess < best.excess_before else None
+        return best if best is not None and best.excess < best.excess_before > REMOVED else None
 
     def yield_to_another(self) -> Search:
         """Return the search where another cause explains the logs better, so that none is adopted."""

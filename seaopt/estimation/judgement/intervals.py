@@ -83,16 +83,14 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
 
 
 def find_single_event(experiments: Sequence[Experiment]) -> Iterator[FitFinding]:
-    """Yield that one step is all that happens, in one log or in several alike: any model follows it with some values,
-    which nothing refutes.
+    """Yield that one step is all that happens to every plant, in one log or in several alike: any model follows it with
+    some values, which nothing refutes. Logs that are too short to tell are no evidence.
     """
-    if len({experiment.plant.name for experiment in experiments}) > 1:
-        return
-    sizes = [_measure_event(experiment) for experiment in experiments]
-    alike = [size for size in sizes if size is not None]
-    if len(alike) < len(sizes) or not np.any(alike):
-        return
-    if np.any(np.min(alike, axis=0) < SECOND * np.max(alike, axis=0)):
+    sizes: dict[str, list[list[float] | None]] = {}
+    for experiment in experiments:
+        if experiment.log.time.size > 2 * BLOCKS:
+            sizes.setdefault(experiment.plant.name, []).append(_measure_event(experiment))
+    if not sizes or not all(map(_are_alike, sizes.values())):
         return
     yield FitFinding(
         severity="error",
@@ -100,6 +98,16 @@ def find_single_event(experiments: Sequence[Experiment]) -> Iterator[FitFinding]
         where=", ".join(experiment.name for experiment in experiments),
         text="its inputs move once and rest: one step tests no model, however often it is logged, and other values "
         "follow it as well; record steps of several sizes, or an input that moves throughout",
+    )
+
+
+def _are_alike(sizes: Sequence[list[float] | None]) -> bool:
+    """Tell whether logs have one step each, of about one size."""
+    steps = [size for size in sizes if size is not None]
+    return (
+        len(steps) == len(sizes)
+        and bool(np.any(steps))
+        and not np.any(np.min(steps, axis=0) < SECOND * np.max(steps, axis=0))
     )
 
 
@@ -112,8 +120,6 @@ def _measure_event(experiment: Experiment) -> list[float] | None:
         if name == plant.clock:
             continue
         steps = np.diff(values)
-        if steps.size < 2 * BLOCKS:
-            return None
         middle, noise = float(np.mean(values)), float(np.std(values))
         if noise <= READING * abs(middle) and np.var(steps) >= noise**2:  # a reading that is white about a constant
             sizes.append(abs(middle))

@@ -102,7 +102,7 @@ def judge(
         *_find_noiseless(fit, minimum),
         *find_excesses(fit),
         *find_rough(fit, error),
-        *find_single_event((*fit.experiments, *validation)),
+        *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each)))),
         *find_other_minimum(fit),
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum).items() if test.p < DOUBTFUL}
@@ -127,14 +127,15 @@ def judge(
             alternatives,
             poor=little or fit.status == "not_identifiable",
             hypotheses=search.able,
-            budget=(OF_HYPOTHESES + OF_CAUSES) * evaluations - (count_evaluations() - begun),
+            budget=max(1, (OF_HYPOTHESES + OF_CAUSES) * evaluations - (count_evaluations() - begun)),
             progress=trying,
         )
         named = list(_name_causes(fit, causes, suspects))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)
-        if causes and causes[0].refit is not None and told:
-            # Both amplitudes and the hypothesis tell how far the values are off: the interval has all three.
-            fit = _widen_to(fit, causes[0].refit.values)
+        refits = [cause.refit for cause in _list_rivals(causes)]
+        if refits and all(refits) and told:
+            # Both amplitudes and the hypotheses tell how far the values are off: the interval has all of them.
+            fit = _widen_to(fit, *(refit.values for refit in refits if refit is not None))
             findings = [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
             named = [replace(each, severity="warning") if each.kind == "cause" else each for each in named]
         findings += named
@@ -142,11 +143,19 @@ def judge(
     return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
 
 
-def _widen_to(fit: Fit, values: Mapping[str, float]) -> Fit:
-    """Return the fit with intervals that reach to other values of its parameters, by what they differ."""
+def _tells(fit: Fit, validation: Experiment) -> bool:
+    """Tell whether a log that is not fitted would determine the values alone, so that it is evidence."""
+    alone = fit.logs.get(validation.name)
+    return alone is not None and alone.determined
+
+
+def _widen_to(fit: Fit, *others: Mapping[str, float]) -> Fit:
+    """Return the fit with intervals that reach to other values of its parameters, by what they differ the most."""
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
     free = fit.covariance.names
-    shift = [values.get(name, fit.parameters[name].value) - fit.parameters[name].value for name in free]
+    before = {name: fit.parameters[name].value for name in free}
+    apart = [[values.get(name, before[name]) - before[name] for values in others] for name in free]
+    shift = [max(each, key=abs) for each in apart]
     shift = np.array([*shift, *([0.0] * (len(noise.names) - len(free)))])
     return widen(fit, np.outer(shift, shift))
 
@@ -386,6 +395,11 @@ def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
     return tests
 
 
+def _list_rivals(causes: Sequence[Cause]) -> list[Cause]:
+    """Return the causes that explain the residuals as well as the best, up to three."""
+    return [cause for cause in causes if cause.gain > RIVAL_SHARE * causes[0].gain][:3]
+
+
 def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, ScoreTest]) -> Iterator[FitFinding]:
     """Yield the explanation that is the most likely, and others that explain as much."""
     against = next((name for name, test in suspects.items() if test.p < CHANCE), None)
@@ -398,7 +412,7 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
         yield _warn("fixed", against, text)
     if not causes:
         return
-    rivals = [cause for cause in causes if cause.gain > RIVAL_SHARE * causes[0].gain][:3]
+    rivals = _list_rivals(causes)
     text = "; or ".join(cause.text for cause in rivals)
     if len(rivals) == 1:
         text = f"likely cause: {text}"

@@ -96,9 +96,11 @@ def _count_between(measured: Float[np.ndarray, " _"]) -> int:
     moving = np.isfinite(second) & (first > 0.0)
     if np.count_nonzero(moving) < FEWEST_MOVES or np.median(first[moving]) < COARSE * find_quantisation(measured):
         return 1
-    straight = np.abs(second[moving]) <= STRAIGHT * np.ptp(measured[np.isfinite(measured)])
-    bends = 1.0 - float(np.mean(straight))
-    return 1 if bends > MOST_BENDS else min(int(np.ceil(2.0 / max(bends, 1e-3))), MOST_BETWEEN)
+    bent = moving & (np.abs(second) > STRAIGHT * np.ptp(measured[np.isfinite(measured)]))
+    if np.count_nonzero(bent) > MOST_BENDS * np.count_nonzero(moving):
+        return 1
+    readings = np.count_nonzero(bent & ~np.append(False, bent[:-1]))  # one between two samples bends at both
+    return min(max(round(np.count_nonzero(moving) / max(readings, 1)), 1), MOST_BETWEEN)
 
 
 def _weigh_gaussian(loss: Loss) -> float:

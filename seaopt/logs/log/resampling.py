@@ -80,7 +80,7 @@ def resample(
             continue
         new_time.append(grid)
         for name, parts in new_values.items():
-            values = fill_holes(time[segment], log.signals[name].values[segment], hole_s)
+            values = fill_holes(time[segment], log.signals[name].values[segment], hole_s, held=name in steps)
             if name in steps:
                 parts.append(_average_steps(grid, time[segment], values, period, rate_hz))
             else:
@@ -97,10 +97,11 @@ def resample(
 
 
 def fill_holes(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], longest_s: float
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], longest_s: float, *, held: bool = False
 ) -> Float[np.ndarray, " n"]:
-    """Return a channel whose missing samples are on the line between those beside them, where these are at most so far
-    apart; at an end they are what is next to them. Devices that write at times of their own leave such holes.
+    """Return a channel whose missing samples are on the line between those beside them, or are the one before them of a
+    channel that is held, where these are at most so far apart; at an end they are what is next to them. Devices that
+    write at times of their own leave such holes.
     """
     present = np.flatnonzero(np.isfinite(values))
     if present.size in (0, values.size) or longest_s <= 0.0:
@@ -109,7 +110,7 @@ def fill_holes(
     late = time[present[np.minimum(after, present.size - 1)]]
     early = time[present[np.maximum(after - 1, 0)]]
     apart = np.maximum(late - time, 0.0) + np.maximum(time - early, 0.0)
-    line = np.interp(time, time[present], values[present])
+    line = values[present[np.maximum(after - 1, 0)]] if held else np.interp(time, time[present], values[present])
     return np.where(np.isnan(values) & (apart <= longest_s), line, values)
 
 

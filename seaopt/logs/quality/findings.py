@@ -202,8 +202,7 @@ def _advise_on_holes(missing: RowRanges, time: Float[np.ndarray, " n"]) -> Mappi
     if longest > MOST_BRIDGED or (stop - start) > PART * np.ptp(time):
         return {"slice_s": [start, stop]}
     period = float(np.median(np.diff(time)))
-    rate_hz, bridge_s = (float(f"{value:.3g}") for value in (1.0 / period, (longest + 1.5) * period))
-    return {"resample": {"rate_hz": rate_hz, "bridge_s": bridge_s}}
+    return {"resample": {"rate_hz": float(f"{1.0 / period:.6g}"), "bridge_s": float(f"{(longest + 1.5) * period:.3g}")}}
 
 
 def _find_longest_without(runs: RowRanges, time: Float[np.ndarray, " n"]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.control.laws.limit_cycles import LimitCycle, predict_limit_cycles
+from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import at_rest, run_loop
 from seaopt.errors import SimulationError
 from seaopt.parameters import ParameterSet
@@ -112,7 +113,8 @@ def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle:
     lasting = min(max(PERIODS / cycle.frequency_hz, LEAST_S), LONGEST_S)
     values = plant.complete(controller.delay(params)).drop_conditions()
     try:
-        loop = build_loop(controller, plant, values)
+        # A gate that gives its sensor up ends a cycle, which would pass for one that does not last.
+        loop = build_loop(controller, plant, values, runnable(controller, gate=False))
         start = at_rest(loop, 1, PUSH * np.array(cycle.state))
         run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
     except SimulationError as error:

@@ -159,6 +159,8 @@ def test_one_step_has_no_power_to_refute():
     assert "event" in list_kinds(so.fit([step_at(0.0)], params), "error")  # a log that begins with it
     assert so.fit([step_at(1.0), step_at(1.0, size=0.25)], params).met
     assert so.fit([step_at(1.0)], params, validation=[step_at(1.0, size=0.25)]).met
+    silent = [step_at(1.0, size=1e-6)]  # a log for validation in which nothing is seen
+    assert "event" in list_kinds(so.fit([step_at(1.0)], params, validation=silent), "error")
 
 
 def test_steps_of_one_size_are_no_evidence_however_many_logs_have_one():

@@ -100,3 +100,11 @@ def test_an_output_on_lines_between_slower_readings_has_their_noise(between, shi
     error = np.random.default_rng(1).normal(scale=0.3, size=own.size)
     excess = measure_excess(*pose(np.interp(rows, own, 2.0 * np.sin(own * 2e-3) + error) - 2.0 * SLOW))
     assert excess["log.y"] == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.37])
+def test_lines_between_slower_readings_do_not_hide_a_slow_error(shift):
+    own = np.arange(-10, N + 10, 10) + shift
+    readings = 2.0 * np.sin(own * 2e-3) + 0.1 * np.sin(2 * np.pi * 10.0 * own * 1e-3)
+    readings += np.random.default_rng(1).normal(scale=0.01, size=own.size)
+    assert measure_excess(*pose(np.interp(np.arange(N), own, readings) - 2.0 * SLOW))["log.y"] > 4.0

@@ -10,6 +10,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control.laws.limit_cycles import describe_friction, predict_limit_cycles
+from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.errors import SimulationError
 from seaopt.plants.friction import friction_states
 from seaopt.plants.roles import Friction
@@ -192,3 +193,13 @@ def test_play_makes_the_cycle_of_an_independent_simulator(stand, thor):
     assert found.simulated.force_N == pytest.approx(spectrum[top], rel=0.03)
     assert found.predicted.frequency_hz == pytest.approx(top / 16.384, rel=0.03)
     assert found.predicted.force_N == pytest.approx(spectrum[top], rel=0.1)
+
+
+def test_a_gate_that_gives_its_sensor_up_does_not_end_a_cycle(blind, stand, rubbing):
+    law = scaled(blind, 1.5, current_limit_A=9.0)
+    (found,) = seek_limit_cycles(law, stand, rubbing)
+    half = 0.5 * found.predicted.force_N
+    gate = PlausibilityGate(range_N=(-half, half), max_step_N=1e4, max_held=5, ramp_A_per_s=90.0)
+    (gated,) = seek_limit_cycles(replace(law, gate=gate), stand, rubbing)
+    assert found.lasts
+    assert gated.simulated == found.simulated
