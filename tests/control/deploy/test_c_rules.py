@@ -211,7 +211,7 @@ def test_a_schedule_takes_extreme_numbers_as_python_does(precision, compiler, tm
             assert (compiled.law.held, compiled.law.misplaced) == (state.held, state.misplaced)
             assert np.isfinite([found, *compiled.law.x]).all()
             assert precision == "float" or found == pytest.approx(wanted, rel=0, abs=1e-10)
-    with pytest.raises(ControlError, match=r"reference = 1e\+308: give a finite number, within"):
+    with pytest.raises(ControlError, match=r"reference = 1e\+308, .*: give finite numbers, within"):
         law.reset(reference=1e308)
 
 
