@@ -370,7 +370,7 @@ class Session:
         score = fitted.predict(experiment)
         comparison = compare_with_log(fitted, experiment, options["loss"], options["band_hz"])
         if as_json:
-            content = {"schema": "seaopt/validation/1", "log": str(log), "fit_met": fitted.met}
+            content = {"schema": "seaopt/validation/1", "log": str(log)}
             sys.stdout.write(to_json(content | comparison.to_dict() | {"outputs": score.to_dict()}))
             return comparison.met is True
         if not fitted.met:

@@ -31,7 +31,7 @@ from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import count_evaluations
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.result.model_error import estimate_model_error
+from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
@@ -117,8 +117,7 @@ def judge(
     evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
     search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting)
     if search.partial is not None:
-        fit = _widen_to(fit, search.partial.parameters)
-        findings = [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
+        fit, findings = _reach(fit, findings, error, search.partial.parameters)
     if wrong or search.able:
         causes = find_causes(
             fit,
@@ -135,8 +134,7 @@ def judge(
         refits = [cause.refit for cause in _list_rivals(causes)]
         if refits and all(refits) and told:
             # Both amplitudes and the hypotheses tell how far the values are off: the interval has all of them.
-            fit = _widen_to(fit, *(refit.values for refit in refits if refit is not None))
-            findings = [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
+            fit, findings = _reach(fit, findings, error, *(refit.values for refit in refits if refit is not None))
             named = [replace(each, severity="warning") if each.kind == "cause" else each for each in named]
         findings += named
         search = search if not causes or causes[0].refit is not None else search.yield_to_another()
@@ -149,15 +147,20 @@ def _tells(fit: Fit, validation: Experiment) -> bool:
     return alone is not None and alone.determined
 
 
-def _widen_to(fit: Fit, *others: Mapping[str, float]) -> Fit:
-    """Return the fit with intervals that reach to other values of its parameters, by what they differ the most."""
+def _reach(
+    fit: Fit, findings: Sequence[FitFinding], error: ModelError, *others: Mapping[str, float]
+) -> tuple[Fit, list[FitFinding]]:
+    """Return the fit with intervals that reach to other values of its parameters, by what they differ the most, and the
+    findings with what is then known only roughly.
+    """
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
     free = fit.covariance.names
     before = {name: fit.parameters[name].value for name in free}
     apart = [[values.get(name, before[name]) - before[name] for values in others] for name in free]
     shift = [max(each, key=abs) for each in apart]
     shift = np.array([*shift, *([0.0] * (len(noise.names) - len(free)))])
-    return widen(fit, np.outer(shift, shift))
+    fit = widen(fit, np.outer(shift, shift))
+    return fit, [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
 
 
 def _state_excess(fit: Fit, excess: Mapping[str, float]) -> Fit:

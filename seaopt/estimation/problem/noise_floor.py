@@ -94,10 +94,12 @@ def _count_between(measured: Float[np.ndarray, " _"]) -> int:
     """Return how many samples lie between two readings at most, of an output on lines between them; 1 of any other."""
     first, second = np.abs(np.diff(measured)[1:]), np.diff(measured, 2)
     moving = np.isfinite(second) & (first > 0.0)
-    if np.count_nonzero(moving) < FEWEST_MOVES or np.median(first[moving]) < COARSE * find_quantisation(measured):
+    if np.count_nonzero(moving) < FEWEST_MOVES:
         return 1
     bent = moving & (np.abs(second) > STRAIGHT * np.ptp(measured[np.isfinite(measured)]))
     if np.count_nonzero(bent) > MOST_BENDS * np.count_nonzero(moving):
+        return 1
+    if np.median(first[moving]) < COARSE * find_quantisation(measured):  # takes the longest, and few come here
         return 1
     readings = np.count_nonzero(bent & ~np.append(False, bent[:-1]))  # one between two samples bends at both
     return min(max(round(np.count_nonzero(moving) / max(readings, 1)), 1), MOST_BETWEEN)
