@@ -30,6 +30,7 @@ from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, pl
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, map_ordered
+from seaopt.files import seal
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -146,24 +147,26 @@ class ScheduleCertificate(Result, Worded):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of schedule_robustness.json (schema seaopt/schedule_robustness/2)."""
-        return {
-            "schema": SCHEDULE_ROBUSTNESS_SCHEMA,
-            "met": self.met,
-            "passed": self.met,
-            "over": self.schedule.over,
-            "unit": self.schedule.unit,
-            "requirements": [row.to_dict() for row in self.requirements],
-            "places": [place.to_dict() for place in self.places],
-            "monte_carlo": to_content(self.monte_carlo),
-            "stretches": to_content(self.stretches),
-            "sweeps": to_content(self.sweeps),
-            "motions": to_content(self.motions),
-            "fastest_rate": self.fastest,
-            "rate_unit": self.rate_unit,
-            "proof": self.proof,
-            "assumption": self.assumption,
-            "notes": list(self.notes),
-        }
+        return seal(
+            {
+                "schema": SCHEDULE_ROBUSTNESS_SCHEMA,
+                "met": self.met,
+                "passed": self.met,
+                "over": self.schedule.over,
+                "unit": self.schedule.unit,
+                "requirements": [row.to_dict() for row in self.requirements],
+                "places": [place.to_dict() for place in self.places],
+                "monte_carlo": to_content(self.monte_carlo),
+                "stretches": to_content(self.stretches),
+                "sweeps": to_content(self.sweeps),
+                "motions": to_content(self.motions),
+                "fastest_rate": self.fastest,
+                "rate_unit": self.rate_unit,
+                "proof": self.proof,
+                "assumption": self.assumption,
+                "notes": list(self.notes),
+            }
+        )
 
     @classmethod
     def from_dict(

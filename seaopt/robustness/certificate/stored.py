@@ -284,6 +284,7 @@ def build_schedule_certificate(
     content: Mapping[str, Any], schedule: ScheduledController, cases: Mapping[float, Cases]
 ) -> ScheduleCertificate:
     """Return the certificate of a schedule_robustness.json, as `ScheduleCertificate.from_dict` does."""
+    check_seal(content, SCHEDULE_FILE, CERTIFY_AGAIN)
     stored = from_content(_StoredSchedule, content, SCHEDULE_FILE, remedy=CERTIFY_AGAIN)
     if len(stored.places) != len(cases):
         raise FileError(

@@ -264,14 +264,20 @@ def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
     plants = {"stand": stand, "swing": swing}
     again = ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
     own = json.loads(to_json(again.to_dict()))
-    for place in (*content["places"], *own["places"]):  # digests change with the last digit
-        place["made_from"] = None
+    for sealed in (content, own, *content["places"], *own["places"]):  # digests change with the last digit
+        sealed["made_from"] = None
     assert not list(compare(content, own, "", sentences=True))
     assert again.requirements == found.requirements
     assert again.notes == found.notes
     content = json.loads(to_json(found.to_dict()))
     content["places"][0]["plants"]["stand"]["worst"]["ms"] = 1.0
     with pytest.raises(FileError, match=r"was edited"):
+        ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
+    content = json.loads(to_json(found.to_dict())) | {"stretches": []}
+    with pytest.raises(FileError, match=r"was edited"):
+        ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
+    del content["made_from"]
+    with pytest.raises(FileError, match=r"written by hand"):
         ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
 
 
