@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from collections import Counter
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -18,9 +17,8 @@ for _name in so.__all__ + so.testing.__all__:  # pytester forgets what is import
 pytest_plugins = ["pytester"]
 ROOT = Path(__file__).resolve().parents[2]
 PLUGIN = "seaopt.testing.plugin"
-# In a fresh installation pytest finds the plugin by itself; a second registration would be refused.
-LOAD = () if any(one.value == PLUGIN for one in entry_points(group="pytest11")) else ("-p", PLUGIN)
-OPTIONS = ("-q", *LOAD, "-p", "no:cacheprovider")
+# What is installed is found anew by each run in this process, and not by all: each run loads what it names (below).
+OPTIONS = ("-q", "-p", PLUGIN, "-p", "no:cacheprovider")
 BENCH = """
 schema = 1
 [parameters]
@@ -76,6 +74,7 @@ def make(experiments, parameters, **_):
 def _as_users_do(pytester, monkeypatch):
     """Let processes that the tests start find this seaopt, not an installed one, and no settings of these tests."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     pytester.makeini("[pytest]\naddopts = --strict-markers\n")
 
 
@@ -90,7 +89,7 @@ def calls(pytester):
 def test_each_expectation_is_an_item_and_the_fit_is_made_once(pytester):
     write(pytester, BENCH + EXPECT)
     pytester.makeconftest(REAL)
-    result = pytester.runpytest_inprocess(*OPTIONS, "-vv")
+    result = pytester.runpytest_inprocess(*OPTIONS, "-vv", "--no-header")
     result.assert_outcomes(passed=6)
     for name in ("fit_met", "parameters.J", "parameters.b_r", "fit_percent.chirp.F2", "fit_percent.again"):
         result.stdout.fnmatch_lines(f"*knee.problem.toml::{name} PASSED*")
@@ -114,7 +113,7 @@ def test_two_workers_each_make_the_fit_at_most_once(pytester, dist):
     pytest.importorskip("xdist")
     write(pytester, BENCH + EXPECT)
     pytester.makeconftest(STUB)
-    result = pytester.runpytest_subprocess(*OPTIONS, "-n", "2", "--dist", dist)
+    result = pytester.runpytest_subprocess(*OPTIONS, "-p", "xdist", "-n", "2", "--dist", dist)
     result.assert_outcomes(passed=6)
     assert set(calls(pytester).values()) == {1}
     assert len(calls(pytester)) <= (1 if dist == "loadfile" else 2)

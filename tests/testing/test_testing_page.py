@@ -20,6 +20,7 @@ for _name in so.__all__:  # pytester forgets what is imported during a run in th
 @pytest.fixture
 def problem_file(pytester, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     pytester.makeini("[pytest]\n")
     (text,) = blocks(PAGE, "toml")
     path = pytester.path / "knee.problem.toml"
