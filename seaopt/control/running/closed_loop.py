@@ -37,6 +37,7 @@ from jaxtyping import Bool, Float, Int
 from seaopt.control.loops.sampled_plant import find_delay, read_conditions, whole_samples
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.errors import SimulationError, StepSizeError, require_seed, suggestion
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
@@ -114,6 +115,7 @@ def run_loop(
     start_s: float = 0.0,
     rtol: float | None = None,
     standing: float | Float[np.ndarray, "..."] = 0.0,
+    places: float | Float[np.ndarray, " n"] = math.nan,
 ) -> LoopRun:
     """Run a loop, once for each set of parameters.
 
@@ -137,6 +139,8 @@ def run_loop(
         Of the integration, see the module's docstring.
     standing : float or array, shape (runs,) or (runs, k)
         Where the link stands of a plant that holds it, as the law reads it: the k signals of `SampledLoop.standing`.
+    places : float or array, shape (n,)
+        The scheduling variable that a schedule is given on a plant that does not have it as a state; none if left out.
 
     Returns
     -------
@@ -168,9 +172,12 @@ def run_loop(
     if wanted.ndim != 2 or wanted.shape[0] not in (1, runs) or not wanted.shape[1]:
         raise SimulationError(f"reference has the shape {reference.shape}; give (n,) or ({runs}, n)")
     n = wanted.shape[1]
+    noise = _noise(loop, values, n, seed, standing)
+    if isinstance(loop.law, RunnableSchedule):
+        noise = np.dstack([noise, np.broadcast_to(0.0 if loop.place in loop.plant.states else places, (runs, n))])
     job = Job(
         reference=np.ascontiguousarray(np.broadcast_to(wanted, (runs, n))),
-        noise=_noise(loop, values, n, seed, standing),
+        noise=noise,
         external=_external(loop.plant, external or {}, n),
         p=np.array([each.vector for each in values]).reshape(runs, -1),
         **_lags(loop, values),

@@ -53,6 +53,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
     takes.
     """
     law, plant = loop.law, loop.plant
+    assert isinstance(law, RunnableLaw)  # a schedule is held at a value
     observe = observe_function(plant, sticks=False)
     names, rows = list(plant.outputs), [find_rest(plant, values) for values in params]
     figures = np.zeros((len(params), 4))

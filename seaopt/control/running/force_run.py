@@ -1,9 +1,9 @@
 """A digital law that is a Python function, such as a predictive one, on a plant as it is, nonlinear and continuous.
 
-A law that is a `RunnableLaw` runs in `seaopt.control.running.closed_loop`, compiled and over many draws at once. Here
-is what that cannot do: any callable, called once per sample. The plant between the samples is the same, with the same
-steps and the same error: each sample is integrated with n and with 2n of them, and n doubled until they agree to
-`rtol`.
+A law that is a `RunnableLaw` or a `RunnableSchedule` runs in `seaopt.control.running.closed_loop`, compiled and over
+many draws at once. Here is what that cannot do: any callable, called once per sample. The plant between the samples is
+the same, with the same steps and the same error: each sample is integrated with n and with 2n of them, and n doubled
+until they agree to `rtol`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from seaopt.control.loops.sampled_plant import (
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
 from seaopt.control.running.sampled_loop import largest_current
-from seaopt.errors import ControlError, SimulationError, require_seed, suggestion
+from seaopt.errors import ControlError, SimulationError, require_seed
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
@@ -121,7 +121,6 @@ def close_loop(
     seed: int = 0,
     start_state: Float[np.ndarray, " nx"] | None = None,
     start_command: float = 0.0,
-    place: str | None = None,
     rtol: float = RTOL,
 ) -> ForceRun:
     """Run a law on a plant, from rest at zero where no other start is given.
@@ -162,15 +161,13 @@ def close_loop(
         Of the plant, at the first sample.
     start_command : float
         What acts until the first command does.
-    place : str, optional
-        A state of the plant that the law is given too, after the measurement, as it stands at the sample.
     rtol : float
         Of the integration, of each state's largest value so far.
 
     Raises
     ------
     ControlError
-        `preview_samples` is no number of samples, the plant has no such output or state, or that output responds to the
+        `preview_samples` is no number of samples, the plant has no such output, or that output responds to the
         current at once, the parameters contain another condition than delays, a sensor's error or command_step is
         negative, that step is above the limit, or the loop diverges.
     SimulationError
@@ -198,9 +195,6 @@ def close_loop(
         )
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
     x = np.zeros(len(plant.states)) if start_state is None else start_state
-    if place is not None and place not in plant.states:
-        raise ControlError(f'place = "{place}" is not a state of {plant.name}; {suggestion(place, plant.states)}')
-    seen = [] if place is None else [list(plant.states).index(place)]
     law, time_s = start, sample_time_s * np.arange(n)
     force, current, law_time_s, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
 
@@ -214,7 +208,7 @@ def close_loop(
         call_start_s = time.perf_counter()
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
         readings = [read(outputs, float(each)) for read, each in zip(reads, noise[:, k], strict=True)]
-        command, law = step(law, coming, readings[0] if len(reads) == 1 else np.array(readings), *x[seen].tolist())
+        command, law = step(law, coming, readings[0] if len(reads) == 1 else np.array(readings))
         law_time_s[k] = time.perf_counter() - call_start_s
         current[k] = _convert_command(command, command_step, most)
         states[k] = x

@@ -1,13 +1,13 @@
-"""`RunnableLaw.step` as an expression of CasADi, from the same numbers: gate, hold, terms, limit, heat guard.
+"""A law's step, scheduled or not, as an expression of CasADi, from the same numbers: gate, hold, terms, limit, heat.
 
 A law whose inputs are numbers (within +-1e15) gives finite ones, so that only the inputs are asked. What is kept from
 one sample to the next is the law's state, what its terms remember, the gate's last reading with how many were refused
-since, the temperatures, and the last command, which is repeated where a sample cannot be used.
+since, the temperatures, the place of a schedule, and the last command, which is repeated where a sample cannot be used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.control.laws.plausibility import LARGEST
-from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.control.laws.realisation import LawState, RunnableLaw
 from seaopt.control.loops.compensation.terms import CompensationShape, compensate
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleShape, ScheduleState
 from seaopt.plants.motor.heat_guard import HEAT_NUMBERS, limit_current, warm_winding
 from seaopt.records import record
 
@@ -34,24 +35,28 @@ class LawShape:
     gated: bool
     heated: bool
     compensation: CompensationShape
+    schedule: ScheduleShape | None = None
     holds: bool = True  # the last command where an input is not a number
 
     @classmethod
-    def of_law(cls, law: RunnableLaw) -> LawShape:
+    def of_law(cls, law: RunnableLaw | RunnableSchedule) -> LawShape:
         """Return the shape of a law."""
+        schedule = law.shape if isinstance(law, RunnableSchedule) else None
         return cls(
-            states=law.c.size,
+            states=law.c.size if isinstance(law, RunnableLaw) else len(law.table.states),
             measured=law.measured,
             limited=bool(np.isfinite(law.command_limit)),
             gated=law.gate is not None,
             heated=law.heat is not None,
             compensation=CompensationShape() if law.compensation is None else law.compensation.shape,
+            schedule=schedule,
         )
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many numbers are kept: of state, terms, gate, temperatures, command."""
-        return self.states, self.compensation.remembered, 3 * self.gated, 2 * self.heated, 1
+        """How many numbers are kept: of state, terms, gate, temperatures, place, command."""
+        placed = int(self.schedule is not None)
+        return self.states, self.compensation.remembered, 3 * self.gated, 2 * self.heated, placed, 1
 
     @property
     def kept(self) -> int:
@@ -60,25 +65,47 @@ class LawShape:
 
     @property
     def number_sizes(self) -> tuple[int, ...]:
-        """How many numbers of each kind `list_numbers` gives."""
-        n, y = self.states, self.measured
+        """How many numbers of each kind `list_numbers` gives: of the law by itself, limit, command, guards, terms."""
         guards = GATE_NUMBERS * self.gated, HEAT_NUMBERS * self.heated
-        return n * n, n, y * n, n, n, 1, y, 1, 1, *guards, self.compensation.size
+        law = sum(self.matrix_sizes) if self.schedule is None else self.schedule.size
+        return law, 1, 1, *guards, self.compensation.size
+
+    @property
+    def matrix_sizes(self) -> tuple[int, ...]:
+        """How many numbers each matrix of a law has that is not scheduled."""
+        n, y = self.states, self.measured
+        return n * n, n, y * n, n, n, 1, y
 
 
-def list_numbers(law: RunnableLaw) -> Float[np.ndarray, " m"]:
+def list_numbers(law: RunnableLaw | RunnableSchedule) -> Float[np.ndarray, " m"]:
     """Return the numbers of a law, as `express_step` takes them."""
     gate, limit = law.gate, law.force_limit_N if np.isfinite(law.command_limit) else 0.0
-    numbers = [law.d_reference, *np.ravel(law.d_measurement), limit, law.per_effort]
+    numbers = [limit, law.per_effort]
     if gate is not None:
         numbers += [*gate.range_N, gate.max_step_N, gate.max_held, gate.ramp_A_per_s * law.sample_time_s]
     numbers += [] if law.heat is None else law.heat.numbers
     numbers += [] if law.compensation is None else law.compensation.numbers
+    if isinstance(law, RunnableSchedule):
+        return np.concatenate([law.numbers, numbers])
     matrices = law.a.ravel("F"), law.b_reference, law.b_measurement.ravel("F"), law.c, law.anti_windup
-    return np.concatenate([*matrices, numbers])
+    return np.concatenate([*matrices, [law.d_reference], np.ravel(law.d_measurement), numbers])
 
 
-def find_faults(law: RunnableLaw, kept: Float[np.ndarray, "runs n"]) -> Bool[np.ndarray, " runs"]:
+def list_kept(law: RunnableLaw | RunnableSchedule, state: LawState) -> Float[np.ndarray, " n"]:
+    """Return what a law in a state keeps, as `express_step` takes it."""
+    seen = state.gate
+    parts = (
+        state.x,
+        state.memory[: LawShape.of_law(law).compensation.remembered],
+        () if law.gate is None else (np.nan_to_num(seen.measurement), not np.isnan(seen.measurement), seen.held),
+        () if law.heat is None else state.heat,
+        (state.place,) if isinstance(state, ScheduleState) else (),
+        (state.current_A,),
+    )
+    return np.concatenate(parts).astype(float)
+
+
+def find_faults(law: RunnableLaw | RunnableSchedule, kept: Float[np.ndarray, "runs n"]) -> Bool[np.ndarray, " runs"]:
     """Tell where the gate of a law, of which this is kept, has given up its sensor."""
     shape = LawShape.of_law(law)
     if law.gate is None:
@@ -91,15 +118,20 @@ def _is_number(value: Any) -> Any:
 
 
 def express_step(
-    shape: LawShape, numbers: Any, kept: Any, reference: Any, measured: Sequence[Any], further: Sequence[Any]
+    shape: LawShape,
+    numbers: Any,
+    kept: Any,
+    reference: Any,
+    measured: Sequence[Any],
+    further: Sequence[Any],
+    place: Any = None,
 ) -> tuple[Any, Any]:
-    """Return the command and what is kept after a sample; `further`: the readings of what the terms read."""
-    n, y = shape.states, shape.measured
-    ends = np.cumsum([0, *shape.number_sizes]).tolist()
-    a, b_r, b_y, out, windup, d_r, d_y, most, gain, gate, heat, added = ca.vertsplit(numbers, ends)
-    x, memory, seen, rises, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
-    a, b_y, fault, known = ca.reshape(a, n, n), ca.reshape(b_y, n, y), 0.0, 1.0
-    measured, memory, rises = list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
+    """Return the command and what is kept after a sample; `further`: the readings of what the terms read; `place`: the
+    scheduling variable, where there is one.
+    """
+    law, most, gain, gate, heat, added = ca.vertsplit(numbers, np.cumsum([0, *shape.number_sizes]).tolist())
+    x, memory, seen, rises, at, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
+    fault, known, measured, memory, rises = 0.0, 1.0, list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
     if shape.gated:
         measured[0], seen, fault = _screen(ca.vertsplit(gate), ca.vertsplit(seen), measured[0])
         known = seen[1]
@@ -108,12 +140,17 @@ def express_step(
         cool = limit_current(ca.vertsplit(heat), rises, ca)
         limit = ca.fmin(limit, cool) if shape.limited else cool
         most = limit / gain
-    read = ca.vertcat(*measured)
+
+    def saturate(force: Any) -> Any:
+        return ca.fmin(ca.fmax(force, -most), most) if shape.limited or shape.heated else force
+
     r, effort, after = compensate(shape.compensation, ca.vertsplit(added), memory, reference, further, ca)
-    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - ca.dot(d_y, read) + effort
-    bounded = shape.limited or shape.heated
-    applied = ca.fmin(ca.fmax(force, -most), most) if bounded else force
-    following = ca.mtimes(a, x) + b_r * r - ca.mtimes(b_y, read) + windup * (applied - force)
+    if shape.schedule is not None:
+        at = ca.if_else(_is_number(place), place, at)
+        gains = shape.schedule.express_gains(law, at)
+        _, applied, following = shape.schedule.express_step(gains, x, r, measured, saturate, effort)
+    else:
+        applied, following = _advance(shape, law, x, r, ca.vertcat(*measured), saturate, effort)
     command, moved = gain * applied, ca.vertcat(following, *after)
     if shape.holds:
         usable = reduce(ca.logic_and, map(_is_number, [reference, *measured, *further]))
@@ -125,7 +162,19 @@ def express_step(
     if shape.heated:
         command = ca.fmin(ca.fmax(command, -limit), limit)
         rises = warm_winding(ca.vertsplit(heat), rises, command, ca)
-    return command, ca.vertcat(moved, *(seen if shape.gated else ()), *rises, command)
+    return command, ca.vertcat(moved, *(seen if shape.gated else ()), *rises, at, command)
+
+
+def _advance(
+    shape: LawShape, numbers: Any, x: Any, r: Any, read: Any, saturate: Callable[[Any], Any], effort: Any
+) -> tuple[Any, Any]:
+    """Return what is left of the effort of a law of matrices in its limit, and the next state."""
+    n, y = shape.states, shape.measured
+    a, b_r, b_y, out, windup, d_r, d_y = ca.vertsplit(numbers, np.cumsum([0, *shape.matrix_sizes]).tolist())
+    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - ca.dot(d_y, read) + effort
+    applied = saturate(force)
+    after = ca.mtimes(ca.reshape(a, n, n), x) + b_r * r - ca.mtimes(ca.reshape(b_y, n, y), read)
+    return applied, after + windup * (applied - force)
 
 
 def _screen(numbers: Sequence[Any], seen: Sequence[Any], reading: Any) -> tuple[Any, list[Any], Any]:

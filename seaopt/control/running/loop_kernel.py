@@ -108,6 +108,12 @@ class _Structure:
     devices: tuple[_Device, ...]  # one per measured output
     encoders: tuple[tuple[str, _Device], ...]  # with errors, of those that the reading is computed from
     sticks: bool
+    place: str | None  # which state a schedule is over, of a plant that has it
+
+    @property
+    def columns(self) -> int:
+        """How many numbers of a sample are data: an error of each reading, and where a scheduling variable is."""
+        return len(self.measured) + (self.law.schedule is not None)
 
 
 def _structure_of(loop: SampledLoop, job: Job) -> _Structure:
@@ -120,6 +126,7 @@ def _structure_of(loop: SampledLoop, job: Job) -> _Structure:
         devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
         sticks=loop.sticks,
+        place=loop.place if loop.place in loop.plant.states else None,
     )
 
 
@@ -128,7 +135,7 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     `u` holds the current in force at first, `late` is the one after it.
     """
     law, queue, measured, kept = structure.law, structure.waiting, len(structure.measured), structure.law.kept
-    z, r, w = ca.SX.sym("z", kept + queue), ca.SX.sym("r"), ca.SX.sym("w", measured)
+    z, r, w = ca.SX.sym("z", kept + queue), ca.SX.sym("r"), ca.SX.sym("w", structure.columns)
     e, devices = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("devices", 3, measured + len(structure.encoders))
     numbers, amplifier = ca.SX.sym("c", sum(law.number_sizes)), ca.SX.sym("amplifier", 2)
     c = ca.vertcat(numbers, amplifier, ca.vec(devices))
@@ -149,7 +156,8 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
                 reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
         readings.append(device.read(reading, devices[:, column]))
     further = [readings[structure.measured.index(name)] for name in law.compensation.reads]
-    current, after = express_step(law, numbers, z[:kept], r, readings[: law.measured], further)
+    place = w[-1] if structure.place is None else plant.x[list(plant.states).index(structure.place)]
+    current, after = express_step(law, numbers, z[:kept], r, readings[: law.measured], further, place)
     if structure.rounds_current:
         step, most = ca.vertsplit(amplifier)
         current = step * ca.floor(current / step + 0.5)
@@ -212,7 +220,7 @@ def make_kernel(loop: SampledLoop, job: Job) -> Callable[[Job, int], LoopArrays]
 
 def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: ca.Function) -> str:
     constants = {
-        "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1, "NW": len(structure.measured),
+        "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1, "NW": structure.columns,
         "NY": len(channel_names(plant)), "NZ": structure.law.kept + structure.waiting,
         "INSTANT": INSTANT,
     }  # fmt: skip

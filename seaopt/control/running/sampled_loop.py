@@ -13,7 +13,8 @@ from jaxtyping import Float
 from seaopt.bench import Sensors
 from seaopt.control.laws.realisation import RunnableLaw
 from seaopt.control.loops.sampled_plant import Measured, find_delay, read_conditions, whole_samples
-from seaopt.control.running.law_step import LawShape
+from seaopt.control.running.law_step import LawShape, list_kept
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -32,7 +33,7 @@ class SampledLoop:
     ----------
     plant : Plant
         Its first input is what the law commands, the motor current as a rule.
-    law : RunnableLaw
+    law : RunnableLaw or RunnableSchedule
         As exported.
     measured : str or tuple of str
         The output that is fed back, or the outputs that the law reads, the regulated one first.
@@ -52,6 +53,9 @@ class SampledLoop:
         smoothed curve.
     link : str, optional
         Of what is measured the link's motion: a plant without that output holds this link, which stands still there.
+    place : str, optional
+        The scheduling variable of a schedule: a state of the plant, which the law is given as it is; else `run_loop`
+        is told where it stands.
 
     Raises
     ------
@@ -60,7 +64,7 @@ class SampledLoop:
     """
 
     plant: Plant
-    law: RunnableLaw
+    law: RunnableLaw | RunnableSchedule
     measured: Measured
     delay_samples: int
     sensors: Sensors = field(default_factory=Sensors)
@@ -68,6 +72,7 @@ class SampledLoop:
     longest_delay_s: float = 0.0
     sticks: bool = False
     link: str | None = None
+    place: str | None = None
 
     def __post_init__(self) -> None:
         plant = self.plant
@@ -173,8 +178,7 @@ class LoopState:
 def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None = None) -> LoopState:
     """Return `runs` loops whose law was reset and whose plant is in state x, zero if left out."""
     start = np.zeros(len(loop.plant.states)) if x is None else x
-    law = loop.law.reset().x
-    z = np.concatenate([law, np.zeros(loop.law_states - law.size + loop.waiting)])
+    z = np.concatenate([list_kept(loop.law, loop.law.reset()), np.zeros(loop.waiting)])
     return LoopState(x=np.tile(start, (runs, 1)), z=np.tile(z, (runs, 1)))
 
 

@@ -5,25 +5,75 @@ The step is that of `seaopt.control.scheduling.step_order`, with limit and anti-
 
 A scheduling variable that is not finite, or beyond 1e15, is not used: the last one that was stands, and the value of
 `fallback` where there was none since the reset.
+
+Law and gains of a place are an expression of CasADi (`ScheduleShape`), which runs here in its virtual machine, compiled
+in the loops of `seaopt.control.running`. Where the variable stands still the law is linear, and `hold` returns it so.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from functools import lru_cache
+from threading import get_ident
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.plausibility import is_number
 from seaopt.control.laws.realisation import Guarded, LawState, Reading, RunnableLaw, realise
 from seaopt.control.scheduling.gain_table import GainTable
-from seaopt.control.scheduling.step_order import SHARE
+from seaopt.control.scheduling.step_order import SHARE, StepOrder
 from seaopt.plants.motor.heat_guard import COLD
 from seaopt.records import record
+from seaopt.simulation.direct_call import DirectCall
 from seaopt.units import show_command
+
+
+@record
+class ScheduleShape:
+    """What a scheduled law's step depends on; all else is numbers: the points, and a row of gains of each."""
+
+    order: StepOrder
+    points: int
+    columns: tuple[str, ...]
+    states: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """How many numbers it takes."""
+        return self.points * (1 + len(self.columns))
+
+    def express_gains(self, numbers: Any, place: Any) -> dict[str, Any]:
+        """Return the gains at a place, as `GainTable.find_numbers` does."""
+        count = len(self.columns)
+        points, rows = numbers[: self.points], ca.reshape(numbers[self.points :], count, self.points)
+        inside = ca.fmin(ca.fmax(place, points[0]), points[-1])
+        first, *further = (
+            ca.vertcat(points[i], points[i + 1], rows[:, i], rows[:, i + 1]) for i in range(self.points - 1)
+        )
+        for stretch in further:
+            first = ca.if_else(inside >= stretch[0], stretch, first)
+        low, high, below, above = ca.vertsplit(first, [0, 1, 2, 2 + count, 2 + 2 * count])
+        gains = below + (inside - low) / (high - low) * (above - below)
+        return dict(zip(self.columns, ca.vertsplit(gains), strict=True))
+
+    def express_step(
+        self,
+        gains: Any,
+        x: Any,
+        reference: Any,
+        measured: Sequence[Any],
+        saturate: Callable[[Any], Any],
+        added: Any = None,
+    ) -> tuple[Any, Any, Any]:
+        """Return the effort, what is left of it in its limit, and the next x, with the gains of a place."""
+        kept = dict(zip(self.states, ca.vertsplit(x), strict=True))
+        effort, applied, after = self.order.step(gains, kept, reference, measured, saturate, added)
+        return effort, applied, ca.vertcat(*after.values())
 
 
 @record(eq=False)
@@ -64,6 +114,20 @@ class RunnableSchedule(Guarded):
     def measured(self) -> int:
         """How many signals it reads."""
         return self.table.order.measured
+
+    @property
+    def shape(self) -> ScheduleShape:
+        """What its step depends on."""
+        table = self.table
+        return ScheduleShape(
+            order=table.order, points=table.points.size, columns=(*table.columns, SHARE), states=table.states
+        )
+
+    @property
+    def numbers(self) -> Float[np.ndarray, " m"]:
+        """All else, as its shape takes it."""
+        rows = np.array([*self.table.columns.values(), self.anti_windup])
+        return np.concatenate([self.table.points, rows.ravel("F")])
 
     def __repr__(self) -> str:
         table = self.table
@@ -107,18 +171,27 @@ class RunnableSchedule(Guarded):
         """Return the command of this sample, and the next state (`Guarded.guard`)."""
         missing = not is_number(place)
         at = state.place if missing else place
-        order, numbers = self.table.order, self.table.find_numbers(at, **{SHARE: self.anti_windup})
+        run = _compile_step(self, get_ident())
 
         def advance(reference: float, measurement: Reading, added: float, most: float) -> tuple[float, float, Any]:
-            x = dict(zip(self.table.states, state.x.tolist(), strict=True))
-            signals = np.ravel(measurement).tolist()
-            force, applied, after = order.step(
-                numbers, x, reference, signals, lambda effort: min(max(effort, -most), most), added
-            )
-            return force, applied, np.array(list(after.values()))
+            effort, applied, x = run(at, state.x, reference, measurement, most, added)
+            return float(effort[0, 0]), float(applied[0, 0]), x[:, 0]
 
         misplaced = state.misplaced + 1 if missing else 0
         return self.guard(state, reference, measurement, readings, advance, place=at, misplaced=misplaced)
+
+
+@lru_cache(maxsize=16)
+def _compile_step(law: RunnableSchedule, _thread: int) -> DirectCall:
+    """Return a law's step of place, x, reference, measured, limit and added effort, which a thread has to itself."""
+    shape, y = law.shape, law.measured
+    place, r, most, added = (ca.SX.sym(name) for name in ("place", "r", "most", "added"))
+    x, measured = ca.SX.sym("x", len(shape.states)), ca.SX.sym("y", y)
+    gains = shape.express_gains(ca.SX(ca.DM(law.numbers)), place)
+    step = shape.express_step(
+        gains, x, r, ca.vertsplit(measured), lambda effort: ca.fmin(ca.fmax(effort, -most), most), added
+    )
+    return DirectCall(ca.Function("step", [place, x, r, measured, most, added], [ca.densify(part) for part in step]))
 
 
 def make_runnable(

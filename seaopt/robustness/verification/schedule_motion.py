@@ -27,15 +27,15 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.codec import OrInfinite
-from seaopt.control.running.force_run import ForceRun
+from seaopt.control.running.closed_loop import LoopRun
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
-from seaopt.errors import ControlError, SimulationError
+from seaopt.errors import SimulationError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import SETTLED
-from seaopt.robustness.verification.schedule_sweep import RestStart, find_least_effort
+from seaopt.robustness.verification.schedule_sweep import RestStart, find_least_effort, find_loss
 
 PUSHES, ROUNDS = (1.0, -1.0, -1.0, 1.0), 3
 LEAST_PERIODS, MOST_PERIODS, JUDGED_PERIODS = 5, 20, 2  # of the least bandwidth: of a push, and of its end
@@ -65,7 +65,7 @@ class _Push:
     """A run under pushes of a size: the rate reached, and the shares taken of the room and of the command's limit."""
 
     size: float
-    run: ForceRun
+    run: LoopRun
     rate: float
     room: float
     command: float
@@ -84,33 +84,28 @@ class _Pushing:
     lasting: int
     period: int
 
-    def run(self, size: float) -> ForceRun:
-        """Return the loop under pushes of a size."""
-        law, start = self.schedule.runnable(), self.start
-        state, reference = start.reset(law, self.middle), size * self.pushes
-        return start.run(law.step, state, self.plant, start.params, reference, place=self.schedule.over)
-
-    def follow(self, run: ForceRun) -> Signal:
+    def follow(self, run: LoopRun) -> Signal:
         """Return the variable at each sample."""
-        return run.state[:, list(self.plant.states).index(self.schedule.over)]
+        return run.states[0, :, list(self.plant.states).index(self.schedule.over)]
 
     def find_push(self, rate: float, first: float) -> _Push | None:
         """Return the push that moves the variable at a rate, or as fast as it may; None where even small ones fail."""
-        size, kept, limit = first, None, self.schedule.runnable().command_limit
+        size, kept, law = first, None, self.schedule.runnable()
         for _ in range(TRIES):
             try:
-                run = self.run(size)
+                run = self.start.run(self.plant, self.start.params, size * self.pushes[None])
                 place = self.follow(run)
                 push = _Push(
                     size=size,
                     run=run,
                     rate=float(np.max(np.abs(np.diff(place)))) / self.schedule.spec.sample_time_s,
                     room=float(np.max(np.abs(place - self.middle))) / self.room,
-                    command=float(np.max(np.abs(run.current))) / limit,
+                    command=float(np.max(np.abs(run.current))) / law.command_limit,
                 )
                 share = max(NEAR * push.rate / rate, push.room, push.command)
+                share = LOST_SHARE if find_loss(run, law) else share
                 kept = push if share <= 1.0 else kept
-            except (ControlError, SimulationError):
+            except SimulationError:
                 share = LOST_SHARE
             if NEAR <= share <= 1.0:
                 break
@@ -141,7 +136,7 @@ def move_schedule(
     if push.rate < rate:
         pushing, push = _change_length(pushing, push, rate)
     place, size = pushing.follow(push.run), push.size
-    left, ringing = pushing.measure((push.run.force - push.run.reference) / size)
+    left, ringing = pushing.measure((push.run.outputs[pushing.start.regulated][0] - push.run.reference[0]) / size)
     standing = [
         pushing.measure(loop.simulate(pushing.pushes)[0] - pushing.pushes)
         for loop in schedule.close_points(plant, params)

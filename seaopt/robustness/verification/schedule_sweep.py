@@ -20,7 +20,7 @@ This finds where a sweep of this shape goes wrong. It proves nothing of other mo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from functools import partial
 from types import SimpleNamespace
@@ -30,12 +30,14 @@ import casadi as ca
 import numpy as np
 
 from seaopt.codec import OrInfinite
-from seaopt.control.laws.realisation import Reading
 from seaopt.control.loops.sampled_plant import find_rest, find_rows
-from seaopt.control.running.force_run import ForceRun, close_loop
-from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
+from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, run_loop
+from seaopt.control.running.law_step import find_faults, list_kept
+from seaopt.control.running.loop_kernel import Rows
+from seaopt.control.running.sampled_loop import find_longest_delay
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
-from seaopt.errors import ControlError, SimulationError
+from seaopt.errors import SimulationError
 from seaopt.executors import Shared, map_ordered
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -187,33 +189,26 @@ def _run_sweep(
     pulse = np.tile(np.repeat([1.0, 0.0], pulses.samples), count)
     place = low + 0.5 * (high - low) * (1.0 - np.cos(omega * ts * np.arange(pulse.size)))
     start = RestStart.at_rest(schedule, plant, params, low)
-    swept = make_swept_plant(plant, schedule.over)
     values = start.params.with_parameters(
         *(
             Parameter(name=key, value=value, unit=unit)
             for key, value, unit in zip(SWEEP, (low, high, omega), (schedule.unit, schedule.unit, "rad/s"), strict=True)
         )
     )
-
-    def step(
-        state: tuple[int, ScheduleState], reference: float, measurement: Reading
-    ) -> tuple[float, tuple[int, ScheduleState]]:
-        number, before = state  # of the sample
-        command, after = law.step(before, reference, measurement, float(place[number]))
-        return command, (number + 1, after)
-
-    reset = 0, start.reset(law, low)
     make_sweep = partial(Sweep, plant=name, rate=0.5 * (high - low) * omega, frequency_hz=frequency_hz)
     try:
-        calm, moved = (start.run(step, reset, swept, values, size * pulse) for size in (0.0, pulses.size))
-    except (ControlError, SimulationError) as error:
+        run = start.run(make_swept_plant(plant, schedule.over), values, np.outer([0.0, pulses.size], pulse), place)
+    except SimulationError as error:
         return make_sweep(peak=math.inf, left=math.inf, fault=f"is lost: {error}")
-    response = (moved.force - calm.force) / pulses.size
+    calm, moved = run.outputs[start.regulated]
+    response = (moved - calm) / pulses.size
     peak = float(max(np.max(response), 1.0 - np.min(response)))
     ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
     left = float(np.max(np.abs(response - pulse)[ends]))
-    fault = ""
-    if max(np.max(np.abs(calm.current)), np.max(np.abs(moved.current))) >= law.command_limit:
+    fault = find_loss(run, law)
+    if fault:
+        peak = left = math.inf
+    elif np.max(np.abs(run.current)) >= law.command_limit:
         fault = "the motion takes the command to its limit"
     elif not peak <= pulses.allowed_peak:
         fault = f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
@@ -228,6 +223,7 @@ class RestStart:
 
     schedule: ScheduledController
     params: ParameterSet
+    value: float  # of the variable
     states: dict[str, float]
     readings: tuple[float, ...]
     command: float
@@ -241,33 +237,42 @@ class RestStart:
         return cls(
             schedule=schedule,
             params=placed.drop_conditions(),
+            value=value,
             states=dict(zip(plant.states, x.tolist(), strict=True)),
             readings=tuple(outputs[find_rows(plant, schedule.controllers[0].signals)].tolist()),
             command=float(u[0]),
         )
 
-    def reset(self, law: RunnableSchedule, value: float) -> ScheduleState:
-        """Return the state of a law at rest there."""
-        return law.reset(self.readings[0], np.array(self.readings), value, self.command)
+    @property
+    def regulated(self) -> str:
+        """The output that follows the reference."""
+        return self.schedule.controllers[0].signals[0]
 
-    def run(
-        self, step: Callable[..., Any], reset: Any, plant: Plant, values: ParameterSet, reference: Signal, **more: Any
-    ) -> ForceRun:
-        """Return the loop of a law from there, of a plant that has these states; the reference counts from there."""
-        spec = self.schedule.spec
-        return close_loop(
-            step,
-            reset,
-            plant,
-            values,
-            self.readings[0] + reference,
+    def run(self, plant: Plant, values: ParameterSet, references: Rows, places: Signal | float = math.nan) -> LoopRun:
+        """Return runs of the loop from there, of a plant that has these states; references count from there, and
+        `places` are for a plant that does not have the variable.
+        """
+        law, value = self.schedule.runnable(), self.value
+        loop = SampledLoop(
+            plant=plant,
+            law=law,
             measured=self.schedule.controllers[0].signals,
-            sample_time_s=spec.sample_time_s,
-            delay_samples=spec.loop_delay_samples,
-            start_state=np.array([self.states[name] for name in plant.states]),
-            start_command=self.command,
-            **more,
+            delay_samples=self.schedule.spec.loop_delay_samples,
+            longest_delay_s=find_longest_delay(plant, [values]),
+            place=self.schedule.over,
         )
+        kept = list_kept(law, law.reset(self.readings[0], np.array(self.readings), value, self.command))
+        x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
+        count = len(references)
+        start = LoopState(x=np.tile(x, (count, 1)), z=np.tile(z, (count, 1)))
+        return run_loop(loop, [values] * count, self.readings[0] + references, start=start, places=places)
+
+
+def find_loss(run: LoopRun, law: RunnableSchedule) -> str:
+    """Return how a loop was lost; empty where it was not."""
+    if not all(np.all(np.isfinite(rows)) for rows in (*run.outputs.values(), run.current)):
+        return "is lost: it runs away"
+    return "is lost: the gate gives its sensor up" if np.any(find_faults(law, run.end.z)) else ""
 
 
 @memo

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import ctypes
 import subprocess
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 import seaopt as so
+from seaopt.control import GainTable
+from seaopt.control.deploy import export as export_module
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import realise
+from seaopt.control.laws.structures import Nominal, SpeedLoop
 from seaopt.control.loops.compensation.ripple_term import RippleTerm
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.running import closed_loop
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.running.outer_run import enclose_law
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
+from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
 from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import STRICT
 from tests.laws import law_of
@@ -77,14 +83,47 @@ def draw_part(number, rng):
         direction=float(rng.choice([-1.0, 1.0])), sample_time_s=TS, place_unit="m",
     )  # fmt: skip
     outer = outer if shape.random() < 0.3 else None
+    guards = draw_guards(shape, rng)
+    source, terms = draw_law(shape, rng), draw_terms(shape, rng, outer)
+    return source, realise(source, per_effort=PER_EFFORT, compensation=terms, **guards), outer
+
+
+def draw_guards(shape, rng):
+    """Return a limit, and a gate and a heat guard or not."""
     gate = PlausibilityGate(range_N=(-2e3, 2e3), max_step_N=300.0, max_held=int(rng.integers(0, 7)), ramp_A_per_s=90.0)
     heat = HeatGuard(**HOT, resistance=0.6, slope=0.002, allowed_rise=rng.uniform(20, 90), share=0.02, ambient=21.0)
-    source, terms = draw_law(shape, rng), draw_terms(shape, rng, outer)
-    law = realise(
-        source, per_effort=PER_EFFORT, command_limit=shape.choice([None, 4.0, 9.0]), compensation=terms,
-        gate=gate if shape.random() < 0.6 else None, heat=heat if shape.random() < 0.5 else None,
+    return {
+        "command_limit": shape.choice([None, 4.0, 9.0]), "gate": gate if shape.random() < 0.6 else None,
+        "heat": heat if shape.random() < 0.5 else None,
+    }  # fmt: skip
+
+
+def draw_schedule(number, rng):
+    """Return a schedule with random parts, of 2 to 5 points."""
+    shape = np.random.default_rng(number)
+    count, observer, speed = shape.integers(2, 6), shape.random() < 0.3, None
+    gains = {"k_p": 0.1, "k_i": 5.0 * (shape.random() < 0.8), "k_d": 1e-3, "T_f": 2e-3, "k_r": 0.1, "c": 0.5}
+    if shape.random() < 0.4:
+        gains |= {"notch_frequency_hz": 70.0, "notch_width": 0.4, "notch_depth": 0.3}
+    if shape.random() < 0.5:
+        gains |= {"prefilter_corner_hz": 30.0, **({"prefilter_damping": 0.8} if shape.random() < 0.5 else {})}
+    if not observer and shape.random() < 0.4:
+        speed = SpeedLoop(differenced=bool(shape.random() < 0.5))
+        gains |= {"k_v": 0.02, "k_ff": 1.1, **({"T_v": 0.05} if shape.random() < 0.5 else {})}
+    if observer:
+        gains |= {"T_q": 0.02}
+        lag = TransferFunction(num=np.array([3.0, -4.0, 1.2]), den=np.array([1.0, -0.9, 0.1]))
+        nominal = Nominal(
+            kept=np.array([0.0, 0.7, 0.3]), inverse=(lag, TransferFunction(num=np.array([0.3]), den=np.ones(1)))
+        )
+    table = GainTable(
+        over="phi", unit="rad", points=np.sort(rng.uniform(-1.0, 1.0, count)), sample_time_s=TS, speed=speed,
+        gains={name: value * rng.uniform(0.5, 1.5, count) for name, value in gains.items()},
+        structure="pid_dob" if observer else "pid" if speed is None else "cascade",
+        nominals=tuple(nominal.scaled(gain) for gain in rng.uniform(0.2, 0.4, count)) if observer else (),
     )  # fmt: skip
-    return source, law, outer
+    guards = draw_guards(shape, rng)
+    return make_runnable(table, per_effort=PER_EFFORT, limit=guards.pop("command_limit"), **guards)
 
 
 def draw_signals(rng, names, clean):
@@ -101,28 +140,34 @@ def draw_signals(rng, names, clean):
     return rows
 
 
-def play_python(law, reference, measured, further):
+def play_python(law, reference, measured, further, places=None):
     """Return the commands, and the size of what is summed to them, of which rounding is."""
     state, commands, largest = law.reset(), [], 1.0
     for k, r in enumerate(reference.tolist()):
-        largest = max(largest, PER_EFFORT * float(np.abs(law.c) @ np.abs(state.x)))
+        size = np.sum(np.abs(state.x)) if isinstance(law, RunnableSchedule) else np.abs(law.c) @ np.abs(state.x)
+        largest = max(largest, PER_EFFORT * float(size))
         read = float(measured[0][k]) if law.measured == 1 else np.array([row[k] for row in measured])
-        command, state = law.step(state, r, read, [float(row[k]) for row in further])
+        at = [] if places is None else [float(places[k])]
+        command, state = law.step(state, r, read, *at, [float(row[k]) for row in further])
         commands.append(command)
         largest = max(largest, abs(command))
     return np.array(commands), largest
 
 
-def export_all(compiler, parts, controller, folder):
+def export_all(compiler, parts, controller, folder, monkeypatch):
     """Return the steps of exported laws, compiled into one library: a function of rows of inputs."""
     code = ["#include <stddef.h>"]
     command = replace(controller.command, per_effort=PER_EFFORT)
     for number, (source, law, outer) in enumerate(parts):
-        name, inputs = f"law{number}", 1 + law.measured + len(reads_of(law))
+        name, scheduled = f"law{number}", isinstance(law, RunnableSchedule)
+        inputs = 1 + law.measured + len(reads_of(law)) + scheduled
         stored = replace(
-            controller, law=source, design=None, compensation=law.compensation, reads=("F", "G")[: law.measured],
-            command=command, outer=outer,
+            controller, law=source or controller.law, design=None, compensation=law.compensation,
+            reads=("F", "G")[: law.measured], command=command, outer=outer,
         )  # fmt: skip
+        if scheduled:
+            monkeypatch.setattr(export_module, "read_runnable", lambda *_, law=law, of=stored: (law, dict_of(of)))
+            stored = {"schema": SCHEDULE_SCHEMA, "controllers": [{}], "broken": [], "feasible": True}
         limit = law.command_limit
         export(stored, folder, name=name, gate=law.gate or False, derate=law.heat or False, command_limit=limit)
         given = "".join(f", in[{i}]" for i in range(1, inputs))
@@ -145,6 +190,10 @@ def export_all(compiler, parts, controller, folder):
     return play
 
 
+def dict_of(controller):
+    return {field.name: getattr(controller, field.name) for field in fields(controller)}
+
+
 def reads_of(law):
     return () if law.compensation is None else law.compensation.reads
 
@@ -153,10 +202,11 @@ def reads_of(law):
 def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tuned, tmp_path, monkeypatch):
     rng, plant = np.random.default_rng(count), make_plant()
     parts = [draw_part(number % STRUCTURES, rng) for number in range(count)]
-    play_c = export_all(compiler, parts, tuned, tmp_path)
+    parts += [(None, draw_schedule(number % (STRUCTURES // 2), rng), None) for number in range(count // 2)]
+    play_c = export_all(compiler, parts, tuned, tmp_path, monkeypatch)
     saturated, differing = 0, 0
     for number, (_, force_law, outer) in enumerate(parts):
-        names, law = ("F", "G")[: force_law.measured], force_law
+        names, law, places = ("F", "G")[: force_law.measured], force_law, None
         fed_back = names if outer is None else (*names, "x")
         if outer is not None:
             law = enclose_law(force_law, outer)
@@ -165,16 +215,20 @@ def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tune
         clean = () if outer is None else ("F" if law.gate else "-",)
         signals = draw_signals(rng, loop.signals, clean)
         reference, *noise = signals.values()
+        if isinstance(law, RunnableSchedule):
+            places = 1.5 * np.sin(0.03 * np.arange(SAMPLES) + rng.uniform(0.0, 6.0))
+            places[rng.integers(0, SAMPLES, 20)] = rng.choice([np.nan, np.inf, 3e15], 20)
         monkeypatch.setattr(closed_loop, "_noise", lambda *_, noise=noise: np.array(noise).T[None].copy())
-        run = run_loop(loop, [so.ParameterSet()], reference)
+        run = run_loop(loop, [so.ParameterSet()], reference, places=np.nan if places is None else places)
         readings = {name: run.outputs[name][0] + signals[name] for name in loop.signals}
         measured, further = ([readings[name] for name in part] for part in (fed_back, reads_of(law)))
-        commands, largest = play_python(law, reference, measured, further)
+        commands, largest = play_python(law, reference, measured, further, places)
         scale = 1e-12 * largest
         np.testing.assert_allclose(run.current[0], commands, rtol=0, atol=scale, err_msg=f"compiled loop, law {number}")
         inputs = [reference, *measured[: len(names)], *further, *measured[len(names) :]]
+        inputs += [] if places is None else [places]
         np.testing.assert_allclose(play_c(number, inputs), commands, rtol=0, atol=scale, err_msg=f"C, law {number}")
         saturated += bool(np.any(np.abs(commands) >= law.command_limit * (1 - 1e-9)))
         differing += np.unique(commands).size > SAMPLES // 2
-    assert saturated > 0.15 * count
-    assert differing > 0.2 * count
+    assert saturated > 0.15 * len(parts)
+    assert differing > 0.2 * len(parts)

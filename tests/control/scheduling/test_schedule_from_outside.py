@@ -17,7 +17,8 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control import GainTable, ScheduledController
-from seaopt.control.running.force_run import close_loop
+from seaopt.control.running.closed_loop import LoopState, SampledLoop, run_loop
+from seaopt.control.running.law_step import list_kept
 from seaopt.control.scheduling.scheduled_controller import freeze, place_variable
 from tests.c_code import CompiledSchedule
 from tests.schedules import read_knee
@@ -149,13 +150,13 @@ def test_the_swinging_knee_is_where_an_own_simulation_has_it(schedule, swung):
     _, swing, values = read_knee()
     x, torque, current = rest_knee(0.3)
     law = schedule.runnable()
-    run = close_loop(
-        law.step, law.reset(torque, torque, 0.3, current), swing, values, references, measured="tau", sample_time_s=TS,
-        delay_samples=1, start_state=np.array(x), start_command=current, place="phi", rtol=1e-8,
-    )  # fmt: skip
-    np.testing.assert_allclose(run.force, torques, atol=1e-5 * np.max(np.abs(torques)))
-    np.testing.assert_allclose(run.state[:, 2], angles, atol=1e-6)
-    np.testing.assert_allclose(run.current, currents, atol=1e-4 * LIMIT)
+    loop = SampledLoop(plant=swing, law=law, measured="tau", delay_samples=1, place="phi")
+    kept = list_kept(law, law.reset(torque, torque, 0.3, current))
+    start = LoopState(x=np.array([x]), z=np.array([[*kept, current]]))
+    run = run_loop(loop, [values], references, start=start, rtol=1e-8)
+    np.testing.assert_allclose(run.outputs["tau"][0], torques, atol=1e-5 * np.max(np.abs(torques)))
+    np.testing.assert_allclose(run.states[0, :, 2], angles, atol=1e-6)
+    np.testing.assert_allclose(run.current[0, 1:], currents[:-1], atol=1e-4 * LIMIT)  # a sample later
 
 
 def test_the_compiled_law_commands_what_the_own_one_does(compiler, tmp_path, schedule, swung):

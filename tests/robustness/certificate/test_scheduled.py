@@ -258,7 +258,7 @@ def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
     def refuse(*args, **keywords):
         raise AssertionError("reading a result must not simulate")
 
-    for module, name in ((verification, "play"), (schedule_sweep, "close_loop"),
+    for module, name in ((verification, "play"), (schedule_sweep, "run_loop"),
                          (limit_cycles, "run_loop"), (scheduled, "bound_stretch")):  # fmt: skip
         monkeypatch.setattr(module, name, refuse)
     plants = {"stand": stand, "swing": swing}
