@@ -96,6 +96,9 @@ class CompiledSchedule:
         real = ctypes.c_double if precision == "double" else ctypes.c_float
 
         law = schedule.runnable()
+        terms = law.compensation
+        rubs = terms is not None and terms.friction is not None
+        at_rest = {term.reads for term in (terms.gravity, terms.ripple) if term} if terms else ()
         heat = (
             *((name, ctypes.c_double) for name in ("rise_winding", "rise_case", "limit")),
             ("derated", ctypes.c_int),
@@ -108,19 +111,21 @@ class CompiledSchedule:
                 ("status", ctypes.c_int), ("place", real), ("misplaced", ctypes.c_ulong),
                 *(heat if options.get("derate") else ()),
                 *(gate if options.get("gate") else ()),
+                *((("friction_last", real), ("friction_known", ctypes.c_int)) if rubs else ()),
             )  # fmt: skip
 
+        reads = () if terms is None else terms.reads
         self.law, self.library = Law(), ctypes.CDLL(str(library))
-        self.library.law_step.argtypes = [ctypes.POINTER(Law), *[real] * (2 + law.measured)]
+        self.library.law_step.argtypes = [ctypes.POINTER(Law), *[real] * (2 + law.measured + len(reads))]
         self.library.law_step.restype = real
-        self.library.law_reset.argtypes = [ctypes.POINTER(Law), *[real] * (3 + law.measured)]
+        self.library.law_reset.argtypes = [ctypes.POINTER(Law), *[real] * (3 + law.measured + len(at_rest))]
         self.library.law_init(ctypes.byref(self.law))
 
-    def step(self, reference, measurement, place):
-        return self.library.law_step(ctypes.byref(self.law), reference, *np.ravel(measurement), place)
+    def step(self, reference, measurement, place, further=()):
+        return self.library.law_step(ctypes.byref(self.law), reference, *np.ravel(measurement), *further, place)
 
-    def reset(self, reference, measurement, place, command):
-        self.library.law_reset(ctypes.byref(self.law), reference, *np.ravel(measurement), place, command)
+    def reset(self, reference, measurement, place, command, further=()):
+        self.library.law_reset(ctypes.byref(self.law), reference, *np.ravel(measurement), *further, place, command)
 
 
 class CompiledMPC(LoadedMPC):

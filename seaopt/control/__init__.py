@@ -38,6 +38,7 @@ from seaopt.control.mpc.step import MPCState, MPCStep
 from seaopt.control.running.closed_loop import run_loop
 from seaopt.control.running.force_run import ForceRun, close_loop
 from seaopt.control.running.sampled_loop import SampledLoop
+from seaopt.control.scheduling.compensation import compensate_schedule
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleState
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
@@ -50,11 +51,12 @@ __all__ = [
     "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator", "EstimatorRun",
     "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "GainTable", "Gains", "GateState", "GivenLaw",
     "Impedance", "ImpedanceRegion", "Law", "LawState", "LinkFeedforward", "LinkPath", "Loop", "LoopFigures",
-    "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate",
-    "Prefilter", "Rendering", "RippleFit", "RunnableLaw", "RunnableSchedule", "SampledLoop", "ScheduleState",
-    "ScheduledController", "Score", "Scorecard", "TransferFunction", "add_compensation", "add_impedance", "assess",
-    "bound_free_law", "cascade_pid", "close_loop", "command_of", "corners", "critical_impedance", "draw", "drive_pid",
-    "estimate_noise", "estimator", "export", "export_mpc", "force_mpc", "ideal_pid", "identify_ripple", "margins",
-    "nu_gap", "parallel_pid", "passive_region", "passivity", "passivity_rows", "read_law", "realise", "render",
-    "run_loop", "runnable", "sample", "scorecard", "sweep", "tune", "tune_schedule",
+    "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity",
+    "PlausibilityGate", "Prefilter", "Rendering", "RippleFit", "RunnableLaw", "RunnableSchedule", "SampledLoop",
+    "ScheduleState", "ScheduledController", "Score", "Scorecard", "TransferFunction", "add_compensation",
+    "add_impedance", "assess", "bound_free_law", "cascade_pid", "close_loop", "command_of", "compensate_schedule",
+    "corners", "critical_impedance", "draw", "drive_pid", "estimate_noise", "estimator", "export", "export_mpc",
+    "force_mpc", "ideal_pid", "identify_ripple", "margins", "nu_gap", "parallel_pid", "passive_region", "passivity",
+    "passivity_rows", "read_law", "realise", "render", "run_loop", "runnable", "sample", "scorecard", "sweep",
+    "tune", "tune_schedule",
 ]  # fmt: skip

@@ -25,6 +25,7 @@ from seaopt.control import (
     add_impedance,
     assess,
     command_of,
+    compensate_schedule,
     critical_impedance,
     force_mpc,
     tune,
@@ -202,7 +203,7 @@ def tune_problem(
             draws=draws,
             progress=progress,
         )
-        return _guard_schedule(problem, tuned)
+        return complete_schedule(problem, tuned, source)
     rounds = table.retune
     if not rounds:
         tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
@@ -255,14 +256,19 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
         else:
             impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
         controller = add_impedance(controller, plant, values, impedance, name=outer.plant)
-    controller = _guard(problem, controller)
+    controller, terms = _guard(problem, controller), _list_terms(problem, values)
+    return add_compensation(controller, **terms) if terms else controller
+
+
+def _list_terms(problem: Problem, values: ParameterSet) -> dict[str, Any]:
+    """Return what the file asks to compensate, as `add_compensation` takes it."""
     tables = problem.controller_table.compensation
     kinds = {"friction": CompensateFriction, "gravity": CompensateGravity, "ripple": CompensateRipple}
-    terms = {name: make_record(kind, table) for name, kind in kinds.items() if (table := getattr(tables, name))}
-    if not terms:
-        return controller
+    terms: dict[str, Any] = {
+        name: make_record(kind, table) for name, kind in kinds.items() if (table := getattr(tables, name))
+    }
     link = tables.gravity and tables.gravity.plant
-    return add_compensation(controller, **terms, link=(problem.plants[link], values) if link else None)
+    return terms | ({"link": (problem.plants[link], values)} if link else {})
 
 
 def _guard(problem: Problem, controller: Controller) -> Controller:
@@ -276,12 +282,18 @@ def _guard(problem: Problem, controller: Controller) -> Controller:
     return replace(controller, gate=_make_gate(problem, controller), derate=derate)
 
 
-def _guard_schedule(problem: Problem, schedule: ScheduledController) -> ScheduledController:
-    """Return a schedule with the problem's guards, the gate that of the point where the plant moves the furthest."""
+def complete_schedule(
+    problem: Problem, schedule: ScheduledController, source: Fit | ParameterSet
+) -> ScheduledController:
+    """Return a schedule with the problem's guards, the gate that of the point where the plant moves the furthest, and
+    with what it compensates.
+    """
     guarded = [_guard(problem, controller) for controller in schedule.controllers]
     gates = [controller.gate for controller in guarded if controller.gate is not None]
     widest = max(gates, key=lambda gate: gate.max_step_N, default=None)
-    return replace(schedule, controllers=tuple(replace(each, gate=widest) for each in guarded))
+    guarded = replace(schedule, controllers=tuple(replace(each, gate=widest) for each in guarded))
+    terms = _list_terms(problem, problem.values(source))
+    return compensate_schedule(guarded, **terms) if terms else guarded
 
 
 def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> PlausibilityGate | None:

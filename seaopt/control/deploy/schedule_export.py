@@ -8,7 +8,8 @@ finite is replaced by the last that was, or by the table's `fallback` where ther
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,11 @@ from seaopt.control.deploy.trace import Term, Trace
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.realisation import choose_limit
 from seaopt.control.laws.structures import AGREES
+from seaopt.control.loops.compensation.terms import Compensation, compensate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.scheduling.gain_table import CORNERS, GainTable
-from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
-from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable, name_terms
+from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA, is_alike
 from seaopt.control.scheduling.step_order import SHARE
 from seaopt.errors import FileError
 
@@ -45,6 +47,11 @@ def read_runnable(
     first, *_ = controllers = [read_controller(stored) for stored in content["controllers"]]
     command = first["command"]
     for point, controller in zip(table.points, controllers, strict=True):
+        if not is_alike(controller["compensation"], first["compensation"]):
+            raise FileError(
+                f"schedule.json: the controller at {table.over} = {point:g} compensates with other terms than the "
+                "first; tune again"
+            )
         if any(controller[key] != first[key] for key in ("command", "sample_time_s", "structure")):
             raise FileError(
                 f"schedule.json: the controller at {table.over} = {point:g} has another command, rate or structure "
@@ -66,6 +73,7 @@ def read_runnable(
         fallback=table.fallback,
         tracking_time_s=tracking_time_s,
         command=(command.input, command.unit),
+        compensations=[each["compensation"] for each in controllers],
     )
     if tracking_time_s is None and not np.allclose(law.anti_windup, table.anti_windup, rtol=AGREES, atol=0.0):
         raise FileError("schedule.json: anti_windup is not what the gains give; tune again")
@@ -78,12 +86,15 @@ def describe_schedule(
     """Return words and numbers of the table, and the step traced."""
     table = law.table
     units = name_gain_units(first["command"]) | dict.fromkeys(CORNERS.values(), WARPED)
-    rows = {**table.columns, SHARE: law.anti_windup}
+    rows = {**table.columns, SHARE: law.anti_windup, **_list_varying(law)}
     signals = [f"read_{identifier(name)}" for name in (first["reads"] or list_names(first["spec"].measured))[1:]]
+    terms = law.compensation or Compensation(sample_time_s=law.sample_time_s)
+    at_rest = {term.reads for term in (terms.gravity, terms.ripple) if term is not None}
+    resets = [f"read_{identifier(name)}" for name in terms.reads if name in at_rest]
     return {
         **_trace(law, f"reference_{name_unit(first['command'])}", list(rows), signals, number),
         "integrators": table.integrates or "T_v" in table.gains or bool(table.nominals),
-        "resets": (),
+        "resets": [name for name in resets if name not in signals],
         "over": strip_markup(table.over),
         "over_unit": strip_markup(table.unit),
         "place": f"at_{identifier(table.over)}",
@@ -111,13 +122,21 @@ def _trace(
         return trace, gains, x, Term(trace, reference), [Term(trace, text) for text in (reading, *signals)]
 
     trace, gains, x, reference, readings = begin(asked, "reading")
+    reference, added = _compensate(law, gains, reference, _REMEMBERED)
     effort, applied, after = order.step(
-        gains, x, reference, readings, lambda effort: trace.keep(f"limited({effort.text}, most)", [effort.text])
+        gains,
+        x,
+        reference,
+        readings,
+        lambda effort: trace.keep(f"limited({effort.text}, most)", [effort.text]),
+        added,
     )
     results = [trace.write(value) for value in (effort, applied, *after.values())]
     step = trace.list_needed(results)
     trace, gains, x, reference, readings = begin("reference", "measurement")
-    start = order.continue_from(gains, Term(trace, "effort"), reference, readings)
+    reference, added = _compensate(law, gains, reference, ())
+    effort = Term(trace, "effort")
+    start = order.continue_from(gains, effort if added is None else effort - added, reference, readings)
     starts = [trace.write(value) for value in start.values()]
     return {
         "order": len(states),
@@ -130,3 +149,44 @@ def _trace(
         "reset_lines": trace.list_needed(starts),
         "starts": starts,
     }
+
+
+class _Operations:
+    """The operations of `compensate`, written down."""
+
+    @staticmethod
+    def fmin(a: Any, b: Any) -> Any:
+        return a.trace.choose(b, "<", a)
+
+    @staticmethod
+    def fmax(a: Any, b: Any) -> Any:
+        return a.trace.choose(b, ">", a)
+
+    @staticmethod
+    def floor(a: Any) -> Any:
+        return a.trace.keep(f"floored({a.text})", [a.text])
+
+
+_REMEMBERED = ("((law->friction_known != 0) ? (real)1 : (real)0)", "law->friction_last")
+
+
+def _list_varying(law: RunnableSchedule) -> dict[str, Any]:
+    """Return those numbers of the compensation that differ from point to point, with names of their own."""
+    rows = () if law.terms is None else law.terms.T
+    return {name: row for name, row in zip(name_terms(law.terms), rows, strict=True) if np.any(row != row[0])}
+
+
+def _compensate(
+    law: RunnableSchedule, gains: Mapping[str, Term], reference: Term, memory: Sequence[Any]
+) -> tuple[Term, Any]:
+    """Return the law's reference and what is added to its effort; at a reset nothing is remembered of friction."""
+    if law.compensation is None or law.terms is None:
+        return reference, None
+    shape, trace = law.compensation.shape, reference.trace
+    numbers = [gains.get(*pair) for pair in zip(name_terms(law.terms), law.terms[0].tolist(), strict=True)]
+    if not memory and shape.friction is not None:
+        shape, numbers = replace(shape, friction=None), numbers[2:]
+    readings = [Term(trace, f"or_zero(read_{identifier(name)})") for name in shape.reads]
+    before = [Term(trace, text) if isinstance(text, str) else text for text in memory]
+    shaped, added, _ = compensate(shape, numbers, before, reference, readings, _Operations)
+    return shaped, added

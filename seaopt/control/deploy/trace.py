@@ -60,6 +60,11 @@ class Trace:
         self.lines[name] = (expression, parts)
         return Term(self, name)
 
+    def choose(self, first: Any, sign: str, other: Any) -> Term:
+        """Record the first of two numbers where it compares so with the other, else that."""
+        texts = [self.write(side) for side in (first, other)]
+        return self.keep(f"({texts[0]} {sign} {texts[1]}) ? {texts[0]} : {texts[1]}", texts)
+
     def write(self, value: Any) -> str:
         """Return a term or a number as C has it."""
         return value.text if isinstance(value, Term) else self.number(float(value))

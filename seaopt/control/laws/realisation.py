@@ -129,7 +129,12 @@ class Guarded:
         return self.command_limit / self.per_effort
 
     def begin(
-        self, reference: float, measurement: Reading | None, current_A: float, readings: Sequence[float]
+        self,
+        reference: float,
+        measurement: Reading | None,
+        current_A: float,
+        readings: Sequence[float],
+        numbers: Sequence[float] | None = None,
     ) -> tuple[float, Reading, float, GateState]:
         """Return reference and measurement at rest, the effort that is to be the law's, and what the gate has seen.
         Raises ControlError: an input is not finite or beyond 1e15, the measurement is outside the gate's range, or the
@@ -150,7 +155,7 @@ class Guarded:
         added = 0.0
         if self.compensation is not None:
             reads = tuple(readings) or (0.0,) * len(self.compensation.reads)
-            reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads)
+            reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads, numbers)
         return reference, measurement, current_A / self.per_effort - added, seen
 
     def _check_measurement(self, measurement: Reading | None) -> Reading:
@@ -172,6 +177,7 @@ class Guarded:
         measurement: Reading,
         readings: Sequence[float],
         advance: Advance,
+        numbers: Sequence[float] | None = None,
         **noted: Any,
     ) -> tuple[float, State]:
         """Return the command of this sample, and the next state.
@@ -181,12 +187,12 @@ class Guarded:
         takes the command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
         `readings` are of the outputs that the compensation reads, in their order. `advance` is the law: of reference,
         measurement, what is added to the effort, and its limit, the effort, what is left of it, and the next x.
-        `noted`: further fields of the next state.
+        `numbers` of the compensation, where they are not its own; `noted`: further fields of the next state.
         """
         if self.heat is None:
-            return self._decide(state, reference, measurement, readings, self.command_limit, advance, noted)
+            return self._decide(state, reference, measurement, readings, self.command_limit, advance, numbers, noted)
         limit = min(self.command_limit, self.heat.limit(state.heat))
-        current, following = self._decide(state, reference, measurement, readings, limit, advance, noted)
+        current, following = self._decide(state, reference, measurement, readings, limit, advance, numbers, noted)
         current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
         return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
 
@@ -198,6 +204,7 @@ class Guarded:
         readings: Sequence[float],
         limit_A: float,
         advance: Advance,
+        numbers: Sequence[float] | None,
         noted: Mapping[str, Any],
     ) -> tuple[float, State]:
         """Return the command within a limit, and the next state."""
@@ -212,7 +219,7 @@ class Guarded:
         added, memory = 0.0, state.memory
         with np.errstate(all="ignore"):
             if self.compensation is not None:
-                reference, added, memory = self.compensation.step(state.memory, reference, readings)
+                reference, added, memory = self.compensation.step(state.memory, reference, readings, numbers)
             force, applied, x = advance(reference, measurement, added, limit_A / self.per_effort)
         if not (taken and math.isfinite(force) and np.isfinite(x).all()):
             return state.current_A, replace(state, held=state.held + 1, gate=seen, **noted)

@@ -68,7 +68,7 @@ class LawShape:
         """How many numbers of each kind `list_numbers` gives: of the law by itself, limit, command, guards, terms."""
         guards = GATE_NUMBERS * self.gated, HEAT_NUMBERS * self.heated
         law = sum(self.matrix_sizes) if self.schedule is None else self.schedule.size
-        return law, 1, 1, *guards, self.compensation.size
+        return law, 1, 1, *guards, self.compensation.size if self.schedule is None else 0
 
     @property
     def matrix_sizes(self) -> tuple[int, ...]:
@@ -84,9 +84,9 @@ def list_numbers(law: RunnableLaw | RunnableSchedule) -> Float[np.ndarray, " m"]
     if gate is not None:
         numbers += [*gate.range_N, gate.max_step_N, gate.max_held, gate.ramp_A_per_s * law.sample_time_s]
     numbers += [] if law.heat is None else law.heat.numbers
-    numbers += [] if law.compensation is None else law.compensation.numbers
     if isinstance(law, RunnableSchedule):
         return np.concatenate([law.numbers, numbers])
+    numbers += [] if law.compensation is None else law.compensation.numbers
     matrices = law.a.ravel("F"), law.b_reference, law.b_measurement.ravel("F"), law.c, law.anti_windup
     return np.concatenate([*matrices, [law.d_reference], np.ravel(law.d_measurement), numbers])
 
@@ -144,10 +144,13 @@ def express_step(
     def saturate(force: Any) -> Any:
         return ca.fmin(ca.fmax(force, -most), most) if shape.limited or shape.heated else force
 
-    r, effort, after = compensate(shape.compensation, ca.vertsplit(added), memory, reference, further, ca)
+    gains, terms = dict[str, Any](), ca.vertsplit(added)
     if shape.schedule is not None:
         at = ca.if_else(_is_number(place), place, at)
         gains = shape.schedule.express_gains(law, at)
+        terms = [gains[name] for name in shape.schedule.columns[-shape.compensation.size :] if shape.compensation.size]
+    r, effort, after = compensate(shape.compensation, terms, memory, reference, further, ca)
+    if shape.schedule is not None:
         _, applied, following = shape.schedule.express_step(gains, x, r, measured, saturate, effort)
     else:
         applied, following = _advance(shape, law, x, r, ca.vertcat(*measured), saturate, effort)

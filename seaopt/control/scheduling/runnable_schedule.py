@@ -25,6 +25,7 @@ from jaxtyping import Float
 
 from seaopt.control.laws.plausibility import is_number
 from seaopt.control.laws.realisation import Guarded, LawState, Reading, RunnableLaw, realise
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.step_order import SHARE, StepOrder
 from seaopt.plants.motor.heat_guard import COLD
@@ -104,11 +105,21 @@ class RunnableSchedule(Guarded):
         The share T_s/(T_t + T_s) at the table's points; zero where nothing integrates.
     fallback : float
         The value that counts until there was a finite one.
+    terms : array, shape (n, c), optional
+        The numbers of the compensation at the table's points.
     """
 
     table: GainTable
     anti_windup: Float[np.ndarray, " n"]
     fallback: float
+    terms: Float[np.ndarray, "n c"] | None = None
+
+    def find_terms(self, value: float) -> list[float] | None:
+        """Return the numbers of the compensation at a value of the variable; None without one."""
+        if self.terms is None:
+            return None
+        i, t = self.table.find_stretch(value)
+        return (self.terms[i] + t * (self.terms[i + 1] - self.terms[i])).tolist()
 
     @property
     def measured(self) -> int:
@@ -120,13 +131,16 @@ class RunnableSchedule(Guarded):
         """What its step depends on."""
         table = self.table
         return ScheduleShape(
-            order=table.order, points=table.points.size, columns=(*table.columns, SHARE), states=table.states
+            order=table.order,
+            points=table.points.size,
+            columns=(*table.columns, SHARE, *name_terms(self.terms)),
+            states=table.states,
         )
 
     @property
     def numbers(self) -> Float[np.ndarray, " m"]:
         """All else, as its shape takes it."""
-        rows = np.array([*self.table.columns.values(), self.anti_windup])
+        rows = np.array([*self.table.columns.values(), self.anti_windup, *([] if self.terms is None else self.terms.T)])
         return np.concatenate([self.table.points, rows.ravel("F")])
 
     def __repr__(self) -> str:
@@ -155,9 +169,10 @@ class RunnableSchedule(Guarded):
         A law without an integral cannot be set: its next command follows from the inputs. `place` is the scheduling
         variable; `fallback` counts where it is not finite. All else is as of `RunnableLaw.reset`.
         """
-        reference, measurement, effort, seen = self.begin(reference, measurement, current_A, readings)
         missing = not is_number(place)
         at = self.fallback if missing else place
+        numbers = self.find_terms(at)
+        reference, measurement, effort, seen = self.begin(reference, measurement, current_A, readings, numbers)
         x = self.table.order.continue_from(
             self.table.find_numbers(at), effort, reference, np.ravel(measurement).tolist()
         )
@@ -178,7 +193,13 @@ class RunnableSchedule(Guarded):
             return float(effort[0, 0]), float(applied[0, 0]), x[:, 0]
 
         misplaced = state.misplaced + 1 if missing else 0
-        return self.guard(state, reference, measurement, readings, advance, place=at, misplaced=misplaced)
+        terms = self.find_terms(at)
+        return self.guard(state, reference, measurement, readings, advance, terms, place=at, misplaced=misplaced)
+
+
+def name_terms(terms: Float[np.ndarray, "n c"] | None) -> list[str]:
+    """Return the names that the numbers of a compensation have among the columns."""
+    return [] if terms is None else [f"compensation_{i}" for i in range(terms.shape[1])]
 
 
 @lru_cache(maxsize=16)
@@ -195,17 +216,25 @@ def _compile_step(law: RunnableSchedule, _thread: int) -> DirectCall:
 
 
 def make_runnable(
-    table: GainTable, *, fallback: float | None = None, limit: float | None = None, **guards: Any
+    table: GainTable,
+    *,
+    fallback: float | None = None,
+    limit: float | None = None,
+    compensations: Sequence[Compensation | None] = (),
+    **guards: Any,
 ) -> RunnableSchedule:
     """Return a table of gains ready to run. `fallback`: the scheduling variable that counts until there was a finite
-    one; the first point if left out. `limit`: of the command, in its unit; None: no limit. All else is as of `realise`,
-    the anti-windup at every point. Raises ControlError: a number is out of range.
+    one; the first point if left out. `limit`: of the command, in its unit; None: no limit. `compensations`: at every
+    point, of one shape. All else is as of `realise`, the anti-windup at every point. Raises ControlError: a number is
+    out of range.
     """
+    terms = [each for each in compensations if each is not None]
     # An observer sees the limited command: what winds up is the integral of the law without it.
     each = [
         realise(
             replace(table.find_gains(point), observer=None).law(table.structure, table.sample_time_s).balanced(),
             command_limit=limit,
+            compensation=terms[0] if terms else None,
             **guards,
         )
         for point in table.points.tolist()
@@ -214,6 +243,7 @@ def make_runnable(
         table=table,
         anti_windup=np.array([_find_share(law) for law in each]),
         fallback=float(table.points[0]) if fallback is None else fallback,
+        terms=np.array([each.numbers for each in terms]) if terms else None,
         **{field.name: getattr(each[0], field.name) for field in fields(Guarded)},
     )
 

@@ -15,6 +15,7 @@ from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.gain_table import GainTable
@@ -177,8 +178,12 @@ class ScheduledController(Result, Worded):
             raise ControlError(f"{self.over} = {value:g} is outside the points; give {low:g} to {high:g}")
         if value in self.points:
             return self.controllers[self.points.index(value)]
-        spec = replace(self.spec, bandwidth_hz=self.asked_hz(value))
-        return freeze(self.table, value, spec, self.design, self.others)
+        spec, first = replace(self.spec, bandwidth_hz=self.asked_hz(value)), self.controllers[0]
+        frozen = freeze(self.table, value, spec, self.design, self.others)
+        (i, t), terms = self.table.find_stretch(value), [each.compensation for each in self.controllers]
+        low, high = terms[i], terms[i + 1]
+        mixed = None if low is None or high is None else low.mix(high, t)
+        return replace(frozen, compensation=mixed, gate=first.gate, derate=first.derate)
 
     def close_points(self, plant: Plant, params: ParameterSet) -> tuple[Loop, ...]:
         """Return a plant's loop at each point, with the variable standing still there."""
@@ -207,7 +212,7 @@ class ScheduledController(Result, Worded):
         )
 
     def runnable(self, *, limit: float | None = None, tracking_time_s: float | None = None) -> RunnableSchedule:
-        """Return the law ready to run, with the guards of its first controller.
+        """Return the law ready to run, with the guards and the compensation of its first controller.
 
         Parameters
         ----------
@@ -224,6 +229,7 @@ class ScheduledController(Result, Worded):
             fallback=self.fallback,
             tracking_time_s=tracking_time_s,
             command=(self.command.input, self.command.unit),
+            compensations=[each.compensation for each in self.controllers],
         )
         return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None)
 
@@ -275,13 +281,18 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
     for point, controller in zip(points, controllers, strict=True):
         gains, speed, observer = controller.gains, controller.speed_loop, controller.observer
         made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, observer, speed)
-        added = controller.compensation is not None or controller.outer is not None or controller.link is not None
+        added = controller.outer is not None or controller.link is not None
         whole = made and not added and made.makes(controller.law, controller.spec.structure)
         if set(gains) != set(first.gains) or not whole:
             raise ControlError(
                 f"the controller at {over} = {point:g} is more than its gains, or has other parts than that at "
                 f"{points[0]:g}, and only gains are interpolated; use the same structure, notch and prefilter at all "
                 "points, and no other parts"
+            )
+        if not is_alike(controller.compensation, first.compensation):
+            raise ControlError(
+                f"the controller at {over} = {point:g} compensates with other terms, ranges or speeds than that at "
+                f"{points[0]:g}, and only their coefficients are interpolated; use compensate_schedule"
             )
         if controller.sample_time_s != first.sample_time_s or not math.isclose(
             controller.command.per_effort, first.command.per_effort, rel_tol=1e-9
@@ -299,6 +310,13 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
         sample_time_s=first.sample_time_s,
         speed=first.speed_loop,
         nominals=tuple(each.observer.nominal for each in controllers if each.observer is not None),
+    )
+
+
+def is_alike(terms: Compensation | None, others: Compensation | None) -> bool:
+    """Tell whether two compensations differ in what is interpolated alone."""
+    return terms is others or (
+        terms is not None and others is not None and terms.shape == others.shape and terms.mix(others, 1.0) == others
     )
 
 

@@ -136,7 +136,7 @@ def move_schedule(
     if push.rate < rate:
         pushing, push = _change_length(pushing, push, rate)
     place, size = pushing.follow(push.run), push.size
-    left, ringing = pushing.measure((push.run.outputs[pushing.start.regulated][0] - push.run.reference[0]) / size)
+    left, ringing = pushing.measure(pushing.start.find_errors(push.run, place)[0] / size)
     standing = [
         pushing.measure(loop.simulate(pushing.pushes)[0] - pushing.pushes)
         for loop in schedule.close_points(plant, params)

@@ -20,7 +20,7 @@ This finds where a sweep of this shape goes wrong. It proves nothing of other mo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from types import SimpleNamespace
@@ -30,7 +30,8 @@ import casadi as ca
 import numpy as np
 
 from seaopt.codec import OrInfinite
-from seaopt.control.loops.sampled_plant import find_rest, find_rows
+from seaopt.control.loops.compensation.terms import FORGOTTEN
+from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, run_loop
 from seaopt.control.running.law_step import find_faults, list_kept
 from seaopt.control.running.loop_kernel import Rows
@@ -200,8 +201,8 @@ def _run_sweep(
         run = start.run(make_swept_plant(plant, schedule.over), values, np.outer([0.0, pulses.size], pulse), place)
     except SimulationError as error:
         return make_sweep(peak=math.inf, left=math.inf, fault=f"is lost: {error}")
-    calm, moved = run.outputs[start.regulated]
-    response = (moved - calm) / pulses.size
+    calm, moved = start.find_errors(run, place)
+    response = (moved - calm) / pulses.size + pulse
     peak = float(max(np.max(response), 1.0 - np.min(response)))
     ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
     left = float(np.max(np.abs(response - pulse)[ends]))
@@ -225,7 +226,7 @@ class RestStart:
     params: ParameterSet
     value: float  # of the variable
     states: dict[str, float]
-    readings: tuple[float, ...]
+    readings: dict[str, float]
     command: float
 
     @classmethod
@@ -239,7 +240,7 @@ class RestStart:
             params=placed.drop_conditions(),
             value=value,
             states=dict(zip(plant.states, x.tolist(), strict=True)),
-            readings=tuple(outputs[find_rows(plant, schedule.controllers[0].signals)].tolist()),
+            readings=dict(zip(plant.outputs, outputs.tolist(), strict=True)),
             command=float(u[0]),
         )
 
@@ -253,6 +254,7 @@ class RestStart:
         `places` are for a plant that does not have the variable.
         """
         law, value = self.schedule.runnable(), self.value
+        fed = np.array([self.readings[name] for name in self.schedule.controllers[0].signals])
         loop = SampledLoop(
             plant=plant,
             law=law,
@@ -261,11 +263,35 @@ class RestStart:
             longest_delay_s=find_longest_delay(plant, [values]),
             place=self.schedule.over,
         )
-        kept = list_kept(law, law.reset(self.readings[0], np.array(self.readings), value, self.command))
+        named = {self.schedule.over: value} | self.readings
+        further = [named.get(name, 0.0) for name in (() if law.compensation is None else law.compensation.reads)]
+        reference = float(fed[0]) - _weigh(law, named, value)
+        kept = list_kept(law, law.reset(reference, fed, value, self.command, readings=further))
         x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
         count = len(references)
         start = LoopState(x=np.tile(x, (count, 1)), z=np.tile(z, (count, 1)))
-        return run_loop(loop, [values] * count, self.readings[0] + references, start=start, places=places)
+        return run_loop(loop, [values] * count, reference + references, start=start, places=places)
+
+    def find_errors(self, run: LoopRun, places: Signal) -> Rows:
+        """Return how far the output is from what the law follows, the weight that it compensates included."""
+        law, errors = self.schedule.runnable(), run.outputs[self.regulated] - run.reference
+        if law.compensation is None or law.compensation.gravity is None:
+            return errors
+        name = law.compensation.gravity.reads
+        read = run.outputs.get(name, np.zeros_like(errors))
+        rows = [
+            [_weigh(law, {name: position}, place) for position, place in zip(row, places.tolist(), strict=True)]
+            for row in read.tolist()
+        ]
+        return errors - np.array(rows)
+
+
+def _weigh(law: RunnableSchedule, readings: Mapping[str, float], place: float) -> float:
+    """Return what a law adds to its reference at readings, those that are missing at zero."""
+    if law.compensation is None:
+        return 0.0
+    read = [readings.get(name, 0.0) for name in law.compensation.reads]
+    return law.compensation.step(FORGOTTEN, 0.0, read, law.find_terms(place))[0]
 
 
 def find_loss(run: LoopRun, law: RunnableSchedule) -> str:
@@ -298,7 +324,7 @@ def make_swept_plant(plant: Plant, over: str) -> Plant:
         )
         return (
             dict(zip(plant.states, ca.vertsplit(slopes), strict=True)),
-            dict(zip(plant.outputs, ca.vertsplit(outputs), strict=True)),
+            {over: moved[over], **dict(zip(plant.outputs, ca.vertsplit(outputs), strict=True))},
         )
 
     def f(t: Any, x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> dict[str, Any]:
@@ -307,11 +333,12 @@ def make_swept_plant(plant: Plant, over: str) -> Plant:
     def h(t: Any, x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> dict[str, Any]:
         return evaluate(t, x, u, p)[1]
 
+    shown = {} if over in plant.outputs else {over: unit}  # for a compensation that reads it
     return Plant(
         name=f"{plant.name}, {over} swept",
         states=kept,
         inputs=plant.inputs,
-        outputs=plant.outputs,
+        outputs={**plant.outputs, **shown},
         parameters={**plant.parameters, **dict(zip(SWEEP, (unit, unit, "rad/s"), strict=True))},
         f=f,
         h=h,

@@ -75,6 +75,23 @@ def draw_terms(shape, rng, outer):
     return Compensation(sample_time_s=TS, **kept) if kept else None
 
 
+def change_terms(terms, rng):
+    """Return terms of the same shape with other coefficients."""
+    changed = {
+        "friction": ("effort", "velocity_per_rate"), "gravity": ("coefficients",), "ripple": ("cos", "sin"),
+    }  # fmt: skip
+    made = {}
+    for name, fields_of in changed.items():
+        if (term := getattr(terms, name)) is not None:
+            values = {key: getattr(term, key) for key in fields_of}
+            more = {
+                key: tuple(rng.uniform(0.5, 1.5, len(v)) * v) if isinstance(v, tuple) else v * rng.uniform(0.5, 1.5)
+                for key, v in values.items()
+            }
+            made[name] = replace(term, **more)
+    return replace(terms, **made)
+
+
 def draw_part(number, rng):
     """Return a law, the same with random parts and limit, and its outer loop or None; `number`: of its structure."""
     shape = np.random.default_rng(number)
@@ -122,8 +139,9 @@ def draw_schedule(number, rng):
         structure="pid_dob" if observer else "pid" if speed is None else "cascade",
         nominals=tuple(nominal.scaled(gain) for gain in rng.uniform(0.2, 0.4, count)) if observer else (),
     )  # fmt: skip
-    guards = draw_guards(shape, rng)
-    return make_runnable(table, per_effort=PER_EFFORT, limit=guards.pop("command_limit"), **guards)
+    guards, terms = draw_guards(shape, rng), draw_terms(shape, rng, None) if shape.random() < 0.6 else None
+    made = [] if terms is None else [change_terms(terms, rng) for _ in range(count)]
+    return make_runnable(table, per_effort=PER_EFFORT, limit=guards.pop("command_limit"), compensations=made, **guards)
 
 
 def draw_signals(rng, names, clean):

@@ -234,7 +234,9 @@ class Compensation:
             motor=0 if self.ripple is None else self.reads.index(self.ripple.reads),
         )
 
-    def step(self, memory: Memory, reference: float, readings: Sequence[float]) -> tuple[float, float, Memory]:
+    def step(
+        self, memory: Memory, reference: float, readings: Sequence[float], numbers: Sequence[float] | None = None
+    ) -> tuple[float, float, Memory]:
         """Return the reference that the law gets, the effort that is added to its own, and the next memory.
 
         Parameters
@@ -245,6 +247,8 @@ class Compensation:
             Of this sample.
         readings : sequence of float
             Of `reads`, in their order.
+        numbers : sequence of float, optional
+            In place of its own: of a schedule, those of the place.
 
         Raises
         ------
@@ -256,8 +260,21 @@ class Compensation:
                 f"readings: the compensation reads {', '.join(self.reads) or 'nothing'}, and got {len(readings)}; give "
                 "one reading for each"
             )
-        shaped, effort, kept = compensate(self.shape, self.numbers, memory, reference, readings, _Floats)
+        at = self.numbers if numbers is None else numbers
+        shaped, effort, kept = compensate(self.shape, at, memory, reference, readings, _Floats)
         return shaped, effort, (kept[0], kept[1]) if kept else FORGOTTEN
+
+    def mix(self, other: Compensation, share: float) -> Compensation:
+        """Return the terms that a share of the way to another's coefficients, of the same shape, leads to."""
+        friction, gravity, ripple = (
+            term and replace(term, **{name: _mix(getattr(term, name), getattr(end, name), share) for name in names})
+            for term, end, names in (
+                (self.friction, other.friction, ("effort", "velocity_per_rate")),
+                (self.gravity, other.gravity, ("coefficients",)),
+                (self.ripple, other.ripple, ("cos", "sin")),
+            )
+        )
+        return replace(self, friction=friction, gravity=gravity, ripple=ripple)
 
     def to_dict(self) -> dict[str, Any]:
         """Return its terms, for controller.json."""
@@ -327,6 +344,13 @@ def compensate(
     now = reference if shape.friction == "reference" else readings[0]
     share = memory[0] * share_per_step * (now - memory[1])
     return shaped, added + effort * _limit(share, operations), [1.0, now]
+
+
+def _mix(first: Any, last: Any, share: float) -> Any:
+    """Return a number, or each of some, a share of the way from the first to the last."""
+    if isinstance(first, tuple):
+        return tuple(_mix(a, b, share) for a, b in zip(first, last, strict=True))
+    return (1.0 - share) * first + share * last
 
 
 def _limit(value: Any, operations: Any) -> Any:
