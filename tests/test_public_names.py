@@ -14,7 +14,7 @@ from tests.pages import DOCS
 
 PACKAGES = (
     "parameters", "plants", "logs", "simulation", "bench", "frequency", "estimation", "control", "robustness",
-    "problem", "reporting", "fleet", "testing", "executors", "errors",
+    "problem", "reporting", "fleet", "machine", "testing", "executors", "errors",
 )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]|did you mean \"")
 
 ORDER = (  # of the commands in the help: as they are used
     "demo", "new", "inspect", "run", "fit", "tune", "certify", "report", "export", "validate", "fleet", "simulate",
-    "frf", "schema",
+    "frf", "accept", "schema",
 )  # fmt: skip
 
 
@@ -497,6 +497,28 @@ def fleet(
         json=json,
         amount=_choose_amount(quiet, verbose),
     )
+    _exit_unless(met)
+
+
+@app.command()
+def accept(
+    problem: ProblemFile,
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOG", help="Logs taken under the exported law.", show_default=False)
+    ],
+    output: Folder = OUT,
+    reference: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN", help="Column of the law's reference; reference or ref if left out."),
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Judge logs taken under the law in DIR: is it this law, and does the machine do what was certified."""
+    from seaopt.cli.machine import accept_logs
+
+    met = accept_logs(problem, logs, output, reference=reference, json=json, amount=_choose_amount(quiet, verbose))
     _exit_unless(met)
 
 

@@ -290,6 +290,21 @@ class ExperimentTable(StrictTable):
     gaps: Literal["split", "error"] = key('Cut the log at gaps, or refuse it ("error").', default="split")
 
 
+class AcceptanceTable(StrictTable):
+    """Which columns a log taken under the exported law has, where they are not those of the plant's experiment."""
+
+    reference: Header | ColumnTable | None = key(
+        "What the law was given as its reference; a column called reference or ref if left out.", default=None
+    )
+    columns: dict[str, Header | ColumnTable] = key(
+        "Columns of the command and of what the law reads; else those of the controller's plant's experiment, or of "
+        "the same name.",
+        default={},
+    )
+    time: Header | ClockTable | None = key("Column of the clock.", default=None)
+    rate_hz: Number | None = key("Ticks per second of a log without a clock.", default=None, gt=0, le=1e9)
+
+
 class FitTable(StrictTable):
     """How the fit is made."""
 

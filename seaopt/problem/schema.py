@@ -24,6 +24,7 @@ from seaopt.control import CompensateFriction, CompensateGravity, CompensateRipp
 from seaopt.control.laws.plausibility import GateSpec
 from seaopt.documents import Flag, Number, Whole
 from seaopt.problem.bench_tables import (
+    AcceptanceTable,
     AnyPlant,
     ExperimentTable,
     FitTable,
@@ -322,6 +323,7 @@ class ProblemTable(StrictTable):
         'What only predictive control has, of a [controller] with structure = "mpc".', default=None
     )
     robustness: RobustnessTable | None = key("What the certificate covers besides the fit's uncertainty.", default=None)
+    acceptance: AcceptanceTable = key("Logs taken under the exported law.", default=AcceptanceTable())
     expect: ExpectTable | None = key("What `seaopt run` and pytest check of the results.", default=None)
 
 

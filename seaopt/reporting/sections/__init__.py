@@ -36,6 +36,7 @@ KINDS = {
     "Fleet": "seaopt.fleet.page",
     "Drift": "seaopt.fleet.page",
     "Population": "seaopt.fleet.page",
+    "Acceptance": "seaopt.machine.page",
 }
 
 

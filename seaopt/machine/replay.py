@@ -1,0 +1,529 @@
+r"""The replay: the law, fed with the logged reference and readings, makes the logged command, to its rounding.
+
+What the log does not have is the law's state at its first row. Where neither a law at zero nor one at rest under the
+first row goes on as logged, it is taken from the first rows: while the command is within its limit, what a state adds
+to the commands is :math:`C A^k x_0`, which is linear in it.
+
+**What rounding allows.** The logged command is off by up to half its step. A reading that is logged coarser than the
+law saw it, by a step :math:`q`, adds an error of variance :math:`\frac{q^2}{12} \sum_{j \le k} h_j^2` at row k, with
+the law's impulse response h: it grows with the integral.
+
+**Causes.** Where the replay does not match, each of a list of causes is tried: the law or the log is changed by it, and
+replayed. Factors are found by least squares of the logged commands over what reference and readings add to them. They
+are ranked by how much of the mismatch they remove; where one removes much and leaves something, a second is looked for
+behind it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.control import Controller, LawState, RunnableLaw, runnable
+from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.errors import SeaoptError
+from seaopt.logs.quality.faults import find_quantisation
+from seaopt.machine.ticks import Ticks
+from seaopt.records import record
+
+FLOOR = 1e-3  # of the command's variation: a mismatch below is none
+SIGMAS = 4.0  # of what rounding allows
+HEAD, LEAST_HEAD = 400, 60  # rows that tell the state at the first, and rows within the limit that factors take
+LONGEST_RESPONSE = 5000  # rows over which an error of rounding is added up
+WINDOW = 2000  # rows on which causes are tried, about the largest mismatch
+EVERY = (2, 3, 4, 5, 10)  # rows per tick of a law that is slower than the logger
+UNITS = (
+    1e-3,
+    1e3,
+    60.0 / (2.0 * math.pi),
+    2.0 * math.pi / 60.0,
+    180.0 / math.pi,
+    math.pi / 180.0,
+    1e-6,
+    1e6,
+    1e2,
+    1e-2,
+)
+SAME_RATE = 0.02  # relative: of the log's clock and the law's
+SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
+AT_LIMIT = 1.0 - 1e-6
+MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
+MOST_CAUSES = 6
+
+
+@record
+class Cause:
+    """Something that the machine does in place of what was exported, and how much of the mismatch it explains."""
+
+    kind: str  # rate, late, sign, unit, factor, gain, limit, feedforward, compensation, gate, heat, another law, ...
+    what: str  # the signal, gain, term or file that it concerns
+    value: float | None  # factor, ticks, limit, rate
+    unit: str
+    removes: float  # share of the mismatch's energy
+    explains: bool  # leaves nothing but rounding
+
+
+@record
+class Replay:
+    """How near the law comes to the logged command."""
+
+    met: bool
+    ticks: int
+    mismatch: float  # rms, in the command's unit
+    largest: float
+    allowed: float  # rms that rounding allows
+    rms: float  # of the command about its mean
+    off_from: int | None  # first tick that is off
+    saturated: float  # share of the ticks at the limit
+    command_late: int  # rows by which the command is logged later than what it was made of
+    rate_hz: float  # of the log
+    law_rate_hz: float
+    causes: tuple[Cause, ...] = ()
+
+
+@record(eq=False)
+class Setting:
+    """A law and a log, as they are or as a cause has them."""
+
+    controller: Controller
+    law: RunnableLaw
+    ticks: Ticks
+
+
+@record(eq=False)
+class Alternative:
+    """A cause that may be, and what it makes of a setting."""
+
+    kind: str
+    what: str
+    change: Callable[[Setting], Setting]
+    value: float | None = None
+    unit: str = ""
+
+
+@record(eq=False)
+class Match:
+    """The commands of a replay, what rounding allows at each row, and how far they are from the log's."""
+
+    commands: Float[np.ndarray, " n"]
+    allowed: Float[np.ndarray, " n"]
+    error: Float[np.ndarray, " n"]
+    start: LawState
+
+    @property
+    def energy(self) -> float:
+        """Mean square of the difference."""
+        return float(np.mean(self.error**2))
+
+    @property
+    def met(self) -> bool:
+        """Whether nothing is left but rounding."""
+        return self.energy <= float(np.mean(self.allowed**2))
+
+
+def replay(controller: Controller, ticks: Ticks, others: Mapping[str, Controller] | None = None) -> Replay:
+    """Return how a controller's law matches a log, and where it does not, why. `others`: laws that may have run in its
+    place, by name.
+    """
+    whole = Setting(controller=controller, law=runnable(controller), ticks=ticks)
+    match = play(whole)
+    late, causes = 0, ()
+    if not match.met:
+        causes, changed = find_causes(whole, match, others or {})
+        first = causes[0] if causes else None
+        if first is not None and first.kind == "late" and first.what == "command" and first.explains:
+            late, causes, match = int(first.value or 0), (), play(changed)
+    rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / controller.sample_time_s
+    if match.met and abs(rate_hz / law_rate_hz - 1.0) > SAME_RATE:
+        causes = (Cause(kind="rate", what="clock", value=rate_hz, unit="Hz", removes=1.0, explains=True),)
+    met = match.met and not causes
+    limit = whole.law.command_limit
+    off = np.flatnonzero(np.abs(match.error) > SIGMAS * match.allowed)
+    return Replay(
+        met=met,
+        ticks=len(ticks),
+        mismatch=math.sqrt(match.energy),
+        largest=float(np.max(np.abs(match.error))),
+        allowed=math.sqrt(float(np.mean(match.allowed**2))),
+        rms=float(np.std(ticks.command)),
+        off_from=None if match.met or not off.size else int(off[0]),
+        saturated=float(np.mean(np.abs(ticks.command) >= AT_LIMIT * limit)) if math.isfinite(limit) else 0.0,
+        command_late=late,
+        rate_hz=rate_hz,
+        law_rate_hz=law_rate_hz,
+        causes=causes,
+    )
+
+
+def play(setting: Setting) -> Match:
+    """Return the commands of a setting's law on its log."""
+    law, ticks = setting.law, setting.ticks
+    head = ticks.take(slice(0, HEAD))
+    allowed = _allow(law, ticks)
+    best, error = law.reset(), np.inf
+    for start in (law.reset(), _rest(law, ticks), _estimate_start(law, head)):
+        off = float(np.mean((_run(law, head, start) - head.command) ** 2))
+        if off < error:
+            best, error = start, off
+        if error <= np.mean(allowed[: len(head)] ** 2):
+            break
+    commands = _run(law, ticks, best)
+    return Match(commands=commands, allowed=allowed, error=commands - ticks.command, start=best)
+
+
+def _run(law: RunnableLaw, ticks: Ticks, start: LawState) -> Float[np.ndarray, " n"]:
+    """Return the commands of a law on a log: of its own step where it has guards or terms, else of its matrices, which
+    is the same and five times as fast.
+    """
+    if law.gate is not None or law.heat is not None or law.compensation is not None:
+        measured = ticks.measured[:, 0] if law.measured == 1 else ticks.measured
+        return law.run(ticks.reference, measured, start, ticks.further)[0]
+    direct, drive = _drive(law, ticks)
+    x, out, most = start.x, np.empty(len(ticks)), law.force_limit_N
+    for k in range(len(ticks)):
+        force = float(law.c @ x) + direct[k]
+        out[k] = min(max(force, -most), most)
+        x = law.a @ x + drive[k] + law.anti_windup * (out[k] - force)
+    return law.per_effort * out
+
+
+def _drive(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
+    """Return what reference and readings add to the effort at once, and to the next state, at each row."""
+    columns, direct = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
+    effort = law.d_reference * ticks.reference - ticks.measured @ direct
+    return effort, np.outer(ticks.reference, law.b_reference) - ticks.measured @ columns.T
+
+
+def _rest(law: RunnableLaw, ticks: Ticks) -> LawState:
+    """Return the law at rest under the first row, its integral as the first command has it."""
+    first = ticks.measured[0]
+    measured: Any = float(first[0]) if law.measured == 1 else first
+    command = float(np.clip(ticks.command[0], -law.command_limit, law.command_limit))
+    try:
+        return law.reset(float(ticks.reference[0]), measured, command, readings=ticks.further[0].tolist())
+    except SeaoptError:  # a reading outside the gate's range
+        return law.reset()
+
+
+def _find_limited(ticks: Ticks) -> Bool[np.ndarray, " n"]:
+    """Tell which logged commands are at a limit: those at the largest magnitude, where several rows in a row are."""
+    size = np.abs(ticks.command)
+    top = size >= AT_LIMIT * np.max(size)
+    return top if np.any(top[1:] & top[:-1]) else np.zeros(size.size, dtype=bool)
+
+
+def _find_modes(law: RunnableLaw, limited: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
+    """Return what each state at the first row adds to the later commands, with the limit as logged."""
+    rows, moved = np.empty((limited.size, law.c.size)), np.eye(law.c.size)
+    ways = law.a, law.a - np.outer(law.anti_windup, law.c)
+    for k, at_limit in enumerate(limited.tolist()):
+        rows[k] = law.c @ moved
+        moved = ways[at_limit] @ moved
+    return law.per_effort * rows
+
+
+def _follow(
+    law: RunnableLaw, ticks: Ticks, limited: Bool[np.ndarray, " n"], share: float = 1.0
+) -> Float[np.ndarray, " n"]:
+    """Return the commands, not limited, of a law that starts from zero and whose limit acts in the rows where it does
+    in the log; with a share of the limit. That is linear in reference, readings and share.
+    """
+    direct, drive = _drive(law, ticks)
+    x, out, most = np.zeros(law.c.size), np.empty(len(ticks)), share * law.force_limit_N
+    signs, at_limit = np.sign(ticks.command), limited.tolist()
+    for k in range(len(ticks)):
+        out[k] = float(law.c @ x) + direct[k]
+        x = law.a @ x + drive[k]
+        if at_limit[k] and math.isfinite(law.force_limit_N):
+            x = x + law.anti_windup * (most * signs[k] - out[k])
+    return law.per_effort * out
+
+
+def _estimate_start(law: RunnableLaw, ticks: Ticks) -> LawState:
+    """Return a state from which the first rows match as well as they can."""
+    limited, start = _find_limited(ticks), law.reset()
+    if np.count_nonzero(~limited) < 3 * max(law.c.size, 1) or not law.c.size:
+        return start
+    left = ticks.command - _follow(law, ticks, limited)
+    shift = np.linalg.lstsq(_find_modes(law, limited)[~limited], left[~limited], rcond=1e-10)[0]
+    return replace(start, x=shift)
+
+
+def _allow(law: RunnableLaw, ticks: Ticks) -> Float[np.ndarray, " n"]:
+    """Return one std of what rounding allows at each row."""
+    n = len(ticks)
+    response = _find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
+    steps = [(law.b_reference, law.d_reference, ticks.reference)]
+    columns = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
+    steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i]) for i in range(law.measured)]
+    variance = np.full(n, ticks.quantum**2 / 12.0 + (FLOOR * float(np.std(ticks.command))) ** 2)
+    for b, d, values in steps:
+        quantum = find_quantisation(values)
+        if quantum:
+            impulse = np.concatenate([[law.per_effort * d], response @ b])
+            grown = np.cumsum(impulse**2) * quantum**2 / 12.0
+            variance += grown[np.minimum(np.arange(n), grown.size - 1)]
+    return np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+
+
+def find_causes(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[tuple[Cause, ...], Setting]:
+    """Return the causes that explain a mismatch, the best first, and the setting as the first (and a second) has it."""
+    middle = int(np.argmax(np.abs(match.error)))
+    begin = max(0, min(middle - WINDOW // 2, len(whole.ticks) - WINDOW))
+    window = replace(whole, ticks=whole.ticks.take(slice(begin, begin + WINDOW)))
+    before = play(window).energy
+    if not before:
+        return (), whole
+    tried = sorted(_try_all(window, others), key=lambda pair: (not pair[1].met, pair[1].energy))
+    if not tried or tried[0][1].energy >= before:
+        return (), whole
+    causes = [_make_cause(alternative, played, before) for alternative, played in tried[:MOST_CAUSES]]
+    best = tried[0][0]
+    if not causes[0].explains and causes[0].removes > MUCH:
+        behind = best.change(window)
+        second = min(_try_all(behind, {}), key=lambda pair: pair[1].energy, default=None)
+        if second is not None and second[1].met:
+            cause = _make_cause(second[0], second[1], before)
+            causes = [causes[0], cause, *causes[1:]]
+    return tuple(cause for cause in causes if cause.removes > 0.0), best.change(whole)
+
+
+def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause:
+    return Cause(
+        kind=alternative.kind,
+        what=alternative.what,
+        value=alternative.value,
+        unit=alternative.unit,
+        removes=1.0 - played.energy / before,
+        explains=played.met,
+    )
+
+
+def _try_all(setting: Setting, others: Mapping[str, Controller]) -> Iterator[tuple[Alternative, Match]]:
+    for alternative in list_alternatives(setting, others):
+        try:
+            played = play(alternative.change(setting))
+        except SeaoptError:  # a law that cannot run so
+            continue
+        if np.isfinite(played.energy):
+            yield alternative, played
+
+
+def list_alternatives(setting: Setting, others: Mapping[str, Controller]) -> Iterator[Alternative]:
+    """Yield what may be the cause, those that change the log first."""
+    yield from _list_of_time(setting)
+    yield from _list_factors(setting)
+    yield from _list_of_guards(setting)
+    yield from _list_of_gains(setting)
+    signals = setting.controller.signals
+    for name, other in others.items():
+        if other.signals == signals:
+            yield Alternative(kind="another law", what=name, change=lambda given, other=other: _take_law(given, other))
+
+
+def _take_law(setting: Setting, controller: Controller) -> Setting:
+    return replace(setting, controller=controller, law=runnable(controller))
+
+
+def _change_ticks(change: Callable[[Ticks], Ticks]) -> Callable[[Setting], Setting]:
+    return lambda setting: replace(setting, ticks=change(setting.ticks))
+
+
+def _list_of_time(setting: Setting) -> Iterator[Alternative]:
+    """Yield other rates, and signals that come late."""
+    for ticks in (1, -1, 2):
+        change = _change_ticks(lambda rows, late=ticks: rows.move_command(late))
+        yield Alternative(kind="late", what="command", change=change, value=ticks, unit="ticks")
+    for ticks in (1, 2):
+        change = _change_ticks(lambda rows, late=ticks: rows.delay_readings(late))
+        yield Alternative(kind="late", what="readings", change=change, value=ticks, unit="ticks")
+    same = float(np.mean(np.diff(setting.ticks.command) == 0.0))
+    for every in EVERY:
+        if same > 0.9 * (1.0 - 1.0 / every):
+            change = _change_ticks(lambda rows, every=every: rows.take_every(every))
+            rate = setting.ticks.rate_hz / every
+            yield Alternative(kind="rate", what="law", change=change, value=rate, unit="Hz")
+
+
+def _scale(what: str, factor: float, setting: Setting) -> Setting:
+    """Return a setting in which the law is given, or its command is, a factor times what it was."""
+    ticks, controller = setting.ticks, setting.controller
+    if what == "reference":
+        return replace(setting, ticks=replace(ticks, reference=factor * ticks.reference))
+    if what in controller.signals:
+        scale = np.ones(ticks.measured.shape[1])
+        scale[controller.signals.index(what)] = factor
+        return replace(setting, ticks=replace(ticks, measured=scale * ticks.measured))
+    return replace(setting, ticks=replace(ticks, command=ticks.command / factor))
+
+
+def _list_factors(setting: Setting) -> Iterator[Alternative]:
+    """Yield signs, units and other factors of reference, readings and command."""
+    fitted = _fit_factors(setting)
+    for what in ("reference", *setting.controller.signals, setting.controller.command.input):
+        factor = fitted.get(what)
+        usual = [-1.0, *UNITS] if factor is None else [factor]
+        for value in dict.fromkeys([-1.0, *usual]):
+            unit = next((each for each in UNITS if abs(value / each - 1.0) < SAME_FACTOR), None)
+            kind = "sign" if abs(value + 1.0) < SAME_FACTOR else "factor" if unit is None else "unit"
+            value = -1.0 if kind == "sign" else value if unit is None else unit
+            yield Alternative(
+                kind=kind,
+                what=what,
+                value=value,
+                change=lambda given, what=what, value=value: _scale(what, value, given),
+            )
+
+
+def _fit_factors(setting: Setting) -> dict[str, float]:
+    """Return the factor of reference, of each reading, and of the command, that fits the logged commands best, each
+    by itself; none where the command is at its limit.
+    """
+    ticks, law = setting.ticks, setting.law
+    limited = _find_limited(ticks)
+    free = ~limited
+    if np.count_nonzero(free) < LEAST_HEAD:
+        return {}
+    nothing = replace(ticks, reference=0.0 * ticks.reference, measured=0.0 * ticks.measured)
+    parts = {"reference": _follow(law, replace(nothing, reference=ticks.reference), limited, 0.0)}
+    for i, name in enumerate(setting.controller.signals):
+        measured = np.zeros_like(ticks.measured)
+        measured[:, i] = ticks.measured[:, i]
+        parts[name] = _follow(law, replace(nothing, measured=measured), limited, 0.0)
+    together, modes = _follow(law, ticks, limited), _find_modes(law, limited)
+    columns = {**parts, setting.controller.command.input: together}
+    factors: dict[str, float] = {}
+    for name, column in columns.items():
+        target = ticks.command - (0.0 if column is together else together - column)
+        solved = np.linalg.lstsq(np.column_stack([column, modes])[free], target[free], rcond=1e-10)[0]
+        if np.isfinite(solved[0]) and abs(solved[0]) > 1e-9:
+            factors[name] = float(solved[0])
+    return factors
+
+
+def _change_law(**changes: Any) -> Callable[[Setting], Setting]:
+    return lambda setting: replace(setting, law=replace(setting.law, **changes))
+
+
+def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
+    """Yield limits, guards and terms that are others, or left out."""
+    law, ticks = setting.law, setting.ticks
+    reached, unit = float(np.max(np.abs(ticks.command))), setting.controller.command.unit
+    if not math.isclose(reached, law.command_limit, rel_tol=1e-3):
+        yield Alternative(
+            kind="limit", what="command", value=reached, unit=unit, change=_change_law(command_limit=reached)
+        )
+    if law.gate is not None:
+        yield Alternative(kind="gate", what="left out", change=_change_law(gate=None))
+    if law.heat is not None:
+        yield Alternative(kind="heat", what="left out", change=_change_law(heat=None))
+    if np.any(law.anti_windup):
+        none = np.zeros_like(law.anti_windup)
+        yield Alternative(kind="anti-windup", what="left out", change=_change_law(anti_windup=none))
+    added = law.compensation
+    terms = [] if added is None else [name for name in ("friction", "gravity", "ripple") if getattr(added, name)]
+    for name in terms:
+        without = replace(added, **{name: None}) if added is not None and len(terms) > 1 else None
+        change = _change_further(without)
+        yield Alternative(kind="compensation", what=name, change=change)
+    if setting.controller.link is not None:
+        change = _change_ticks(
+            lambda rows: replace(rows, measured=rows.measured * _all_but_last(rows.measured.shape[1]))
+        )
+        yield Alternative(kind="feedforward", what="link", change=change)
+
+
+def _all_but_last(n: int) -> Float[np.ndarray, " n"]:
+    return np.append(np.ones(n - 1), 0.0)
+
+
+def _change_further(compensation: Any) -> Callable[[Setting], Setting]:
+    """Return what replaces the terms of a law, with the columns of the log that those left over read."""
+
+    def change(setting: Setting) -> Setting:
+        before = [] if setting.law.compensation is None else list(setting.law.compensation.reads)
+        read = [] if compensation is None else [before.index(name) for name in compensation.reads]
+        ticks = replace(setting.ticks, further=setting.ticks.further[:, read])
+        return replace(setting, law=replace(setting.law, compensation=compensation), ticks=ticks)
+
+    return change
+
+
+def _read_gains(controller: Controller) -> Gains | None:
+    """Return the gains that make a controller's law; None of a law of the user's own."""
+    if not set(LAW_GAINS) <= set(controller.gains):
+        return None
+    return Gains.from_names(controller.gains, controller.observer, controller.speed_loop, controller.link)
+
+
+def _make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:
+    """Return what gives a setting the law of other gains, or of another sample time, with the guards that it has."""
+
+    def change(setting: Setting) -> Setting:
+        period = sample_time_s or controller.sample_time_s
+        law = gains.law(controller.spec.structure, period).balanced()
+        made = runnable(replace(controller, law=law))
+        guards = {name: getattr(setting.law, name) for name in ("gate", "heat", "compensation", "command_limit")}
+        return replace(setting, law=replace(made, **guards))
+
+    return change
+
+
+def _list_of_gains(setting: Setting) -> Iterator[Alternative]:
+    """Yield laws with parts that are left out, with gains of another size, and made for another rate."""
+    controller, gains = setting.controller, _read_gains(setting.controller)
+    if gains is None:
+        return
+    parts: list[tuple[str, str, dict[str, Any]]] = [
+        ("feedforward", "reference", {"k_r": gains.k_p}),
+        ("feedforward", "reference", {"k_r": 0.0}),
+        ("feedforward", "derivative of the reference", {"c": 0.0}),
+        ("feedforward", "derivative of the reference", {"c": 1.0}),
+        ("part", "prefilter", {"prefilter": None}),
+        ("part", "notch", {"notch": None}),
+        ("part", "disturbance observer", {"observer": None}),
+        ("part", "integral", {"k_i": 0.0}),
+        ("part", "derivative", {"k_d": 0.0}),
+        ("gain", "T_f", {"T_f": 0.5 * gains.T_f}),
+        ("gain", "T_f", {"T_f": 2.0 * gains.T_f}),
+    ]
+    for kind, what, changes in parts:
+        if any(getattr(gains, name) != value for name, value in changes.items()):
+            value = next(iter(changes.values())) if kind == "gain" else None
+            yield Alternative(
+                kind=kind, what=what, value=value, change=_make_law(controller, replace(gains, **changes))
+            )
+    for name, value in _fit_gains(setting, gains).items():
+        change = _make_law(controller, replace(gains, **{name: value}))
+        yield Alternative(kind="gain", what=name, value=value, change=change)
+    rates = {2.0 * controller.sample_time_s, 0.5 * controller.sample_time_s, 1.0 / setting.ticks.rate_hz}
+    for period in rates:
+        if not math.isclose(period, controller.sample_time_s, rel_tol=1e-3):
+            change = _make_law(controller, gains, period)
+            yield Alternative(kind="rate", what="gains", value=1.0 / period, unit="Hz", change=change)
+
+
+def _fit_gains(setting: Setting, gains: Gains) -> dict[str, float]:
+    """Return the size of each gain, alone, that fits the logged commands best: a law is linear in each of them."""
+    ticks, limited = setting.ticks, _find_limited(setting.ticks)
+    free = ~limited
+    if np.count_nonzero(free) < LEAST_HEAD:
+        return {}
+    base, fitted = _follow(setting.law, ticks, limited), dict[str, float]()
+    modes = _find_modes(setting.law, limited)
+    for name in ("k_p", "k_i", "k_d", "k_r"):
+        value = getattr(gains, name)
+        if not value:
+            continue
+        changed = _make_law(setting.controller, replace(gains, **{name: 1.01 * value}))(setting)
+        column = (_follow(changed.law, ticks, limited) - base) / (0.01 * value)
+        table = np.column_stack([column, modes])
+        step = np.linalg.lstsq(table[free], (ticks.command - base)[free], rcond=1e-10)[0][0]
+        if np.isfinite(step) and value + step > 0.0:
+            fitted[name] = float(value + step)
+    return fitted

@@ -1,0 +1,121 @@
+"""A log taken under a law, as the ticks of that law: its reference, what it read, and what it commanded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control import Controller
+from seaopt.errors import LogError
+from seaopt.formatting import join_words
+from seaopt.logs import Log
+from seaopt.logs.quality.faults import find_quantisation
+from seaopt.records import record
+
+REFERENCES = ("reference", "ref")  # what the reference's channel is called where nobody says
+FEWEST = 50  # ticks that a replay takes at least
+
+
+@record(eq=False)
+class Ticks:
+    """The longest stretch of a log without a gap or a missing number, a row per tick."""
+
+    source: str
+    rate_hz: float  # by the log's own clock
+    reference: Float[np.ndarray, " n"]
+    measured: Float[np.ndarray, "n y"]
+    further: Float[np.ndarray, "n r"]  # what the terms of the law read besides
+    command: Float[np.ndarray, " n"]
+    left_out: int = 0  # rows of the log that are in no such stretch
+
+    def __len__(self) -> int:
+        return self.command.size
+
+    def take(self, rows: slice, *, command: slice | None = None, measured: slice | None = None) -> Ticks:
+        """Return some rows; with the command, or the readings, of other rows."""
+        read = rows if measured is None else measured
+        return replace(
+            self,
+            reference=self.reference[rows],
+            measured=self.measured[read],
+            further=self.further[read],
+            command=self.command[rows if command is None else command],
+        )
+
+    def move_command(self, late: int) -> Ticks:
+        """Return the ticks with the command of the row that is `late` rows further down, or up where negative."""
+        n, shift = len(self), abs(late)
+        first, second = slice(0, n - shift), slice(shift, n)
+        return self.take(first, command=second) if late > 0 else self.take(second, command=first)
+
+    def delay_readings(self, ticks: int) -> Ticks:
+        """Return the ticks of a law that is given its readings so many ticks late."""
+        return self.take(slice(ticks, None), measured=slice(0, len(self) - ticks))
+
+    def take_every(self, every: int) -> Ticks:
+        """Return the first of each group of rows in which the command stays, where a slower law ran beside a logger."""
+        changes = np.flatnonzero(np.diff(self.command)) + 1
+        phase = int(np.argmax(np.bincount(changes % every, minlength=every))) if changes.size else 0
+        return self.take(slice(phase, None, every))
+
+    @property
+    def quantum(self) -> float:
+        """The step of the logged command; 0 where none is seen."""
+        return find_quantisation(self.command)
+
+
+def list_further(controller: Controller) -> tuple[str, ...]:
+    """Return what the terms of a controller read besides its signals."""
+    return () if controller.compensation is None else tuple(controller.compensation.reads)
+
+
+def take_ticks(controller: Controller, log: Log, reference: str | None = None) -> Ticks:
+    """Return the ticks of a log whose channels carry the names of the controller's signals, of the input that it
+    commands, and of its reference. Raises LogError: a channel is missing, or no stretch is long enough.
+    """
+    command, names = controller.command, (*controller.signals, *list_further(controller))
+    called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
+    if not called or called[0] not in log.signals:
+        raise LogError(
+            f"{log.source}: has no channel {reference or ' or '.join(REFERENCES)}; log what the law was given as its "
+            "reference in each tick, or name its column: --reference COLUMN"
+        )
+    missing = [name for name in (*names, command.input) if name not in log.signals]
+    if missing:
+        what = "the command that the law returned" if missing == [command.input] else "what the law reads"
+        raise LogError(
+            f"{log.source}: has no {join_words(missing)}, {what}; log in each tick {join_words(names)} as the law was "
+            f"given them, and {command.input} as it returned it"
+        )
+    columns = [log[name] for name in (called[0], command.input, *names)]
+    table = np.column_stack(columns)
+    rows = _find_longest(log, np.all(np.isfinite(table), axis=1))
+    if rows.stop - rows.start < FEWEST:
+        raise LogError(
+            f"{log.source}: {rows.stop - rows.start} rows in a row have all of {called[0]}, {command.input}, "
+            f"{join_words(names)}; log at least {FEWEST} ticks without a gap, better some periods of the reference"
+        )
+    table, count = table[rows], len(controller.signals)
+    return Ticks(
+        source=log.source,
+        rate_hz=log.rate_hz,
+        reference=table[:, 0],
+        command=table[:, 1],
+        measured=table[:, 2 : 2 + count],
+        further=table[:, 2 + count :],
+        left_out=len(log) - len(table),
+    )
+
+
+def _find_longest(log: Log, whole: Any) -> slice:
+    """Return the longest run of rows that are whole, within one segment of the log."""
+    best = slice(0, 0)
+    for segment in log.segments:
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], whole[segment], [False]]).astype(int)))
+        for start, stop in edges.reshape(-1, 2):
+            if stop - start > best.stop - best.start:
+                best = slice(segment.start + int(start), segment.start + int(stop))
+    return best

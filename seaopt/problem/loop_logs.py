@@ -1,0 +1,68 @@
+"""Logs taken under a law, read by the columns that a problem file gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from seaopt.errors import LogError
+from seaopt.logs import Column, Log, contents, read_log
+from seaopt.logs.formats import Field
+from seaopt.problem.bench_tables import ExperimentTable
+from seaopt.problem.columns import make_column
+from seaopt.problem.problem import Problem
+from seaopt.units import bare_name
+
+REFERENCE = "reference"
+MOST_NAMES = 20  # in a message
+REFERENCES = (REFERENCE, "ref")  # what its column is called where nobody says
+
+
+def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], reference: str | None = None) -> Log:
+    """Return a log taken under a law, with the channels that the law has and its reference.
+
+    A column is that of [acceptance], else of the experiment of the controller's plant, else of the channel's own name.
+    One that states no unit has the law's. `units`: of each channel, that of the reference by the name "reference".
+    `reference`: the header of its column. Raises LogError: a column is missing, or the log cannot be read.
+    """
+    table = problem.table.acceptance
+    fields = {field.name: field for field in contents(path).fields}
+    template = _find_template(problem)
+    columns = {} if template is None else {**template.inputs, **template.outputs}
+    columns = {**columns, **table.columns} | ({} if table.reference is None else {REFERENCE: table.reference})
+    columns = columns if reference is None else {**columns, REFERENCE: reference}
+    stated = {name: make_column(column, problem.folder) for name, column in columns.items() if name in units}
+    channels: dict[str, Column] = {}
+    for name, unit in units.items():
+        column = _choose_column(name, stated.get(name), fields)
+        if column is None:
+            continue  # who judges the log says what it is for
+        field = fields.get(column.column) if isinstance(column.column, str) else None
+        has_none = column.unit is None and field is not None and field.unit is None
+        channels[name] = replace(column, unit=unit or "-") if has_none else column
+    if not channels:
+        raise LogError(
+            f"{path}: has none of {', '.join(units)}; its columns are {', '.join(list(fields)[:MOST_NAMES])}: name "
+            "them in [acceptance] of the problem file: columns = { ... }"
+        )
+    clock = table.time if table.time is not None or template is None else template.time
+    time = None if clock is None else make_column(clock, problem.folder)
+    if time is not None and table.time is None and isinstance(time.column, str) and time.column not in fields:
+        time = None  # another log's
+    return read_log(path, time=time, channels=channels, rate_hz=table.rate_hz)
+
+
+def _find_template(problem: Problem) -> ExperimentTable | None:
+    """Return the first experiment of the controller's plant that has a log."""
+    of_plant = [each for each in problem.table.experiment if problem.plants[each.plant] is problem.design_plant]
+    return next((each for each in of_plant if each.virtual is None), None)
+
+
+def _choose_column(name: str, stated: Column | None, fields: Mapping[str, Field]) -> Column | None:
+    """Return the column that is stated, where the log has it, else one of the channel's name."""
+    if stated is not None and (not isinstance(stated.column, str) or stated.column in fields):
+        return stated
+    called = REFERENCES if name == REFERENCE else (name,)
+    header = next((field for field in fields if field in called or bare_name(field) in called), None)
+    return stated if header is None else Column(column=header)

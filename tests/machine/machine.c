@@ -1,0 +1,62 @@
+/* A ball-screw actuator between two fixed links under an exported law, with faults that a bench may have. Its equations
+ * are written out here, and share nothing with seaopt:
+ *   M q'' = kF i - b q' - f_c tanh(q'/v_s) - k q - s,  F = k q,  s = k2 (q - q2) + c2 (q' - q2'),  m2 q2'' = s
+ * with i the command that is in force: of tick j from (j + late) T + delay on. */
+#include <math.h>
+#include "force_law.h"
+
+typedef struct {
+    double mass, damping, stiffness, per_ampere, coulomb, smoothing; /* M, b, k, kF, f_c, v_s */
+    double mass2, stiffness2, damping2;                              /* zero mass2: no such part */
+    double delay_s, late, law_gain, reading_sign, drive_sign, sensor_range, current_step, force_step, every;
+} machine;
+
+static void rate(const machine *m, const double *x, double i, double *d)
+{
+    double s = m->mass2 > 0 ? m->stiffness2 * (x[0] - x[2]) + m->damping2 * (x[1] - x[3]) : 0.0;
+    d[0] = x[1];
+    d[1] = (m->per_ampere * i - m->damping * x[1] - m->coulomb * tanh(x[1] / m->smoothing) - m->stiffness * x[0] - s) / m->mass;
+    d[2] = x[3];
+    d[3] = m->mass2 > 0 ? s / m->mass2 : 0.0;
+}
+
+static void advance(const machine *m, double *x, double i, double h)
+{
+    double k1[4], k2[4], k3[4], k4[4], y[4];
+    int j;
+    rate(m, x, i, k1);
+    for (j = 0; j < 4; j++) y[j] = x[j] + 0.5 * h * k1[j];
+    rate(m, y, i, k2);
+    for (j = 0; j < 4; j++) y[j] = x[j] + 0.5 * h * k2[j];
+    rate(m, y, i, k3);
+    for (j = 0; j < 4; j++) y[j] = x[j] + h * k3[j];
+    rate(m, y, i, k4);
+    for (j = 0; j < 4; j++) x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j]);
+}
+
+/* Run n ticks of `period` seconds; `force` is what the sensor showed, `current` what the firmware sent. */
+void run(const machine *m, long n, long steps, double period, const double *reference, const double *noise,
+         double *force, double *current)
+{
+    force_law_law law;
+    double x[4] = {0, 0, 0, 0}, u = 0.0;
+    long k, j, every = (long)m->every;
+    force_law_init(&law);
+    for (k = 0; k < n; k++) {
+        double reading = m->stiffness * x[0] + noise[k];
+        if (m->force_step > 0) reading = m->force_step * floor(reading / m->force_step + 0.5);
+        if (reading > m->sensor_range) reading = m->sensor_range;
+        if (reading < -m->sensor_range) reading = -m->sensor_range;
+        if (k % every == 0) {
+            u = m->law_gain * force_law_step(&law, reference[k], m->reading_sign * reading);
+            if (m->current_step > 0) u = m->current_step * floor(u / m->current_step + 0.5);
+        }
+        force[k] = reading;
+        current[k] = u;
+        for (j = 0; j < steps; j++) {
+            double t = (double)k + ((double)j + 0.5) / (double)steps - m->late - m->delay_s / period;
+            long at = (long)floor(t);
+            advance(m, x, m->drive_sign * (at >= 0 ? current[at] : 0.0), period / (double)steps);
+        }
+    }
+}

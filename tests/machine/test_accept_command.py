@@ -1,0 +1,72 @@
+"""`seaopt accept`: files in, files out, exit codes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import seaopt as so
+from seaopt.cli.main import app
+from tests.machine.simulator import Bench, Machine, multisine
+from tests.machine.test_replay import LINES
+
+PROBLEM = """
+schema = 1
+title = "Stand"
+plant = { stand = { kind = "high_impedance" } }
+controller = { plant = "stand", measured = "F1", bandwidth_hz = 30, max_sensitivity = 1.6, current_limit_A = 9.0 }
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(compiler, tmp_path_factory):
+    """Return a folder with a problem, its controller, and logs of two machines."""
+    from typer.testing import CliRunner
+
+    home = tmp_path_factory.mktemp("accept")
+    (home / "stand.toml").write_text(PROBLEM)
+    assert CliRunner().invoke(app, ["tune", str(home / "stand.toml"), "-o", str(home / "out")]).exit_code == 0
+    content = json.loads((home / "out" / "controller.json").read_text())
+    problem = so.read_problem(home / "stand.toml")
+    controller = so.Controller.from_dict(content, problem.design_plant, problem.values(problem.parameters))
+    bench, reference = Bench(compiler, home, controller), multisine(1000, LINES, 4, 250.0, 3, bias=300.0)
+    so.write_log(bench.log(Machine(), reference, decimals=3), home / "good.csv")
+    so.write_log(bench.log(Machine(law_gain=0.5), reference, decimals=3), home / "half.csv")
+    bare = (home / "good.csv").read_text().replace(" [N]", "").replace(" [A]", "").replace("reference", "goal")
+    (home / "bare.csv").write_text(bare)
+    return home
+
+
+@pytest.fixture
+def accept(folder, capsys):
+    def run(*arguments):
+        from typer.testing import CliRunner
+
+        return CliRunner().invoke(
+            app, ["accept", str(folder / "stand.toml"), *map(str, arguments), "-o", str(folder / "out")]
+        )
+
+    return run
+
+
+def test_a_log_of_this_law_is_accepted(folder, accept):
+    done = accept(folder / "good.csv")
+    assert done.exit_code == 0, done.output
+    content = json.loads((folder / "out" / "acceptance.json").read_text())
+    assert content["schema"] == "seaopt/acceptance/1" and content["met"] and content["replay"]["met"]
+    assert "Replay" in (folder / "out" / "acceptance.html").read_text()
+
+
+def test_columns_without_units_and_with_other_names_are_read(folder, accept):
+    assert accept(folder / "bare.csv", "--reference", "goal").exit_code == 0
+    wrong = accept(folder / "bare.csv")
+    assert wrong.exit_code != 0 and "--reference COLUMN" in str(wrong.exception)
+
+
+def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
+    done = accept(folder / "good.csv", folder / "half.csv")
+    assert done.exit_code == 1 and "I is 0.5 times what it should be" in done.output
+    content = json.loads((folder / "out" / "acceptance.json").read_text())
+    assert [row["met"] for row in content["replay"]["logs"]] == [True, False]
+    assert content["replay"]["logs"][1]["causes"][0]["kind"] == "factor"

@@ -1,0 +1,112 @@
+"""The replay of an exported law on logs of a machine that shares nothing with seaopt, and the names of its faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from tests.machine.conftest import SPEC
+from tests.machine.simulator import Bench, Machine, multisine
+
+LINES = np.unique(np.round(np.geomspace(1, 120, 40)).astype(int))
+REFERENCE = multisine(1000, LINES, 4, 250.0, 3, bias=300.0)
+
+
+def rename(log, **columns):
+    """Return a log with other columns in place of some."""
+    arrays = {"time": log.time, "reference": log["reference"], "I": log["I"], "F1": log["F1"]} | columns
+    return so.Log.from_arrays(source="bench", **arrays)
+
+
+def cause_of(controller, log, **options):
+    """Return the first cause that the replay names."""
+    (row,) = so.accept(controller, [log], **options).replays
+    assert not row.met and row.causes[0].explains, row
+    return row.causes[0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 5.0])
+def test_the_exported_law_is_replayed_to_the_last_digits(controller, bench, noise):
+    (row,) = so.accept(controller, [bench.log(Machine(), REFERENCE, noise=noise)]).replays
+    assert row.met and row.mismatch < 1e-12 and row.command_late == 0 and row.causes == ()
+
+
+@pytest.mark.parametrize("decimals", [None, 2, 0])
+def test_a_log_that_begins_in_the_middle_and_is_rounded_is_the_same_law(controller, bench, decimals):
+    log = bench.log(Machine(), REFERENCE, decimals=decimals).between(1.2345, 3.7)
+    assert so.accept(controller, [log]).met
+
+
+@pytest.mark.parametrize("late", [1, -1])
+def test_a_command_that_is_logged_a_row_late_or_early_is_allowed(controller, bench, late):
+    log = bench.log(Machine(), REFERENCE)
+    shifted = rename(log, I=np.roll(log["I"], late)).between(0.1, 3.5)
+    (row,) = so.accept(controller, [shifted]).replays
+    assert row.met and row.command_late == late
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"law_gain": 0.5}, ("factor", "I", 0.5)),
+        ({"reading_sign": -1.0}, ("sign", "F1", -1.0)),
+        ({"every": 2.0}, ("rate", "law", 500.0)),
+    ],
+)
+def test_a_fault_of_the_firmware_has_its_name(controller, bench, changes, expected):
+    cause = cause_of(controller, bench.log(replace(Machine(), **changes), REFERENCE))
+    assert (cause.kind, cause.what) == expected[:2] and np.isclose(cause.value, expected[2], rtol=1e-6)
+
+
+def test_a_law_that_is_stepped_at_another_rate_is_told_by_the_clock(controller, bench):
+    cause = cause_of(controller, bench.log(Machine(), REFERENCE, period=2e-3))
+    assert (cause.kind, cause.what) == ("rate", "clock") and np.isclose(cause.value, 500.0)
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (lambda log: {"I": 1e3 * log["I"]}, ("unit", "I", 1e3)),
+        (lambda log: {"F1": 1e-3 * log["F1"]}, ("unit", "F1", 1e3)),
+        (lambda log: {"reference": -log["reference"]}, ("sign", "reference", -1.0)),
+    ],
+)
+def test_a_column_in_another_unit_or_sign_has_its_name(controller, bench, columns, expected):
+    log = bench.log(Machine(), REFERENCE)
+    cause = cause_of(controller, rename(log, **columns(log)))
+    assert (cause.kind, cause.what) == expected[:2] and np.isclose(cause.value, expected[2])
+
+
+def test_another_law_and_another_limit_are_named(compiler, tmp_path, controller):
+    stand, thor = so.plants.high_impedance(), so.plants.thor()
+    slower = so.tune(stand, thor, replace(SPEC, bandwidth_hz=22.0))
+    log = Bench(compiler, tmp_path, slower).log(Machine(), REFERENCE)
+    cause = cause_of(controller, log, others={"old/controller.json": slower})
+    assert (cause.kind, cause.what) == ("another law", "old/controller.json")
+    lower = Bench(compiler, tmp_path, replace(controller, spec=replace(SPEC, current_limit_A=2.0)), "lower")
+    cause = cause_of(controller, lower.log(Machine(), REFERENCE))
+    assert (cause.kind, cause.value) == ("limit", 2.0)
+
+
+def test_a_missing_feedforward_is_named(compiler, tmp_path, controller):
+    gains = {name: controller.gains[name] for name in ("k_p", "k_i", "k_d", "T_f", "c")}
+    from seaopt.control import Gains
+
+    law = Gains(**gains, k_r=controller.gains["k_p"]).law("pid", 1e-3).balanced()
+    custom = replace(controller, law=law, structure="custom", gains={}, spec=replace(SPEC, structure="custom"))
+    cause = cause_of(controller, Bench(compiler, tmp_path, custom).log(Machine(), REFERENCE))
+    assert (cause.kind, cause.what) == ("feedforward", "reference")
+
+
+def test_what_a_log_lacks_is_said_with_what_to_record(controller, bench):
+    log = bench.log(Machine(), REFERENCE)
+    lacks = {"reference": "--reference COLUMN", "I": "as it returned it", "F1": "log in each tick F1"}
+    for left_out, says in lacks.items():
+        arrays = {"time": log.time} | {name: log[name] for name in ("reference", "I", "F1") if name != left_out}
+        with pytest.raises(so.SeaoptError, match=says):
+            so.accept(controller, [so.Log.from_arrays(**arrays)])
+    with pytest.raises(so.SeaoptError, match="log at least 50 ticks"):
+        so.accept(controller, [log.between(0.0, 0.02)])
