@@ -59,9 +59,9 @@ Around any plant, besides those of `seaopt.plants.drives`:
     Dead times T_c before the input and T_m behind the same outputs, as Padé approximants of order three: the phase is
     right to one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are
     for linearisation and continuous-time loops.
-``droop``, ``friction_drift``, ``friction_direction``, ``back_driving``, ``cogging``, ``stand``
-    A motor that saturates or cogs, friction that changes over a log, with the direction or with who drives whom, a
-    stand that gives: `seaopt.plants.motor.effects`.
+``droop``, ``falling_torque``, ``friction_drift``, ``friction_direction``, ``back_driving``, ``cogging``, ``stand``
+    A motor that saturates, is weaker at speed or cogs, friction that changes over a log, with the direction or with
+    who drives whom, a stand that gives: `seaopt.plants.motor.effects`.
 ``deflection_sensor``
     One more output, what two encoders and a nominal stiffness make: `seaopt.plants.sensors.deflection`.
 """
@@ -100,6 +100,7 @@ Part = Literal[
     "spring_damping",
     "screw_mode",
     "droop",
+    "falling_torque",
     "friction_drift",
     "friction_direction",
     "back_driving",
@@ -329,6 +330,7 @@ _DEAD_TIMES = ("command_delay", "measurement_delay")  # from a command to what a
 # What is the motor's and the transmission's own, behind the drive.
 _EFFECTS: dict[str, Callable[[Plant], Plant]] = {
     "droop": effects.let_droop,
+    "falling_torque": effects.let_torque_fall,
     "friction_drift": effects.let_friction_drift,
     "friction_direction": effects.let_friction_differ,
     "back_driving": effects.let_back_driving_differ,

@@ -14,13 +14,14 @@ from seaopt.plants.parts import add_part
 TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 2.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0, "c_s": 0.5}
 EFFECTS = {
     "droop": {"a_i": 0.012},
+    "falling_torque": {"a_v": 0.2},
     "friction_drift": {"w_c": 0.4, "b_t": 8e-5},
     "friction_direction": {"f_a": 0.006, "b_a": -4e-5},
     "back_driving": {"d_e": 0.06},
     "cogging": {"a_g": 0.01, "b_g": -0.006, "n_g": 1.4},
     "stand": {"c_t": 1.0 / (15.0 * 300.0)},
 }
-NONLINEAR = ("droop", "friction_drift", "friction_direction")
+NONLINEAR = ("droop", "falling_torque", "friction_drift", "friction_direction")
 
 
 def _command(t):
@@ -31,7 +32,9 @@ def _rate(t, x, p):
     angle, speed = x
     k = 1.0 / (1.0 / p["k_s"] + p.get("c_t", 0.0))
     current, torque = _command(t), k * angle / p["N"] + p["c_s"] * speed / p["N"]
-    motor = p["K_tau"] * current * (1.0 - p.get("a_i", 0.0) * current**2)
+    motor = (
+        p["K_tau"] * current * (1.0 - p.get("a_i", 0.0) * current**2) * (1.0 - p.get("a_v", 0.0) * abs(speed) / p["N"])
+    )
     dry = p["f_c"] * math.tanh(speed / p["v_s"]) * (1.0 - p.get("w_c", 0.0) * t)
     viscous = (p["b_r"] + p.get("b_t", 0.0) * t) * speed
     rub = dry + viscous + p.get("f_a", 0.0) + p.get("b_a", 0.0) * abs(speed)
@@ -139,7 +142,7 @@ def test_a_part_says_which_role_it_lacks():
         name="mass", states={"x": "m", "v": "m/s"}, inputs={"F": "N"}, outputs={"x": "m"}, parameters={"m": "kg"},
         f=lambda t, x, u, p: {"x": x.v, "v": u.F / p.m}, h=lambda t, x, u, p: {"x": x.x},
     )  # fmt: skip
-    needed = {"droop": "current", "stand": "stiffness"} | dict.fromkeys(set(EFFECTS) - {"droop", "stand"}, "friction")
-    for part, needs in needed.items():
+    needed = {"droop": "current", "falling_torque": "speed", "stand": "stiffness"}
+    for part, needs in (dict.fromkeys(EFFECTS, "friction") | needed).items():
         with pytest.raises(PlantError, match=needs):
             so.plants.wrapped(bare, [part])

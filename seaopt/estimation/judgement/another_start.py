@@ -13,6 +13,7 @@ import numpy as np
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.second_log import find_excess
+from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import LITTLE
@@ -41,7 +42,7 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
         return
     if not np.isfinite(solved.misfit):
         return
-    gain = 0.5 * (_measure_misfit(minimum) - solved.misfit) / _measure_colour(fit)
+    gain = 0.5 * (_measure_misfit(minimum) - solved.misfit) / measure_colour(fit.covariance, fit.white_covariance)
     values = problem.unknowns.by_name(solved.solution.z)
     moved: dict[str, tuple[float, float]] = {}
     for name in fit.covariance.names:
@@ -73,12 +74,6 @@ def _search(minimum: Minimum) -> Solved:
         evaluation = problem.evaluate(np.clip(start, unknowns.low, unknowns.high))
         solved.append(settle_roughly(problem, evaluation))
     return min(solved, key=lambda each: each.misfit)
-
-
-def _measure_colour(fit: Fit) -> float:
-    """Return how many times more than for white residuals the estimates vary: at least once."""
-    pairs = zip(np.diag(fit.covariance.matrix), np.diag(fit.white_covariance.matrix), strict=True)
-    return max([1.0, *(float(c / w) for c, w in pairs if np.isfinite(c) and np.isfinite(w) and w > 0.0)])
 
 
 def _measure_misfit(minimum: Minimum) -> float:

@@ -23,6 +23,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
+from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.settle import ROUGH_ITERATIONS, Solved, settle_roughly, sharpen
 from seaopt.formatting import join_words
@@ -73,7 +74,7 @@ def find_causes(
     """
     minimum = fit.require_minimum("find_causes")
     whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
-    colour = _measure_colour(fit)
+    colour = measure_colour(fit.covariance, fit.white_covariance)
     causes: list[Cause] = []
     candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor))
     causes += _weigh_hypotheses(fit, hypotheses, whole, colour)
@@ -118,13 +119,6 @@ def _measure_kept(fit: Fit, minimum: Minimum, kept: Sequence[Experiment]) -> Flo
     spread = {e.name: np.array([measure_spread(e.log[name]) for name in e.outputs]) for e in kept}
     problem = problem.with_values("spread", spread)
     return _measure_powers(problem.evaluate(z), problem)
-
-
-def _measure_colour(fit: Fit) -> float:
-    """Return how many times more than for white residuals the estimates vary: at least once."""
-    coloured, white = np.diag(fit.covariance.matrix), np.diag(fit.white_covariance.matrix)
-    finite = np.isfinite(coloured) & np.isfinite(white) & (white > 0.0)
-    return float(max(1.0, np.max(coloured[finite] / white[finite], initial=1.0)))
 
 
 def _refit(minimum: Minimum, candidate: Candidate) -> Solved | None:

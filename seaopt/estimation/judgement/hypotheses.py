@@ -7,6 +7,7 @@ such as play, have no slope there, and start from a size that actuators have.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields, replace
 from functools import cache
@@ -64,6 +65,7 @@ class Hypothesis:
     fixed: Callable[[Sizes], Mapping[str, float]] = lambda sizes: {}
     searched: tuple[str, ...] = ()
     usual: Callable[[float], float] | None = None
+    lag: Callable[[Mapping[str, float]], float] = lambda start: 0.0  # s, that a fitted delay has in place of the effect
 
 
 def _zero(*names: str) -> Callable[[Sizes], Starts]:
@@ -88,7 +90,14 @@ HYPOTHESES = (
         part="droop",
         starts=lambda s: [{"a_i": 0.1 / s.current**2}] if s.current else [],
     ),
+    Hypothesis(effect="the motor's torque falls with its speed", part="falling_torque", starts=_zero("a_v")),
     Hypothesis(effect="the spring hardens", part="hardening", starts=_zero("k_3")),
+    Hypothesis(
+        effect="the current lags its command",
+        part="current_loop",
+        starts=lambda s: [{"current_loop_hz": 90.0}],  # from more than twice of what it is a step goes beyond zero
+        lag=lambda start: 1.0 / (2.0 * math.pi * start["current_loop_hz"]),
+    ),
     Hypothesis(effect="friction changes over the log", part="friction_drift", starts=_zero("w_c", "b_t")),
     Hypothesis(
         effect="friction grows with the spring's load",
@@ -123,11 +132,11 @@ HYPOTHESES = (
     ),
     Hypothesis(effect="the motor cogs", part="cogging", starts=lambda s: [s.ripple] if s.ripple else []),
     Hypothesis(effect="the supply sags", part="supply_sag", starts=_zero("R_b")),
-    Hypothesis(effect="the servo's firmware acts late", part="servo_delay", starts=lambda s: [{"T_v": 1e-3}]),
     Hypothesis(
-        effect="the current lags its command",
-        part="current_loop",
-        starts=lambda s: [{"current_loop_hz": 300.0}],
+        effect="the servo's firmware acts late",
+        part="servo_delay",
+        starts=lambda s: [{"T_v": 1e-3}],
+        lag=lambda start: start["T_v"],
     ),
     Hypothesis(
         effect="the stand is compliant",

@@ -24,9 +24,10 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_
 from seaopt.estimation.problem.noise_floor import measure_floor
 from seaopt.estimation.problem.residual_statistics import compute_residuals
 from seaopt.estimation.problem.shapes import Vector
+from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
-from seaopt.estimation.solver.least_squares import minimise
+from seaopt.estimation.solver.least_squares import FIRST_RADIUS, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, estimate_sigma
 from seaopt.estimation.solver.step_size import choose_first_steps
 from seaopt.parameters import ParameterSet
@@ -40,7 +41,9 @@ HALF = 0.5  # of the excess power that one has to take
 TIED = 1.05  # times the least excess, up to which hypotheses are as good
 ROUND, ROUNDS = 4, 5  # iterations of a refit between two looks at whether it helps, and how many looks
 MOST_ROUNDS = 15  # where each of them halves the power that is left
-HELPS = 0.02  # of a residual's power, that a round has to take from some output
+HELPS = 0.02  # of a residual's power beyond noise, that a round has to take from some output
+CHANCE = 10.0  # of log-likelihood, over the colour of the residual, that chance may give
+CLOSE = 1e-2  # over the size of the start: the second radius that a step may have
 BASES = 3  # hypotheses, the best, beside which each other one is tried
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
 
@@ -53,6 +56,7 @@ class Refit:
     problem: FitProblem
     evaluation: Evaluation
     excess: float
+    gain: float  # logarithm of its likelihood over the fit's
     evaluations: int
 
     @property
@@ -113,18 +117,19 @@ class Search:
         return replace(self, trials=tuple(rows))
 
 
-def search_hypotheses(fit: Fit, budget: int, progress: Progress = ignore) -> Search:
+def search_hypotheses(fit: Fit, budget: int, progress: Progress = ignore, *, doubtful: bool = False) -> Search:
     """Return the hypotheses that were tried, the best first; none where the residual asks for none.
 
-    `fit`: with its minimum; `budget`: evaluations that the search may take.
+    `fit`: with its minimum; `budget`: evaluations that the search may take; `doubtful`: whether values hang on little
+    of the residual, so that what is hardly more than noise asks, too.
     """
     minimum = fit.require_minimum("search_hypotheses")
     first = _measure_excess(minimum.problem, minimum.z)
-    if first <= ASKS or minimum.problem.predicts:
+    if (first <= ASKS and not doubtful) or minimum.problem.predicts:
         return Search()
     end = count_evaluations() + budget
     refits = _Search(fit, minimum, end, budget, progress).run(first)
-    return _judge(refits, first)
+    return _judge(refits, first, measure_colour(fit.covariance, fit.white_covariance))
 
 
 class _Search:
@@ -132,13 +137,15 @@ class _Search:
 
     def __init__(self, fit: Fit, minimum: Minimum, end: int, budget: int, progress: Progress) -> None:
         self.fit, self.minimum, self.end, self.budget, self.progress = fit, minimum, end, budget, progress
+        self.helps = HELPS
         self.sizes = measure_sizes(fit)
         self.silent = {effect.part for effect in fit.silent}  # which no refit tells from other values
+        self.base = minimum.problem.evaluate(minimum.z)
 
     def run(self, first: float) -> list[Refit]:
         """Return the refits of single hypotheses, and of pairs with the best of them where none suffices."""
-        base = self.minimum.problem.evaluate(self.minimum.z)
-        single = list(self.try_each(self.minimum.problem, base, self.fit.experiments, self.fit.parameters))
+        self.helps = HELPS * (1.0 - first**-2)
+        single = list(self.try_each(self.minimum.problem, self.base, self.fit.experiments, self.fit.parameters))
         refits = sorted(single, key=lambda refit: refit.excess)
         bases = refits[:BASES]
         partners = [refit.change.hypotheses[-1] for refit in bases]
@@ -176,7 +183,7 @@ class _Search:
                 continue
             self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
             try:
-                refit = _refit(change, problem, fitted)
+                refit = _refit(change, problem, fitted, self.helps, self.base)
             except SeaoptError:  # what does not make a problem explains nothing
                 continue
             if refit is not None:
@@ -188,10 +195,10 @@ def _take_values(refit: Refit) -> ParameterSet:
     return refit.problem.params.update(**{name: refit.values[name] for name in refit.problem.shared_names})
 
 
-def _refit(change: Change, old: FitProblem, fitted: Evaluation) -> Refit | None:
-    """Return the minimum with a change, from the fit's; None where it cannot be simulated.
+def _refit(change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation) -> Refit | None:
+    """Return the minimum with a change, from the fit's, `base` the fit without any; None where it cannot be simulated.
 
-    A search that takes hardly anything from the residual in a round of iterations is given up.
+    A search that takes less than `helps` of the residual's power in a round of iterations is given up.
     """
     before = count_evaluations()
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
@@ -201,33 +208,40 @@ def _refit(change: Change, old: FitProblem, fitted: Evaluation) -> Refit | None:
     if not np.isfinite(start.cost):
         return None
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
-    least = _measure_powers(fitted)
+    least, radius = _measure_powers(fitted), FIRST_RADIUS
     for number in range(MOST_ROUNDS):
         # The smaller the residual has become, the finer must be the steps.
         problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
-        solution = minimise(problem, evaluation, unknowns.low, unknowns.high, decrement=NEAR, max_iterations=ROUND)
+        limits, first = (unknowns.low, unknowns.high), evaluation
+        solution = minimise(problem, evaluation, *limits, decrement=NEAR, max_iterations=ROUND, first_radius=radius)
         evaluation = solution.evaluation
+        if evaluation is first and solution.status == "max_iterations" and radius == FIRST_RADIUS:
+            radius = CLOSE  # every step went too far
+            continue
         if not np.isfinite(evaluation.cost):
             return None
         problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
         evaluation = problem.assemble(evaluation.passes, evaluation.z)
         before_round, powers = powers, _measure_powers(evaluation)
         comes_near = number == 0 and np.any(powers < HALF * before_round)  # a start may be far from the fit
-        if np.all(powers > (1.0 - HELPS) * np.minimum(least, before_round)) and not comes_near:
+        if np.all(powers > (1.0 - helps) * np.minimum(least, before_round)) and not comes_near:
             break
         if number >= ROUNDS - 1 and not np.any(powers < HALF * before_round):
             break
         least = np.minimum(least, powers)
     excess = _measure_excess(problem, evaluation.z)
     spent = count_evaluations() - before
-    return Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, evaluations=spent)
+    gain = _measure_gain(base, evaluation)
+    return Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, gain=gain, evaluations=spent)
 
 
 def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> Evaluation:
     """Return the evaluation at the fit's values and the best start of what is added."""
     unknowns, evaluations = problem.unknowns, list[Evaluation]()
+    delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
     for start in change.starts:
         z = unknowns.start_from({**fitted, **start})
+        z[delays] -= change.hypotheses[-1].lag(start)
         evaluations.append(problem.evaluate(np.clip(z, unknowns.low, unknowns.high)))
     return min(evaluations, key=lambda evaluation: evaluation.cost)
 
@@ -255,13 +269,23 @@ def _measure_powers(evaluation: Evaluation) -> Vector:
     return np.concatenate([power.squares / np.maximum(power.counts, 1.0) for power in evaluation.power.values()])
 
 
+def _measure_gain(before: Evaluation, after: Evaluation) -> float:
+    """Return the logarithm of a likelihood over another one's, at each one's own residuals."""
+    counts = np.concatenate([power.counts for power in before.power.values()])
+    powers = (np.maximum(_measure_powers(each), 1e-300) for each in (before, after))
+    was, left = powers
+    return 0.5 * float(np.sum(counts * (np.log(was) - np.log(left))))
+
+
 def _takes_half(before: float, after: float) -> bool:
     """Tell whether a refit takes half of the excess power; of noise alone there is none."""
     return after**2 - 1.0 <= HALF * (before**2 - 1.0)
 
 
-def _judge(refits: Sequence[Refit], first: float) -> Search:
-    """Return what became of each hypothesis, the best first: of those as good the one with the fewest unknowns."""
+def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
+    """Return what became of each hypothesis, the best first: of those as good the one with the fewest unknowns.
+    `first`, `colour`: of the fit, its excess and how many times more than for white residuals its estimates vary.
+    """
     single = [refit for refit in refits if len(refit.change.hypotheses) == 1]
     best_single = min((refit.excess for refit in single), default=np.inf)
     # Two effects are taken where one leaves an excess, and the other takes half of that.
@@ -270,10 +294,14 @@ def _judge(refits: Sequence[Refit], first: float) -> Search:
         for refit in refits
         if refit.excess <= max(REMOVED, NEARLY * first)
         and _takes_half(first, refit.excess)
+        and refit.gain > CHANCE * colour
         and (refit in single or (best_single > ASKS and _takes_half(best_single, refit.excess)))
     ]
     least = min((refit.excess for refit in able), default=np.inf)
     tied = [refit for refit in able if refit.excess <= TIED * least]
+    if least <= ASKS:  # what is left is noise, and tells them apart
+        best = max(refit.gain for refit in tied)
+        tied = [refit for refit in tied if refit.gain >= best - CHANCE * colour]
     tied.sort(key=lambda refit: (refit.evaluation.z.size, refit.excess))
     others = sorted((refit for refit in refits if refit not in tied), key=lambda refit: refit.excess)
     outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *["tried" for _ in others]]

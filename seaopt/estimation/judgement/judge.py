@@ -115,7 +115,8 @@ def judge(
     little = any(finding.kind == "explained" for finding in findings)
     refitting, trying = divide(trying, OF_HYPOTHESES, OF_CAUSES)
     evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
-    search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting)
+    doubtful = _hangs_on_little(fit, findings)
+    search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting, doubtful=doubtful)
     if search.partial is not None:
         fit, findings = _reach(fit, findings, error, search.partial.parameters)
     if wrong or search.able:
@@ -139,6 +140,14 @@ def judge(
         findings += named
         search = search if not causes or causes[0].refit is not None else search.yield_to_another()
     return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
+
+
+def _hangs_on_little(fit: Fit, findings: Sequence[FitFinding]) -> bool:
+    """Tell whether values are known only roughly, or weakly apart by residuals that are not noise: a scale that a small
+    part of the residual tells is moved far by as little that the model lacks.
+    """
+    coloured = any(fitted.whiteness_p < DOUBTFUL for _, fitted in _list_outputs(fit))
+    return any(finding.kind == "rough" for finding in findings) or (coloured and bool(fit.identifiability.weak))
 
 
 def _tells(fit: Fit, validation: Experiment) -> bool:

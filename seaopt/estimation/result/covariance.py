@@ -247,3 +247,10 @@ def mark_unseen(matrix: ParameterMatrix, unseen: ParameterVector) -> ParameterMa
     marked = 0.5 * (matrix + matrix.T)
     marked[lost, :] = marked[:, lost] = np.inf
     return marked
+
+
+def measure_colour(coloured: Covariance, white: Covariance) -> float:
+    """Return how many times more than for white residuals estimates vary: at least once."""
+    variances, if_white = np.diag(coloured.matrix), np.diag(white.matrix)
+    finite = np.isfinite(variances) & np.isfinite(if_white) & (if_white > 0.0)
+    return float(np.max(variances[finite] / if_white[finite], initial=1.0))

@@ -5,6 +5,10 @@ Parts of `seaopt.plants.parts`; each is nothing where its parameters are zero:
 ``droop``
     The torque of a motor whose iron saturates: the current I makes what :math:`I (1 - a_i I^2)` would, up to where that
     is largest, and no more beyond. It takes the actuation's role.
+``falling_torque``
+    Less torque the faster the motor turns, as of a supply that sags or a drive near its voltage: the current I makes
+    what :math:`I \max(1 - a_v |v|, 0)` would at rest, v the speed on
+    which the actuation's effort works: behind the gear, or the nut's.
 ``friction_drift``
     Friction changes while a log is recorded, as grease warms up: after :math:`t` seconds dry friction is
     :math:`1 - w_c t` of what it was, but never less than nothing, and damping :math:`b_t t` more. The time is an input
@@ -48,6 +52,10 @@ AMPERE = "A"
 STRAIGHT = 1e-12  # 1/A^2: a torque constant that droops less does not droop at all
 
 
+def _fall_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
+    return (declare("a_v", 0.0, f"s/{effort.place}", -math.inf, "share of torque that is lost, over the speed"),)
+
+
 def _drift_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
     return (
         declare("w_c", 0.0, "1/s", -math.inf, "share of dry friction that is lost per second"),
@@ -77,6 +85,7 @@ def _stand_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
 BACK_DRIVING = declare("d_e", 0.0, "-", -0.9, "share of the spring's effort lost driving, less driven")
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "droop": (declare("a_i", 0.0, "1/A^2", 0.0, "share of torque that is lost, over the current's square"),),
+    "falling_torque": _fall_parameters(LINEAR),
     "friction_drift": _drift_parameters(LINEAR),
     "friction_direction": _direction_parameters(LINEAR),
     "back_driving": (BACK_DRIVING,),
@@ -84,6 +93,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "stand": _stand_parameters(LINEAR),
 }
 ROTARY_PARTS: dict[str, tuple[Parameter, ...]] = {
+    "falling_torque": _fall_parameters(ROTARY),
     "friction_drift": _drift_parameters(ROTARY),
     "friction_direction": _direction_parameters(ROTARY),
     "cogging": _cogging_parameters(ROTARY),
@@ -108,6 +118,24 @@ def let_droop(plant: Plant) -> Plant:
 
     friction = put_behind(plant.friction, saturate)
     return _change(plant, "droop", PARTS["droop"], saturate, let_droop, friction=friction)
+
+
+def let_torque_fall(plant: Plant) -> Plant:
+    """Return a plant whose motor is weaker the faster it turns. Raises PlantError: its actuation states no speed."""
+    actuation = plant.actuation
+    if actuation is None or actuation.speed is None:
+        raise PlantError(
+            f'plant {plant.name}: part "falling_torque" needs the speed on which the motor works; give the role '
+            "actuation = Actuation(input, effort, speed=lambda x, p: ...)"
+        )
+    name, speed = actuation.input, actuation.speed
+
+    def weaken(x: Any, u: Any, p: Any) -> SimpleNamespace:
+        return with_values(u, {name: getattr(u, name) * ca.fmax(1.0 - p.a_v * ca.fabs(speed(x, p)), 0.0)})
+
+    parameters = _fall_parameters(mechanics_of(actuation.unit))
+    friction = put_behind(plant.friction, weaken)
+    return _change(plant, "falling_torque", parameters, weaken, let_torque_fall, friction=friction)
 
 
 def let_friction_drift(plant: Plant) -> Plant:
