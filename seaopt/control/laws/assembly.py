@@ -71,8 +71,8 @@ class Assembly:
         return replace(self, chain=self.chain * factor, c=self.c * factor, d=self.d * factor)
 
     def widened(self, count: int) -> Assembly:
-        """Return this on so many inputs, of which it does not read the last."""
-        more = ((0, 0), (0, count - self.d.size))
+        """Return this on so many inputs, of which it does not read the last; of a negative count, not the first."""
+        more = ((0, 0), (0, count - self.d.size) if count > 0 else (-count - self.d.size, 0))
         return replace(self, chain=np.pad(self.chain, more), b=np.pad(self.b, more), d=np.pad(self.d, more[1]))
 
     def through(self, part: TransferFunction) -> Assembly:

@@ -105,6 +105,9 @@ class Controller(LoopDelays, Result, Worded):
         Which readings the exported law believes.
     derate : bool
         The exported law lowers its limit as the winding warms up.
+    share : float or None
+        Of a schedule with an observer, frozen: how its integral winds up there, T_s/(T_t + T_s). The observer sees the
+        limited command then (`seaopt.control.scheduling.step_order`).
     """
 
     plot = PlotAccessor()
@@ -133,6 +136,7 @@ class Controller(LoopDelays, Result, Worded):
     compensation: Compensation | None = None
     gate: PlausibilityGate | None = None
     derate: bool = False
+    share: float | None = None
 
     @property
     def signals(self) -> tuple[str, ...]:

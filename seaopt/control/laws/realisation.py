@@ -42,6 +42,7 @@ from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, GateState, PlausibilityGate, is_number
 from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
 from seaopt.control.loops.law import SLOW_LAG, Law
 from seaopt.errors import ControlError, require_number, require_type
@@ -374,8 +375,13 @@ def runnable(
     >>> round(current, 6)
     9.0
     """
+    law, share = controller.law, controller.share
+    if share is not None:
+        gains = Gains.from_names(controller.gains, controller.observer)
+        law = gains.law(controller.spec.structure, controller.sample_time_s, share).balanced()
     return realise(
-        controller.law,
+        law,
+        excess=share is not None,
         per_effort=controller.command.per_effort,
         command_limit=choose_limit(controller.command, controller.spec, command_limit),
         command=(controller.command.input, controller.command.unit),
@@ -419,6 +425,7 @@ def realise(
     command: tuple[str, str] = ("I", "A"),
     heat: HeatGuard | None = None,
     compensation: Compensation | None = None,
+    excess: bool = False,
 ) -> RunnableLaw:
     """Return a law with limit and anti-windup.
 
@@ -440,6 +447,8 @@ def realise(
         What lowers the limit as the winding warms up, of a command in A.
     compensation : Compensation, optional
         What is added to reference and effort.
+    excess : bool
+        The law's last input is the limited effort less the unlimited, and its column K.
 
     Raises
     ------
@@ -462,9 +471,11 @@ def realise(
         hidden = f"its pole {near:.2g} from 1 is not told from a slow lag; give the law as gains, or fewer slow poles"
         meant = hidden if near < SLOW_LAG else "tune a stable one"
         raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; {meant}")
-    m = law.integrators
+    m, taken = law.integrators, law.b[:, -1]
+    law = replace(law, b=law.b[:, :-1], d=law.d[:-1]) if excess else law
     tracking = _compute_tracking_time(law) if tracking_time_s is None and m else tracking_time_s
     share = law.sample_time_s / (tracking + law.sample_time_s) if tracking is not None else 0.0
+    chain = [math.comb(m, j) * share**j for j in range(1, m + 1)]
     measured = 1 if law.d.size == 2 else slice(1, None)
     return RunnableLaw(
         a=law.a,
@@ -473,7 +484,7 @@ def realise(
         c=law.c,
         d_reference=float(law.d[0]),
         d_measurement=-law.d[measured],
-        anti_windup=np.array([math.comb(m, j) * share**j for j in range(1, m + 1)] + [0.0] * (law.c.size - m)),
+        anti_windup=taken if excess else np.array(chain + [0.0] * (law.c.size - m)),
         integrators=m,
         tracking_time_s=tracking if m else None,
         sample_time_s=law.sample_time_s,

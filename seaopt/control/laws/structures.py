@@ -78,7 +78,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.codec import to_content
-from seaopt.control.laws.assembly import Assembly
+from seaopt.control.laws.assembly import Assembly, Columns
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant
@@ -253,17 +253,29 @@ class DisturbanceObserver:
 
         `surplus` is what acts on the reference alone at 0 Hz, less 1/P_n: where it is zero, so is its integral.
         """
-        pole, short = self._pole(sample_time_s)
-        kept, seen = self.nominal.kept, Assembly.of_gains(np.array([1.0, -1.0]))  # - measurement = error - reference
+        seen = Assembly.of_gains(np.array([1.0, -1.0]))  # - measurement = error - reference
         for part in self.nominal.inverse:
             seen = seen.through(part)
+        return self._enclose(law, law, seen, np.array([0.0, surplus]), sample_time_s)
+
+    def limit(self, law: Assembly, sample_time_s: float) -> Assembly:
+        """Return (law + Q excess)/(1 - Q) of one input, the excess: what the limit takes off the command."""
+        return self._enclose(law, law.plus(Assembly.of_gains(np.ones(1))), None, np.zeros(1), sample_time_s)
+
+    def _enclose(
+        self, law: Assembly, known: Assembly, seen: Assembly | None, surplus: Columns, sample_time_s: float
+    ) -> Assembly:
+        """Return law + (Q known + Q_0 seen)/(1 - Q); `surplus`: at 0 Hz of the inputs that nothing integrates but Q."""
+        pole, short = self._pole(sample_time_s)
+        kept = self.nominal.kept
         e = np.zeros(max(kept.size - 1, 2))
         e[: kept.size - 1] = short**2 * np.cumsum(kept[:0:-1])[::-1]
         at_one = float(np.sum(e)) + 2 * pole * short
         e[:2] += [2 * pole * short + pole**2, -(pole**2)]
         over_e = TransferFunction(num=short**2 / e[:1], den=e / e[0])
-        estimate = law.through(TransferFunction(num=kept, den=np.ones(1))).plus(seen).through(over_e)
-        return law.plus(estimate.integrated(np.array([estimate.static[0], short**2 / at_one * surplus])))
+        estimate = known.through(TransferFunction(num=kept, den=np.ones(1)))
+        estimate = (estimate if seen is None else estimate.plus(seen)).through(over_e)
+        return law.plus(estimate.integrated(np.array([estimate.static[0], *(short**2 / at_one * surplus[1:])])))
 
     def _pole(self, sample_time_s: float) -> tuple[float, float]:
         """Return p and 1 - p."""
@@ -405,8 +417,11 @@ class Gains:
         near = np.abs(law.responses(f) - expected) <= AGREES * np.abs(expected) + rounding
         return made.integrators == law.integrators and bool(np.all(near))
 
-    def law(self, structure: Structure, sample_time_s: float) -> Law:
-        """Return the law as a state space from reference and what is measured; `Law.balanced` is what runs."""
+    def law(self, structure: Structure, sample_time_s: float, share: float | None = None) -> Law:
+        """Return the law as a state space from reference and what is measured; `Law.balanced` is what runs. With a
+        `share` of the excess that its integral takes (an observer's law) a last input is that excess, the limited
+        effort less the unlimited, which the observer sees.
+        """
         alone = self.k_r - self.k_p  # the two inputs are the error and the reference, on which these act alone
         short = sample_time_s / (self.T_f + sample_time_s)
         lag = TransferFunction(num=np.array([1.0, -1.0]), den=np.array([1.0, -self.T_f / (self.T_f + sample_time_s)]))
@@ -427,6 +442,10 @@ class Gains:
             law = law.through(TransferFunction(num=over / under[0], den=under / under[0]))
         if self.prefilter is not None:
             law = law.with_reference_behind(*self.prefilter.filters(sample_time_s))
+        if share is not None and self.observer is not None:
+            taken = Assembly.of_gains(np.array([share]))  # q/(1 - q) = 1/delta - 1
+            wound = self.observer.limit(taken.integrated(taken.static).plus(taken.scaled(-1.0)), sample_time_s)
+            law = law.widened(3).plus(wound.widened(-3))
         made = law.law(sample_time_s)
         return made if self.link is None else made.reading(self.link.feedback(sample_time_s))
 

@@ -20,6 +20,7 @@ from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
+from seaopt.control.scheduling.step_order import SHARE
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.tuner import describe_law, make_task
 from seaopt.errors import ControlError, suggestion
@@ -171,19 +172,25 @@ class ScheduledController(Result, Worded):
         """Return the controller that the schedule is while the variable stands at a value.
 
         At a point it is the one that was tuned there. Elsewhere its specification asks for the bandwidth that it has:
-        what is asked there is judged by `between`. Raises ControlError: the value is not finite, or outside the points.
+        what is asked there is judged by `between`. It runs as the schedule does (`Controller.share`). Raises
+        ControlError: the value is not finite, or outside the points.
         """
         low, high = self.points[0], self.points[-1]
         if not low <= value <= high:
             raise ControlError(f"{self.over} = {value:g} is outside the points; give {low:g} to {high:g}")
         if value in self.points:
-            return self.controllers[self.points.index(value)]
-        spec, first = replace(self.spec, bandwidth_hz=self.asked_hz(value)), self.controllers[0]
-        frozen = freeze(self.table, value, spec, self.design, self.others)
-        (i, t), terms = self.table.find_stretch(value), [each.compensation for each in self.controllers]
-        low, high = terms[i], terms[i + 1]
-        mixed = None if low is None or high is None else low.mix(high, t)
-        return replace(frozen, compensation=mixed, gate=first.gate, derate=first.derate)
+            frozen = self.controllers[self.points.index(value)]
+        else:
+            spec, first = replace(self.spec, bandwidth_hz=self.asked_hz(value)), self.controllers[0]
+            frozen = freeze(self.table, value, spec, self.design, self.others)
+            (i, t), terms = self.table.find_stretch(value), [each.compensation for each in self.controllers]
+            low, high = terms[i], terms[i + 1]
+            mixed = None if low is None or high is None else low.mix(high, t)
+            frozen = replace(frozen, compensation=mixed, gate=first.gate, derate=first.derate)
+        if not self.table.nominals:
+            return frozen
+        share = self.table.find_numbers(value, **{SHARE: self.runnable().anti_windup})[SHARE]
+        return replace(frozen, share=share)
 
     def close_points(self, plant: Plant, params: ParameterSet) -> tuple[Loop, ...]:
         """Return a plant's loop at each point, with the variable standing still there."""

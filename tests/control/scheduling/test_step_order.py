@@ -4,12 +4,13 @@ The plain law is another realisation (balanced, its integrators a chain), and ru
 """
 
 import json
+import math
 
 import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import GainTable, Notch, Prefilter, ScheduledController, realise, tune_schedule
+from seaopt.control import GainTable, Notch, Prefilter, ScheduledController, realise, runnable, tune_schedule
 from seaopt.control.laws.structures import Gains, SpeedLoop
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.scheduling.runnable_schedule import make_runnable
@@ -166,18 +167,22 @@ def test_an_observer_sees_the_limited_command(schedule):
     assert 0.1 < np.mean(np.abs(commands) == law.command_limit) < 0.9
 
 
-def test_standing_still_a_tuned_one_is_its_controllers_law(schedule):
-    """Between the points too, an observer's with the gain of its nominal plant on a line."""
-    law, rng = schedule.runnable(limit=np.inf), np.random.default_rng(4)
+@pytest.mark.parametrize("limited", [False, True])
+def test_standing_still_a_tuned_one_is_what_runs_at_its_place(schedule, limited):
+    """Between the points too, an observer's with the gain of its nominal plant on a line; saturated as exported."""
+    limit, rng = None if limited else math.inf, np.random.default_rng(4)
+    law = schedule.runnable(limit=limit)
     low, high = schedule.points
-    for place in (low, 0.6 * low + 0.4 * high):
-        plain = realise(schedule.at(place).law, per_effort=law.per_effort)
+    size = 0.02 if law.measured > 1 else 1.0
+    for place in (low, 0.6 * low + 0.4 * high) if schedule.table.nominals or not limited else (low,):
+        plain = runnable(schedule.at(place), command_limit=limit)
         state, other, pairs = law.reset(place=place), plain.reset(), np.zeros((800, 2))
-        for pair in pairs:
-            r, y = rng.normal(), 0.3 * rng.normal(size=law.table.order.measured)
+        for k, pair in enumerate(pairs):
+            r, y = size * (rng.normal() + 30.0 * (k < 300)), 0.3 * size * rng.normal(size=law.measured)
             pair[0], state = law.step(state, r, y, place)
             pair[1], other = plain.step(other, r, y if y.size > 1 else float(y[0]))
         np.testing.assert_allclose(*pairs.T, atol=1e-11 * np.max(np.abs(pairs)))
+        assert not limited or 0.05 < np.mean(np.abs(pairs[:, 0]) == law.command_limit) < 0.95
 
 
 def test_a_tuned_one_rests_where_it_is_reset(schedule):
