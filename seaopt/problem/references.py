@@ -98,7 +98,6 @@ def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         )
     for key, there in (
         ('controller.structure = "mpc"', law.structure == "mpc"),
-        ("controller.link_feedforward", law.link_feedforward is not False),
         ("impedance", table.impedance is not None),
         ("robustness.retune", robustness is not None and robustness.retune),
         ("expect.controller", expect is not None and expect.controller is not None),

@@ -87,7 +87,6 @@ def test_a_rate_that_the_link_does_not_reach_is_named_with_what_to_change(knee, 
         ("I_p = [0.3, 0.42]", "phi = [0.3, 0.42]", "robustness.parameters.phi"),
         ("samples = 50", "retune = 2", "robustness.retune"),
         ("[robustness]", "[expect.controller]\n[robustness]", "expect.controller"),
-        ('structure = "pid"', 'structure = "pid"\nlink_feedforward = true', "controller.link_feedforward is there"),
     ],
 )
 def test_what_cannot_be_scheduled_is_one_line(knee, seaopt, text, old, new, words):

@@ -65,6 +65,7 @@ def read_runnable(
             gains={name: np.array(row) for name, row in table.gains.items()},
             structure=first["structure"],
             sample_time_s=first["sample_time_s"],
+            links=tuple(each["link"] for each in controllers if each["link"] is not None),
             nominals=tuple(each["observer"].nominal for each in controllers if each["observer"] is not None),
             speed=first["spec"].find_speed_loop(first["reads"] or list_names(first["spec"].measured)),
         ),

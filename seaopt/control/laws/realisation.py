@@ -377,7 +377,7 @@ def runnable(
     """
     law, share = controller.law, controller.share
     if share is not None:
-        gains = Gains.from_names(controller.gains, controller.observer)
+        gains = Gains.from_names(controller.gains, controller.observer, link=controller.link)
         law = gains.law(controller.spec.structure, controller.sample_time_s, share).balanced()
     return realise(
         law,

@@ -447,7 +447,10 @@ class Gains:
             wound = self.observer.limit(taken.integrated(taken.static).plus(taken.scaled(-1.0)), sample_time_s)
             law = law.widened(3).plus(wound.widened(-3))
         made = law.law(sample_time_s)
-        return made if self.link is None else made.reading(self.link.feedback(sample_time_s))
+        if self.link is None:
+            return made
+        made = made.reading(self.link.feedback(sample_time_s))
+        return made if share is None else replace(made, b=made.b[:, [0, 1, 3, 2]], d=made.d[[0, 1, 3, 2]])
 
 
 def _factors(roots: Complex[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:

@@ -24,13 +24,14 @@ The real part of 1 - q is not negative, so that this derivative is largest where
         + \max k_d \; h\,|T_f'|\,\max \Big|\frac{\partial D}{\partial T_f}\Big|
 
 holds at every frequency for the whole stretch, which `bound_change` returns over :math:`|C_y(\bar s)|`. There is no
-such rule yet for a notch, an observer and a cascade, whose change is not bounded.
+such rule yet for a notch, an observer, a cascade and a link's feedforward, whose change is not bounded.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -51,6 +52,7 @@ from seaopt.control.laws.structures import (
     Structure,
     evaluate_terms,
 )
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.scheduling.step_order import INVERSE_GAIN, StepOrder
 from seaopt.errors import ControlError
@@ -58,6 +60,7 @@ from seaopt.records import record
 
 STRUCTURES = ("pd", "pid", "pid_dob", CASCADE)  # whose gains can be interpolated
 CORNERS = {NOTCH_GAINS[0]: "notch_w", PREFILTER: "prefilter_w"}  # tan(pi f T_s) of a frequency in Hz
+LINK_NUMBERS = ("inertia", "damping")
 MOST_POINTS = 100
 
 
@@ -80,6 +83,8 @@ class GainTable:
         What a cascade's speed loop reads.
     nominals : tuple of Nominal
         The nominal plant of a pid_dob's observer at each point, the same but for its gain.
+    links : tuple of LinkPath
+        What is fed forward of the link's motion at each point, of one signal.
 
     Raises
     ------
@@ -108,6 +113,7 @@ class GainTable:
     sample_time_s: float
     speed: SpeedLoop | None = None
     nominals: tuple[Nominal, ...] = ()
+    links: tuple[LinkPath, ...] = ()
 
     def __post_init__(self) -> None:
         check_points(self.over, self.points)
@@ -129,6 +135,10 @@ class GainTable:
                     "the observers of a schedule have different nominal plants, or one that follows the command at "
                     "once, and what they keep would change its meaning from point to point; tune the schedule again"
                 )
+        if len({(link.measured, link.unit, link.is_speed, link.high_pass_hz > 0.0) for link in self.links}) > 1:
+            raise ControlError(
+                "link_feedforward of a schedule reads one signal at all points, everywhere with a high-pass or nowhere"
+            )
         integrates = np.asarray(self.gains["k_i"]) > 0.0
         if not self.nominals and np.any(integrates) and not np.all(integrates):
             at = ", ".join(f"{value:g}" for value in self.points[~integrates])
@@ -190,7 +200,24 @@ class GainTable:
         if self.nominals:
             nominal = self.nominals[0].scaled(self.find_numbers(value)[INVERSE_GAIN])
             observer = DisturbanceObserver(nominal=nominal, T_q=numbers["T_q"])
-        return Gains.from_names(numbers, observer, self.speed)
+        return Gains.from_names(numbers, observer, self.speed, self._find_link(value))
+
+    def _find_link(self, value: float) -> LinkPath | None:
+        """Return what is fed forward of the link at a value."""
+        if not self.links:
+            return None
+        (i, t), numbers, per_hz = self.find_stretch(value), self.find_numbers(value), np.pi * self.sample_time_s
+        low, high = self.links[i : i + 2]
+        fraction = low.fraction + t * (high.fraction - low.fraction)
+        per_fraction = 1.0 / fraction if fraction else 0.0
+        return replace(
+            low,
+            fraction=fraction,
+            inertia=numbers["link_inertia"] * per_fraction,
+            damping=numbers["link_damping"] * per_fraction,
+            corner_hz=float(np.arctan(numbers["link_w"])) / per_hz,
+            high_pass_hz=float(np.arctan(numbers["link_slow_w"])) / per_hz if low.high_pass_hz else 0.0,
+        )
 
     def law(self, value: float) -> Law:
         """Return the law while the variable stands at a value."""
@@ -203,7 +230,7 @@ class GainTable:
         """
         if np.any((self.points > low) & (self.points < high)):
             raise ControlError(f"a stretch from {low:g} to {high:g} has a point of the table in it; end it there")
-        if self.speed is not None or self.nominals or NOTCH_GAINS[0] in self.gains:
+        if self.speed is not None or self.nominals or self.links or NOTCH_GAINS[0] in self.gains:
             return np.full(f.size, np.inf)
         ts, half = self.sample_time_s, 0.5 * (high - low)
         first, last, middle = (self.interpolate(value) for value in (low, high, 0.5 * (low + high)))
@@ -230,6 +257,8 @@ def _find_order(table: GainTable) -> StepOrder:
         speed=table.speed,
         speed_integrates="T_v" in table.gains,
         nominal=table.nominals[0] if table.nominals else None,
+        link=("speed" if table.links[0].is_speed else "position") if table.links else None,
+        link_high_pass=bool(table.links and table.links[0].high_pass_hz),
     )
 
 
@@ -246,8 +275,15 @@ def _list_columns(table: GainTable) -> Mapping[str, Float[np.ndarray, " n"]]:
         CORNERS.get(name, name): np.tan(np.pi * row * table.sample_time_s) if name in CORNERS else np.asarray(row)
         for name, row in table.gains.items()
     }
-    gains = [nominal.inverse_gain for nominal in table.nominals]
-    return columns | ({INVERSE_GAIN: np.array(gains)} if gains else {})
+    gains, links = [nominal.inverse_gain for nominal in table.nominals], table.links
+    columns |= {INVERSE_GAIN: np.array(gains)} if gains else {}
+    if links:
+        per_hz = np.pi * table.sample_time_s
+        columns |= {f"link_{name}": np.array([x.fraction * getattr(x, name) for x in links]) for name in LINK_NUMBERS}
+        columns["link_w"] = np.array([np.tan(per_hz * link.corner_hz) for link in links])
+        if links[0].high_pass_hz:
+            columns["link_slow_w"] = np.array([np.tan(per_hz * link.high_pass_hz) for link in links])
+    return columns
 
 
 def refuse_structure(structure: str) -> ControlError:

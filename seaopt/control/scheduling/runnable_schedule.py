@@ -232,7 +232,9 @@ def make_runnable(
     # An observer sees the limited command: what winds up is the integral of the law without it.
     each = [
         realise(
-            replace(table.find_gains(point), observer=None).law(table.structure, table.sample_time_s).balanced(),
+            replace(table.find_gains(point), observer=None, link=None)
+            .law(table.structure, table.sample_time_s)
+            .balanced(),
             command_limit=limit,
             compensation=terms[0] if terms else None,
             **guards,

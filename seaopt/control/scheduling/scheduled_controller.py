@@ -22,6 +22,7 @@ from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
 from seaopt.control.scheduling.step_order import SHARE
 from seaopt.control.tuning.optimisation_problem import Task
+from seaopt.control.tuning.solution import feed_link
 from seaopt.control.tuning.tuner import describe_law, make_task
 from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import format_count, join_words
@@ -287,10 +288,10 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
     first = controllers[0]
     for point, controller in zip(points, controllers, strict=True):
         gains, speed, observer = controller.gains, controller.speed_loop, controller.observer
-        made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, observer, speed)
-        added = controller.outer is not None or controller.link is not None
-        whole = made and not added and made.makes(controller.law, controller.spec.structure)
-        if set(gains) != set(first.gains) or not whole:
+        made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, observer, speed, controller.link)
+        whole = made and controller.outer is None and made.makes(controller.law, controller.spec.structure)
+        alike = set(gains) == set(first.gains) and (controller.link is None) == (first.link is None)
+        if not alike or not whole:
             raise ControlError(
                 f"the controller at {over} = {point:g} is more than its gains, or has other parts than that at "
                 f"{points[0]:g}, and only gains are interpolated; use the same structure, notch and prefilter at all "
@@ -317,6 +318,7 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
         sample_time_s=first.sample_time_s,
         speed=first.speed_loop,
         nominals=tuple(each.observer.nominal for each in controllers if each.observer is not None),
+        links=tuple(each.link for each in controllers if each.link is not None),
     )
 
 
@@ -336,6 +338,7 @@ def freeze(
     plant, params = design[0], place_variable(*design, table.over, value)
     task = make_task(plant, plant.complete(params), spec, place_plants(others, table.over, value))
     gains, law = table.find_gains(value), table.law(value)
+    task = feed_link(task, gains.link)
 
     def describe(task: Task) -> Controller:
         loops = task.measure_law(

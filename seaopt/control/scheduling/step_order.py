@@ -21,6 +21,9 @@ Of a pid u is v. **A cascade** has a speed s, read or the difference of two posi
 
 two equal lags behind the last efforts and an inverse plant, whose factors are the same at all places.
 
+**A link's feedforward** has the filters of `seaopt.control.loops.compensation.link_feedforward` in front of its two
+numbers, outside all else: an observer sees what it makes as little as what terms add.
+
 **Filters** are state-variable ones by Tustin's rule (Zavalishin, The Art of VA Filter Design, 2012): w = tan(pi f T_s),
 
 .. math:: h = \frac{u - (2\zeta + w) s_1 - s_2}{1 + 2\zeta w + w^2}, \qquad b = w h + s_1, \qquad l = w b + s_2, \qquad
@@ -39,8 +42,9 @@ Numbers may be floats or symbols: the C code is this step, traced.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -64,11 +68,13 @@ class StepOrder:
     speed: SpeedLoop | None = None  # of a cascade
     speed_integrates: bool = False
     nominal: Nominal | None = None  # of an observer, but for the gain of its inverse
+    link: Literal["position", "speed"] | None = None  # what is fed forward of it, the last signal that is read
+    link_high_pass: bool = False
 
     @property
     def measured(self) -> int:
         """How many signals it reads."""
-        return 1 if self.speed is None else 2
+        return 1 + (self.speed is not None) + (self.link is not None)
 
     def rest(self, reference: Any, readings: Sequence[Any]) -> dict[str, Any]:
         """Return the states at rest under constant inputs, integrals at zero."""
@@ -88,7 +94,10 @@ class StepOrder:
                     x[f"inverse_{i}_{number}"] = later = (b * given - a * seen) + later
         filters = {"prefilter": reference} if self.prefilter else {}
         if self.notch:
-            filters |= {"notch_reference": reference} | {f"notch_{i}": y for i, y in enumerate(readings, start=1)}
+            law = readings[: self.measured - (self.link is not None)]
+            filters |= {"notch_reference": reference} | {f"notch_{i}": y for i, y in enumerate(law, start=1)}
+        if self.link is not None:
+            filters |= {"link_slow": readings[-1], "link": 0.0} if self.link_high_pass else {"link": readings[-1]}
         for name, value in filters.items():
             x |= {name: value} if self._is_first_order(name) else {f"{name}_band": 0.0, name: value}
         return x
@@ -98,11 +107,13 @@ class StepOrder:
         return [] if self.nominal is None else [f"effort_{i}" for i in range(1, self.nominal.kept.size)]
 
     def _is_first_order(self, name: str) -> bool:
-        return name == "prefilter" and self.prefilter == PREFILTER_ORDERS[0]
+        return name == "link_slow" or (name == "prefilter" and self.prefilter == PREFILTER_ORDERS[0])
 
     def continue_from(self, g: Numbers, effort: Any, reference: Any, readings: Sequence[Any]) -> dict[str, Any]:
         """Return the states at rest from which the next effort is one that was, where something integrates."""
         x = self.rest(reference, readings)
+        if self.link is not None:
+            effort = effort - self._feed_link(g, x, {}, readings[-1])
         outer, scale = "speed_integral" if self.speed_integrates else "integral", 1.0
         if self.nominal is not None:  # both lags rest, or the second makes the effort where nothing else can
             x |= dict.fromkeys(self._list_efforts(), effort)
@@ -127,7 +138,10 @@ class StepOrder:
     ) -> tuple[Any, Any, dict[str, Any]]:
         """Return the effort with what is added to it, what is left of it in its limit, and the next states."""
         effort, into_speed, half, after = self._evaluate(g, x, reference, readings)
-        effort = effort if added is None else effort + added
+        outside: Any = None if self.link is None else self._feed_link(g, x, after, readings[-1])
+        if added is not None:
+            outside = added if outside is None else outside + added
+        effort = effort if outside is None else effort + outside
         applied, ts, share = saturate(effort), self.sample_time_s, g[SHARE]
         excess = applied - effort
         pull = share * excess
@@ -139,7 +153,8 @@ class StepOrder:
         if self.integrates:
             after["integral"] = (x["integral"] + 2.0 * half) + pull
         efforts = self._list_efforts()
-        after |= dict(zip(efforts, (applied, *(x[name] for name in efforts[:-1])), strict=False))
+        seen = applied if outside is None else applied - outside
+        after |= dict(zip(efforts, (seen, *(x[name] for name in efforts[:-1])), strict=False))
         return effort, applied, {name: after[name] for name in x}
 
     def _evaluate(
@@ -148,7 +163,8 @@ class StepOrder:
         """Return the effort, not limited, what a speed loop integrates, what half a sample adds to the integral, and
         the next states but for integrals.
         """
-        after, ts, (y, *further) = dict[str, Any](), self.sample_time_s, readings
+        after, ts = dict[str, Any](), self.sample_time_s
+        y, *further = readings[: self.measured - (self.link is not None)]
         r = reference
         if self.prefilter:
             r = _filter(x, after, "prefilter", r, g["prefilter_w"], g.get(PREFILTER_DAMPING))[0]
@@ -181,6 +197,17 @@ class StepOrder:
         if self.speed_integrates:
             effort = (effort + (0.5 * ts / g["T_v"]) * into_speed) + x["speed_integral"]
         return effort, into_speed, half, after
+
+    def _feed_link(self, g: Numbers, x: Numbers, after: dict[str, Any], read: Any) -> Any:
+        """Return what is fed forward of the link's motion, and put down its next states."""
+        if self.link_high_pass:
+            read = read - _filter(x, after, "link_slow", read, g["link_slow_w"], None)[0]
+        low, band = _filter(x, after, "link", read, g["link_w"], math.sqrt(0.5))
+        corner = (2.0 / self.sample_time_s) * g["link_w"]
+        if self.link == "speed":
+            return corner * (g["link_inertia"] * band) + g["link_damping"] * low
+        high = (read - low) - math.sqrt(2.0) * band
+        return corner * (corner * (g["link_inertia"] * high) + g["link_damping"] * band)
 
     def _observe(self, g: Numbers, x: Numbers, after: dict[str, Any], y: Any) -> Any:
         """Return what an observer adds to the effort, and put down its next states."""

@@ -149,11 +149,6 @@ def tune_schedule(
 
 
 def _check_structure(spec: ControllerSpec) -> None:
-    if spec.link_feedforward is not None:
-        raise ControlError(
-            "link_feedforward has the model of one link, which no schedule carries from point to point; leave "
-            "link_feedforward out, or tune one law for all points: so.tune(..., draws=[{name: value}, ...])"
-        )
     if spec.structure not in STRUCTURES:
         raise refuse_structure(spec.structure)
 

@@ -72,7 +72,7 @@ def bound_stretch(
     frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s
     change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
     if np.isinf(change):
-        reason = "how far a law with a notch, an observer or a speed loop changes between two values is not bounded"
+        reason = "how far a law with other parts than a pid and a prefilter changes between two values is not bounded"
         return StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=reason)
     moves = table.over in plant.parameters or table.over in plant.states
     ranges = {table.over: (low, high)} if moves else {}  # of a plant without the variable the law alone changes

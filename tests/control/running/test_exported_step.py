@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 import seaopt as so
-from seaopt.control import GainTable
+from seaopt.control import GainTable, LinkPath
 from seaopt.control.deploy import export as export_module
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.plausibility import PlausibilityGate
@@ -37,7 +37,7 @@ HOT = {"a_11": 0.985, "a_12": 0.01, "a_21": 0.001, "a_22": 0.9989, "b_1": 0.02, 
 
 def make_plant():
     """Return a plant that hardly feels the command, so that the readings are those that the test gives."""
-    names = {"F": "N", "G": "N", "q": "m", "x": "m"}
+    names = {"F": "N", "G": "N", "H": "N", "q": "m", "x": "m"}
     return so.Plant(
         name="deaf", states={"s": ""}, inputs={"I": "A"}, outputs=names, parameters={},
         f=lambda t, x, u, p: {"s": 1e-6 * u.I - x.s}, h=lambda t, x, u, p: dict.fromkeys(names, 1e-3 * x.s),
@@ -133,10 +133,17 @@ def draw_schedule(number, rng):
         nominal = Nominal(
             kept=np.array([0.0, 0.7, 0.3]), inverse=(lag, TransferFunction(num=np.array([0.3]), den=np.ones(1)))
         )
+    links = ()
+    if shape.random() < 0.3:
+        kind = {"is_speed": bool(shape.random() < 0.5), "high_pass_hz": 2.0 * (shape.random() < 0.5)}
+        links = tuple(
+            LinkPath(measured="G", unit="m", inertia=m, damping=9.0 * m, fraction=0.5, corner_hz=20.0 * m, **kind)
+            for m in rng.uniform(0.5, 1.5, count)
+        )
     table = GainTable(
         over="phi", unit="rad", points=np.sort(rng.uniform(-1.0, 1.0, count)), sample_time_s=TS, speed=speed,
         gains={name: value * rng.uniform(0.5, 1.5, count) for name, value in gains.items()},
-        structure="pid_dob" if observer else "pid" if speed is None else "cascade",
+        links=links, structure="pid_dob" if observer else "pid" if speed is None else "cascade",
         nominals=tuple(nominal.scaled(gain) for gain in rng.uniform(0.2, 0.4, count)) if observer else (),
     )  # fmt: skip
     guards, terms = draw_guards(shape, rng), draw_terms(shape, rng, None) if shape.random() < 0.6 else None
@@ -181,7 +188,7 @@ def export_all(compiler, parts, controller, folder, monkeypatch):
         inputs = 1 + law.measured + len(reads_of(law)) + scheduled
         stored = replace(
             controller, law=source or controller.law, design=None, compensation=law.compensation,
-            reads=("F", "G")[: law.measured], command=command, outer=outer,
+            reads=("F", "G", "H")[: law.measured], command=command, outer=outer,
         )  # fmt: skip
         if scheduled:
             monkeypatch.setattr(export_module, "read_runnable", lambda *_, law=law, of=stored: (law, dict_of(of)))
@@ -224,7 +231,7 @@ def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tune
     play_c = export_all(compiler, parts, tuned, tmp_path, monkeypatch)
     saturated, differing = 0, 0
     for number, (_, force_law, outer) in enumerate(parts):
-        names, law, places = ("F", "G")[: force_law.measured], force_law, None
+        names, law, places = ("F", "G", "H")[: force_law.measured], force_law, None
         fed_back = names if outer is None else (*names, "x")
         if outer is not None:
             law = enclose_law(force_law, outer)

@@ -5,13 +5,27 @@ The plain law is another realisation (balanced, its integrators a chain), and ru
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import bilinear, lfilter
 
 import seaopt as so
-from seaopt.control import GainTable, Notch, Prefilter, ScheduledController, realise, runnable, tune_schedule
+from seaopt.control import (
+    Compensation,
+    GainTable,
+    LinkFeedforward,
+    LinkPath,
+    Notch,
+    Prefilter,
+    ScheduledController,
+    realise,
+    runnable,
+    tune_schedule,
+)
 from seaopt.control.laws.structures import Gains, SpeedLoop
+from seaopt.control.loops.compensation.ripple_term import RippleTerm
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.scheduling.runnable_schedule import make_runnable
 from seaopt.errors import ControlError
@@ -41,10 +55,11 @@ LAWS = {
 }
 
 
-def make_table(gains, speed):
+def make_table(gains, speed, links=()):
     return GainTable(
         over="phi", unit="rad", points=np.array(POINTS), structure="pid" if speed is None else "cascade",
         gains={name: np.array(row) for name, row in (PID | gains).items()}, sample_time_s=TS, speed=speed,
+        links=links,
     )  # fmt: skip
 
 
@@ -83,6 +98,43 @@ def test_a_reset_continues_from_its_command_and_stays_at_rest(name):
         assert command == pytest.approx(25.0, rel=1e-9)
 
 
+def make_link(fraction, *, is_speed, high_pass_hz):
+    return LinkPath(
+        measured="x", unit="m/s" if is_speed else "m", inertia=40.0, damping=900.0, is_speed=is_speed,
+        fraction=fraction, corner_hz=25.0, high_pass_hz=high_pass_hz,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("is_speed", [False, True])
+@pytest.mark.parametrize("high_pass_hz", [0.0, 3.0])
+def test_what_is_fed_forward_of_the_link_is_that_of_filters_by_scipy(is_speed, high_pass_hz):
+    """(M s^2 + b s) of a position, between its filters, each made sampled by itself with its own corner prewarped."""
+    links = tuple(make_link(share, is_speed=is_speed, high_pass_hz=high_pass_hz) for share in (0.4, 0.8, 0.9))
+    law = make_runnable(make_table(NOTCH, None, links))
+    w, high = (2.0 / TS * np.tan(np.pi * f * TS) for f in (25.0, high_pass_hz))
+    top = [40.0, 900.0] if is_speed else [40.0, 900.0, 0.0]
+    filters = [bilinear(np.array(top) * w**2, [1.0, np.sqrt(2.0) * w, w**2], fs=1.0 / TS)]
+    filters += [bilinear([1.0, 0.0], [1.0, high], fs=1.0 / TS)] if high_pass_hz else []
+    motion = np.cumsum(np.random.default_rng(6).normal(size=900)) * 1e-5
+    expected = 0.6 * motion  # half the way from the first point to the second
+    for num, den in filters:
+        expected = lfilter(num, den, expected)
+    state, found = law.reset(place=0.35), np.zeros(900)
+    for k, x in enumerate(motion):
+        found[k], state = law.step(state, 0.0, np.array([0.0, x]), 0.35)
+    np.testing.assert_allclose(found, expected, atol=1e-10 * np.max(np.abs(expected)))
+    state = law.reset(2.0, np.array([2.0, 0.3]), 0.35, 25.0)
+    for _ in range(50):
+        command, state = law.step(state, 2.0, np.array([2.0, 0.3]), 0.35)
+        assert command == pytest.approx(25.0, rel=1e-9)
+
+
+def test_links_that_differ_in_kind_are_refused():
+    links = [make_link(0.5, is_speed=False, high_pass_hz=high) for high in (0.0, 3.0, 3.0)]
+    with pytest.raises(ControlError, match="link_feedforward of a schedule reads one signal"):
+        make_table({}, None, tuple(links))
+
+
 def test_corners_are_lines_as_the_filter_has_them():
     table = make_table(NOTCH, None)
     middle = np.tan(np.pi * TS * np.array(NOTCH["notch_frequency_hz"][:2])).mean()
@@ -103,9 +155,21 @@ def test_the_change_of_a_law_without_a_rule_for_it_is_not_bounded(name):
     assert np.all(np.isinf(change)) == (speed is not None or "notch_width" in gains)
 
 
-@pytest.fixture(scope="module", params=["notch and prefilter", "cascade", "observer", "observer and notch"])
+PARTS = ["notch and prefilter", "cascade", "observer", "observer and notch", "link", "link and observer"]
+
+
+@pytest.fixture(scope="module", params=PARTS)
 def schedule(request):
     """Return a tuned schedule."""
+    if "link" in request.param:
+        stand, swing, values = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+        spec = so.ControllerSpec(
+            bandwidth_hz=30.0, max_sensitivity=1.6, reserve=0.03, current_limit_A=9.0,
+            link_feedforward=LinkFeedforward(),
+        )  # fmt: skip
+        if "observer" in request.param:
+            spec = replace(spec, structure="pid_dob", bandwidth_hz=20.0, max_sensitivity=1.9, max_complementary=1.6)
+        return tune_schedule(stand, values, spec, "I_p", (0.36, 0.6), {"swing": swing})
     if request.param == "cascade":
         plant, over, points = so.plants.rotary(link="locked"), "k_s", (250.0, 300.0)
         spec = so.ControllerSpec(
@@ -137,7 +201,7 @@ def test_on_the_plant_it_is_the_linear_loop_of_its_point(schedule):
 def test_an_observer_sees_the_limited_command(schedule):
     """Q and Q/P_n multiplied out, as difference equations of the test's own, beside those of the pid"""
     controller, point = schedule.controllers[0], schedule.points[0]
-    if controller.observer is None or schedule.table.order.notch:
+    if controller.observer is None or schedule.table.order.notch or schedule.table.order.link:
         pytest.skip("another law")
     law, g, n = schedule.runnable(), controller.gains, 900
     q, inverse = controller.observer.filters(TS)
@@ -173,16 +237,33 @@ def test_standing_still_a_tuned_one_is_what_runs_at_its_place(schedule, limited)
     limit, rng = None if limited else math.inf, np.random.default_rng(4)
     law = schedule.runnable(limit=limit)
     low, high = schedule.points
-    size = 0.02 if law.measured > 1 else 1.0
+    size = np.array([0.02, 0.006] if law.measured > 1 else [1.0, 0.3])
+    if schedule.table.order.link:
+        size = np.array([20.0, 3e-6])
     for place in (low, 0.6 * low + 0.4 * high) if schedule.table.nominals or not limited else (low,):
         plain = runnable(schedule.at(place), command_limit=limit)
         state, other, pairs = law.reset(place=place), plain.reset(), np.zeros((800, 2))
         for k, pair in enumerate(pairs):
-            r, y = size * (rng.normal() + 30.0 * (k < 300)), 0.3 * size * rng.normal(size=law.measured)
+            r, y = size[0] * (rng.normal() + 30.0 * (k < 300)), size[-law.measured :] * rng.normal(size=law.measured)
             pair[0], state = law.step(state, r, y, place)
             pair[1], other = plain.step(other, r, y if y.size > 1 else float(y[0]))
         np.testing.assert_allclose(*pairs.T, atol=1e-11 * np.max(np.abs(pairs)))
         assert not limited or 0.05 < np.mean(np.abs(pairs[:, 0]) == law.command_limit) < 0.95
+
+
+def test_what_is_added_is_outside_the_law_and_its_observer(schedule):
+    """A term's effort is no part of what an observer takes for the law's: of the plain law neither."""
+    term = RippleTerm(cycles=(1,), cos=(0.7,), sin=(0.2,), period=1.0, reads="z", unit="m", fraction=1.0)
+    added, rng = Compensation(sample_time_s=TS, ripple=term), np.random.default_rng(7)
+    law, (place, _) = schedule.runnable(limit=np.inf), schedule.points
+    law = replace(law, compensation=added, terms=np.array([added.numbers] * 2))
+    plain = realise(schedule.at(place).law, per_effort=law.per_effort, compensation=added)
+    state, other, pairs = law.reset(place=place), plain.reset(), np.zeros((800, 2))
+    for k, pair in enumerate(pairs):
+        r, y, z = rng.normal(), 0.01 * rng.normal(size=law.table.order.measured), [0.003 * k]
+        pair[0], state = law.step(state, r, y, place, z)
+        pair[1], other = plain.step(other, r, y if y.size > 1 else float(y[0]), z)
+    np.testing.assert_allclose(*pairs.T, atol=1e-10 * np.max(np.abs(pairs)))
 
 
 def test_a_tuned_one_rests_where_it_is_reset(schedule):
@@ -200,7 +281,7 @@ def test_every_limit_holds_at_the_points_and_between(schedule):
 
 def test_a_file_of_it_reads_back_the_same(schedule):
     written = to_json(schedule.to_dict())
-    again = ScheduledController.from_dict(json.loads(written), *schedule.design)
+    again = ScheduledController.from_dict(json.loads(written), *schedule.design, schedule.others)
     assert to_json(again.to_dict()) == written
 
 
@@ -208,14 +289,16 @@ def test_a_file_of_it_reads_back_the_same(schedule):
 def test_in_c_every_command_is_pythons(schedule, precision, share, compiler, tmp_path):
     law, compiled = schedule.runnable(), CompiledSchedule(compiler, tmp_path, schedule, precision)
     rng, several = np.random.default_rng(3), law.table.order.measured > 1
-    scale = 0.02 if several else 1.0
-    references, readings = 3.0 * scale * rng.normal(size=2000), scale * rng.normal(size=(2000, 1 + several))
-    references[800:1200] += 40.0 * scale
+    scale = np.array([0.02, 0.02] if several else [1.0])
+    if schedule.table.order.link:
+        scale = np.array([10.0, 1e-5])
+    references, readings = 3.0 * scale[0] * rng.normal(size=2000), scale * rng.normal(size=(2000, 1 + several))
+    references[800:1200] += 40.0 * scale[0]
     low, high = schedule.points
     places = low + (high - low) * (0.5 + 0.7 * np.sin(np.arange(2000) / 150.0))
     places[300:320], places[700] = np.nan, np.inf
     references[50], readings[51:55, -1] = np.nan, np.inf
-    start = (0.5, np.full(readings.shape[1], 0.2), np.nan, 1.0)
+    start = (0.5, 0.2 * scale, np.nan, 1.0)
     state, pairs = law.reset(*start), np.zeros((2000, 2))
     compiled.reset(*start)
     for pair, r, y, place in zip(pairs, references, readings, places, strict=True):
