@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields, replace
-from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -216,13 +215,6 @@ def change_plants(
         params=params.with_parameters(*added),
         starts=starts,
     )
-
-
-@cache
-def list_freed() -> frozenset[str]:
-    """Return the names of the parameters that hypotheses free."""
-    sizes = Sizes(**dict.fromkeys(SIZES, 1.0), ripple=dict.fromkeys(("a_g", "b_g", "n_g"), 1.0))
-    return frozenset(name for hypothesis in HYPOTHESES for start in hypothesis.starts(sizes) for name in start)
 
 
 def measure_sizes(fit: Fit) -> Sizes:

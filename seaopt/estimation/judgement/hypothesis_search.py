@@ -128,23 +128,23 @@ def search_hypotheses(fit: Fit, budget: int, progress: Progress = ignore, *, dou
     if (first <= ASKS and not doubtful) or minimum.problem.predicts:
         return Search()
     end = count_evaluations() + budget
-    refits = _Search(fit, minimum, end, budget, progress).run(first)
+    refits = _Search(fit, minimum, first, end, budget, progress).run()
     return _judge(refits, first, measure_colour(fit.covariance, fit.white_covariance))
 
 
 class _Search:
     """A search's budget, and what it knows of the fit; lives only inside `search_hypotheses`."""
 
-    def __init__(self, fit: Fit, minimum: Minimum, end: int, budget: int, progress: Progress) -> None:
+    def __init__(self, fit: Fit, minimum: Minimum, first: float, end: int, budget: int, progress: Progress) -> None:
         self.fit, self.minimum, self.end, self.budget, self.progress = fit, minimum, end, budget, progress
-        self.helps = HELPS
+        self.first, self.helps = first, HELPS * (1.0 - first**-2)
         self.sizes = measure_sizes(fit)
-        self.silent = {effect.part for effect in fit.silent}  # which no refit tells from other values
+        # Which no refit tells from other values; but far from the logs sensitivities say little.
+        self.silent = {effect.part for effect in fit.silent if first <= REMOVED}
         self.base = minimum.problem.evaluate(minimum.z)
 
-    def run(self, first: float) -> list[Refit]:
+    def run(self) -> list[Refit]:
         """Return the refits of single hypotheses, and of pairs with the best of them where none suffices."""
-        self.helps = HELPS * (1.0 - first**-2)
         single = list(self.try_each(self.minimum.problem, self.base, self.fit.experiments, self.fit.parameters))
         refits = sorted(single, key=lambda refit: refit.excess)
         bases = refits[:BASES]
@@ -153,7 +153,7 @@ class _Search:
         rounds = [(best, partners[number:]) for number, best in enumerate(bases[:-1], start=1)]
         for number, (best, others) in enumerate([*rounds, *((best, HYPOTHESES) for best in bases)]):
             least = min(refit.excess for refit in refits)
-            if least <= (REMOVED if number >= len(bases) else ASKS) or best.excess >= first:
+            if least <= (REMOVED if number >= len(bases) else ASKS) or best.excess >= self.first:
                 break
             values, done = _take_values(best), [set(refit.change.hypotheses) for refit in refits]
             refits += self.try_each(
@@ -183,7 +183,7 @@ class _Search:
                 continue
             self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
             try:
-                refit = _refit(change, problem, fitted, self.helps, self.base)
+                refit = _refit(change, problem, fitted, self.helps, self.base, self.end)
             except SeaoptError:  # what does not make a problem explains nothing
                 continue
             if refit is not None:
@@ -195,10 +195,13 @@ def _take_values(refit: Refit) -> ParameterSet:
     return refit.problem.params.update(**{name: refit.values[name] for name in refit.problem.shared_names})
 
 
-def _refit(change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation) -> Refit | None:
+def _refit(
+    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, end: int
+) -> Refit | None:
     """Return the minimum with a change, from the fit's, `base` the fit without any; None where it cannot be simulated.
 
-    A search that takes less than `helps` of the residual's power in a round of iterations is given up.
+    A search that takes less than `helps` of the residual's power in a round of iterations is given up, and so is one
+    that has come to `end`, a count of evaluations.
     """
     before = count_evaluations()
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
@@ -227,6 +230,8 @@ def _refit(change: Change, old: FitProblem, fitted: Evaluation, helps: float, ba
         if np.all(powers > (1.0 - helps) * np.minimum(least, before_round)) and not comes_near:
             break
         if number >= ROUNDS - 1 and not np.any(powers < HALF * before_round):
+            break
+        if count_evaluations() >= end:
             break
         least = np.minimum(least, powers)
     excess = _measure_excess(problem, evaluation.z)
@@ -294,7 +299,7 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
         for refit in refits
         if refit.excess <= max(REMOVED, NEARLY * first)
         and _takes_half(first, refit.excess)
-        and refit.gain > CHANCE * colour
+        and (first > ASKS or refit.gain > CHANCE * colour)
         and (refit in single or (best_single > ASKS and _takes_half(best_single, refit.excess)))
     ]
     least = min((refit.excess for refit in able), default=np.inf)

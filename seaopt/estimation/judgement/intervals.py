@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from seaopt.estimation.judgement.hypotheses import list_freed
 from seaopt.estimation.judgement.second_log import FAR, SECOND, find_excess, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.shapes import Signal
@@ -22,6 +21,7 @@ from seaopt.plants.friction import list_smoothing
 from seaopt.simulation.simulate import input_samples
 
 ROUGH = 0.2  # half of the width of an interval over its value, beyond which a value is known only roughly
+DEPENDS = 0.7  # correlation from which half of a value's variance is that of another one
 UNSEEN = 0.02  # of an output's spread: what may be zero is known well enough where half its interval does less
 BLOCKS, EVENT = 64, 0.1  # of a log: in so many blocks an input moves or rests; and the longest event, as a share
 MOVES = 0.01  # of the block in which an input moves the most
@@ -54,14 +54,14 @@ def find_excesses(fit: Fit) -> Iterator[FitFinding]:
 
 def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
     """Yield free parameters whose interval is wider than a design can use. One that may be zero, as a friction that a
-    plant need not have, is known well enough where it hardly does anything; how large an effect is that hypotheses
-    bring does not have to be known, as long as the actuator's values are.
+    plant need not have, is known well enough where it hardly does anything; how large an effect is that a part brings
+    does not have to be known, as long as the actuator's values do not depend on it.
     """
     if fit.status != "converged":
         return
     plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
     smoothing = {name for plant in plants for name in list_smoothing(plant)}
-    effects = list_freed()
+    effects = _list_effects(fit)
     for name in fit.covariance.names:
         parameter = fit.parameters[name]
         if parameter.known is None or parameter.known <= ROUGH or not parameter.identified or parameter.at_bound:
@@ -80,6 +80,22 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "
             "output, fix it, or give it a prior",
         )
+
+
+def _list_effects(fit: Fit) -> set[str]:
+    """Return the free parameters that parts bring around an actuator, and that none of its own values depends on."""
+    added = set[str]()
+    for experiment in fit.experiments:
+        recipe, plant = experiment.plant.recipe, experiment.plant
+        added |= plant.parameters.keys() - recipe.make(()).parameters.keys() if recipe is not None else set()
+    names, matrix = fit.total_covariance.names, fit.total_covariance.matrix
+    stds = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    own = [i for i, name in enumerate(names) if name not in added]
+    return {
+        name
+        for i, name in enumerate(names)
+        if name in added and not np.any(np.abs(matrix[i, own]) > DEPENDS * stds[i] * stds[own])
+    }
 
 
 def find_single_event(experiments: Sequence[Experiment]) -> Iterator[FitFinding]:

@@ -159,15 +159,14 @@ def _tells(fit: Fit, validation: Experiment) -> bool:
 def _reach(
     fit: Fit, findings: Sequence[FitFinding], error: ModelError, *others: Mapping[str, float]
 ) -> tuple[Fit, list[FitFinding]]:
-    """Return the fit with intervals that reach to other values of its parameters, by what they differ the most, and the
-    findings with what is then known only roughly.
+    """Return the fit with intervals that reach to other values of its parameters and delays, by what they differ the
+    most, and the findings with what is then known only roughly.
     """
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
-    free = fit.covariance.names
-    before = {name: fit.parameters[name].value for name in free}
-    apart = [[values.get(name, before[name]) - before[name] for values in others] for name in free]
-    shift = [max(each, key=abs) for each in apart]
-    shift = np.array([*shift, *([0.0] * (len(noise.names) - len(free)))])
+    minimum = fit.require_minimum("_reach")
+    before = minimum.problem.unknowns.by_name(minimum.z)
+    apart = [[values.get(name, before[name]) - before[name] for values in others] for name in noise.names]
+    shift = np.array([max(each, key=abs) for each in apart])
     fit = widen(fit, np.outer(shift, shift))
     return fit, [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
 

@@ -23,6 +23,7 @@ from seaopt.plants.friction import friction_matrices, remove_friction
 from seaopt.plants.plant import Plant, state_space
 
 MOST = 1200  # wave numbers that are tried
+LONGEST = 10_000  # samples, of a segment's beginning, that are looked at: each wave number costs two spectra of them
 FINE = 8  # steps on either side of the best
 LEAST = 0.1  # of a residual's power that a ripple has to account for
 TURNS = 0.25  # of a period, the most that the motor moves in a sample
@@ -42,8 +43,9 @@ def find_ripple(
 
     `position`: of the motor as the fit has it, over segment `number`.
     """
-    raw = left.segments[number].raw.T
-    raw = np.nan_to_num(raw - np.nanmean(raw, axis=1, keepdims=True))[:, : position.size]
+    position = position[:LONGEST]
+    raw = left.segments[number].raw.T[:, : position.size]
+    raw = np.nan_to_num(raw - np.nanmean(raw, axis=1, keepdims=True))
     size = np.sqrt(np.sum(raw**2, axis=1))
     travel, moved = float(np.ptp(position)), np.abs(np.gradient(position))
     if not travel or not np.all(size > 0.0):

@@ -29,6 +29,7 @@ from seaopt.estimation.result.covariance import compute_bread, compute_meat
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import find_blocked
 from seaopt.parameters import ParameterSet
+from seaopt.plants.published import GRAVITY
 from seaopt.records import record
 from seaopt.simulation import make_model
 
@@ -99,8 +100,8 @@ def find_candidates(problem: FitProblem, fit: Fit) -> tuple[tuple[str, ...], tup
     bending: list[str] = []
     for name in fit.parameters:
         users = [e for e in problem.experiments if name in e.data.plant.parameters and name not in e.data.parameters]
-        if name in free or not users:
-            continue
+        if name in free or not users or all(e.data.plant.parameters[name] == GRAVITY for e in users):
+            continue  # a constant is not at fault
         models = (
             make_model(e.data.plant, e.data.apply_own(fit.parameters), (*e.model.free, name), e.data.outputs)
             for e in users
