@@ -23,6 +23,7 @@ from seaopt.control.loops.sampled_plant import (
     linearise_sets,
     sample_linear,
 )
+from seaopt.control.systems.resolvent import Resolvent
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import SLIDING, find_bristle_stiffness, friction_matrices, friction_slopes, friction_states
@@ -82,7 +83,8 @@ class FrictionLoop:
         """
         period = self.plant.sample_time_s
         s = 1j * (theta[:, None] + 2 * np.pi * orders) / period
-        response = transfer(self.a, np.column_stack([self.friction, self.motor]), seen, s)
+        resolvent = Resolvent.of(self.a, np.column_stack([self.friction, self.motor]), seen)
+        response = np.moveaxis(resolvent.respond(s.ravel()), -1, 0).reshape(*s.shape, len(seen), -1)
         # The hold over a period, (1 - exp(-sT))/(sT): the numerator is the same at all aliases.
         drive = (-np.expm1(-1j * theta) * np.exp(-1j * theta * self.plant.delay_samples))[:, None] / (s * period)
         if self.delay_s:
@@ -101,30 +103,6 @@ class FrictionResponse:
 
     by_friction: Complex[np.ndarray, "m k y p"]  # per unit of each friction effort, as it pushes
     by_motor: Complex[np.ndarray, "m k y"]  # per unit of the sampled motor command at the fundamental, delayed and held
-
-
-def transfer(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n u"], c: Float[np.ndarray, "y n"], s: Complex[np.ndarray, "m k"]
-) -> Complex[np.ndarray, "m k y u"]:
-    """Return c (sI - a)^-1 b, by back substitution in a Schur basis of the balanced matrix, for all s at once."""
-    from scipy.linalg import matrix_balance, schur
-
-    balanced, transform = matrix_balance(a, permute=False)
-    scale = np.diag(transform)
-    triangle, basis = np.array(schur(balanced, output="complex")[:2])
-    right, left = basis.conj().T @ (b / scale[:, None]), (c * scale) @ basis
-    n, flat = len(triangle), s.ravel()
-    x = np.empty((n, right.shape[1], flat.size), dtype=complex)
-    for i in range(n - 1, -1, -1):
-        x[i] = right[i][:, None]
-        for j in range(i + 1, n):  # no matrix product: BLAS starts threads for it, which cost more than they save
-            x[i] += triangle[i, j] * x[j]
-        x[i] *= 1.0 / (flat - triangle[i, i])
-    out = np.zeros((len(left), right.shape[1], flat.size), dtype=complex)
-    for row, weights in zip(out, left, strict=True):
-        for weight, state in zip(weights, x, strict=True):
-            row += weight * state
-    return np.moveaxis(out, -1, 0).reshape(*s.shape, *out.shape[:2])
 
 
 def make_friction_loops(

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.polynomial.polynomial import polypow
-from scipy.linalg import block_diag, schur
+from scipy.linalg import block_diag
 
 from seaopt.control.loops.minimal import (
     NEAR_ONE,
@@ -45,6 +45,7 @@ from seaopt.control.loops.minimal import (
 )
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.systems.block import COMMAND, EFFORT, REFERENCE, Block, name_readings
+from seaopt.control.systems.resolvent import Resolvent
 from seaopt.errors import ControlError
 from seaopt.formatting import format_count
 from seaopt.records import record
@@ -136,19 +137,15 @@ class Law:
 
     def evaluate(self, from_one: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
         """Return u per reference and per measured signal at z = 1 + from_one."""
-        m, triangle, left, right = _factorise(self)
+        m, resolvent = _factorise(self)
         distance = np.where(np.abs(from_one) < NEAREST_TO_ONE, NEAREST_TO_ONE, from_one)
         out = np.repeat(self.d[:, None], from_one.size, axis=1).astype(complex)
         power = np.ones_like(distance)
         for row in self.b[:m]:
             power = power / distance
             out += np.multiply.outer(row, power)
-        if not left.size:
-            return out
-        x = np.zeros((left.size, from_one.size), dtype=complex)
-        for i in range(left.size):  # x (zI - triangle) = left
-            x[i] = (left[i] + triangle[:i, i] @ x[:i]) / (from_one + (1.0 - triangle[i, i]))
-        return out + right.T @ x
+        apart = from_one + (1.0 - resolvent.poles[:, None])
+        return out + resolvent.read(resolvent.solve(apart, resolvent.right[:, :, None]))[:, 0]
 
     def balanced(self) -> Law:
         """Return the same law with what does not integrate balanced and of least order; as it is if that hardly decays.
@@ -423,15 +420,10 @@ def _count_integrators(law: Law) -> int:
 
 
 @lru_cache(maxsize=32)
-def _factorise(
-    law: Law,
-) -> tuple[int, Complex[np.ndarray, "n n"], Complex[np.ndarray, " n"], Complex[np.ndarray, "n k"]]:
-    """Return how many states integrate, and of the rest the Schur form with its output and inputs, once for a law."""
+def _factorise(law: Law) -> tuple[int, Resolvent]:
+    """Return how many states integrate, and of the rest the resolvent from its output to its inputs, once for a law."""
     a, b, c = law.rest
-    if not c.size:
-        return law.integrators, a + 0j, c + 0j, b + 0j
-    triangle, basis = (np.asarray(part) for part in schur(a, output="complex")[:2])
-    return law.integrators, triangle, c @ basis, basis.conj().T @ b
+    return law.integrators, Resolvent.of(a.T, c[:, None], b.T)
 
 
 def make_static_law(gain: float, sample_time_s: float, measured: int = 1) -> Law:

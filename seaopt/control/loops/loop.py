@@ -40,7 +40,7 @@ STABLE, GROWING = 1.0 - 1e-11, 1.0 + 1e-9
 
 @record
 class LoopFigures:
-    """Figures of a closed loop; frequencies in Hz, None where there is none.
+    """Figures of a closed loop; frequencies in Hz, None where there is none. The defaults are those of an unstable one.
 
     Parameters
     ----------
@@ -81,21 +81,21 @@ class LoopFigures:
 
     stable: bool
     spectral_radius: float
-    bandwidth_hz: float | None
-    tracking_band_hz: tuple[float, float] | None
-    crossover_hz: float | None
-    sensitivity_bandwidth_hz: float
-    ms: float
-    mt: float
-    ms_hz: float
-    reference_peak: float
-    droop_db: float
-    return_hz: float | None
-    gain_margin_db: float | None
-    phase_margin_deg: float | None
-    delay_margin_s: float | None
-    disk_margin: float
-    noise_gain: float
+    bandwidth_hz: float | None = None
+    tracking_band_hz: tuple[float, float] | None = None
+    crossover_hz: float | None = None
+    sensitivity_bandwidth_hz: float = 0.0
+    ms: float = np.inf
+    mt: float = np.inf
+    ms_hz: float = np.nan
+    reference_peak: float = np.inf
+    droop_db: float = np.inf
+    return_hz: float | None = None
+    gain_margin_db: float | None = 0.0
+    phase_margin_deg: float | None = 0.0
+    delay_margin_s: float | None = 0.0
+    disk_margin: float = 0.0
+    noise_gain: float = np.inf
     other_noise_gains: tuple[float, ...] = ()
 
     @property
@@ -117,30 +117,6 @@ class LoopFigures:
             for value in (self.gain_margin_db, self.phase_margin_deg, self.delay_margin_ms)
         )
         return f"gain margin {gain} dB, phase margin {phase} deg, delay margin {delay} ms"
-
-
-def make_unstable_figures(spectral_radius: float, signals: int = 1) -> LoopFigures:
-    """Return the figures of a loop that is not stable, whose law reads so many signals."""
-    return LoopFigures(
-        stable=False,
-        spectral_radius=spectral_radius,
-        bandwidth_hz=None,
-        tracking_band_hz=None,
-        crossover_hz=None,
-        sensitivity_bandwidth_hz=0.0,
-        ms=np.inf,
-        mt=np.inf,
-        ms_hz=np.nan,
-        reference_peak=np.inf,
-        droop_db=np.inf,
-        return_hz=None,
-        gain_margin_db=0.0,
-        phase_margin_deg=0.0,
-        delay_margin_s=0.0,
-        disk_margin=0.0,
-        noise_gain=np.inf,
-        other_noise_gains=(np.inf,) * (signals - 1),
-    )
 
 
 @record(eq=False)
@@ -251,7 +227,9 @@ class Loop:
         system = self.system()
         radius = float(np.max(np.abs(system.poles), initial=0.0))
         if not radius < STABLE:
-            return make_unstable_figures(radius, self.law.d.size - 1)
+            return LoopFigures(
+                stable=False, spectral_radius=radius, other_noise_gains=(np.inf,) * (self.law.d.size - 2)
+            )
         extremes = find_extremes(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
         (ms, mt, skew, noise, reference, *further), ms_at = extremes.peaks, extremes.at[0]

@@ -18,6 +18,8 @@ delay in it.
 
 from __future__ import annotations
 
+from dataclasses import field
+
 import numpy as np
 from jaxtyping import Float
 
@@ -80,15 +82,15 @@ class Margins:
         Symmetric, S-based and T-based.
     """
 
-    gain_up_db: float | None
-    gain_down_db: float | None
-    phase_deg: float | None
-    phase_hz: float | None
-    delay_s: float | None
-    delay_hz: float | None
-    gain_crossings: tuple[tuple[float, float], ...]
-    phase_crossings: tuple[tuple[float, float], ...]
-    disks: dict[str, DiskMargin]
+    gain_up_db: float | None = 0.0
+    gain_down_db: float | None = 0.0
+    phase_deg: float | None = 0.0
+    phase_hz: float | None = None
+    delay_s: float | None = 0.0
+    delay_hz: float | None = None
+    gain_crossings: tuple[tuple[float, float], ...] = ()
+    phase_crossings: tuple[tuple[float, float], ...] = ()
+    disks: dict[str, DiskMargin] = field(default_factory=dict[str, DiskMargin])
 
 
 def margins(loop: Loop) -> Margins:
@@ -106,17 +108,7 @@ def margins(loop: Loop) -> Margins:
     """
     system = loop.system()
     if not np.max(np.abs(system.poles), initial=0.0) < STABLE:
-        return Margins(
-            gain_up_db=0.0,
-            gain_down_db=0.0,
-            phase_deg=0.0,
-            phase_hz=None,
-            delay_s=0.0,
-            delay_hz=None,
-            gain_crossings=(),
-            phase_crossings=(),
-            disks={},
-        )
+        return Margins()
     extremes = find_extremes(system)
     hz = 1.0 / (2 * np.pi * loop.plant.sample_time_s)
     gains, lag, delays = extremes.gains_db, extremes.lags_deg, extremes.delays * loop.plant.sample_time_s

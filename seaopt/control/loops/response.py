@@ -41,6 +41,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control.loops.law import Law
 from seaopt.control.systems.block import COMMAND, EFFORT, REFERENCE, Block, connect
+from seaopt.control.systems.resolvent import Resolvent
 from seaopt.records import record
 
 SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
@@ -92,10 +93,7 @@ class ClosedLoop:
     b: Float[np.ndarray, "n i"]
     c: Float[np.ndarray, "o n"]
     d: Float[np.ndarray, "o i"]
-    # triangle, right, left: the complex Schur form of `a`, and `b` and `c` in its basis
-    triangle: Complex[np.ndarray, "n n"]
-    right: Complex[np.ndarray, "n i"]
-    left: Complex[np.ndarray, "o n"]
+    resolvent: Resolvent  # of `a`, `b` and `c`
     opened: Complex[np.ndarray, " n"]  # the poles of plant and law, which are the zeros of S
     # the matrices of plant and law whose eigenvalues those are, but for the law's integrators
     blocks: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
@@ -105,11 +103,11 @@ class ClosedLoop:
     @property
     def poles(self) -> Complex[np.ndarray, " n"]:
         """The eigenvalues of `a`."""
-        return self.triangle.diagonal()
+        return self.resolvent.poles
 
     def curves(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
         """Return S, T, S - T, C_y S, F/F_ref and what else is in the table at angles (rad) on the unit circle."""
-        return self._combine(self._solve(self._from_poles(np.exp(1j * theta)), self.right[:, :, None]))
+        return self._combine(self.resolvent.respond(np.exp(1j * theta)))
 
     def sensitivity(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
@@ -132,39 +130,22 @@ class ClosedLoop:
         the curve number `which` of each angle, shape (m,).
         """
         z = np.exp(1j * theta)
-        distance = self._from_poles(z)
-        x = self._solve(distance, self.right[:, :, None])
-        values: Any = self._combine(x, which)
-        turned: Any = self._combine(self._solve(distance, x), which, direct=False) * (-1j * z)
+        resolvent, distance = self.resolvent, z - self.poles[:, None]
+        x = resolvent.solve(distance, resolvent.right[:, :, None])
+        values: Any = self._combine(resolvent.read(x), which)
+        turned: Any = self._combine(resolvent.read(resolvent.solve(distance, x)), which, direct=False) * (-1j * z)
         size = np.maximum(values.real**2 + values.imag**2, 1e-150)
         return values, (values.real * turned.real + values.imag * turned.imag) / size**2
 
-    def _from_poles(self, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, "n m"]:
-        return z - self.poles[:, None]
-
-    def _solve(
-        self, distance: Complex[np.ndarray, "n m"], rhs: Complex[np.ndarray, "n i k"]
-    ) -> Complex[np.ndarray, "n i m"]:
-        """Return (zI - A)^-1 rhs in the Schur basis, by back substitution, of the distances of z from the poles."""
-        (n, count), inputs = distance.shape, self.right.shape[1]
-        x = np.zeros((n, inputs, count), dtype=complex)
-        flat = x.reshape(n, inputs * count)
-        for i in range(n - 1, -1, -1):
-            above = self.triangle[i, i + 1 :] @ flat[i + 1 :]
-            x[i] = (rhs[i] + above.reshape(inputs, -1)) / distance[i]
-        return x
-
     def _combine(
-        self, x: Complex[np.ndarray, "n i m"], which: Indices | None = None, direct: bool = True
+        self, out: Complex[np.ndarray, "o i m"], which: Indices | None = None, direct: bool = True
     ) -> Complex[np.ndarray, "*k m"]:
-        """Return the transfer functions of a state, or of each angle's state one, with or without direct terms."""
-        n, inputs, count = x.shape
+        """Return the curves of all responses, or of each angle's the curve `which`, with or without direct terms."""
         table, through = self.table, self.through
-        out = (self.left @ x.reshape(n, inputs * count)).reshape(self.left.shape[0], inputs, count)
         if which is None:
             values = table.factors[:, None] * out[table.outputs, table.inputs]
             return values + through[:, None] if direct else values
-        values = table.factors[which] * out[table.outputs[which], table.inputs[which], np.arange(count)]
+        values = table.factors[which] * out[table.outputs[which], table.inputs[which], np.arange(which.size)]
         return values + through[which] if direct else values
 
     def modulus(self, curve: int, level: float) -> Pencil:
@@ -201,7 +182,7 @@ class ClosedLoop:
 
 def close(plant: Block, law: Law) -> ClosedLoop:
     """Return the loop of a plant and u = C_r r - C_y m; of a plant that is not finite an unstable one."""
-    from scipy.linalg import matrix_balance, schur
+    from scipy.linalg import matrix_balance
 
     measured, regulated, *_ = len(plant.outputs), *plant.outputs
     inputs, outputs = (regulated, REFERENCE), (regulated, EFFORT)
@@ -216,36 +197,22 @@ def close(plant: Block, law: Law) -> ClosedLoop:
     whole = np.zeros((n + side, n + side))
     whole[:n, : n + b.shape[1]], whole[n : n + len(c), :n] = np.hstack([a, b]), c
     if not np.max(np.abs(whole)) < LARGEST_ENTRY:
-        gone = np.diag(opened)
-        return ClosedLoop(
-            a=a,
-            b=b,
-            c=c,
-            d=d,
-            triangle=gone,
-            right=b + 0j,
-            left=c + 0j,
-            opened=opened,
-            blocks=(plant.a, law.rest[0]),
-            table=table,
-            through=through,
-        )
-    with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
-        scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
-        scale = scale[:n] / np.prod(scale[n:]) ** (1.0 / side)
-        balanced = a * scale / scale[:, None], b / scale[:, None], c * scale
-    if all(np.all(np.isfinite(matrix)) for matrix in balanced):
-        a, b, c = balanced
-    triangle, basis = (np.asarray(matrix) for matrix in schur(a, output="complex")[:2])
-    opened = np.concatenate([np.linalg.eigvals(plant.a), law.poles]).astype(complex)
+        resolvent = Resolvent(triangle=np.diag(opened), right=b + 0j, left=c + 0j)
+    else:
+        with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
+            scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
+            scale = scale[:n] / np.prod(scale[n:]) ** (1.0 / side)
+            balanced = a * scale / scale[:, None], b / scale[:, None], c * scale
+        if all(np.all(np.isfinite(matrix)) for matrix in balanced):
+            a, b, c = balanced
+        resolvent = Resolvent.of(a, b, c)
+        opened = np.concatenate([np.linalg.eigvals(plant.a), law.poles]).astype(complex)
     return ClosedLoop(
         a=a,
         b=b,
         c=c,
         d=d,
-        triangle=triangle,
-        right=basis.conj().T @ b,
-        left=c @ basis,
+        resolvent=resolvent,
         opened=opened,
         blocks=(plant.a, law.rest[0]),
         table=table,

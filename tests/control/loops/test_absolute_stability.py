@@ -14,7 +14,7 @@ import seaopt as so
 from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.laws.friction_margin import find_friction_margin, find_friction_margins
 from seaopt.control.loops import absolute_stability as proof
-from seaopt.control.loops.friction_loop import FrictionLoop, transfer
+from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError
 from tests.laws import law_of, measurement_matrices
@@ -165,16 +165,6 @@ def test_a_loop_that_needs_friction_is_not_shown_stable():
     margin = find_friction_margin(controller, swing, actuator)
     eigenvalues = controller.close(swing, actuator.update(f_c=0.0)).eigenvalues()
     assert margin.shown <= bool(np.max(np.abs(eigenvalues)) < 1.0)
-
-
-def test_the_responses_are_those_of_a_solve_at_each_point():
-    """Four states of very different size: back substitution against numpy's own solution, one point at a time."""
-    a = np.array([[0, 1, 0, 0], [-3e5, -20, 4e3, 0], [0, 0, -1e3, 5e4], [2e-3, 0, 0, -300.0]])
-    b, c = np.array([[0.0, 1.0], [3.0, 0.1], [0.0, 0.0], [1e-3, 0.0]]), np.array([[0.0, 1.0, 0.0, 2e2]])
-    s = 1j * np.array([[0.1, 3.0], [500.0, -2e5]])
-    found = transfer(a, b, c, s)
-    for place in np.ndindex(s.shape):
-        np.testing.assert_allclose(found[place], c @ np.linalg.solve(s[place] * np.eye(4) - a, b), rtol=1e-9)
 
 
 def test_one_friction_is_tested_as_many_are():

@@ -32,7 +32,6 @@ from seaopt.control.loops.loop import (
     SHOULDER,
     SHOULDER_FALL,
     LoopFigures,
-    make_unstable_figures,
 )
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.peaks import HALF_POWER
@@ -105,7 +104,7 @@ class DiscLoop:
         :math:`|1 - e^{-j\omega\tau}| < 1/|T|` at every frequency.
         """
         if not self.is_stable():
-            return make_unstable_figures(np.inf)
+            return LoopFigures(stable=False, spectral_radius=np.inf)
         f = self.grid()
         p, r = self.plant.response(f), self.plant.discs(f)
         reference, negative = self.law.responses(f)[:2]
