@@ -220,11 +220,12 @@ def largest_step(plant: DigitalPlant, effort_limit: float) -> float:
     """Return how far an output moves at most in a sample, the effort limited. Raises ControlError: it never rests."""
     if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) >= 1.0:
         raise ControlError("the plant does not come to rest by itself, so that no step is the largest; give max_step_N")
-    x, before, total, largest = plant.b, plant.d, abs(plant.d), abs(plant.d)
+    x, row, before = plant.b, plant.c[0], float(plant.d[0])
+    total = largest = abs(before)
     for _ in range(MOST_TERMS):
-        now = float(plant.c @ x)
+        now = float(row @ x)
         total += abs(now - before)
         largest, before, x = max(largest, abs(now)), now, plant.a @ x
-        if np.linalg.norm(plant.c) * np.linalg.norm(x) <= SETTLED * largest:
+        if np.linalg.norm(row) * np.linalg.norm(x) <= SETTLED * largest:
             break
     return effort_limit * (total + abs(before))

@@ -170,7 +170,7 @@ class Nominal:
     def of(cls, plant: DigitalPlant) -> Nominal:
         """Split a sampled plant."""
         a = np.poly(plant.a)
-        b = np.poly(plant.a - np.outer(plant.b, plant.c)) - a + plant.d * a  # of z, descending: of q, ascending
+        b = np.poly(plant.a - np.outer(plant.b, plant.c[0])) - a + plant.d[0] * a  # of z, descending: of q, ascending
         lead = int(np.argmax(np.abs(b) > 1e-9 * np.max(np.abs(b))))
         zeros = np.roots(b[lead:]).astype(complex)
         inverted = (np.abs(zeros) < LARGEST_INVERTED) & (np.real(zeros) > 0.0)

@@ -52,7 +52,7 @@ from seaopt.records import record
 
 SLOW_LAG = 1e-3  # distance from 1 of a pole that may have been meant to be an integrator
 SAME_POLE = 1e-3  # to which poles that are equal are computed
-NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
+NO_COEFFICIENT = 1e-7  # of a polynomial that begins with 1: what rounding leaves of some twenty poles at zero is below
 if TYPE_CHECKING:
     import control
 

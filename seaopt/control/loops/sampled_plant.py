@@ -58,37 +58,27 @@ class DigitalPlant:
     Parameters
     ----------
     a, b, c, d
-        Matrices, shapes (n, n), (n,), (n,) and a number: y is the regulated output.
+        Matrices, shapes (n, n), (n,), (y, n) and (y,): a row for each output that a law reads, the regulated one first.
     sample_time_s : float
         Seconds.
     delay_samples : int
         From measurement to output, besides the hold.
     static_gain : float
         y/u at 0 Hz, from the continuous plant; infinite where it has an integrator.
-    others : (c, d), optional
-        The same of further outputs that a law reads, shapes (k, n) and (k,).
     """
 
     a: Float[np.ndarray, "n n"]
     b: Float[np.ndarray, " n"]
-    c: Float[np.ndarray, " n"]
-    d: float
+    c: Float[np.ndarray, "y n"]
+    d: Float[np.ndarray, " y"]
     sample_time_s: float
     delay_samples: int
     static_gain: float
-    others: tuple[Float[np.ndarray, "k n"], Float[np.ndarray, " k"]] | None = None
 
     @property
     def nyquist_hz(self) -> float:
         """Half the sample rate."""
         return 0.5 / self.sample_time_s
-
-    @property
-    def sensed(self) -> tuple[Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]:
-        """Rows c and numbers d of every output, the regulated one's first."""
-        if self.others is None:
-            return self.c[None], np.array([self.d])
-        return np.vstack([self.c, self.others[0]]), np.append(self.d, self.others[1])
 
     def response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return P(z) z^-delay at frequencies in Hz, of the regulated output."""
@@ -98,12 +88,12 @@ class DigitalPlant:
         """Return P(z) z^-delay at frequencies in Hz, of every output."""
         z = np.exp(2j * np.pi * f * self.sample_time_s)
         x = np.linalg.solve(z[:, None, None] * np.eye(self.b.size) - self.a, self.b[None, :, None])[..., 0]
-        return np.array([(x @ c + d) * z**-self.delay_samples for c, d in zip(*self.sensed, strict=True)])
+        return np.array([(x @ c + d) * z**-self.delay_samples for c, d in zip(self.c, self.d, strict=True)])
 
     @property
     def block(self) -> Block:
         """The plant from the command to every output, with the delay as states."""
-        return make_plant(self.a, self.b, *self.sensed, self.delay_samples)
+        return make_plant(self.a, self.b, self.c, self.d, self.delay_samples)
 
 
 def sample(
@@ -153,12 +143,11 @@ def sample_linear(
         DigitalPlant(
             a=a,
             b=b,
-            c=c[0],
-            d=float(d[0]),
+            c=c,
+            d=d,
             sample_time_s=sample_time_s,
             delay_samples=delay_samples,
             static_gain=_compute_static_gain(*(block[k] for block in plants)),
-            others=(c[1:], d[1:]) if len(c) > 1 else None,
         )
         for k, (a, b, c, d) in enumerate(zip(*hold(*plants, sample_time_s, delay_s), strict=True))
     ]

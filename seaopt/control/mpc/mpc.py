@@ -538,8 +538,8 @@ def _design(
         a=digital.a,
         b=kalman.B[:nx, 0],
         late=kalman.late[:nx, 0],
-        c=digital.c,
-        w=digital.c + spec.lag_s * rate,
+        c=digital.c[0],
+        w=digital.c[0] + spec.lag_s * rate,
         gain=gain,
         sample_time_s=spec.sample_time_s,
     )
@@ -578,12 +578,12 @@ def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec, limit: floa
             f"{plant.name} does not come to rest by itself, so that no {source} belongs to a {word}; design on the "
             "stand"
         )
-    gain = float(digital.c @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
+    gain = float(digital.c[0] @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
     if abs(gain) < 1e-9:
         raise ControlError(f"{spec.measured} of {plant.name} does not follow a constant {source}; design on the stand")
-    if digital.d != 0.0:
+    if digital.d[0] != 0.0:
         raise ControlError(
-            f"{spec.measured} of {plant.name} follows the {source} at once (d = {digital.d:.3g}); "
+            f"{spec.measured} of {plant.name} follows the {source} at once (d = {digital.d[0]:.3g}); "
             f"control the spring's {word}"
         )
     largest = abs(gain) * limit

@@ -30,7 +30,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.loops.peaks import HALF_POWER
-from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.mpc.force_plant import ForcePlant
 from seaopt.control.mpc.knots import interpolate_knots
 from seaopt.control.mpc.output_bounds import OutputBounds
@@ -92,20 +91,14 @@ def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
 
     A, b = plant.add_command()
     resting = np.linalg.solve(np.eye(plant.b.size) - plant.a, plant.b + plant.late) / plant.gain  # x_s per newton
-    below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
+    below, row = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW), np.append(plant.c, 0.0)
 
     def tracking(candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
-        loop = DigitalPlant(
-            a=A - np.outer(b, np.append(candidate.K_x, candidate.K_u)),
-            b=b * (candidate.K_x @ resting + candidate.K_u / plant.gain),
-            c=np.append(plant.c, 0.0),
-            d=0.0,
-            sample_time_s=plant.sample_time_s,
-            delay_samples=0,
-            static_gain=1.0,
-        )
-        return np.abs(loop.response(f))
+        closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))
+        drive = b * (candidate.K_x @ resting + candidate.K_u / plant.gain)
+        inner = np.exp(2j * np.pi * f * plant.sample_time_s)[:, None, None] * np.eye(b.size) - closed
+        return np.abs(np.linalg.solve(inner, drive[None, :, None])[..., 0] @ row)
 
     def excess(log_rho: float) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth; it falls with the weight."""

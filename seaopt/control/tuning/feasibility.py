@@ -77,10 +77,10 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
 
 def _count_waiting(plant: DigitalPlant) -> int:
     """Return after how many samples an output first answers, the drive's delay among them."""
-    if plant.d:
+    if plant.d[0]:
         return plant.delay_samples
     x, late = plant.b, 1
-    while plant.c @ x == 0.0 and late <= x.size:
+    while plant.c[0] @ x == 0.0 and late <= x.size:
         x, late = plant.a @ x, late + 1
     return plant.delay_samples + late
 

@@ -210,7 +210,7 @@ def _ease_fall(sliding: PlantWithFriction, share: float) -> PlantWithFriction:
     loop, left = sliding.loop, (1.0 - share) * np.minimum(sliding.flattest, 0.0)
     a = loop.a + (loop.friction * left) @ loop.velocity
     c = loop.sensed + (loop.through * left) @ loop.velocity
-    linear = (a[None], loop.motor[None], c[None], loop.plant.sensed[1][None])
+    linear = (a[None], loop.motor[None], c[None], loop.plant.d[None])
     delay_s = np.array([loop.delay_s])
     (plant,) = sample_linear(linear, delay_s, loop.plant.sample_time_s, loop.plant.delay_samples)
     eased = replace(loop, a=a, sensed=c, slopes=loop.slopes + left, plant=plant)

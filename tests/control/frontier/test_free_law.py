@@ -25,7 +25,7 @@ LIFTED = {
 def delayed_gain(samples, rate_hz, gain=1.0):
     """A gain whose answer comes some samples late, one at least."""
     return DigitalPlant(
-        a=np.zeros((1, 1)), b=np.array([gain]), c=np.ones(1), d=0.0, sample_time_s=1.0 / rate_hz,
+        a=np.zeros((1, 1)), b=np.array([gain]), c=np.ones((1, 1)), d=np.zeros(1), sample_time_s=1.0 / rate_hz,
         delay_samples=samples - 1, static_gain=gain,
     )  # fmt: skip
 
@@ -140,7 +140,13 @@ def draw_plant(rng, rate):
     b, c = np.array([0.0, 0.0, 1.0]), np.array([1.0, rng.uniform(-1.0, 1.0), 0.0])
     gain = float(c @ np.linalg.solve(np.eye(3) - a, b))
     return DigitalPlant(
-        a=a, b=b / gain, c=c, d=0.0, sample_time_s=1.0 / rate, delay_samples=int(rng.integers(0, 3)), static_gain=1.0
+        a=a,
+        b=b / gain,
+        c=c[None],
+        d=np.zeros(1),
+        sample_time_s=1.0 / rate,
+        delay_samples=int(rng.integers(0, 3)),
+        static_gain=1.0,
     )
 
 
@@ -153,7 +159,10 @@ def integrate_by_hand(plant, spec, functions, x):
     for coefficient, corner in zip(x[functions:], np.geomspace(0.01, spec.bandwidth_hz, 12), strict=True):
         pole = np.exp(-2 * np.pi * corner * ts)
         q = q + coefficient * (1 - pole) * z / (z - pole)
-    p = np.array([plant.c @ np.linalg.solve(one * np.eye(3) - plant.a, plant.b) for one in z]) / z**plant.delay_samples
+    p = (
+        np.array([plant.c[0] @ np.linalg.solve(one * np.eye(3) - plant.a, plant.b) for one in z])
+        / z**plant.delay_samples
+    )
     return np.trapezoid(np.abs(1.0 - p * q), np.log(f))
 
 
@@ -177,7 +186,13 @@ def test_the_bound_is_below_its_own_answer_and_close(monkeypatch, seed):
 
 def test_a_plant_that_grows_has_no_bound_and_no_functions_are_refused():
     growing = DigitalPlant(
-        a=np.array([[1.01]]), b=np.ones(1), c=np.ones(1), d=0.0, sample_time_s=1e-3, delay_samples=1, static_gain=-100.0
+        a=np.array([[1.01]]),
+        b=np.ones(1),
+        c=np.ones((1, 1)),
+        d=np.zeros(1),
+        sample_time_s=1e-3,
+        delay_samples=1,
+        static_gain=-100.0,
     )
     assert bound_free_law(growing, so.ControllerSpec(bandwidth_hz=30)).status == "unstable plant"
     with pytest.raises(ControlError, match="functions = 0"):

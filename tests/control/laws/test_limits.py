@@ -189,7 +189,7 @@ def test_only_lags_between_zero_and_one_are_filters_of_a_derivative(poles, sampl
     assert count_filter_samples(law) == pytest.approx(samples, rel=1e-5)
 
 
-@pytest.mark.parametrize("count", [2, 8, 16])
+@pytest.mark.parametrize("count", [2, 8, 16, 20])
 def test_a_measurement_averaged_over_samples_keeps_the_filter_of_the_law(loop, count):
     ahead, back = loop.law.transfer_functions()
     average = TransferFunction(num=np.convolve(back.num, np.full(count, 1.0 / count)), den=back.den)
@@ -207,7 +207,7 @@ def test_the_rate_of_the_integral_is_the_loops_slowest_pole(stand, thor, structu
     observer = DisturbanceObserver(nominal=Nominal.of(plant), T_q=8e-3) if structure == "pid_dob" else None
     gains = Gains(k_p=0.4, k_i=1.4 * rate, k_d=2e-3, T_f=2e-3, k_r=1.4, observer=observer)
     law = gains.law(structure, 1e-3)
-    model = control.ss(plant.a, plant.b[:, None], plant.c[None], plant.d, 1e-3)
+    model = control.ss(plant.a, plant.b[:, None], plant.c, plant.d[:, None], 1e-3)
     late = model * control.ss(control.tf([1.0], [1.0, *[0.0] * plant.delay_samples], 1e-3))
     c_y = control.ss(law.a, -law.b[:, 1:], law.c[None], -law.d[1], 1e-3)
     poles = np.log(control.feedback(late * c_y, 1).poles()) / 1e-3

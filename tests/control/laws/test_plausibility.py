@@ -157,9 +157,9 @@ def test_a_force_that_really_has_moved_is_believed_again():
 def test_the_largest_step_is_reached_by_its_own_input_and_by_no_other(tuned, thor, stand):
     plant = tuned.close(stand, thor).plant
     claimed = largest_step(plant, 5.0)
-    h, x = [plant.d], plant.b
+    h, x = [plant.d[0]], plant.b
     for _ in range(3000):
-        h.append(plant.c @ x)
+        h.append(plant.c[0] @ x)
         x = plant.a @ x
     h = np.array(h)
     worst = 5.0 * np.sign(np.diff(h, prepend=0.0))[::-1]

@@ -58,7 +58,10 @@ def test_the_nominal_inverse_is_stable_and_exact(thor, options):
     q, q_over_p = observer.filters(TS)
     f = np.geomspace(0.5, 490, 60)
     z = np.exp(2j * np.pi * f * TS)
-    p = np.array([plant.c @ np.linalg.inv(x * np.eye(len(plant.b)) - plant.a) @ plant.b + plant.d for x in z]) / z**2
+    p = (
+        np.array([plant.c[0] @ np.linalg.inv(x * np.eye(len(plant.b)) - plant.a) @ plant.b + plant.d[0] for x in z])
+        / z**2
+    )
     np.testing.assert_allclose(q_over_p.response(f, TS) * p, q.response(f, TS), rtol=1e-6, atol=1e-9)
     assert np.abs(np.roots(q_over_p.den)).max() < 1
     assert q.num.sum() / q.den.sum() == pytest.approx(1.0)
@@ -82,7 +85,7 @@ def judged(controller, plants, params):
         open_loop, tracking, noise = independent(loop, f)
         s = 1 / (1 + open_loop)
         rows.append((abs(s).max(), abs(open_loop * s).max(), 2 / abs(2 * s - 1).max(), abs(noise).max()))
-        model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], TS)
+        model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c, loop.plant.d[:, None], TS)
         law = control.ss(control.tf(controller.measurement.num, controller.measurement.den, TS))
         late = control.ss(control.tf([1], [1] + [0] * controller.compute_delay_samples, TS))
         stable &= bool(np.abs(control.feedback(model * late * law, 1).poles()).max() < 1)

@@ -47,7 +47,7 @@ def pid(k_p, k_d, k_i=0.6, T_f=1.3e-3):
 
 def loop_of(law, slope=1.0):
     a, b = discretise(PERIOD)
-    plant = DigitalPlant(a=a, b=b, c=C, d=0.0, sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0)
+    plant = DigitalPlant(a=a, b=b, c=C[None], d=np.zeros(1), sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0)
     return FrictionLoop(
         a=A, motor=B, friction=B[:, None], velocity=np.array([[0.0, 1.0]]), sensed=C[None], through=np.zeros((1, 1)),
         slopes=np.array([slope]), plant=plant, law=law,
@@ -129,7 +129,13 @@ def test_every_viscous_friction_within_the_margin_is_stable(seed):
         slope = share * min(margin.slopes[0], 1e9)
         block = expm(np.block([[A - slope * np.outer(B, [0, 1]), B[:, None]], [np.zeros((1, 3))]]) * PERIOD)
         plant = DigitalPlant(
-            a=block[:2, :2], b=block[:2, 2], c=C, d=0.0, sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0
+            a=block[:2, :2],
+            b=block[:2, 2],
+            c=C[None],
+            d=np.zeros(1),
+            sample_time_s=PERIOD,
+            delay_samples=DELAY,
+            static_gain=1.0,
         )
         closed = so.control.Loop(plant=plant, law=law)
         assert np.max(np.abs(closed.eigenvalues())) < 1.0 + 1e-9, share

@@ -154,7 +154,7 @@ def test_poles_are_those_of_the_observers_own_block_diagram(rate_hz, thor, stand
         size = max(part.num.size, part.den.size)
         inverse = inverse * control.ss(control.tf(*(np.pad(p, (0, size - p.size)) for p in (part.num, part.den)), ts))
     law = control.feedback(control.ss([], [], [], [[1.0]], ts), lag * lag * kept, 1) * (back + lag * lag * inverse)
-    model = control.ss(plant.a, plant.b[:, None], plant.c[None], [[plant.d]], ts)
+    model = control.ss(plant.a, plant.b[:, None], plant.c, plant.d[:, None], ts)
     late = control.ss(control.tf([1], [1, 0], ts))
     expected = control.feedback(model * late * law, control.ss([], [], [], [[1.0]], ts)).poles()
     found = Loop(plant=plant, law=gains.law("pid_dob", ts).balanced()).eigenvalues()

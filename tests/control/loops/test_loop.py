@@ -30,7 +30,7 @@ def test_the_sampled_plant_is_scipys_zero_order_hold(swing, thor):
     a, b, c, d, _ = cont2discrete((model.A, model.B * gain, model.C[:1], model.D[:1] * gain), 1e-3, "zoh")
     np.testing.assert_allclose(found.a, a, rtol=1e-10, atol=1e-14)
     np.testing.assert_allclose(found.b, b[:, 0], rtol=1e-9, atol=1e-16)
-    np.testing.assert_allclose(found.c, c[0])
+    np.testing.assert_allclose(found.c, c)
     assert found.static_gain == pytest.approx(1.0)
     assert found.d == d[0, 0]
 
@@ -61,7 +61,7 @@ def independent(loop, f):
     """Return L and F/F_ref in NumPy alone, from matrices and coefficients."""
     z = np.exp(2j * np.pi * f * loop.plant.sample_time_s)
     states = np.linalg.solve(z[:, None, None] * np.eye(len(loop.plant.b)) - loop.plant.a, loop.plant.b[None, :, None])
-    p = ((loop.plant.c @ states)[:, 0] + loop.plant.d) * z**-loop.plant.delay_samples
+    p = ((loop.plant.c @ states)[:, 0, 0] + loop.plant.d[0]) * z**-loop.plant.delay_samples
     value = lambda c: sum(v * z**-i for i, v in enumerate(c))  # noqa: E731
     c_r, c_y = (value(tf.num) / value(tf.den) for tf in loop.law.transfer_functions())
     return p * c_y, p * c_r / (1 + p * c_y), c_y / (1 + p * c_y)
@@ -97,7 +97,7 @@ def test_margins_are_python_controls_on_a_stable_loop(stand, thor):
     loop = loop_of("pid", stand, thor)
     z = control.tf("z")
     z.dt = 1e-3
-    plant = control.ss2tf(control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], 1e-3))
+    plant = control.ss2tf(control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c, loop.plant.d[:, None], 1e-3))
     c_y = loop.law.transfer_functions()[1]
     c = control.tf(c_y.num, c_y.den, 1e-3)
     open_loop = plant * c * control.tf([1], [1, 0], 1e-3)
@@ -135,7 +135,7 @@ def test_a_light_mode_between_grid_points_is_found():
         ),
         ts,
     )
-    plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=0, static_gain=1e-6)
+    plant = DigitalPlant(a=a, b=b[:, 0], c=c, d=np.zeros(1), sample_time_s=ts, delay_samples=0, static_gain=1e-6)
     loop = Loop(plant=plant, law=law_of([1.0]))
     f = np.linspace(77.12, 77.126, 50_001)
     exact = np.abs(1 / (1 + independent(loop, f)[0])).max()

@@ -45,7 +45,7 @@ def modal(modes, ts=1e-3, delay=0, law=ONE):
         b[2 * k + 1], c[0, 2 * k] = w, gain
     a, b, c, _, _ = cont2discrete((a, b, c, np.zeros((1, 1))), ts)
     plant = DigitalPlant(
-        a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=delay, static_gain=sum(m[2] for m in modes)
+        a=a, b=b[:, 0], c=c, d=np.zeros(1), sample_time_s=ts, delay_samples=delay, static_gain=sum(m[2] for m in modes)
     )
     return Loop(plant=plant, law=law)
 
@@ -57,7 +57,7 @@ def independent(loop, f):
     x = np.linalg.solve(z[:, None, None] * np.eye(plant.b.size) - plant.a, rhs)[..., 0]
     value = lambda c: sum(v * z**-i for i, v in enumerate(c))  # noqa: E731
     c_y = loop.law.transfer_functions()[1]
-    return (x @ plant.c + plant.d) * z**-plant.delay_samples * value(c_y.num) / value(c_y.den)
+    return (x @ plant.c[0] + plant.d[0]) * z**-plant.delay_samples * value(c_y.num) / value(c_y.den)
 
 
 def poles_of(loop, factor=1.0, extra=0):
@@ -117,7 +117,9 @@ def test_a_gain_margin_downwards():
     """A double integrator with lag needs its gain: raising and lowering it both end stability."""
     ts = 1e-2
     a, b = np.array([[1, ts], [0, 1]]), np.array([ts**2 / 2, ts])
-    plant = DigitalPlant(a=a, b=b, c=np.array([1.0, 0]), d=0.0, sample_time_s=ts, delay_samples=0, static_gain=np.inf)
+    plant = DigitalPlant(
+        a=a, b=b, c=np.array([[1.0, 0]]), d=np.zeros(1), sample_time_s=ts, delay_samples=0, static_gain=np.inf
+    )
     lead = law_of(np.convolve([40.0, -38.4], [1.0, -0.995]), np.convolve([1.0, -0.4], [1.0, -1.0]))
     loop = Loop(plant=plant, law=lead)
     found = margins(loop)
@@ -168,7 +170,7 @@ def test_an_unstable_loop_that_python_control_calls_comfortable(stand, thor):
     f = np.geomspace(0.1, 499.9, 20_000)
     s = 1 / (1 + independent(loop, f))
     assert 2 / np.abs(2 * s - 1).max() > 0.5
-    model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], 1e-3)
+    model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c, loop.plant.d[:, None], 1e-3)
     c_y = loop.law.transfer_functions()[1]
     law = control.ss(control.tf(c_y.num, c_y.den, 1e-3))
     open_loop = model * control.ss(control.tf([1], [1, 0], 1e-3)) * law
@@ -311,7 +313,7 @@ def rational(num, den, ts=1e-3):
     a, b, c, d = (np.atleast_2d(block) for block in tf2ss(num, den))
     a, b, c, d, _ = cont2discrete((a, b, c, d), ts)
     gain = num[-1] / den[-1] if den[-1] else np.inf
-    plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=d[0, 0], sample_time_s=ts, delay_samples=0, static_gain=gain)
+    plant = DigitalPlant(a=a, b=b[:, 0], c=c, d=d[0], sample_time_s=ts, delay_samples=0, static_gain=gain)
     return Loop(plant=plant, law=ONE)
 
 
@@ -395,7 +397,7 @@ def velocity(hz, zeta, gain, ts=1e-3, delay=1):
     w = 2 * np.pi * hz
     a, b, c = np.array([[0, w], [-w, -2 * zeta * w]]), np.array([[0.0], [w]]), np.array([[0.0, 1.0]])
     a, b, c, _, _ = cont2discrete((a, b, c, np.zeros((1, 1))), ts)
-    plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=delay, static_gain=0.0)
+    plant = DigitalPlant(a=a, b=b[:, 0], c=c, d=np.zeros(1), sample_time_s=ts, delay_samples=delay, static_gain=0.0)
     law = gained(-gain * 2 * zeta)
     return Loop(plant=plant, law=law)
 

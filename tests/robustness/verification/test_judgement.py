@@ -119,12 +119,12 @@ def test_every_run_of_an_unstable_loop_fails_and_says_so(controller, stand, thor
     a[:n, :n], a[:n, n + d - 1] = plant.a, plant.b
     num = np.pad(tf.num, (0, m + 1 - tf.num.size))
     command = np.zeros(size)
-    command[:n] = -num[0] * plant.c
+    command[:n] = -num[0] * plant.c[0]
     command[n : n + m] -= tf.den[1:]
     command[n + max(d, m) :] -= num[1:]
     a[n] = command
     a[n + 1 : n + max(d, m), n : n + max(d, m) - 1] = np.eye(max(d, m) - 1)
-    a[n + max(d, m), :n] = plant.c
+    a[n + max(d, m), :n] = plant.c[0]
     a[n + max(d, m) + 1 :, n + max(d, m) : -1] = np.eye(m - 1)
     poles = np.linalg.eigvals(a)
     fastest = poles[np.argmax(np.abs(poles))]
