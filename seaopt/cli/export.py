@@ -12,6 +12,7 @@ from typing import Any, Literal
 from seaopt.cli.provenance import FILES, SCHEDULE_FILES, digest
 from seaopt.cli.session import OWN_LAW, SCHEDULE_SCHEMAS, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
+from seaopt.codec import to_content
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.deploy.schedule_export import is_schedule
 from seaopt.control.laws.plausibility import GateSpec, PlausibilityGate
@@ -47,6 +48,8 @@ def export_controller(
     expected = content["made_from"].get(fitted.name)
     if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
+    if derate_margin_K is not None and options["derate"] is False:
+        raise ProblemError("--no-derate and --derate-margin: type one of them")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
         options["derate"] = read_guard(_take_first(content), derate_margin_K) or True
     options["gate"] = choose_gate(_take_first(content), gate or {}, options)
@@ -100,7 +103,7 @@ def _list_typed(content: Mapping[str, Any], options: Mapping[str, Any]) -> list[
     """Return the parts of the law that options make another than that of the certificate."""
     guards, gate = _take_first(content).get("guards") or {}, options["gate"]
     differs = {
-        "the gate": gate or (gate is False and guards.get("gate") is not None),
+        "the gate": gate is not None and (to_content(gate) if gate else None) != guards.get("gate"),
         "the heat guard": options["derate"] is not None and options["derate"] != guards.get("derate", False),
         "the anti-windup": options["tracking_time_s"] is not None,
     }

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
+from seaopt.cli.export import _list_typed
+from seaopt.codec import to_content
+from seaopt.control import PlausibilityGate
 from seaopt.files import write_json
 
 
@@ -58,6 +62,14 @@ def test_a_law_that_is_not_the_certified_one_is_warned_of(done, seaopt, tmp_path
     assert (f"warning: {part} of this export" in " ".join(out.stderr.split())) == bool(part)
 
 
+@pytest.mark.parametrize(("largest", "typed"), [(300.0, []), (200.0, ["the gate"])])
+def test_a_gate_that_is_typed_as_the_file_has_it_is_the_certified_one(largest, typed):
+    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=300.0, max_held=5, ramp_A_per_s=90.0)
+    content = {"guards": {"gate": to_content(gate), "derate": False}}
+    options = {"gate": replace(gate, max_step_N=largest), "derate": None, "tracking_time_s": None}
+    assert _list_typed(content, options) == typed
+
+
 def one_line(out):
     assert out.returncode == 2
     (line,) = out.stderr.strip().splitlines()
@@ -76,6 +88,7 @@ def one_line(out):
         (("results", "--c", "out", "--name", "7"), "cannot begin a name in C"),
         (("results", "--c", "out", "--current-limit", "0"), "is not positive"),
         (("results", "--c", "out", "--derate-margin", "15"), "part thermal"),
+        (("results", "--c", "out", "--no-derate", "--derate-margin", "15"), "type one of them"),
     ],
 )
 def test_bad_input_is_one_line_and_exits_2(folder, done, seaopt, arguments, words):

@@ -52,8 +52,8 @@ def identifier(name: str) -> str:
 
 
 def strip_markup(text: str) -> str:
-    """Return text without what would end a comment."""
-    return re.sub(r"[^\w .,:;+()<>=-]", "", str(text), flags=re.ASCII)
+    """Return text without what would begin or end a comment."""
+    return re.sub(r"[^\w .,:;+()<>=/-]", "", str(text), flags=re.ASCII).replace("//", "").strip("/")
 
 
 def literal(precision: Precision) -> Callable[[float], str]:

@@ -204,6 +204,8 @@ def certify(  # pyright: ignore[reportInconsistentOverload]  # of which keywords
         command_step=command_step,
     )
     check_options(options, ControlError)
+    if min_rate is not None and not isinstance(subject, ScheduledController):
+        raise ControlError(f"min_rate = {min_rate:g} is of a schedule's variable, and this law has none; leave it out")
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)

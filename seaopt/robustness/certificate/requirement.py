@@ -102,6 +102,10 @@ class Requirement(Result):
             return abs(self.value - self.limit) <= slack
         return self.value >= self.limit - slack if self.sense == "≥" else self.value <= self.limit + slack
 
+    def __post_init__(self) -> None:
+        for name in ("limit", "value"):  # a whole number is read back as one with a point, and sealed so
+            object.__setattr__(self, name, float(getattr(self, name)))
+
     @property
     def subject(self) -> str:
         """Whose figure it is in words: the schedule's value, the plant and the state of its friction."""

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from seaopt.codec import Fields, Key, OrInfinite, OrNaN
-from seaopt.control import Controller
+from seaopt.control import Controller, runnable
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.running.closed_loop import run_loop
@@ -179,7 +179,8 @@ def large_signal(
     linear = controller.close(take_sliding(plant, values), values)
     if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
-    loop = build_loop(controller, plant, parameters)
+    # A gate gives its sensor up at the largest amplitudes, where there is no response then.
+    loop = build_loop(controller, plant, parameters, runnable(controller, gate=False))
     if frequencies_hz is None:
         wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)
     else:

@@ -58,6 +58,7 @@ class Motion:
     left: OrInfinite  # at the end of a push, over 2 A: how far the output is off
     ringing: OrInfinite  # what of that is fast
     fault: str  # why it does not keep the judgement; empty where it does
+    lost: str = ""  # how larger pushes are, where that is why the rate was not reached
 
 
 @record(eq=False)
@@ -88,9 +89,11 @@ class _Pushing:
         """Return the variable at each sample."""
         return run.states[0, :, list(self.plant.states).index(self.schedule.over)]
 
-    def find_push(self, rate: float, first: float) -> _Push | None:
-        """Return the push that moves the variable at a rate, or as fast as it may; None where even small ones fail."""
-        size, kept, law = first, None, self.schedule.runnable()
+    def find_push(self, rate: float, first: float) -> tuple[_Push | None, str]:
+        """Return the push that moves the variable at a rate, or as fast as it may; None where even small ones fail. And
+        how larger ones were lost, where that ends the search.
+        """
+        size, kept, law, loss = first, None, self.schedule.runnable(), ""
         for _ in range(TRIES):
             try:
                 run = self.start.run(self.plant, self.start.params, size * self.pushes[None])
@@ -103,14 +106,15 @@ class _Pushing:
                     command=float(np.max(np.abs(run.current))) / law.command_limit,
                 )
                 share = max(NEAR * push.rate / rate, push.room, push.command)
+                loss = find_loss(run, law) or loss
                 share = LOST_SHARE if find_loss(run, law) else share
                 kept = push if share <= 1.0 else kept
-            except SimulationError:
-                share = LOST_SHARE
+            except SimulationError as error:
+                share, loss = LOST_SHARE, f"is lost: {error}"
             if NEAR <= share <= 1.0:
-                break
+                return kept, ""
             size *= AIM / max(share, AIM / LOST_SHARE)
-        return kept
+        return kept, loss
 
     def measure(self, error: Signal) -> tuple[float, float]:
         """Return how large an error is at the ends of pushes, over their step, and its fast part."""
@@ -128,13 +132,13 @@ def move_schedule(
     if schedule.over not in plant.states:
         return None
     pushing = _make_pushing(schedule, plant, params, rate)
-    push = pushing.find_push(rate, FIRST_SHARE * find_least_effort(schedule))
+    push, loss = pushing.find_push(rate, FIRST_SHARE * find_least_effort(schedule))
     if push is None:
         middle, lost = (dict.fromkeys(("low", "high"), pushing.middle), dict.fromkeys(("left", "ringing"), math.inf))
-        fault = "is lost under any push, small ones too"
+        fault = f"{loss}, under any push, small ones too"
         return Motion(plant=name, asked=rate, rate=0.0, size=0.0, fault=fault, **middle, **lost)
     if push.rate < rate:
-        pushing, push = _change_length(pushing, push, rate)
+        pushing, push, loss = _change_length(pushing, push, loss, rate)
     place, size = pushing.follow(push.run), push.size
     left, ringing = pushing.measure(pushing.start.find_errors(push.run, place)[0] / size)
     standing = [
@@ -160,17 +164,18 @@ def move_schedule(
         left=left,
         ringing=ringing,
         fault=fault,
+        lost=loss if push.rate < rate else "",
     )
 
 
-def _change_length(pushing: _Pushing, push: _Push, rate: float) -> tuple[_Pushing, _Push]:
+def _change_length(pushing: _Pushing, push: _Push, loss: str, rate: float) -> tuple[_Pushing, _Push, str]:
     """Return pushes of the length that takes both room and command to their limits, where these are faster."""
     lasting = _limit_length(pushing.lasting * math.sqrt(push.command / max(push.room, LEAST_ROOM)), pushing.period)
     if lasting == pushing.lasting:
-        return pushing, push
+        return pushing, push, loss
     other = replace(pushing, pushes=_make_pushes(lasting, pushing.period), lasting=lasting)
-    faster = other.find_push(rate, push.size)
-    return (pushing, push) if faster is None or faster.rate <= push.rate else (other, faster)
+    faster, later = other.find_push(rate, push.size)
+    return (pushing, push, loss) if faster is None or faster.rate <= push.rate else (other, faster, later)
 
 
 def _make_pushing(schedule: ScheduledController, plant: Plant, params: ParameterSet, rate: float) -> _Pushing:
@@ -209,4 +214,5 @@ def describe_motion(motion: Motion, over: str, unit: str) -> str:
     moves = f"{head}, pushed to and fro, and {motion.fault or 'neither rings nor departs'}"
     if motion.rate >= motion.asked:
         return moves
-    return f"{moves}; {motion.asked:.3g} {unit} is not reached within the table and the command's limit"
+    why = f": a larger push {motion.lost}" if motion.lost else " within the table and the command's limit"
+    return f"{moves}; {motion.asked:.3g} {unit} is not reached{why}"

@@ -16,6 +16,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import seaopt as so
 from seaopt.control import Gains, Loop, PlausibilityGate
+from seaopt.control.deploy.c_text import strip_markup
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.laws.stored import read_controller
@@ -265,6 +266,13 @@ def test_text_cannot_leave_its_comment(tuned, tmp_path):
     for path in export(content, tmp_path, allow_infeasible=True):
         assert path.parent == tmp_path
         assert path.read_text().count("*/ int") == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"), [("rad/s", "rad/s"), ("N/(m s)", "N/(m s)"), ("x */ y /* z //", "x / y / z ")]
+)
+def test_a_unit_keeps_its_slash_and_no_comment_ends(text, kept):
+    assert strip_markup(text) == kept
 
 
 @pytest.mark.parametrize(

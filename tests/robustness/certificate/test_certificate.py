@@ -320,6 +320,7 @@ def test_a_nominal_value_outside_its_range_is_noted(controller, swing, thor):
         ({"ranges": {"I_p": (True, 2)}}, "give \\(low, high\\)"),
         ({"ranges": {"phi": (-30, 30)}}, "angles are in rad"),
         ({"ranges": {"delay_s": (0, 0.5)}}, "500 samples"),
+        ({"min_rate": 5.0}, "min_rate = 5 is of a schedule"),
     ],
 )
 def test_bad_numbers_are_told_in_one_line(controller, swing, thor, options, words):

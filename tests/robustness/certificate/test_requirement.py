@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,6 +36,12 @@ def test_words_and_file_follow_from_the_fields(row, words):
     }
     (again,) = list_requirements(content, "robustness.json")
     assert again == row
+
+
+def test_a_whole_number_is_one_with_a_point():
+    row = Requirement(name="max_sensitivity", limit=2, value=1, met=True)
+    assert json.dumps(row.to_dict()) == json.dumps(replace(row, limit=2.0, value=1.0).to_dict())
+    assert '"limit": 2.0' in json.dumps(row.to_dict())
 
 
 def test_an_older_file_has_words_alone():

@@ -9,6 +9,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import PlausibilityGate
+from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 from seaopt.robustness.verification.verification import verify
@@ -29,6 +30,14 @@ def test_a_gate_that_is_never_asked_changes_nothing(limited_controller, stand, t
     )
     assert wide.rows == plain.rows
     assert plain.met
+
+
+def test_bandwidths_at_amplitudes_are_those_of_the_law_behind_its_gate(limited_controller, stand, thor):
+    plain, strict = (
+        large_signal(each, stand, thor, amplitudes_N=(20.0,), frequencies_hz=(10.0, 30.0, 60.0))
+        for each in (limited_controller, gated(limited_controller, 0.5))
+    )
+    np.testing.assert_array_equal(plain.gain, strict.gain)
 
 
 def test_a_gate_that_takes_true_readings_for_faults_fails_the_run(limited_controller, stand, thor):

@@ -1,19 +1,24 @@
 """Sweeps of a scheduling variable against simulations of the test's own."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 import seaopt as so
+from seaopt.control import PlausibilityGate
 from seaopt.executors import Shared
 from seaopt.plants.plant import output_function
+from seaopt.robustness.verification.schedule_motion import describe_motion, move_schedule
 from seaopt.robustness.verification.schedule_sweep import (
     SWEEP,
     _choose_pulses,
     _run_sweep,
     find_fastest,
     make_swept_plant,
+    sweep_schedule,
 )
 from tests.schedules import read_knee, tune_knee
 
@@ -71,6 +76,16 @@ def test_a_sweep_that_is_too_fast_does_not_keep_the_judgement():
     pulses = _choose_pulses(schedule, swing, values)
     fast = _run_sweep(Shared((schedule, "swing", swing, values, pulses)), 15.0)
     assert fast.fault and find_fastest([fast]) == 0.0
+
+
+def test_a_gate_that_gives_its_sensor_up_is_named_in_sweeps_and_pushes():
+    schedule, (_, swing, values) = tune_knee(), read_knee()
+    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=1e-6, max_held=1, ramp_A_per_s=90.0)
+    gated = replace(schedule, controllers=tuple(replace(each, gate=gate) for each in schedule.controllers))
+    (sweep,) = sweep_schedule(gated, "swing", swing, values)
+    motion = move_schedule(gated, "swing", swing, values, 1.0)
+    assert "gate gives its sensor up" in sweep.fault and "gate gives its sensor up" in motion.lost
+    assert "is not reached: a larger push is lost: the gate" in describe_motion(motion, "phi", "rad/s")
 
 
 def test_a_parameter_that_moves_has_no_rate_of_its_own():
