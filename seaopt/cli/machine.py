@@ -35,7 +35,13 @@ def accept_logs(
     with show_progress(errors, "judging the logs", errors.say) as tell:
         tell("reading the logs", 0.0)
         read = [read_loop_log(session.problem, log, units, reference) for log in logs]
-        result = accept(controller, read, others=_find_others(folder, controller))
+        result = accept(
+            controller,
+            read,
+            others=_find_others(folder, controller),
+            uncertainty=session.parameters(),
+            ranges=session.problem.ranges,
+        )
     content = write(result, session, logs)
     if json:
         sys.stdout.write(to_json(content))

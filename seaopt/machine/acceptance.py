@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
 from typing import Any
 
 from seaopt.codec import to_content
-from seaopt.control import Controller
-from seaopt.errors import LogError, require_type
+from seaopt.control import Controller, draw
+from seaopt.control.laws.delay import find_drive
+from seaopt.errors import ControlError, LogError, require_number, require_type
+from seaopt.estimation import Fit
 from seaopt.logs import Log
+from seaopt.machine.differences import Differences, compare
+from seaopt.machine.periods import Blocks, cut_periods, join_blocks
 from seaopt.machine.replay import Replay, replay
+from seaopt.machine.response import Response, judge_response
 from seaopt.machine.ticks import take_ticks
+from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
 
+DRAWS, SEED = 200, 1
+OTHER_LAW = "the logs are not of this law; mend that first, then record again"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
 
 
@@ -28,16 +37,33 @@ class Acceptance(Result, Worded):
         The logs.
     replays : tuple of Replay
         Of each log, how near the law comes to the logged command, and what else would come nearer.
+    response : Response or None
+        The measured loop, and which of its limits the logs confirm or refute; None where it cannot be judged.
+    differences : Differences or None
+        The measured plant beside the certified one.
+    left_out : mapping of str to str
+        Why there is no response, or none of a log.
     """
 
     controller: Controller
     sources: tuple[str, ...]
     replays: tuple[Replay, ...]
+    response: Response | None = None
+    differences: Differences | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def replayed(self) -> bool:
+        """Whether every log was made by this law."""
+        return all(row.met for row in self.replays)
 
     @property
     def met(self) -> bool:
-        """Whether every log was made by this law."""
-        return all(row.met for row in self.replays)
+        """Whether every log was made by this law, each limit of the loop is confirmed, and the machine is one of those
+        that were certified.
+        """
+        judged = self.response is not None and self.response.met
+        return self.replayed and judged and (self.differences is None or self.differences.inside)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of acceptance.json (schema seaopt/acceptance/1)."""
@@ -45,7 +71,10 @@ class Acceptance(Result, Worded):
         content = {
             "schema": ACCEPTANCE_SCHEMA,
             "met": self.met,
-            "replay": {"met": all(row.met for row in self.replays), "logs": logs},
+            "replay": {"met": self.replayed, "logs": logs},
+            "response": None if self.response is None else self.response.to_dict(),
+            "differences": self.differences,
+            "left_out": self.left_out,
         }
         return to_content(content)
 
@@ -56,6 +85,9 @@ def accept(
     *,
     reference: str | None = None,
     others: Mapping[str, Controller] | None = None,
+    uncertainty: Fit | ParameterSet | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    confidence: float = 0.95,
 ) -> Acceptance:
     """Judge logs that were recorded under a controller's exported law.
 
@@ -70,6 +102,12 @@ def accept(
         The reference's channel; "reference" or "ref" if left out.
     others : mapping of name to Controller, optional
         Laws that may have run in its place, such as those of earlier tunings.
+    uncertainty : Fit or ParameterSet, optional
+        What the controller was certified for, with `ranges`: draws of it say how far a machine may be from the model.
+    ranges : mapping of str to (low, high), optional
+        As in `certify`.
+    confidence : float
+        Of each statement on the response.
 
     Returns
     -------
@@ -79,6 +117,12 @@ def accept(
     ------
     LogError
         A channel is missing, or a log is too short.
+
+    Notes
+    -----
+    The response is judged on logs whose reference is periodic, of three periods at least, the first of which is left
+    out; with dry friction six sets of random phases are needed. Limits are those of the controller's specification with
+    5 % of grace; of the bandwidth with 10 %.
 
     Examples
     --------
@@ -101,9 +145,40 @@ def accept(
         raise LogError("logs is empty; give the logs that were recorded under the law")
     for log in logs:
         require_type(log, Log, "logs", "give logs of read_log or Log.from_arrays", LogError)
+    if not 0.5 <= require_number(confidence, "confidence", LogError) < 1.0:
+        raise LogError(f"confidence = {confidence:g} is not between 0.5 and 1; give 0.95")
     rows = [take_ticks(controller, log, reference) for log in logs]
-    return Acceptance(
-        controller=controller,
-        sources=tuple(log.source for log in logs),
-        replays=tuple(replay(controller, ticks, others) for ticks in rows),
-    )
+    replays = tuple(replay(controller, ticks, others) for ticks in rows)
+    result = Acceptance(controller=controller, sources=tuple(log.source for log in logs), replays=replays)
+    if not result.replayed:
+        return replace(result, left_out={"response": OTHER_LAW})
+    rows = [
+        ticks.move_command(row.command_late) if row.command_late else ticks
+        for ticks, row in zip(rows, replays, strict=True)
+    ]
+    blocks, left_out = list[Blocks](), dict[str, str]()
+    for ticks in rows:
+        try:
+            blocks.append(cut_periods(controller, ticks))
+        except LogError as error:
+            left_out[ticks.source] = str(error)
+    if not blocks:
+        return replace(result, left_out=left_out)
+    response = judge_response(controller, join_blocks(blocks), confidence)
+    whole = [ticks for ticks in rows if ticks.source not in left_out]
+    draws = _list_draws(controller, uncertainty, ranges)
+    differences = compare(controller, response.measured, whole, draws, confidence)
+    return replace(result, response=response, differences=differences, left_out=left_out)
+
+
+def _list_draws(
+    controller: Controller, uncertainty: Fit | ParameterSet | None, ranges: Mapping[str, tuple[float, float]] | None
+) -> list[dict[str, float]]:
+    """Return draws of what the controller was certified for; none where nothing is uncertain."""
+    if uncertainty is None or controller.design is None:
+        return []
+    try:
+        drive = find_drive(controller.spec, controller.design[0], uncertainty)
+        return draw(uncertainty, DRAWS, SEED, ranges, drive)
+    except ControlError:
+        return []

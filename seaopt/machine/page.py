@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from seaopt.files import write_text
-from seaopt.formatting import format_count, format_number
+from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
+from seaopt.machine.differences import Difference, Differences
+from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Cause, Replay
+from seaopt.machine.response import Judged, Measured, Response
+from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_parts, render_template
-from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import Commands, KeyFigure, Mark, Reason, Section, Style, Table, Verdict, mark_met
 from seaopt.units import unit_after
 
 PARTS = {
     "replay": "Is it this law",
     "causes": "Why the command differs",
+    "response": "Does the loop keep its limits",
+    "differences": "What differs from what was certified",
     "provenance": "Provenance",
 }
 MOST_CAUSES = 5
+OUTCOMES: dict[str, Style] = {"confirmed": "good", "refuted": "bad", "undecided": "warning"}
 MISSED = (
     "no cause was found: are these the logs of this problem, and was the C code exported from this controller.json?"
 )
@@ -59,13 +66,62 @@ def say_cause(cause: Cause) -> str:
             return f"the {cause.kind} is {cause.what}"
 
 
+def say_difference(each: Difference) -> str:
+    """Return a difference in words."""
+    also = f" (or {join_words(each.alike)})" if each.alike else ""
+    match each.kind:
+        case "range":
+            return (
+                f"{each.name} stops at {format_number(each.value)}{unit_after(each.unit)}: its sensor is at its range"
+            )
+        case "delay":
+            return f"the loop is {1e3 * each.value:+.3g} ms later than certified"
+        case "mode":
+            apart = 100.0 * abs(1.0 / (each.size or 1.0) - 1.0)
+            return f"there is a mode at {format_number(each.value, 3)} Hz, its pole {apart:.2g} % away from it"
+        case "gain":
+            turned = "the sign of the drive is turned; " if each.value < 0.0 else ""
+            return f"{turned}the force per command is {format_number(each.value, 3)} times the certified one{also}"
+        case _:
+            return f"{each.name} is {format_number(each.value, 3)} times its value{also}"
+
+
 def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     """Return the verdict on an acceptance."""
     off = [(source, row) for source, row in zip(result.sources, result.replays, strict=True) if not row.met]
-    reasons = tuple(Reason(what=_say_mismatch(row, result), where=source) for source, row in off)
+    reasons = [Reason(what=_say_mismatch(row, result), where=source) for source, row in off]
     count = format_count(len(result.sources), "log")
-    text = f"Replay: the law makes the logged command in {len(result.sources) - len(off)} of {count}"
-    return Verdict(met=result.met, text=text, reasons=reasons)
+    parts = [f"the law makes the logged command in {len(result.sources) - len(off)} of {count}"]
+    response, differences = result.response, result.differences
+    if response is not None:
+        limited = [row for row in response.judged if row.limit is not None]
+        confirmed = sum(row.outcome == "confirmed" for row in limited)
+        parts.append(f"{confirmed} of {len(limited)} limits confirmed")
+        reasons += [Reason(what=_say_judged(row, response)) for row in limited if row.outcome != "confirmed"]
+    if differences is not None and not differences.inside:
+        parts.append("the machine is not one of those certified")
+        best = "its response is another one" if not differences.found else say_difference(differences.found[0])
+        reasons.append(Reason(what=best))
+    if response is None and result.replayed:
+        reasons += [Reason(what=f"no response: {text}") for text in result.left_out.values()]
+    return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons))
+
+
+def _say_judged(row: Judged, response: Response) -> str:
+    unit = unit_after(row.unit)
+    if row.name == "stability":
+        return f"stability is {row.outcome}"
+    limit = f"{row.name} {row.sense} {format_number(row.limit)}{unit} is {row.outcome}"
+    at = "" if row.where_hz is None else f" at {format_number(row.where_hz, 3)} Hz"
+    found = f"{format_number(row.value, 3)} ({_show_interval(row)}){at}"
+    if response.needs_phases:
+        return f"{limit}: {found}; with dry friction record six sets of random phases"
+    more = "" if row.periods is None else f"; {row.periods} periods in all would decide"
+    return f"{limit}: {found}{more}"
+
+
+def _show_interval(row: Judged) -> str:
+    return f"{format_number(row.low, 3, 'none')} to {format_number(row.high, 3, 'none')}"
 
 
 def _say_mismatch(row: Replay, result: Acceptance) -> str:
@@ -79,11 +135,80 @@ def _say_mismatch(row: Replay, result: Acceptance) -> str:
 
 
 def describe(result: Acceptance) -> list[Section]:
-    """Return what was compared, and what may be the cause where it differs."""
+    """Return what was compared, what may be the cause where it differs, and what the response says."""
+    sections = _describe_replay(result)
+    if result.response is not None:
+        sections.append(_describe_response(result.response, result.left_out))
+    if result.differences is not None:
+        sections.append(_describe_differences(result.differences))
+    return sections
+
+
+def _describe_response(response: Response, left_out: Mapping[str, str]) -> Section:
+    rows = tuple(
+        (
+            row.name,
+            Mark(text=row.outcome, style=OUTCOMES[row.outcome]),
+            ""
+            if row.limit is None or row.name == "stability"
+            else f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}",
+            "" if row.name == "stability" else format_number(row.value, 3),
+            "" if row.name == "stability" else _show_interval(row),
+            format_number(row.where_hz, 3),
+            "" if row.periods is None else str(row.periods),
+        )
+        for row in response.judged
+    )
+    head = ("figure", "verdict", "limit", "measured", "interval", "at (Hz)", "periods needed")
+    aside = ", ".join(_say_extent(part) for part in response.measured)
+    remarks = [
+        f"Each statement holds with a probability of {100.0 * response.confidence:g} %. Limits are those of the "
+        "specification with 5 % of grace, of the bandwidth 10 %. Nothing is said between the lines and beyond them."
+    ]
+    if response.at_amplitude_only:
+        remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
+    remarks += [f"Left out: {text}" for text in left_out.values()]
+    tables = (Table(head=head, rows=rows, align="<<>>>>>"),)
+    return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks))
+
+
+def _say_extent(part: Measured) -> str:
+    """Return how much was measured."""
+    low, high = (format_number(edge, 3) for edge in (part.f[0], part.f[-1]))
+    counts = format_count(part.periods, "period"), format_count(part.phases, "set")
+    return f"{counts[0]}, {counts[1]} of phases, {part.f.size} lines from {low} to {high} Hz"
+
+
+def _describe_differences(differences: Differences) -> Section:
+    rows = tuple(
+        (
+            say_difference(each),
+            "" if each.low is None else f"{format_number(each.low, 3)} to {format_number(each.high, 3)}",
+            f"{100.0 * each.explains:.3g} %",
+        )
+        for each in differences.found
+    )
+    inside = (
+        "The machine is one of those that were certified"
+        if differences.inside
+        else "The machine is not one of those that were certified"
+    )
+    sentences = [
+        f"{inside}: the measured plant is off by {format_number(differences.misfit**0.5, 3)} times its noise (rms)."
+    ]
+    if differences.nearest:
+        nearest = ", ".join(f"{name} {format_number(value)}" for name, value in differences.nearest.items())
+        sentences.append(f"The nearest of the certificate's draws: {nearest}.")
+    tables = (Table(head=("difference", "95 % interval", "explains"), rows=rows, align="<>>"),) if rows else ()
+    return Section(title="Measured and certified", part="differences", sentences=tuple(sentences), tables=tables)
+
+
+def _describe_replay(result: Acceptance) -> list[Section]:
+    """Return how near the replay comes, and the causes that were tried."""
     unit = result.controller.command.unit
     rows = tuple(
         (
-            source,
+            Path(source).name,
             mark_met(row.met),
             str(row.ticks),
             *(format_number(value, 3) for value in (row.mismatch, row.largest, row.allowed, row.rms)),
@@ -115,7 +240,9 @@ def describe(result: Acceptance) -> list[Section]:
         )
         if table:
             table = Table(head=("if", "removes", "explains"), rows=table, align="<><")
-            sections.append(Section(title=f"Causes that were tried on {source}", part="causes", tables=(table,)))
+            sections.append(
+                Section(title=f"Causes that were tried on {Path(source).name}", part="causes", tables=(table,))
+            )
     return sections
 
 
@@ -124,7 +251,12 @@ def summarise(result: Acceptance) -> list[KeyFigure]:
     worst = max(result.replays, key=lambda row: row.mismatch)
     unit = unit_after(result.controller.command.unit)
     off, size = (f"{format_number(value, 3)}{unit}" for value in (worst.mismatch, worst.rms))
-    return [KeyFigure(name="command off (rms)", value=off, against=f"of {size}")]
+    figures = [KeyFigure(name="command off (rms)", value=off, against=f"of {size}")]
+    for row in () if result.response is None else result.response.judged:
+        if row.limit is not None and row.name != "stability":
+            limit = f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}, {row.outcome}"
+            figures.append(KeyFigure(name=row.name, value=format_number(row.value, 3), against=limit))
+    return figures
 
 
 def write_acceptance_page(
@@ -163,7 +295,9 @@ def write_acceptance_page(
         verdicts=[verdict],
         glance=summarise(result),
         described=render_parts([*describe(result), describe_provenance((), files, command)], PARTS),
-        plates={},
+        plates={
+            "response": [{"heading": "", "text": "", "charts": [make_chart(panel) for panel in list_panels(result)]}]
+        },
         doubt="",
         controller=None,
         header=None,

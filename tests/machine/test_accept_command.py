@@ -9,7 +9,7 @@ import pytest
 import seaopt as so
 from seaopt.cli.main import app
 from tests.machine.simulator import Bench, Machine, multisine
-from tests.machine.test_replay import LINES
+from tests.machine.test_response import LINES
 
 PROBLEM = """
 schema = 1
@@ -30,7 +30,7 @@ def folder(compiler, tmp_path_factory):
     content = json.loads((home / "out" / "controller.json").read_text())
     problem = so.read_problem(home / "stand.toml")
     controller = so.Controller.from_dict(content, problem.design_plant, problem.values(problem.parameters))
-    bench, reference = Bench(compiler, home, controller), multisine(1000, LINES, 4, 250.0, 3, bias=300.0)
+    bench, reference = Bench(compiler, home, controller), multisine(1000, LINES, 8, 60.0, 3, bias=300.0)
     so.write_log(bench.log(Machine(), reference, decimals=3), home / "good.csv")
     so.write_log(bench.log(Machine(law_gain=0.5), reference, decimals=3), home / "half.csv")
     bare = (home / "good.csv").read_text().replace(" [N]", "").replace(" [A]", "").replace("reference", "goal")

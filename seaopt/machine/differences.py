@@ -1,0 +1,356 @@
+r"""What differs between the machine and what was certified: the measured plant beside the model's, cause by cause.
+
+The measured plant :math:`\hat G_k = \bar Y/\bar U` has a std s at each line. A cause with a size :math:`\theta`, a
+parameter's factor, a gain, a delay, a mode, makes another response of the model, and
+
+.. math:: \chi^2(\theta) = \sum_k |\hat G_k - G_k(\theta)|^2/s_k^2
+
+is least at its size. Causes are ranked by how much of :math:`\chi^2` they take away beyond the number of lines, which
+noise leaves. Some cannot be told from each other (a torque constant and an efficiency): they are named together.
+
+With dry friction the model's response is that of the same law on the nonlinear plant, simulated under the logged
+reference and cut as the log is, since it depends on amplitude.
+
+**Inside what was certified** is a machine whose response at every line is no further from the nominal one than a draw
+of the certificate is, but for the disc of the measurement and 2 % of the response.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control import Controller, SampledLoop, run_loop, runnable
+from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditions
+from seaopt.logs.quality.faults import find_runs
+from seaopt.machine.periods import cut_periods, join_blocks
+from seaopt.machine.response import Measured, has_dry_friction
+from seaopt.machine.ticks import Ticks
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
+from seaopt.records import record
+
+STEP = 0.02  # of a parameter, to see what it does
+ROUNDS = 4  # of Gauss and Newton
+MOST_LOG = 1.5  # of a factor: its logarithm goes no further
+ALIKE = 0.05  # of what the best cause takes away: causes that are as good
+TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
+FEWEST_FLAT = 10  # readings at the edge of a range, some in a row
+MODE_DAMPINGS = (0.02, 0.1)
+MOST = 4  # causes that are listed
+Lines = Complex[np.ndarray, " m"]
+Values = Mapping[str, float]
+
+
+@record
+class Difference:
+    """A way in which the machine differs, its size, and how much of the difference it explains."""
+
+    kind: str  # parameter, gain, delay, mode, range
+    name: str  # the parameter, the signal
+    value: float  # factor of a parameter or gain; seconds; Hz; the range
+    low: float | None
+    high: float | None
+    unit: str
+    explains: float  # share of the misfit
+    alike: tuple[str, ...] = ()  # parameters that would explain as much
+    size: float | None = None  # of a mode: its zero's frequency over its pole's
+
+
+@record
+class Differences:
+    """How the measured plant differs from the certified one."""
+
+    inside: bool  # the machine is one of those that were certified
+    misfit: float  # mean square of the difference over its std; 1 is noise
+    off: float  # largest share of the response by which it differs, beyond its disc
+    off_hz: float | None
+    found: tuple[Difference, ...]
+    nearest: Mapping[str, float]  # of the certificate's draws, the values of the one that is nearest
+    nearest_misfit: float | None
+
+
+@record(eq=False)
+class Comparison:
+    """The measured plant and a model of it, as one vector of lines."""
+
+    controller: Controller
+    measured: Sequence[Measured]
+    logs: Sequence[Ticks]
+
+    @property
+    def response(self) -> Lines:
+        """The measured response, signal by signal, amplitude by amplitude."""
+        return np.concatenate([ratio.value for part in self.measured for ratio in part.plants])
+
+    @property
+    def std(self) -> Float[np.ndarray, " m"]:
+        """Its std."""
+        return np.concatenate([ratio.std for part in self.measured for ratio in part.plants])
+
+    @property
+    def f(self) -> Float[np.ndarray, " m"]:
+        """Hz, of each of its lines."""
+        return np.concatenate([part.f for part in self.measured for _ in part.plants])
+
+    def radius(self, alpha: float) -> Float[np.ndarray, " m"]:
+        """Return the radii of its discs, all of which hold the truth but with the probability `alpha`."""
+        each = alpha / self.f.size
+        return np.concatenate([ratio.disc(each)[1] for part in self.measured for ratio in part.plants])
+
+    def misfit(self, model: Lines) -> float:
+        """Return the sum of squares of a model's difference, over the std."""
+        return float(np.sum(np.abs((self.response - model) / self.std) ** 2))
+
+    def predict(self, sets: Sequence[ParameterSet]) -> list[Lines]:
+        """Return the responses of the model with each of some values."""
+        assert self.controller.design is not None
+        plant = self.controller.design[0]
+        if has_dry_friction(self.controller):
+            return self._simulate(plant, sets)
+        return [self._linearise(plant, values) for values in sets]
+
+    def _linearise(self, plant: Plant, values: ParameterSet) -> Lines:
+        seen = self.controller.plant(take_sliding(plant, values), values)
+        return np.concatenate([seen.responses(part.f).ravel() for part in self.measured])
+
+    def _simulate(self, plant: Plant, sets: Sequence[ParameterSet]) -> list[Lines]:
+        """Return the responses of the law on the nonlinear plant, under the logged references."""
+        controller, law = self.controller, runnable(self.controller, gate=False, heat=False)
+        values = [controller.delay(each) for each in sets]
+        seen = controller.see(plant)
+        longest = max(float(find_delay(seen, read_conditions(seen, seen.complete(each)))) for each in values)
+        loop = SampledLoop(
+            plant=seen,
+            law=law,
+            measured=controller.signals,
+            delay_samples=controller.compute_delay_samples,
+            longest_delay_s=longest,
+        )
+        runs = [run_loop(loop, values, ticks.reference) for ticks in self.logs]
+        return [self._cut([run.outputs for run in runs], k) for k in range(len(sets))]
+
+    def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> Lines:
+        """Return the response of the k-th of some runs, cut as the logs are."""
+        law, parts = self.controller.law, list[Lines]()
+        blocks = []
+        for ticks, run in zip(self.logs, outputs, strict=True):
+            readings = np.column_stack([run[name][k] for name in self.controller.signals])
+            blocks.append(cut_periods(self.controller, replace(ticks, measured=readings, command=0.0 * ticks.command)))
+        for group in join_blocks(blocks):
+            mean = group.average()
+            read = np.mean(mean.measured / mean.reference[:, None, :], axis=0)
+            forward, *feedback = law.responses(group.f)
+            effort = forward + np.sum(np.array(feedback) * read, axis=0)
+            parts.append((read / effort).ravel())
+        return np.concatenate(parts)
+
+
+def compare(
+    controller: Controller,
+    measured: Sequence[Measured],
+    logs: Sequence[Ticks],
+    draws: Sequence[Values],
+    confidence: float,
+) -> Differences | None:
+    """Return how the machine differs from a controller's design plant; None where the controller does not know it.
+    `logs`: those that `measured` comes from. `draws`: of the certificate.
+    """
+    if controller.design is None:
+        return None
+    comparison = Comparison(controller=controller, measured=measured, logs=logs)
+    plant, values = controller.design
+    nominal = plant.complete(values)
+    response, count = comparison.response, comparison.f.size
+    drawn = comparison.predict([values, *(_place(plant, values, draw) for draw in draws)])
+    model, drawn = drawn[0], np.array(drawn[1:]).reshape(-1, count)
+    before = comparison.misfit(model)
+    reach = np.max(np.abs(drawn - model), axis=0, initial=0.0)
+    left = np.abs(response - model) - comparison.radius(1.0 - confidence) - reach
+    share = left / np.abs(model)
+    flat = [*_list_clipped(controller, logs)]
+    found = [*flat, *_explain(comparison, plant, nominal, values, model, before)]
+    misfits = [comparison.misfit(row) for row in drawn]
+    best = int(np.argmin(misfits)) if misfits else None
+    inside = bool(np.all(share <= TOLERATED)) and not flat
+    worst = int(np.argmax(share))
+    return Differences(
+        inside=inside,
+        misfit=before / count,
+        off=max(float(share[worst]), 0.0),
+        off_hz=float(comparison.f[worst]) if share[worst] > TOLERATED else None,
+        found=tuple(found),
+        nearest={} if best is None else dict(draws[best]),
+        nearest_misfit=None if best is None else misfits[best] / count,
+    )
+
+
+def _place(plant: Plant, values: ParameterSet, draw: Values) -> ParameterSet:
+    """Return values with those of a draw that the plant, or its drive, has."""
+    complete = {**plant.complete(values), **values}
+    known = {name: value for name, value in draw.items() if name in complete}
+    return values.with_parameters(*(replace(complete[name], value=value) for name, value in known.items()))
+
+
+def _list_clipped(controller: Controller, logs: Sequence[Ticks]) -> Iterator[Difference]:
+    """Yield the signals whose readings stop at an edge."""
+    for i, name in enumerate(controller.signals):
+        for ticks in logs:
+            size = np.abs(ticks.measured[:, i])
+            top = size >= np.max(size) * (1.0 - 1e-9)
+            runs = find_runs(top)
+            if np.count_nonzero(top) >= FEWEST_FLAT and np.max(runs.lengths, initial=0) >= 3 and not np.all(top):
+                unit = controller.command.reference_unit if i == 0 else ""
+                edge = float(np.max(size))
+                yield Difference(kind="range", name=name, value=edge, low=None, high=None, unit=unit, explains=1.0)
+                break
+
+
+def _explain(
+    comparison: Comparison, plant: Plant, nominal: ParameterSet, values: ParameterSet, model: Lines, before: float
+) -> list[Difference]:
+    """Return the causes that explain the misfit, the best first."""
+    noise = float(comparison.f.size)
+    if before <= 2.0 * noise:
+        return []
+    tried = [
+        *_try_parameters(comparison, nominal, values, model),
+        *_try_shapes(comparison, model),
+    ]
+    excess = before - noise
+    rated = [(difference, max(0.0, 1.0 - max(after - noise, 0.0) / excess)) for difference, after in tried]
+    rated.sort(key=lambda pair: -pair[1])
+    listed: list[Difference] = []
+    for difference, share in rated:
+        twin = next(
+            (
+                k
+                for k, other in enumerate(listed)
+                if abs(other.explains - share) < ALIKE * share and _same(other, difference)
+            ),
+            None,
+        )
+        if twin is not None:
+            listed[twin] = replace(listed[twin], alike=(*listed[twin].alike, difference.name))
+        elif share > 0.0:
+            listed.append(replace(difference, explains=share))
+    return listed[:MOST]
+
+
+def _same(first: Difference, second: Difference) -> bool:
+    """Tell whether two causes that explain as much may be one: factors of parameters and gains."""
+    return first.unit == second.unit == "-" and {first.kind, second.kind} <= {"parameter", "gain"}
+
+
+Tried = tuple[Difference, float]
+
+
+def _try_parameters(
+    comparison: Comparison, nominal: ParameterSet, values: ParameterSet, model: Lines
+) -> Iterator[Tried]:
+    """Yield the parameters of the plant with the factors that fit best."""
+    names = [name for name, each in nominal.items() if each.value and name not in DELAYS]
+
+    def change(name: str, log: float) -> ParameterSet:
+        each = nominal[name]
+        return values.with_parameters(replace(each, value=each.value * math.exp(log), min=-math.inf, max=math.inf))
+
+    logs = dict.fromkeys(names, 0.0)
+    models = dict.fromkeys(names, model)
+    slopes: dict[str, Lines] = {}
+    for _ in range(ROUNDS):
+        stepped = comparison.predict([change(name, logs[name] + STEP) for name in names])
+        for name, after in zip(names, stepped, strict=True):
+            slope = (after - models[name]) / STEP
+            weight = 1.0 / comparison.std**2
+            size = float(np.sum(weight * np.abs(slope) ** 2))
+            if size <= 0.0 or not math.isfinite(size):
+                continue
+            slopes[name] = slope
+            error = comparison.response - models[name]
+            step = float(np.sum(weight * np.real(np.conj(slope) * error))) / size
+            logs[name] = float(np.clip(logs[name] + np.clip(step, -0.5, 0.5), -MOST_LOG, MOST_LOG))
+        names = [name for name in names if name in slopes]
+        fitted = comparison.predict([change(name, logs[name]) for name in names])
+        models = dict(zip(names, fitted, strict=True))
+    for name in names:
+        after = comparison.misfit(models[name])
+        std = _find_std(comparison, slopes[name], after)
+        low, value, high = (math.exp(logs[name] + k * std) for k in (-1.96, 0.0, 1.96))
+        yield Difference(kind="parameter", name=name, value=value, low=low, high=high, unit="-", explains=0.0), after
+
+
+def _find_std(comparison: Comparison, slope: Lines, after: float) -> float:
+    """Return the std of a real size whose slope is given, widened by what is left of the misfit."""
+    information = 2.0 * float(np.sum(np.abs(slope / comparison.std) ** 2))
+    return math.sqrt(max(after / comparison.f.size, 1.0) / information) if information else math.inf
+
+
+def _try_shapes(comparison: Comparison, model: Lines) -> Iterator[Tried]:
+    """Yield a gain, a delay and a mode, each with the size that fits best."""
+    from scipy.optimize import least_squares  # deferred: 0.2 s
+
+    f, response, std = comparison.f, comparison.response, comparison.std
+    weight = 1.0 / std**2
+
+    def fit(shape: Callable[[Float[np.ndarray, " k"]], Lines], start: Sequence[float]) -> tuple[np.ndarray, float]:
+        def errors(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"]:
+            left = (response - model * shape(x)) / std
+            return np.concatenate([left.real, left.imag])
+
+        solved = least_squares(errors, start, x_scale=np.maximum(np.abs(start), 1e-3), max_nfev=200)
+        return solved.x, 2.0 * float(solved.cost)
+
+    gain = float(np.sum(weight * np.real(np.conj(model) * response)) / np.sum(weight * np.abs(model) ** 2))
+    after = comparison.misfit(gain * model)
+    spread = 1.96 * _find_std(comparison, model, after)
+    yield (
+        Difference(kind="gain", name="gain", value=gain, low=gain - spread, high=gain + spread, unit="-", explains=0.0),
+        after,
+    )
+    (delay,), after = fit(lambda x: np.exp(-2j * np.pi * f * x[0]), [0.0])
+    spread = 1.96 * _find_std(comparison, model * 2j * np.pi * f, after)
+    yield (
+        Difference(
+            kind="delay", name="delay", value=delay, low=delay - spread, high=delay + spread, unit="s", explains=0.0
+        ),
+        after,
+    )
+    yield from _try_mode(comparison, model, fit)
+
+
+def _try_mode(comparison: Comparison, model: Lines, fit: Callable[..., tuple[np.ndarray, float]]) -> Iterator[Tried]:
+    """Yield the mode, a pair of zeros and one of poles, that fits best of several starts."""
+    f = comparison.f
+
+    def pair(hertz: float, damping: float) -> Lines:
+        return 1.0 - (f / hertz) ** 2 + 2j * damping * f / hertz
+
+    def shape(x: Float[np.ndarray, " k"]) -> Lines:
+        zero, pole = np.exp(x[0]), np.exp(x[1])
+        return pair(zero, np.exp(x[2])) / pair(pole, np.exp(x[3]))
+
+    misfit = np.abs((comparison.response - model) / comparison.std)
+    starts = {float(f[k]) for k in np.argsort(-misfit)[:4]}
+    best: tuple[np.ndarray, float] | None = None
+    for hertz in starts:
+        for ratio in (0.95, 1.05):
+            for damping in MODE_DAMPINGS:
+                x, after = fit(shape, [math.log(hertz), math.log(hertz * ratio), math.log(damping), math.log(damping)])
+                inside = f[0] < math.exp(x[0]) < f[-1] and f[0] < math.exp(x[1]) < f[-1]
+                if inside and max(x[2], x[3]) < math.log(0.5) and (best is None or after < best[1]):
+                    best = x, after
+    if best is not None:
+        zero, pole = math.exp(best[0][0]), math.exp(best[0][1])
+        # A pair costs four sizes in place of one.
+        yield (
+            Difference(
+                kind="mode", name="mode", value=zero, low=None, high=None, unit="Hz", explains=0.0, size=zero / pole
+            ),
+            best[1] + 3.0,
+        )

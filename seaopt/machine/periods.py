@@ -1,0 +1,167 @@
+"""Periods of a log under a periodic reference: where they are, and their Fourier coefficients at its lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from seaopt.control import Controller
+from seaopt.errors import LogError
+from seaopt.machine.ticks import Ticks
+from seaopt.records import record
+
+SHORTEST = 20  # ticks of a period
+LIKE = 0.25  # of the autocorrelation at zero: what a period's is at least
+REPEATS = 0.2  # of the rows, that repeat after a period at least
+SAME = 1e-4  # of the reference's range: rows that are alike
+WEAKEST = 1e-2  # of the strongest line
+TRANSIENT = 1  # periods that are left out at the start of each stretch
+SAME_AMPLITUDE = 0.1  # relative
+AT_LIMIT = 1.0 - 1e-6
+
+
+@record(eq=False)
+class Blocks:
+    """Whole periods, one row each, at the lines of the reference."""
+
+    f: Float[np.ndarray, " m"]
+    reference: Complex[np.ndarray, "b m"]
+    effort: Complex[np.ndarray, "b m"]  # the command over what an effort of one takes
+    measured: Complex[np.ndarray, "b y m"]
+    realisation: Int[np.ndarray, " b"]  # which stretch of the reference, of one set of phases
+    period_s: float
+    amplitude: float  # rms of the reference about its mean
+    saturated: int  # periods that were left out since the command was at its limit
+
+    @property
+    def realisations(self) -> int:
+        """How many stretches there are."""
+        return len(np.unique(self.realisation))
+
+    def average(self) -> Blocks:
+        """Return one row per stretch, the mean of its periods."""
+        kinds = np.unique(self.realisation)
+        rows = [self.realisation == kind for kind in kinds]
+        reference, effort, measured = (
+            np.array([part[chosen].mean(axis=0) for chosen in rows])
+            for part in (self.reference, self.effort, self.measured)
+        )
+        return Blocks(
+            f=self.f,
+            reference=reference,
+            effort=effort,
+            measured=measured,
+            realisation=kinds,
+            period_s=self.period_s,
+            amplitude=self.amplitude,
+            saturated=self.saturated,
+        )
+
+
+def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
+    """Return the period of a reference in rows; None where it does not repeat."""
+    moving = reference - np.mean(reference)
+    size = float(np.ptp(reference))
+    if not size:
+        return None
+    n = moving.size
+    spectrum = np.abs(np.fft.rfft(moving, 2 * n)) ** 2
+    like = np.fft.irfft(spectrum)[: n // 2 + 2]
+    like /= like[0]
+    inner = like[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= like[:-2]) & (inner >= like[2:]) & (inner > LIKE))
+    for lag in peaks[peaks >= SHORTEST].tolist():
+        if np.mean(_find_repeated(reference, lag, size)) > REPEATS:
+            return int(lag)
+    return None
+
+
+def _find_repeated(reference: Float[np.ndarray, " n"], lag: int, size: float) -> Bool[np.ndarray, " k"]:
+    """Tell which rows come again after a lag."""
+    return np.abs(reference[lag:] - reference[:-lag]) <= SAME * size
+
+
+def cut_periods(controller: Controller, ticks: Ticks) -> Blocks:
+    """Return the periods of a log. Raises LogError: its reference does not repeat, or too few periods are whole and
+    below the limit of the command.
+    """
+    period, seconds = find_period(ticks.reference), 1.0 / ticks.rate_hz
+    if period is None:
+        raise LogError(
+            f"{ticks.source}: its reference does not repeat, so that the loop's response cannot be told from noise; "
+            "play a periodic multisine, of at least 3 periods, as the reference"
+        )
+    size = float(np.ptp(ticks.reference))
+    same = np.concatenate([[False], _find_repeated(ticks.reference, period, size), [False]])
+    starts: list[tuple[int, int]] = []  # first row, stretch
+    for number, (first, last) in enumerate(np.flatnonzero(np.diff(same.astype(int))).reshape(-1, 2)):
+        whole = (last - first) // period + 1
+        block = ticks.reference[first : first + period]
+        if last - first >= period and np.ptp(block) > SAME * size:
+            starts += [(int(first) + period * k, number) for k in range(TRANSIENT, whole)]
+    limit = AT_LIMIT * (controller.command_limit or np.inf)
+    free = [pair for pair in starts if np.max(np.abs(ticks.command[pair[0] : pair[0] + period])) < limit]
+    if len(free) < 2:
+        reached = len(starts) - len(free)
+        why = f"in {reached} of them the command is at its limit: lower the amplitude" if reached else "record more"
+        raise LogError(
+            f"{ticks.source}: {len(free)} periods of {period * seconds:.3g} s are whole, after the first of each "
+            f"stretch; {why}, at least 3 periods are needed"
+        )
+    return _transform(controller, ticks, period, free, len(starts) - len(free))
+
+
+def _transform(
+    controller: Controller, ticks: Ticks, period: int, starts: Sequence[tuple[int, int]], saturated: int
+) -> Blocks:
+    rows = np.array([first for first, _ in starts])[:, None] + np.arange(period)
+    reference, command = (np.fft.rfft(part[rows], axis=1) for part in (ticks.reference, ticks.command))
+    measured = np.fft.rfft(ticks.measured[rows], axis=1).swapaxes(1, 2)
+    strength = np.sqrt(np.mean(np.abs(reference) ** 2, axis=0))
+    strength[0] = 0.0
+    lines = np.flatnonzero(strength > WEAKEST * np.max(strength))
+    lines = lines[lines < (period - 1) // 2]
+    scale = 2.0 / period
+    return Blocks(
+        f=lines * ticks.rate_hz / period,
+        reference=scale * reference[:, lines],
+        effort=scale * command[:, lines] / controller.command.per_effort,
+        measured=scale * measured[:, :, lines],
+        realisation=np.array([number for _, number in starts]),
+        period_s=period / ticks.rate_hz,
+        amplitude=float(np.sqrt(0.5 * np.mean(np.sum(np.abs(scale * reference[:, lines]) ** 2, axis=1)))),
+        saturated=saturated,
+    )
+
+
+def join_blocks(parts: Sequence[Blocks]) -> list[Blocks]:
+    """Return the periods of several logs, together where they have the same lines and amplitude."""
+    groups: list[list[Blocks]] = []
+    for part in sorted(parts, key=lambda each: each.amplitude):
+        for group in groups:
+            first = group[0]
+            alike = first.f.size == part.f.size and bool(np.allclose(first.f, part.f, rtol=1e-3))
+            if alike and abs(part.amplitude / first.amplitude - 1.0) < SAME_AMPLITUDE:
+                group.append(part)
+                break
+        else:
+            groups.append([part])
+    return [_join(group) for group in groups]
+
+
+def _join(group: Sequence[Blocks]) -> Blocks:
+    if len(group) == 1:
+        return group[0]
+    offsets = np.cumsum([0, *(int(np.max(part.realisation)) + 1 for part in group[:-1])])
+    return Blocks(
+        f=group[0].f,
+        reference=np.concatenate([part.reference for part in group]),
+        effort=np.concatenate([part.effort for part in group]),
+        measured=np.concatenate([part.measured for part in group]),
+        realisation=np.concatenate([part.realisation + at for part, at in zip(group, offsets, strict=True)]),
+        period_s=group[0].period_s,
+        amplitude=float(np.mean([part.amplitude for part in group])),
+        saturated=sum(part.saturated for part in group),
+    )

@@ -1,0 +1,360 @@
+r"""The loop's response from periods of a log, and which of its limits the log confirms or refutes.
+
+The reference R is known without error, so that everything is taken from it, jointly (the joint input-output method):
+U/R and what the law makes of the readings, :math:`V/R = \sum_i C_i Y_i/R`. Then :math:`\hat L = \bar V/\bar U` at each
+line, however the noise goes round the loop; U over Y alone tends to -1/C with noise. The tracking is Y/R itself.
+
+With :math:`\hat L` of std s and the limit :math:`M_s`, at a risk :math:`\alpha` of a false statement:
+
+- *confirmed*, where all lines have :math:`|1 + \hat L| - x - M_s x^2/2 \ge 1/M_s`, x the radial bound at
+  :math:`\alpha`. To confirm is to state each of several things, so that each may keep the whole of the risk.
+- *refuted*, where a line has :math:`|1 + \hat L| + R(\alpha/m) < 1/M_s`: one of m statements.
+- *undecided* otherwise; the std falls with the root of the periods, which tells how many would decide.
+
+The other figures are judged by the discs in the same way: all lines at :math:`\alpha`, or one of them at
+:math:`\alpha/m`. Nothing is said between the lines, nor beyond them. With dry friction the response is that of the
+amplitude and the phases that were played: blocks are the means over periods of one set of phases, of at least six.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control import Controller
+from seaopt.control.loops.measured.loop import bound_disc
+from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.machine.discs import Ratio
+from seaopt.machine.periods import Blocks
+from seaopt.plants.friction import find_dry_friction
+from seaopt.records import record
+
+LEAST_PHASES = 6  # sets of phases, with dry friction
+SAME_GAIN = 0.1  # relative, between two amplitudes
+GRACE = 0.05  # of each limit: a machine is not its model to the last digit
+SHORT_BY = 0.1  # of the bandwidth
+CENTRE = 1.0 - 1e-9  # a risk at which discs are points
+Outcome = Literal["confirmed", "refuted", "undecided"]
+
+
+@record
+class Judged:
+    """A figure of the measured loop, and what the log says of its limit."""
+
+    name: str
+    limit: float | None  # as judged: with the grace
+    sense: Literal["at most", "at least"]
+    value: float | None  # estimated
+    low: float | None  # the interval, at the confidence that is stated
+    high: float | None
+    unit: str
+    outcome: Outcome
+    where_hz: float | None  # the line that decides, or is the nearest to deciding
+    periods: int | None  # in all, that would decide where it is undecided
+
+
+@record(eq=False)
+class Measured:
+    """The response at one amplitude."""
+
+    f: Float[np.ndarray, " m"]
+    loop: Ratio  # L
+    tracking: Ratio  # Y/R of the regulated output
+    plants: tuple[Ratio, ...]  # of each signal, per effort
+    periods: int
+    blocks: int
+    phases: int
+    amplitude: float
+    saturated: int  # periods that were left out
+
+    @property
+    def distance(self) -> Complex[np.ndarray, " m"]:
+        """1 + L."""
+        return 1.0 + self.loop.value
+
+
+@record(eq=False)
+class Response:
+    """The measured loop, and its limits."""
+
+    met: bool
+    confidence: float
+    judged: tuple[Judged, ...]
+    measured: tuple[Measured, ...]  # by amplitude
+    at_amplitude_only: bool  # dry friction, and the gain is another one at another amplitude, or was seen at one only
+    needs_phases: bool  # dry friction, and fewer than six sets of phases
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for JSON."""
+        return {
+            "met": self.met,
+            "confidence": self.confidence,
+            "figures": self.judged,
+            "at_amplitude_only": self.at_amplitude_only,
+            "needs_phases": self.needs_phases,
+            "measured": [_describe_lines(part, 1.0 - self.confidence) for part in self.measured],
+        }
+
+
+def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
+    radius = part.loop.disc(alpha)[1]
+    return {
+        "amplitude": part.amplitude,
+        "periods": part.periods,
+        "blocks": part.blocks,
+        "phases": part.phases,
+        "saturated": part.saturated,
+        "frequency_hz": part.f,
+        "loop_re": np.real(part.loop.value),
+        "loop_im": np.imag(part.loop.value),
+        "loop_radius": np.where(np.isfinite(radius), radius, -1.0),
+        "tracking_re": np.real(part.tracking.value),
+        "tracking_im": np.imag(part.tracking.value),
+        "tracking_radius": part.tracking.disc(alpha)[1],
+    }
+
+
+def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured:
+    """Return the response of periods of one amplitude; `by_phases`: of means over the periods of each set of phases."""
+    rows = blocks.average() if by_phases else blocks
+    feedback = -controller.law.responses(blocks.f)[1:]
+    effort = rows.effort / rows.reference
+    measured = rows.measured / rows.reference[:, None, :]
+    returned = np.sum(feedback * measured, axis=1)
+    return Measured(
+        f=blocks.f,
+        loop=Ratio(numerator=returned, denominator=effort),
+        tracking=Ratio(numerator=measured[:, 0], denominator=np.ones_like(effort)),
+        plants=tuple(Ratio(numerator=measured[:, i], denominator=effort) for i in range(measured.shape[1])),
+        periods=len(blocks.reference),
+        blocks=len(rows.reference),
+        phases=blocks.realisations,
+        amplitude=blocks.amplitude,
+        saturated=blocks.saturated,
+    )
+
+
+def has_dry_friction(controller: Controller) -> bool:
+    """Tell whether the design plant has dry friction at its values."""
+    if controller.design is None:
+        return False
+    plant, values = controller.design
+    return any(find_dry_friction(plant, plant.complete(values)).values())
+
+
+def judge_response(controller: Controller, groups: Sequence[Blocks], confidence: float) -> Response:
+    """Return the response of periods, a group per amplitude, and what it says of the controller's limits."""
+    dry = has_dry_friction(controller)
+    by_phases = dry or all(group.realisations >= LEAST_PHASES for group in groups)
+    by_phases = by_phases and all(group.realisations >= 2 for group in groups)
+    measured = tuple(measure(controller, group, by_phases) for group in groups)
+    needs_phases = dry and any(part.phases < LEAST_PHASES for part in measured)
+    alpha = 1.0 - confidence
+    rows = [
+        _judge_stability(controller, measured, alpha),
+        *_judge_peaks(controller, measured, alpha),
+        _judge_bandwidth(controller, measured, alpha),
+    ]
+    if needs_phases:  # nothing is confirmed, for the discs do not hold the truth
+        rows = [_leave_open(row) for row in rows]
+    limited = [row for row in rows if row.limit is not None]
+    return Response(
+        met=all(row.outcome == "confirmed" for row in limited),
+        confidence=confidence,
+        judged=tuple(rows),
+        measured=measured,
+        at_amplitude_only=dry and not _is_same_gain(measured),
+        needs_phases=needs_phases,
+    )
+
+
+def _leave_open(row: Judged) -> Judged:
+    return replace(row, outcome="undecided", periods=None)
+
+
+def _is_same_gain(measured: Sequence[Measured]) -> bool:
+    """Tell whether two amplitudes have the same gain at every line."""
+    if len(measured) < 2 or any(part.f.size != measured[0].f.size for part in measured):
+        return False
+    gains = [np.abs(part.plants[0].value) for part in measured]
+    return all(bool(np.all(np.abs(gain / gains[0] - 1.0) < SAME_GAIN)) for gain in gains[1:])
+
+
+def _judge_stability(controller: Controller, measured: Sequence[Measured], alpha: float) -> Judged:
+    """Judge whether the loop is stable: no disc about 1 + L has zero in it, and 1 + L turns as that of the model."""
+    lines = sum(part.f.size for part in measured)
+    room, where = math.inf, None
+    turned, known = False, True
+    for part in measured:
+        centre, radius = part.loop.disc(alpha / lines)
+        ratio = np.abs(1.0 + centre) / np.maximum(radius, 1e-300)
+        at = int(np.argmin(ratio))
+        if ratio[at] < room:
+            room, where = float(ratio[at]), float(part.f[at])
+        if controller.design is not None:
+            model = 1.0 + controller.close(*controller.design).open_loop(part.f)
+            turn = np.unwrap(np.angle(part.distance / model))
+            turned = turned or abs(float(turn[-1] - turn[0])) > math.pi
+            known = known and float(np.max(np.abs(np.diff(turn)), initial=0.0)) < 0.5 * math.pi
+    outcome: Outcome = (
+        "refuted" if turned and room > 1.0 and known else "confirmed" if room > 1.0 and known else "undecided"
+    )
+    count = sum(part.periods for part in measured)
+    needed = math.ceil(count / room**2) if outcome == "undecided" and 0.0 < room <= 1.0 else None
+    return Judged(
+        name="stability", limit=1.0, sense="at least", value=room, low=None, high=None, unit="-", outcome=outcome,
+        where_hz=where, periods=needed,
+    )  # fmt: skip
+
+
+def _judge_peaks(controller: Controller, measured: Sequence[Measured], alpha: float) -> list[Judged]:
+    spec, rows = controller.spec, list[Judged]()
+    ms, mt, peak = (spec.level(name) for name in ("max_sensitivity", "max_complementary", "max_reference_peak"))
+    rows.append(_judge_sensitivity(ms, measured, alpha))
+    rows.append(_judge_discs("Mt", mt, measured, alpha, _bound_complementary))
+    rows.append(_judge_discs("reference peak", peak, measured, alpha, _bound_tracking(controller)))
+    return rows
+
+
+def _judge_sensitivity(asked: float | None, measured: Sequence[Measured], alpha: float) -> Judged:
+    """Judge Ms by the inequalities of the module."""
+    limit = None if asked is None else asked * (1.0 + GRACE)
+    m = sum(part.f.size for part in measured)
+    low = high = value = 0.0
+    where, needed = None, 0.0
+    confirmed, refuted, least = True, False, math.inf
+    for part in measured:
+        distance = np.abs(part.distance)
+        wide, narrow = part.loop.disc(alpha / m), part.loop.disc(alpha)
+        lower = 1.0 / (np.abs(1.0 + wide[0]) + wide[1])
+        left = np.abs(1.0 + narrow[0]) - narrow[1]
+        upper = np.where(left > 0.0, 1.0 / np.where(left > 0.0, left, 1.0), np.inf)
+        value, low, high = (max(a, float(np.max(b))) for a, b in ((value, 1.0 / distance), (low, lower), (high, upper)))
+        if limit is None:
+            continue
+        x = part.loop.radial(alpha)
+        slack = distance - x - 0.5 * limit * x**2 - 1.0 / limit
+        confirmed = confirmed and bool(np.all(slack >= 0.0) and np.all(part.loop.sure))
+        refuted = refuted or bool(np.any(lower > limit))
+        at = int(np.argmin(slack))
+        if slack[at] < least:
+            least, where = float(slack[at]), float(part.f[at])
+        room = distance - 1.0 / limit
+        allowed = (np.sqrt(1.0 + 2.0 * limit * np.maximum(room, 0.0)) - 1.0) / limit  # x that would just confirm
+        share = np.where(room > 0.0, x / np.maximum(allowed, 1e-300), wide[1] / np.maximum(-room, 1e-300))
+        needed = max(needed, float(np.max(share[slack < 0.0], initial=0.0)) ** 2 * part.periods)
+    outcome = _decide(confirmed, refuted) if limit is not None else "undecided"
+    return Judged(
+        name="Ms", limit=limit, sense="at most", value=value, low=low, high=high, unit="-", outcome=outcome,
+        where_hz=where, periods=math.ceil(needed) if outcome == "undecided" and 0.0 < needed < 1e6 else None,
+    )  # fmt: skip
+
+
+def _decide(confirmed: bool, refuted: bool) -> Outcome:
+    return "refuted" if refuted else "confirmed" if confirmed else "undecided"
+
+
+Bounds = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]
+
+
+def _bound_complementary(part: Measured, alpha: float) -> Bounds:
+    centre, radius = part.loop.disc(alpha)
+    known = radius < np.abs(1.0 + centre)
+    low, high = bound_disc("L", centre, np.where(known, radius, 0.0), np.ones_like(centre), np.ones_like(centre))
+    return np.where(known, low, 0.0), np.where(known, high, np.inf)
+
+
+def _bound_tracking(controller: Controller) -> Any:
+    def bound(part: Measured, alpha: float) -> Bounds:
+        centre, radius = part.tracking.disc(alpha)
+        static = _find_static(controller, part)
+        size = np.abs(centre)
+        return np.maximum(size - radius, 0.0) / static, (size + radius) / static
+
+    return bound
+
+
+def _find_middle(bound: Any, part: Measured) -> Float[np.ndarray, " m"]:
+    """Return a size at the centres of the discs."""
+    lower, upper = bound(part, CENTRE)
+    return 0.5 * (lower + upper)
+
+
+def _find_static(controller: Controller, part: Measured) -> float:
+    """Return the tracking at rest: one with an integral, else that of the lowest line."""
+    return 1.0 if controller.law.integrators else float(np.abs(part.tracking.value[0]))
+
+
+def _judge_discs(name: str, asked: float | None, measured: Sequence[Measured], alpha: float, bound: Any) -> Judged:
+    """Judge a peak by discs: all lines keep the limit, each at `alpha`, or one breaks it, at its share of `alpha`."""
+    limit = None if asked is None else asked * (1.0 + GRACE)
+    m = sum(part.f.size for part in measured)
+    low = high = value = needed = 0.0
+    where: float | None = None
+    for part in measured:
+        lower, upper = bound(part, alpha / m)[0], bound(part, alpha)[1]
+        middle = _find_middle(bound, part)
+        low, high = max(low, float(np.max(lower))), max(high, float(np.max(upper)))
+        at = int(np.argmax(middle))
+        if middle[at] > value:
+            value, where = float(middle[at]), float(part.f[at])
+        if limit is not None:
+            over = upper > limit
+            room = np.abs(limit - middle[over])
+            needed = max(
+                needed,
+                float(np.max((upper - middle)[over] / np.maximum(room, 1e-300), initial=0.0)) ** 2 * part.periods,
+            )
+    outcome = "undecided" if limit is None else _decide(high <= limit, low > limit)
+    return Judged(
+        name=name, limit=limit, sense="at most", value=value, low=low, high=high if math.isfinite(high) else None,
+        unit="-", outcome=outcome, where_hz=where,
+        periods=math.ceil(needed) if outcome == "undecided" and 0.0 < needed < 1e6 else None,
+    )  # fmt: skip
+
+
+def _judge_bandwidth(controller: Controller, measured: Sequence[Measured], alpha: float) -> Judged:
+    """Judge whether the tracking stays above -3 dB up to the bandwidth that was asked for, less its share."""
+    limit = (1.0 - SHORT_BY) * controller.spec.bandwidth_hz
+    tracked = controller.achieved.bandwidth_hz is not None and controller.achieved.bandwidth_hz < 1e6
+    m, bound = sum(part.f.size for part in measured), _bound_tracking(controller)
+    values, lows, highs = list[float](), list[float](), list[float]()
+    confirmed, refuted, needed, where = True, False, 0.0, None
+    for part in measured:
+        below = part.f <= limit
+        lower, upper = bound(part, alpha)[0], bound(part, alpha / m)[1]
+        middle = _find_middle(bound, part)
+        confirmed = confirmed and bool(np.all(lower[below] >= HALF_POWER)) and bool(np.any(part.f > limit))
+        broken = np.flatnonzero(below & (upper < HALF_POWER))
+        refuted = refuted or broken.size > 0
+        where = float(part.f[broken[0]]) if broken.size else where
+        values.append(_find_fall(part.f, middle))
+        lows.append(_find_fall(part.f, bound(part, alpha / m)[0]))
+        highs.append(_find_fall(part.f, bound(part, alpha)[1]))
+        open_ = below & (lower < HALF_POWER)
+        room = np.maximum(np.abs(middle - HALF_POWER), 1e-300)
+        needed = max(needed, float(np.max(((middle - lower) / room)[open_], initial=0.0)) ** 2 * part.periods)
+    outcome = _decide(confirmed, refuted)
+    high = min(highs)
+    return Judged(
+        name="bandwidth", limit=limit if tracked else None, sense="at least", value=min(values), low=min(lows),
+        high=high if math.isfinite(high) else None, unit="Hz", outcome=outcome, where_hz=where,
+        periods=math.ceil(needed) if outcome == "undecided" and 0.0 < needed < 1e6 else None,
+    )  # fmt: skip
+
+
+def _find_fall(f: Float[np.ndarray, " m"], size: Float[np.ndarray, " m"]) -> float:
+    """Return where a curve first falls below -3 dB, by a straight line; infinite where it does not."""
+    down = np.flatnonzero(size < HALF_POWER)
+    if not down.size:
+        return math.inf
+    k = int(down[0])
+    if k == 0:
+        return float(f[0])
+    share = (size[k - 1] - HALF_POWER) / (size[k - 1] - size[k])
+    return float(f[k - 1] + share * (f[k] - f[k - 1]))

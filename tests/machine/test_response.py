@@ -1,0 +1,128 @@
+"""Response and differences on logs of a machine that shares nothing with seaopt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import seaopt as so
+from seaopt.machine.discs import Ratio
+from seaopt.machine.periods import cut_periods, find_period
+from seaopt.machine.ticks import take_ticks
+from tests.machine.simulator import Machine, multisine
+
+LINES = np.unique(np.round(np.geomspace(1, 150, 40)).astype(int))
+REFERENCE = multisine(1000, LINES, 10, 60.0, 3, bias=300.0)
+
+
+def respond(machine, f, controller, delay):
+    """Return L and Y/R of the simulator's equations: sampled exactly by python's own matrix exponential."""
+    a = np.array([[0.0, 1.0], [-machine.stiffness / machine.mass, -machine.damping / machine.mass]])
+    b = np.array([0.0, machine.per_ampere * controller.per_effort / machine.mass])
+    whole = np.zeros((3, 3))
+    whole[:2, :2], whole[:2, 2] = a, b
+    moved = scipy.linalg.expm(whole * 1e-3)
+    z = np.exp(2j * np.pi * f * 1e-3)
+    plant = np.array([machine.stiffness * np.linalg.solve(x * np.eye(2) - moved[:2, :2], moved[:2, 2])[0] for x in z])
+    plant = plant * z**-delay
+    forward, feedback = controller.law.responses(f)
+    return -feedback * plant, forward * plant / (1.0 - feedback * plant)
+
+
+def test_the_measured_loop_is_that_of_the_equations(controller, bench):
+    machine = Machine()
+    response = so.accept(controller, [bench.log(machine, REFERENCE, noise=0.0)]).response
+    (part,) = response.measured
+    loop, tracking = respond(machine, part.f, controller, 1)
+    assert np.allclose(part.loop.value, loop, rtol=1e-4) and np.allclose(part.tracking.value, tracking, rtol=1e-4)
+    by_name = {row.name: row for row in response.judged}
+    assert np.isclose(by_name["Ms"].value, np.max(1.0 / np.abs(1.0 + loop)), rtol=1e-4)
+    assert response.met and all(row.outcome == "confirmed" for row in response.judged)
+
+
+def test_the_right_machine_is_accepted(controller, bench):
+    result = so.accept(controller, [bench.log(Machine(), REFERENCE)])
+    assert result.met and result.differences.inside and result.differences.misfit < 2.0, result
+
+
+@pytest.mark.parametrize(
+    ("machine", "kind", "name", "value"),
+    [
+        (replace(Machine(), per_ampere=0.85 * Machine().per_ampere), "parameter", "K_tau", 0.85),
+        (replace(Machine(), stiffness=0.8 * Machine().stiffness), "parameter", "k", 0.8),
+        (replace(Machine(), damping=2.0 * Machine().damping), "parameter", "b_r", 2.0),
+        (replace(Machine(), delay_s=2e-3), "delay", "delay", 2e-3),
+        (replace(Machine(), late=2.0), "delay", "delay", 1e-3),
+        (Machine().with_mode(40.0), "mode", "mode", 40.0),
+    ],
+)
+def test_another_machine_is_found_and_named(controller, bench, machine, kind, name, value):
+    result = so.accept(controller, [bench.log(machine, REFERENCE)])
+    assert result.replayed and not result.met and not result.differences.inside
+    first = result.differences.found[0]
+    assert (first.kind, first.name) == (kind, name) and np.isclose(first.value, value, rtol=0.05), result
+
+
+def test_a_sensor_at_its_range_is_named(controller, bench):
+    log = bench.log(replace(Machine(), sensor_range=330.0), REFERENCE)
+    result = so.accept(controller, [log])
+    assert not result.met and result.differences.found[0].kind == "range"
+
+
+def test_a_figure_that_the_machine_breaks_is_refuted_and_one_in_the_noise_is_undecided(controller, bench):
+    late = so.accept(controller, [bench.log(replace(Machine(), delay_s=2e-3), REFERENCE)])
+    (ms,) = (row for row in late.response.judged if row.name == "Ms")
+    assert ms.outcome == "refuted" and ms.low > ms.limit
+    noisy = so.accept(controller, [bench.log(Machine(), REFERENCE[:4000], noise=6.0)])
+    (ms,) = (row for row in noisy.response.judged if row.name == "Ms")
+    assert ms.outcome == "undecided" and ms.periods > 3 and ms.low < ms.limit < ms.high
+
+
+def test_phases_are_told_apart_and_the_first_period_of_each_is_left_out(controller, bench):
+    reference = np.concatenate([multisine(1000, LINES, 3, 60.0, seed, bias=300.0) for seed in range(6)])
+    assert find_period(reference) == 1000
+    blocks = cut_periods(controller, take_ticks(controller, bench.log(Machine(), reference)))
+    assert blocks.realisations == 6 and len(blocks.reference) == 12 and np.allclose(blocks.f, LINES)
+
+
+@pytest.mark.parametrize(
+    ("reference", "says"),
+    [
+        (100.0 * np.sin(np.arange(4000) ** 1.5 * 1e-3), "does not repeat"),
+        (multisine(1000, LINES, 2, 60.0, 3), "at least 3 periods"),
+        (multisine(1000, LINES, 4, 900.0, 3), "lower the amplitude"),
+    ],
+)
+def test_a_log_that_tells_no_response_says_what_to_record(controller, bench, reference, says):
+    result = so.accept(controller, [bench.log(Machine(), reference)])
+    assert result.replayed and result.response is None and not result.met
+    assert says in result.left_out["bench"] and says in repr(result).replace("\n", " ").replace("  ", " ")
+
+
+def test_discs_hold_the_truth_as_often_as_they_say():
+    rng, alpha, misses, far = np.random.default_rng(1), 0.05, 0, 0
+    truth, runs, m = 0.8 - 0.6j, 400, 25
+    for _ in range(runs):
+        w = np.full((6, m), 2.0 + 1j) + 0.05 * (rng.normal(size=(6, m)) + 1j * rng.normal(size=(6, m)))
+        z = truth * (2.0 + 1j) + 0.3 * (rng.normal(size=(6, m)) + 1j * rng.normal(size=(6, m)))
+        ratio = Ratio(numerator=z, denominator=w)
+        centre, radius = ratio.disc(alpha)
+        misses += np.count_nonzero(np.abs(centre - truth) > radius)
+        far += np.count_nonzero(np.real((centre - truth) * np.exp(0.3j)) > ratio.radial(alpha))
+    low, high = scipy.stats.binom.ppf([1e-4, 1.0 - 1e-4], runs * m, alpha)
+    assert low <= misses <= high and low <= far <= high
+
+
+def test_what_is_divided_by_nothing_sure_has_the_set_of_fieller():
+    rng, alpha, held, known, runs = np.random.default_rng(2), 0.1, 0, 0, 4000
+    truth, w0 = 1.5 + 0.5j, 1.0
+    w = w0 + 0.8 * (rng.normal(size=(5, runs)) + 1j * rng.normal(size=(5, runs)))
+    z = truth * w0 + 0.5 * (rng.normal(size=(5, runs)) + 1j * rng.normal(size=(5, runs)))
+    ratio = Ratio(numerator=z, denominator=w)
+    centre, radius = ratio.disc(alpha)
+    unsure = ~ratio.sure
+    held, known = np.mean((np.abs(centre - truth) <= radius)[unsure]), np.mean(np.isfinite(radius[unsure]))
+    assert np.mean(unsure) > 0.5 and held > 0.86 and known < 1.0
