@@ -55,6 +55,7 @@ SMALL = 1e-5  # below which a systematic residual is worth no word
 HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
+HARDLY = 0.02  # half of an interval over its value, from which what is told apart weakly may be far off
 TICK = 0.1  # of a sample, by which a delay may be beyond its bound
 PUSH = 4.0  # standard deviations that a bound holds an estimate away from where the logs want it
 NOISELESS = 1e-6  # of the spread: 20 bits, and less than rounding to single precision makes of a log
@@ -147,7 +148,9 @@ def _hangs_on_little(fit: Fit, findings: Sequence[FitFinding]) -> bool:
     part of the residual tells is moved far by as little that the model lacks.
     """
     coloured = any(fitted.whiteness_p < DOUBTFUL for _, fitted in _list_outputs(fit))
-    return any(finding.kind == "rough" for finding in findings) or (coloured and bool(fit.identifiability.weak))
+    weak = {name for direction in fit.identifiability.weak for name in direction}
+    hanging = any((fit.parameters[name].known or 0.0) > HARDLY for name in weak)
+    return any(finding.kind == "rough" for finding in findings) or (coloured and hanging)
 
 
 def _tells(fit: Fit, validation: Experiment) -> bool:
