@@ -73,13 +73,13 @@ def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     schedule = None if table.controller is None else table.controller.schedule
     if schedule is None or table.controller is None:
         return
-    named = [table.controller.plant, *table.controller.robust_to]
-    responses = [name for name in named if name.startswith(RESPONSE)]
-    if responses:
+    if table.controller.plant.startswith(RESPONSE):
         raise ProblemError(
-            f"controller.schedule is there, and {responses[0]} is a measured response, which stands at one value of "
-            f"{schedule.over}; name plants, or leave the schedule out"
+            f"controller.schedule is there, and {table.controller.plant} is a measured response, taken at one value of "
+            f"{schedule.over}: at the others nothing is known of it; name a plant, and the response in "
+            "robust_to, or leave the schedule out"
         )
+    named = [name for name in [table.controller.plant, *table.controller.robust_to] if not name.startswith(RESPONSE)]
     try:
         check_points(schedule.over, np.array(schedule.points))
         find_unit(schedule.over, {name: plants[name] for name in named})
@@ -99,7 +99,6 @@ def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     for key, there in (
         ('controller.structure = "mpc"', law.structure == "mpc"),
         ("impedance", table.impedance is not None),
-        ("robustness.retune", robustness is not None and robustness.retune),
         ("expect.controller", expect is not None and expect.controller is not None),
         ("expect.certificate", expect is not None and expect.certificate is not None),
     ):

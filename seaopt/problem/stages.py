@@ -191,30 +191,32 @@ def tune_problem(
     assert problem.spec is not None
     spec, draws = settle_delays(problem.spec, problem.design_plant, source)[0], problem.draws(source)
     values, schedule, table = problem.values(source), problem.schedule, problem.robustness
+    rounds = table.retune
+    scheduled: dict[str, Any] = {}
     if schedule is not None:
+        scheduled = {"over": schedule.over, "points": schedule.points, "bandwidths_hz": schedule.bandwidth_hz}
+    if schedule is not None and not rounds:
         tuned = tune_schedule(
             problem.design_plant,
             values,
             spec,
-            schedule.over,
-            schedule.points,
-            robust_to,
-            bandwidths_hz=schedule.bandwidth_hz,
+            robust_to=robust_to,
+            **scheduled,
             draws=draws,
             progress=progress,
         )
         return complete_schedule(problem, tuned, source)
-    rounds = table.retune
     if not rounds:
         tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
         tuned = complete_controller(problem, tuned, source)
         if rounds == 0 or not _needs_reserve(problem, tuned, source):
             return tuned
         rounds = ROUNDS
-    if problem.response_names:
+    if problem.designs_on_response:
         raise ProblemError(
-            f"{problem.source}: retune = {rounds} in [robustness] tunes again on models, and "
-            f"{problem.response_names[0]} is a measured response; leave retune out"
+            f"{problem.source}: retune = {rounds} in [robustness] tunes again at worst draws, and of "
+            f"{problem.response_names[0]}, a measured response, nothing is drawn; leave retune out, or name a plant "
+            "there and the response in robust_to"
         )
     return tune_certified(
         problem.design_plant,
@@ -223,12 +225,14 @@ def tune_problem(
         problem.certified_plants(),
         ranges=problem.ranges,
         robust_to=robust_to,
+        **scheduled,
         draws=draws,
         others=problem.parameters,
+        measured=problem.measure_responses(source),
         samples=table.samples,
         seed=table.seed + 1,
         rounds=rounds,
-        complete=partial(complete_controller, problem, source=source),
+        complete=partial(complete_controller if schedule is None else complete_schedule, problem, source=source),
         executor=executor,
         progress=progress,
     )
@@ -415,7 +419,7 @@ def certify_problem(
     options |= {"bounds": Budget() if table.bounds else None, "min_friction_margin": table.min_friction_margin}
     if isinstance(controller, ScheduledController):
         assert problem.schedule is not None
-        return certify(controller, plants, source, min_rate=problem.schedule.min_rate, **options)
+        return certify(controller, plants, source, min_rate=problem.schedule.min_rate, measured=measured, **options)
     if problem.mpc is None:
         certificate = certify(controller, plants, source, measured=measured, **options)
     else:

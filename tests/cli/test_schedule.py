@@ -85,7 +85,7 @@ def test_a_rate_that_the_link_does_not_reach_is_named_with_what_to_change(knee, 
         ("points = [0.0, 0.35]", "points = [0.35, 0.0]", "do not ascend"),
         ("min_rate = 1.0", "bandwidth_hz = [30.0]", "give one per point"),
         ("I_p = [0.3, 0.42]", "phi = [0.3, 0.42]", "robustness.parameters.phi"),
-        ("samples = 50", "retune = 2", "robustness.retune"),
+        ('plant = "stand"\nmeasured', 'plant = "frf:x"\nmeasured', "frf:x"),
         ("[robustness]", "[expect.controller]\n[robustness]", "expect.controller"),
     ],
 )

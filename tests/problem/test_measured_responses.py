@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import seaopt as so
 from seaopt.cli.main import app
 from seaopt.errors import ControlError, ProblemError
-from seaopt.problem.stages import list_plants, tune_problem
+from seaopt.problem.stages import certify_problem, list_plants, tune_problem
 
 FILE = """
 schema = 1
@@ -61,6 +61,26 @@ def test_a_response_is_read_with_the_delay_that_its_experiment_has(write):
 
 
 @pytest.mark.slow
+def test_a_schedule_keeps_its_limits_on_a_response_at_the_point_where_it_was_taken(write, tmp_path):
+    """The stand was measured with its own spring, which is a point; the other spring is known of the model alone."""
+    path, own = write(), 655000
+    table = f'[controller.schedule]\nover = "k"\npoints = [{own}, 750000]\n[robustness]'
+    path.write_text(path.read_text().replace("[robustness]", table))
+    problem = so.read_problem(path)
+    schedule = tune_problem(problem, problem.parameters)
+    assert [[one.name for one in each.measured] for each in schedule.controllers] == [["frf:chirp"], []]
+    assert schedule.met
+    certificate = certify_problem(problem, schedule, problem.parameters)
+    rows = [row for row in certificate.requirements if row.where.startswith("frf:chirp") or row.plant == "frf:chirp"]
+    assert {row.place for row in rows} == {("k", own)} and all(row.met for row in rows)
+    path.write_text(path.read_text().replace(f"{own}, 750000", "600000, 750000"))
+    problem = so.read_problem(path)
+    with pytest.raises(
+        ControlError, match=r"taken at k = 655000, and no point is there; give points = \[600000, 655000"
+    ):
+        tune_problem(problem, problem.parameters)
+
+
 def test_without_a_model_no_fit_is_needed_and_points_are_certified(write, tmp_path):
     path = write("frf:chirp", "").rename(tmp_path / "points.toml")
     path.write_text(path.read_text().split("[robustness]")[0])

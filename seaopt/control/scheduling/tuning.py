@@ -39,7 +39,7 @@ from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import Solution, recheck, solve
-from seaopt.control.tuning.tuner import make_controller, make_task, tune
+from seaopt.control.tuning.tuner import RobustTo, make_controller, make_task, tune
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.frequency import MeasuredResponse
@@ -57,7 +57,7 @@ def tune_schedule(
     spec: ControllerSpec,
     over: str,
     points: Sequence[float],
-    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    robust_to: RobustTo | None = None,
     *,
     bandwidths_hz: Sequence[float] | None = None,
     draws: Sequence[Mapping[str, float]] = (),
@@ -79,8 +79,9 @@ def tune_schedule(
         that is known while the law runs, such as a load.
     points : sequence of float
         Its values, ascending, SI; the ends are the range for which the schedule is made.
-    robust_to : mapping of name to Plant or (Plant, ParameterSet), optional
-        As in `seaopt.tune`; those that have the variable are placed at each point.
+    robust_to : mapping of name to Plant, (Plant, ParameterSet) or MeasuredResponse, optional
+        As in `seaopt.tune`; those that have the variable are placed at each point. A measured response was taken at the
+        value that `params` have of the variable, which has to be a point: it counts there.
     bandwidths_hz : sequence of float, optional
         One per point, in place of the specification's.
     draws : sequence of mappings, optional
@@ -114,15 +115,19 @@ def tune_schedule(
     check_points(over, places)
     robust_to = take_own_delays(spec, plant, robust_to or {}, params)
     spec, values = settle_delays(spec, plant, params)
+    responses = {name: plant for name, plant in robust_to.items() if isinstance(plant, MeasuredResponse)}
     others = _pair_plants(robust_to, values)
     if over in DELAYS:
         raise ControlError(f'over = "{over}": a delay cannot be read as the law runs; give a state or a parameter')
     if any(over in draw for draw in draws):
         raise ControlError(f'draws have "{over}", which the schedule is over; take it out of the draws')
     unit = find_unit(over, {"the design plant": plant, **{name: other for name, (other, _) in others.items()}})
-    placed = [
+    placed: list[tuple[ParameterSet, RobustTo]] = [
         (place_variable(plant, values, over, value), place_plants(others, over, value)) for value in places.tolist()
     ]
+    if responses:
+        at = _find_point(over, places.tolist(), {"": (plant, values), **others}, values, next(iter(responses)))
+        placed[at] = placed[at][0], {**placed[at][1], **responses}
     tasks = [
         make_task(plant, plant.complete(at_point), point_spec, at_points, draws)
         for (at_point, at_points), point_spec in zip(placed, _specify(spec, places, bandwidths_hz), strict=True)
@@ -158,12 +163,24 @@ def _pair_plants(robust_to: Mapping[str, Any], values: ParameterSet) -> Plants:
     pairs: dict[str, tuple[Plant, ParameterSet]] = {}
     for name, plant in robust_to.items():
         if isinstance(plant, MeasuredResponse):
-            raise ControlError(
-                f"robust_to: {name} is a measured response, which stands at one value of the variable; name a plant"
-            )
+            continue
         pairs[str(name)] = plant if isinstance(plant, tuple) else (plant, values)
         require_plant(pairs[str(name)][0], f"robust_to: {name}", ControlError)
     return pairs
+
+
+def _find_point(over: str, points: Sequence[float], plants: Plants, values: ParameterSet, name: str) -> int:
+    """Return the point at which a measured response was taken: where the parameters have the variable."""
+    stated = [values[over].value] if over in values else []
+    stated += [plant.complete(params)[over].value for plant, params in plants.values() if over in plant.parameters]
+    place = stated[0] if stated else 0.0
+    if place not in points:
+        more = ", ".join(f"{value:g}" for value in sorted({*points, place}))
+        raise ControlError(
+            f"robust_to: {name} is a measured response, which was taken at {over} = {place:g}, and no point is there; "
+            f"give points = [{more}], or the value of {over} it was taken at among the parameters"
+        )
+    return points.index(place)
 
 
 def _specify(spec: ControllerSpec, points: Any, bandwidths_hz: Sequence[float] | None) -> list[ControllerSpec]:

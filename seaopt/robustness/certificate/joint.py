@@ -19,13 +19,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from seaopt.control import Controller, ControllerSpec, tune
+from seaopt.control import Controller, ControllerSpec, ScheduledController, tune, tune_schedule
 from seaopt.control.laws.delay import settle_delays
 from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared
 from seaopt.formatting import format_count, format_table, format_values, html_text
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore, prefix
@@ -35,15 +36,16 @@ from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.measured_draws import measure_draws, search_worst
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
+from seaopt.robustness.certificate.scheduled import ScheduleCertificate
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
-from seaopt.robustness.uncertainty.worst import place_values
+from seaopt.robustness.uncertainty.worst import Worst, place_values
 
 MOST_ROUNDS = 6
 TUNING, CERTIFYING = 1.0, 2.0  # of the time of a round
 LOOKED_AT, LOOK_STREAM = 64, 0x100C  # draws of a first look, and their seed, which no certificate has
 SAME_WITNESS = 1e-6  # witnesses that differ by less than this share in every parameter are one
-Pairs = Mapping[str, tuple[Plant, ParameterSet]]
+Witnesses = Mapping[str, tuple[Plant, ParameterSet] | MeasuredResponse]
 
 
 @record(eq=False)
@@ -56,8 +58,8 @@ class Round:
         From 1.
     plants : int
         Number of plants on which the tuner kept its limits, the design plant included.
-    controller : Controller
-    certificate : Certificate or None
+    controller : Controller or ScheduledController
+    certificate : Certificate, ScheduleCertificate or None
         None if the controller misses its limits on those plants already.
     added : tuple of str
         Witnesses that the next round keeps its limits on too.
@@ -65,8 +67,8 @@ class Round:
 
     number: int
     plants: int
-    controller: Controller
-    certificate: Certificate | None
+    controller: Controller | ScheduledController
+    certificate: Certificate | ScheduleCertificate | None
     added: tuple[str, ...] = ()
 
 
@@ -80,20 +82,20 @@ class JointTuning(Result):
         "certified"; "infeasible": the limits cannot be met on the witnesses together; "stuck": the certificate fails
         on plants where the tuner met its limits, or on a requirement that it does not treat; "rounds": there were too
         few.
-    controller : Controller
+    controller : Controller or ScheduledController
         Of the last round.
-    certificate : Certificate or None
+    certificate : Certificate, ScheduleCertificate or None
         Of that controller; None if it is infeasible.
     rounds : tuple of Round
-    robust_to : mapping of name to (plant, parameters)
+    robust_to : mapping of name to (plant, parameters) or MeasuredResponse
         Every plant besides the design plant on which the last controller had to keep its limits.
     """
 
     status: Literal["certified", "infeasible", "stuck", "rounds"]
-    controller: Controller
-    certificate: Certificate | None
+    controller: Controller | ScheduledController
+    certificate: Certificate | ScheduleCertificate | None
     rounds: tuple[Round, ...]
-    robust_to: Pairs
+    robust_to: Witnesses
 
     @property
     def met(self) -> bool:
@@ -106,7 +108,8 @@ class JointTuning(Result):
         if self.status == "certified":
             return ""
         if self.certificate is None:
-            return self.controller.explanation
+            law = self.controller
+            return law.explanation if isinstance(law, Controller) else law.remedy
         broken = next(row for row in self.certificate.requirements if not row.met)
         if self.status == "rounds":
             return f"{len(self.rounds)} rounds were too few: {broken}; give more rounds, or a larger reserve"
@@ -133,14 +136,18 @@ def tune_certified(
     plants: Plants,
     *,
     ranges: Ranges | None = None,
-    robust_to: Pairs | None = None,
+    robust_to: Witnesses | None = None,
+    over: str | None = None,
+    points: Sequence[float] = (),
+    bandwidths_hz: Sequence[float] | None = None,
     draws: Sequence[Mapping[str, float]] = (),
     others: ParameterSet | None = None,
+    measured: Mapping[str, MeasuredResponse] | None = None,
     samples: int = 1375,
     seed: int = 1,
     confidence: float = CONFIDENCE,
     rounds: int = MOST_ROUNDS,
-    complete: Callable[[Controller], Controller] | None = None,
+    complete: Callable[[Any], Any] | None = None,
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> JointTuning:
@@ -156,10 +163,13 @@ def tune_certified(
         Bandwidth and limits.
     plants : mapping of name to Plant
         Plants on which the controller must pass; each is in the first round at the nominal parameters.
-    ranges, others, samples
+    ranges, others, measured, samples
         As in `certify`.
-    robust_to : mapping of name to (Plant, ParameterSet), optional
+    robust_to : mapping of name to (Plant, ParameterSet) or MeasuredResponse, optional
         More for the first round, such as the ends of the ranges.
+    over, points, bandwidths_hz
+        Of a schedule, as in `tune_schedule`; one law for all if left out. The worst case of each plant, at whatever
+        value of the variable it was found, is kept at all points of the next round.
     draws : sequence of mappings of parameter to value, optional
         As in `tune`, in every round.
     seed : int
@@ -204,16 +214,22 @@ def tune_certified(
     finished: list[Round] = []
     for number, part in enumerate(divide(progress, *(1.0 for _ in range(rounds))), start=1):
         tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
-        controller = tune(plant, values, spec, witnesses, draws=draws, progress=tuning)
+        options: dict[str, Any] = {"robust_to": witnesses, "draws": draws, "progress": tuning}
+        controller: Controller | ScheduledController
+        if over is None:
+            controller = tune(plant, values, spec, **options)
+        else:
+            controller = tune_schedule(plant, values, spec, over, points, bandwidths_hz=bandwidths_hz, **options)
         controller = controller if complete is None else complete(controller)
         certificate = None
-        if controller.feasible:
+        if controller.met:
             certificate = certify(
                 controller,
                 plants,
                 parameters,
                 ranges=ranges,
                 others=others,
+                measured=measured,
                 samples=samples,
                 seed=seed + number - 1,
                 confidence=share,
@@ -221,7 +237,8 @@ def tune_certified(
                 executor=executor,
                 progress=certifying,
             )
-        added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
+        pairs = [pair for pair in witnesses.values() if not isinstance(pair, MeasuredResponse)]
+        added = _list_new_witnesses(certificate, [(plant, values), *pairs], number)
         plants_met = 1 + len(witnesses)
         made: dict[str, Any] = {"controller": controller, "certificate": certificate}
         finished.append(Round(number=number, plants=plants_met, added=(*added,), **made))
@@ -255,7 +272,7 @@ def breaks_at_draws(
 
 
 def _list_new_witnesses(
-    certificate: Certificate | None, tuned_on: Sequence[tuple[Plant, ParameterSet]], number: int
+    certificate: Certificate | ScheduleCertificate | None, tuned_on: Sequence[tuple[Plant, ParameterSet]], number: int
 ) -> dict[str, tuple[Plant, ParameterSet]]:
     """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need. Of
     friction it is the draw with the least margin, where that is not what is asked.
@@ -263,19 +280,35 @@ def _list_new_witnesses(
     if certificate is None or certificate.passed:
         return {}
     cases: dict[str, tuple[Plant, ParameterSet, Mapping[str, float]]] = {
-        name: (worst[0], worst[1], worst.parameters) for name, worst in certificate.worst.items()
+        name: (worst[0], worst[1], worst.parameters) for name, worst in find_worst(certificate).items()
     }
-    least = certificate.controller.spec.level(MIN_FRICTION_MARGIN)
-    for name, draws in certificate.friction_draws.items():
-        if least is not None and draws.least_slope < least:
-            plant = certificate.models[name]
-            values = place_values(plant, certificate.parameters, draws.parameters)
-            cases[f"{name}'s friction"] = (plant, values, draws.parameters)
+    for each in list_certificates(certificate):
+        least = each.controller.spec.level(MIN_FRICTION_MARGIN)
+        for name, draws in each.friction_draws.items():
+            if least is not None and draws.least_slope < least:
+                plant = each.models[name]
+                values = place_values(plant, each.parameters, draws.parameters)
+                cases[f"{name}'s friction"] = (plant, values, draws.parameters)
     return {
         f"{name}, round {number}: {format_values(place, missing='nominal')}": (plant, values)
         for name, (plant, values, place) in cases.items()
         if not any(plant is other and _agree(values, at, place) for other, at in tuned_on)
     }
+
+
+def list_certificates(certificate: Certificate | ScheduleCertificate) -> tuple[Certificate, ...]:
+    """Return a certificate, or those of a schedule's places."""
+    return certificate.places if isinstance(certificate, ScheduleCertificate) else (certificate,)
+
+
+def find_worst(certificate: Certificate | ScheduleCertificate) -> dict[str, Worst]:
+    """Return the worst case of each plant, of a schedule over all of its places."""
+    found: dict[str, Worst] = {}
+    for each in list_certificates(certificate):
+        for name, worst in each.worst.items():
+            if name not in found or worst.severity > found[name].severity:
+                found[name] = worst
+    return found
 
 
 def _agree(values: ParameterSet, other_values: ParameterSet, names: Iterable[str]) -> bool:
@@ -290,7 +323,7 @@ def _list_cells(entry: Round) -> tuple[str, str, str, str]:
     """Return a row of the table of rounds."""
     if entry.certificate is None:
         return str(entry.number), str(entry.plants), "–", "limits not met on these plants"
-    name, worst = max(entry.certificate.worst.items(), key=lambda pair: pair[1].severity)
+    name, worst = max(find_worst(entry.certificate).items(), key=lambda pair: pair[1].severity)
     size = "unstable" if worst.severity >= UNSTABLE else f"{worst.severity:.4f}"
     failures, place = str(entry.certificate.monte_carlo.failures), format_values(worst.parameters, missing="nominal")
     return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {place}"

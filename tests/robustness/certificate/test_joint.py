@@ -144,3 +144,21 @@ def test_a_friction_margin_is_certified_and_the_draw_that_lacks_it_goes_back_to_
     )
     assert plant is stand
     assert values["k"].value == draws.parameters["k"]
+
+
+@pytest.mark.slow
+def test_a_schedule_is_tuned_again_with_the_worst_case_of_any_of_its_values():
+    stand, swing, thor = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+    ranges = {"m": (2.0, 6.0), "k": (5.5e5, 7.5e5)}
+    done = tune_certified(stand, thor, spec, {"swing": swing}, over="I_p", points=[0.2, 0.6], ranges=ranges, samples=60)
+    first, last = done.rounds[0], done.rounds[-1]
+    assert done.met and first.certificate.monte_carlo.failures > 0 == last.certificate.monte_carlo.failures
+    assert any(name.startswith("swing, round 1") for name in first.added)
+    # The corner that was worst, at every value of the table, by eigenvalues and a grid of the test's own.
+    worst = thor.update(m=6.0, k=7.5e5)
+    for value in np.linspace(0.2, 0.6, 7):
+        law, f = done.controller.at(float(value)), np.geomspace(0.1, 499.0, 4000)
+        loop = law.close(swing, worst.update(I_p=float(value)))
+        assert np.max(np.abs(loop.eigenvalues())) < 1.0
+        assert np.max(np.abs(1.0 / (1.0 + loop.plant.response(f) * law.law.measurement_response(f)))) < 1.6 * 1.005

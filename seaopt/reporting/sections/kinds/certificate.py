@@ -44,6 +44,7 @@ REMEDIES = {
     "ripple_compensation": "a smaller fraction of ripple, or fewer of its cycles, in compensate of [controller]",
     "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
     "constrained_failure_probability": "more constrained_runs in [robustness]",
+    "min_schedule_rate": "a smaller min_rate in [controller.schedule], or a higher bandwidth_hz",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }
 
@@ -69,7 +70,7 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
         return Verdict(met=True, text=text)
     broken = [row for row in certificate.requirements if not row.met]
     reasons = [explain_failure(failure) for failure in group_failures(broken)]
-    remedies = [_advise(row.name) for row in broken]
+    remedies = [advise(row.name) for row in broken]
     if certificate.constrained is not None:
         remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
     first = next((text for text in remedies if text), "")
@@ -98,7 +99,8 @@ def _advise_ranges(certificate: Certificate) -> tuple[str, ...]:
     return ()
 
 
-def _advise(name: str) -> str:
+def advise(name: str) -> str:
+    """Return what to change where a requirement is not met."""
     return BY_REQUIREMENT[name].remedy if name in BY_REQUIREMENT else REMEDIES.get(name, "")
 
 

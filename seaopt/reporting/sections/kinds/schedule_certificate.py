@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from seaopt.formatting import format_count
 from seaopt.reporting.sections.data import Commands, Section, Table, Verdict, list_notes
-from seaopt.reporting.sections.kinds.certificate import explain_failure
+from seaopt.reporting.sections.kinds.certificate import advise, explain_failure
 from seaopt.robustness import ScheduleCertificate
 from seaopt.robustness.certificate.requirement import group_failures
-from seaopt.robustness.certificate.scheduled import MOTION_RATE
 from seaopt.units import unit_after
 
 
@@ -27,8 +26,8 @@ def judge(certificate: ScheduleCertificate, commands: Commands) -> Verdict:
     broken = [row for row in certificate.requirements if not row.met]
     reasons = tuple(explain_failure(failure) for failure in group_failures(broken))
     command = f"type {commands.certify}" if commands.certify else "tune again"
-    slow = all(row.name == MOTION_RATE and row.value > 0.0 for row in broken)  # 0 where it rings or departs
-    change = "ask a smaller min_rate, or allow more current" if slow else "raise reserve, or add points"
+    remedies = (row.remedy or advise(row.name) for row in broken)
+    change = next((text for text in remedies if text), "raise reserve, or add points")
     return Verdict(
         met=False,
         text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
