@@ -148,6 +148,19 @@ def json_schema(cls: type[Any]) -> dict[str, Any]:
     return make_model(cls).model_json_schema(by_alias=True)
 
 
+def join_schemas(*kinds: type[Any]) -> dict[str, Any]:
+    """Return the JSON Schema of a file that holds one of several records."""
+    schemas = [json_schema(kind) for kind in kinds]
+    shared = [name for name in schemas[0]["required"] if all(name in schema["required"] for schema in schemas)]
+    return {
+        "$defs": {name: each for schema in schemas for name, each in schema.pop("$defs", {}).items()},
+        "description": " ".join(schema["description"] for schema in schemas),
+        "type": "object",
+        "required": shared,
+        "anyOf": schemas,
+    }
+
+
 @cache
 def make_model(cls: type[Any]) -> type[BaseModel]:
     """Return the pydantic model of a record's file; what is a property may be left out, and is not read."""

@@ -143,6 +143,13 @@ def seal(content: Mapping[str, Any]) -> dict[str, Any]:
     return {**content, "made_from": {**(content.get("made_from") or {}), CONTENT: digest_content(content)}}
 
 
+def check_schema(content: Any, schema: str, source: Path | str, remedy: str) -> None:
+    """Refuse what does not carry a schema (FileError): another file, or one of an older version."""
+    stated = content.get("schema") if isinstance(content, Mapping) else None
+    if stated != schema:
+        raise FileError(f'{source}: schema is {stated!r}, expected "{schema}"; {remedy}')
+
+
 def check_seal(content: Mapping[str, Any], source: Path | str, remedy: str) -> None:
     """Refuse a result without a digest, which somebody wrote by hand, and one that was edited since. Raises FileError:
     the digest is missing or damaged, or another one than the content has.
@@ -217,8 +224,6 @@ def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage aga
     """
     source = Path(path)
     content = parse_file(source, json.loads, "JSON", remedy=remedy)
-    stated = content.get("schema") if isinstance(content, dict) else None
-    if stated != schema:
-        raise FileError(f'{source}: schema is {stated!r}, expected "{schema}"; {remedy}')
+    check_schema(content, schema, source, remedy)
     check_seal(content, source, remedy)
     return content

@@ -9,12 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from seaopt.cli.provenance import FILES, SCHEDULE_FILES, digest
-from seaopt.cli.session import OWN_LAW, SCHEDULE_SCHEMAS, SCHEMAS
+from seaopt.cli.provenance import FILES, digest
+from seaopt.cli.session import OWN_LAW, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.codec import to_content
 from seaopt.control.deploy.export import export, read_guard
-from seaopt.control.deploy.schedule_export import is_schedule
 from seaopt.control.laws.plausibility import GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
@@ -39,11 +38,11 @@ def export_controller(
     SeaoptError: there is no controller, it was edited or made from another fit than the one beside it, or it cannot be
     written.
     """
-    path, schema, certificate = _find_law(results)
+    path, certificate = results / FILES["tune"], results / FILES["certify"]
     of_problem = f"PROBLEM -o {shlex.quote(str(results))}"
     if not exists(path):
         raise ProblemError(f"{path}: no such file; give the folder of results, or make them: seaopt run {of_problem}")
-    content = read_json(path, schema, remedy=f"run seaopt tune {of_problem}{OWN_LAW}")
+    content = read_json(path, SCHEMAS["tune"], remedy=f"run seaopt tune {of_problem}{OWN_LAW}")
     fitted = results / FILES["fit"]
     expected = content["made_from"].get(fitted.name)
     if expected is not None and fitted.exists() and digest(fitted) != expected:
@@ -51,8 +50,8 @@ def export_controller(
     if derate_margin_K is not None and options["derate"] is False:
         raise ProblemError("--no-derate and --derate-margin: type one of them")
     if derate_margin_K is not None:  # without a guard `export` says what is missing
-        options["derate"] = read_guard(_take_first(content), derate_margin_K) or True
-    options["gate"] = choose_gate(_take_first(content), gate or {}, options)
+        options["derate"] = read_guard(content, derate_margin_K) or True
+    options["gate"] = choose_gate(content, gate or {}, options)
     failed = _list_broken_requirements(path, certificate)
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
@@ -82,7 +81,8 @@ def export_controller(
         sys.stdout.write(to_json(result))
         return met
     console = Terminal()
-    missed = content["broken"] if is_schedule(content) else [join_labels(content["active_constraints"])]
+    schedule = content["schedule"]
+    missed = [join_labels(content["active_constraints"])] if schedule is None else schedule["broken"]
     for good, text in (
         (fit_met, UNMET),
         (feasible, "; ".join(missed)),
@@ -101,18 +101,13 @@ def export_controller(
 
 def _list_typed(content: Mapping[str, Any], options: Mapping[str, Any]) -> list[str]:
     """Return the parts of the law that options make another than that of the certificate."""
-    guards, gate = _take_first(content).get("guards") or {}, options["gate"]
+    guards, gate = content.get("guards") or {}, options["gate"]
     differs = {
         "the gate": gate is not None and (to_content(gate) if gate else None) != guards.get("gate"),
         "the heat guard": options["derate"] is not None and options["derate"] != guards.get("derate", False),
         "the anti-windup": options["tracking_time_s"] is not None,
     }
     return [name for name, differ in differs.items() if differ]
-
-
-def _take_first(content: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a controller.json as it is, and of a schedule its first controller, whose guards are those of all."""
-    return content["controllers"][0] if is_schedule(content) else content
 
 
 def choose_gate(
@@ -163,9 +158,9 @@ def _find_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> float
     """Return the limit of the command of the exported law; None where it has none."""
     if "mpc" in content:
         return read_code(content["mpc"]["code"]).numbers["limit"]
-    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+    from seaopt.control.scheduling.stored import read_laws  # deferred: pydantic
 
-    stored = read_controller(content)
+    stored, *_ = read_laws(content)
     limit = options["command_limit"] if options["current_limit_A"] is None else options["current_limit_A"]
     limit = choose_limit(stored["command"], stored["spec"], limit)
     return None if limit is None or not math.isfinite(limit) else limit
@@ -176,9 +171,9 @@ def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -
     limits = [options[name] for name in ("current_limit_A", "command_limit") if options.get(name) is not None]
     if not limits:
         return ""
-    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+    from seaopt.control.scheduling.stored import read_laws  # deferred: pydantic
 
-    stored = read_controller(_take_first(content))
+    stored, *_ = read_laws(content)
     return find_raised_limit(stored["command"], stored["spec"], limits[0])
 
 
@@ -203,31 +198,17 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
     return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h"))
 
 
-def _find_law(results: Path) -> tuple[Path, str, Path]:
-    """Return the law's or schedule's file, schema and certificate's file. Raises ProblemError: both are there."""
-    law, scheduled = results / FILES["tune"], results / SCHEDULE_FILES["tune"]
-    if not exists(scheduled):
-        return law, SCHEMAS["tune"], results / FILES["certify"]
-    if law.is_file():
-        raise ProblemError(
-            f"{results}: has {law.name} and {scheduled.name}, one of them from an earlier run; tune again into a "
-            "folder of its own: seaopt tune PROBLEM -o DIR"
-        )
-    return scheduled, SCHEDULE_SCHEMAS["tune"], results / SCHEDULE_FILES["certify"]
-
-
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
     """Return the requirements that the certificate of this controller says are not met; None without a certificate.
     Raises SeaoptError: the certificate was edited or written by hand, or is of another controller.
     """
-    from seaopt.robustness.certificate.stored import list_requirements  # deferred: pydantic
+    from seaopt.robustness.certificate.stored import read_requirements  # deferred: pydantic
 
     if not certificate.is_file():
         return None
-    scheduled = certificate.name == SCHEDULE_FILES["certify"]
     again = f"run seaopt certify PROBLEM -o {shlex.quote(str(certificate.parent))}, or delete it"
-    content = read_json(certificate, (SCHEDULE_SCHEMAS if scheduled else SCHEMAS)["certify"], remedy=again)
+    content = read_json(certificate, SCHEMAS["certify"], remedy=again)
     if content["made_from"].get(controller.name) != digest(controller):
         raise ProblemError(f"{certificate}: is not of {controller.name} beside it; {again}")
-    rows = list_requirements(content, str(certificate))
+    rows = read_requirements(content, str(certificate))
     return list(dict.fromkeys(row.name for row in rows if not row.met))

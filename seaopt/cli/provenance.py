@@ -24,13 +24,7 @@ FILES = {
     "sweep": "frontier.json",
     "certify": "robustness.json",
 }
-SCHEDULE_FILES = {"tune": "schedule.json", "certify": "schedule_robustness.json"}  # where gains are scheduled
 ROBUSTNESS = "[robustness]"  # the digest of what a design took from there
-
-
-def name_file(problem: Problem, stage: str) -> str:
-    """Return the name of the file that a stage writes."""
-    return (SCHEDULE_FILES if problem.schedule is not None else FILES).get(stage, FILES[stage])
 
 
 def digest(path: Path) -> str:
@@ -57,7 +51,7 @@ def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]
             _shape_by_robustness(problem, (problem.robustness.retune or 0) if stage == "tune" else 0)
         )
     for before in earlier:
-        path = folder / name_file(problem, before)
+        path = folder / FILES[before]
         if path.exists() and (before != "fit" or problem.table.experiment):
             out[path.name] = digest(path)
     return out

@@ -15,16 +15,15 @@ from typing import Any
 
 from seaopt import __version__
 from seaopt.cli.progress import LEAST_SHARE, show_progress
-from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources, name_file
+from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
 from seaopt.control.frontier.frontier import FRONTIER_SCHEMA
-from seaopt.control.laws.controller import CONTROLLER_SCHEMA
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, warn_delays
+from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
-from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, compare_with_log, warn_unidentified
 from seaopt.estimation.fit import SCALED
@@ -59,7 +58,6 @@ from seaopt.reporting.sections.data import Commands, Verdict
 from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, name_guesses
 from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate, linear_controller
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
-from seaopt.robustness.certificate.scheduled import SCHEDULE_ROBUSTNESS_SCHEMA
 from seaopt.testing.expectations import list_expectations
 
 SCHEMAS = {
@@ -69,7 +67,6 @@ SCHEMAS = {
     "sweep": FRONTIER_SCHEMA,
     "certify": ROBUSTNESS_SCHEMA,
 }
-SCHEDULE_SCHEMAS = {"tune": SCHEDULE_SCHEMA, "certify": SCHEDULE_ROBUSTNESS_SCHEMA}
 LABELS = {
     "simulate": "simulating",
     "frf": "frequency responses",
@@ -267,10 +264,7 @@ class Session:
         self._write("tune", controller.to_dict() | plan)
 
     def _path(self, stage: str) -> Path:
-        return self.folder / name_file(self.problem, stage)
-
-    def _schema(self, stage: str) -> str:
-        return (SCHEDULE_SCHEMAS if self.problem.schedule is not None else SCHEMAS).get(stage, SCHEMAS[stage])
+        return self.folder / FILES[stage]
 
     def _check_spec(self, stored: ControllerSpec) -> None:
         spec = self._spec().to_dict()
@@ -303,7 +297,7 @@ class Session:
         path, again = self._path(stage), f"run {self._spell(stage)}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
-        content = read_json(path, self._schema(stage), remedy=f"{again} again{OWN_LAW if stage == 'tune' else ''}")
+        content = read_json(path, SCHEMAS[stage], remedy=f"{again} again{OWN_LAW if stage == 'tune' else ''}")
         made_from, expected = content["made_from"], digest_sources(self.problem, stage, self.folder)
         changed = {name for name in {*expected, *made_from} - {CONTENT} if expected.get(name) != made_from.get(name)}
         if changed - {ROBUSTNESS}:

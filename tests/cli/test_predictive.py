@@ -60,7 +60,7 @@ def test_it_is_designed_certified_and_exported(planned, seaopt):
     robustness = json.loads((planned / "out" / "robustness.json").read_text(encoding="utf-8"))
     runs = robustness["constrained"]
     assert robustness["passed"] and runs["runs"] == 1 and runs["largest_ring"] > 0.0
-    assert runs["sensors"]["noise_std"] == {"F1": 1.0} and runs["current_step_A"] == 0.01
+    assert runs["sensors"]["noise_std"] == {"F1": 1.0} and runs["command_step"] == 0.01
     assert any("F2" in note and "no run" in note for note in robustness["remarks"])
     assert seaopt("export", "out", "--c", "code").returncode == 0
     problem = so.read_problem(planned / "plan.toml")

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.cli.test_schemas import validator
+
 KNEE = Path(__file__).resolve().parents[2] / "problems" / "lever_knee.toml"
 SHORTER = {
     "points = [0.0, 0.3, 0.55, 0.75, 0.9, 1.05, 1.15]": "points = [0.0, 0.35]",
@@ -33,14 +35,12 @@ def knee(folder, text):
 def test_tune_writes_a_schedule_that_export_takes(knee, seaopt):
     out = seaopt("tune", "knee.toml")
     assert out.returncode == 0, out.stderr
-    content = json.loads((knee / "out" / "schedule.json").read_text(encoding="utf-8"))
-    assert content["schema"] == "seaopt/schedule/2" and content["points"] == [0.0, 0.35]
-    assert not (knee / "out" / "controller.json").exists()
+    content = json.loads((knee / "out" / "controller.json").read_text(encoding="utf-8"))
+    assert content["schema"] == "seaopt/controller/3" and content["schedule"]["points"] == [0.0, 0.35]
+    assert not list(validator("controller").iter_errors(content))
     written = seaopt("export", "out", "--c", "c", "--name", "knee")
     assert written.returncode == 0 and {path.name for path in (knee / "c").iterdir()} == {"knee.h", "knee.c"}
     assert "not certified" in written.stdout
-    (knee / "out" / "controller.json").write_text("{}", encoding="utf-8")  # whichever of both is meant
-    assert seaopt("export", "out", "--c", "c").returncode == 2
 
 
 @pytest.mark.slow
@@ -48,9 +48,8 @@ def test_a_schedule_has_the_gate_of_its_file_at_every_point_and_in_c(knee, seaop
     gated = text.replace("[controller.schedule]", "[controller.gate]\nrange_N = [-200, 200]\n\n[controller.schedule]")
     (knee / "knee.toml").write_text(gated, encoding="utf-8")
     assert seaopt("tune", "knee.toml").returncode == 0
-    content = json.loads((knee / "out" / "schedule.json").read_text(encoding="utf-8"))
-    first, second = (each["guards"]["gate"] for each in content["controllers"])
-    assert first == second and first["range_N"] == [-200.0, 200.0]
+    content = json.loads((knee / "out" / "controller.json").read_text(encoding="utf-8"))
+    assert content["guards"]["gate"]["range_N"] == [-200.0, 200.0]
     assert seaopt("export", "out", "--c", "c", "--name", "knee").returncode == 0
     assert "A reading is believed" in (knee / "c" / "knee.h").read_text(encoding="utf-8")
     assert seaopt("export", "out", "--c", "d", "--name", "knee", "--no-gate").returncode == 0
@@ -65,6 +64,8 @@ def test_a_whole_run_is_met_and_its_report_has_the_schedule(knee, seaopt):
     page = (knee / "out" / "report.html").read_text(encoding="utf-8")
     assert "Gains at the points" in page and "proved" in page
     assert seaopt("report", "knee.toml").returncode == 0
+    content = json.loads((knee / "out" / "robustness.json").read_text(encoding="utf-8"))
+    assert not list(validator("robustness").iter_errors(content))
     written = seaopt("export", "out", "--c", "c")
     assert written.returncode == 0 and "not certified" not in written.stdout
 

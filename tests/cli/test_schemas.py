@@ -11,8 +11,7 @@ import pytest
 
 from seaopt.cli.schemas import DOCUMENTS, json_schema
 from seaopt.cli.session import Session
-from seaopt.control.laws.controller import CONTROLLER_SCHEMA
-from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
+from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.estimation.result.fit_result import FIT_SCHEMA
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
 
@@ -47,8 +46,7 @@ def test_results_agree(done, document):
 
 @pytest.mark.parametrize(
     ("document", "written"),
-    [("fit", FIT_SCHEMA), ("controller", CONTROLLER_SCHEMA), ("schedule", SCHEDULE_SCHEMA),
-     ("robustness", ROBUSTNESS_SCHEMA)],
+    [("fit", FIT_SCHEMA), ("controller", CONTROLLER_SCHEMA), ("robustness", ROBUSTNESS_SCHEMA)],
 )  # fmt: skip
 def test_a_schema_has_the_version_of_the_files(document, written):
     assert json_schema(document)["$id"].rsplit(":", 1)[1] == written.rsplit("/", 1)[1]

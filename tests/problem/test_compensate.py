@@ -44,7 +44,7 @@ def test_what_the_file_asks_is_what_runs(tmp_path, asked, fraction, source):
     assert (
         Controller.from_dict(content, problem.design_plant, problem.parameters).compensation == controller.compensation
     )
-    content["compensation"]["friction"]["reads"] = "" if source == "speed" else "q"
+    content["terms"]["friction"]["reads"] = "" if source == "speed" else "q"
     with pytest.raises(so.SeaoptError, match="reads"):
         Controller.from_dict(content, problem.design_plant, problem.parameters)
 
@@ -117,7 +117,7 @@ def test_ripple_of_the_file_is_added(tmp_path):
     assert (term.reads, term.cycles, term.period) == ("q", (6, 12), 0.002)
     assert controller.command.per_effort * term.effort(0.0) == pytest.approx(0.08)
     content = json.loads(to_json(controller.to_dict()))
-    content["compensation"]["ripple"]["cos"] = [0.1]
+    content["terms"]["ripple"]["cos"] = [0.1]
     with pytest.raises(so.SeaoptError, match="one cos and one sin"):
         Controller.from_dict(content, problem.design_plant, problem.parameters)
     path.write_text(TEXT % asked.replace("[0.1, 0.0]", "[0.1]"), encoding="utf-8")

@@ -29,7 +29,7 @@ from seaopt.control.deploy.c_text import (
     render,
     strip_markup,
 )
-from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_schedule, is_schedule, read_runnable
+from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_schedule, read_runnable
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
@@ -76,8 +76,8 @@ def export(
     Parameters
     ----------
     controller : Controller, ScheduledController or mapping
-        The controller, or the content of its controller.json; or of a schedule.json, of which NAME.h and NAME.c are
-        written (`seaopt.control.deploy.schedule_export`).
+        The controller, or the content of its controller.json; of a schedule NAME.h and NAME.c alone are written
+        (`seaopt.control.deploy.schedule_export`).
     folder : path
         For NAME.h, NAME.c, NAME_gains.h and NAME_gains.m; created if it does not exist.
     precision : {"double", "float"}
@@ -133,10 +133,11 @@ def export(
         fit_met = controller.get("fit_met", True) is True
     content = controller.to_dict() if isinstance(controller, ScheduledController) else controller
     law: RunnableLaw | RunnableSchedule
-    if isinstance(content, Mapping) and is_schedule(content):
+    if isinstance(content, Mapping) and content.get("schedule") is not None:
         law, stored = read_runnable(content, limit, tracking_time_s)
-        figures, heat = list[str](), read_guard(content["controllers"][0])
-        templates, missed, met, kind = SCHEDULE_TEMPLATES, "; ".join(content["broken"]), content["feasible"], "schedule"
+        figures, heat = list[str](), read_guard(content)
+        missed, met = "; ".join(content["schedule"]["broken"]), content["feasible"]
+        templates, kind = SCHEDULE_TEMPLATES, "schedule"
     else:
         stored, figures, heat = _read(content)
         templates, missed, met, kind = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"

@@ -23,7 +23,7 @@ from seaopt.control.loops.compensation.terms import Compensation, compensate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.scheduling.gain_table import CORNERS, GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable, name_terms
-from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA, is_alike
+from seaopt.control.scheduling.scheduled_controller import is_alike
 from seaopt.control.scheduling.step_order import SHARE
 from seaopt.errors import FileError
 
@@ -31,38 +31,24 @@ SCHEDULE_TEMPLATES = {"{}.h": "law.h.jinja", "{}.c": "law.c.jinja"}
 WARPED = "tan(pi f T)"  # the unit of a corner in the table, in words
 
 
-def is_schedule(content: Mapping[str, Any]) -> bool:
-    """Tell whether the content of a file is that of a schedule.json."""
-    return content.get("schema") == SCHEDULE_SCHEMA
-
-
 def read_runnable(
     content: Mapping[str, Any], limit: float | None = None, tracking_time_s: float | None = None
 ) -> tuple[RunnableSchedule, dict[str, Any]]:
-    """Return a schedule.json's law ready to run, and its first controller's fields. Raises ControlError, FileError."""
-    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
-    from seaopt.control.scheduling.stored import read_schedule
+    """Return the law of a schedule's controller.json, ready to run, and the fields of its first controller. Raises
+    ControlError, FileError.
+    """
+    from seaopt.control.scheduling.stored import read_points  # deferred: pydantic
 
-    table = read_schedule(content)
-    first, *_ = controllers = [read_controller(stored) for stored in content["controllers"]]
-    command = first["command"]
-    for point, controller in zip(table.points, controllers, strict=True):
-        if not is_alike(controller["compensation"], first["compensation"]):
-            raise FileError(
-                f"schedule.json: the controller at {table.over} = {point:g} compensates with other terms than the "
-                "first; tune again"
-            )
-        if any(controller[key] != first[key] for key in ("command", "sample_time_s", "structure")):
-            raise FileError(
-                f"schedule.json: the controller at {table.over} = {point:g} has another command, rate or structure "
-                "than the first; tune again"
-            )
+    table, _, (first, *further) = read_points(content)
+    controllers, command = [first, *further], first["command"]
+    if not all(is_alike(each["compensation"], first["compensation"]) for each in further):
+        raise FileError("controller.json: terms are not alike at all points; tune again")
     law = make_runnable(
         GainTable(
             over=table.over,
             unit=table.unit,
             points=np.array(table.points),
-            gains={name: np.array(row) for name, row in table.gains.items()},
+            gains={name: np.array([each["gains"][name] for each in controllers]) for name in first["gains"]},
             structure=first["structure"],
             sample_time_s=first["sample_time_s"],
             links=tuple(each["link"] for each in controllers if each["link"] is not None),
@@ -77,7 +63,7 @@ def read_runnable(
         compensations=[each["compensation"] for each in controllers],
     )
     if tracking_time_s is None and not np.allclose(law.anti_windup, table.anti_windup, rtol=AGREES, atol=0.0):
-        raise FileError("schedule.json: anti_windup is not what the gains give; tune again")
+        raise FileError("controller.json: schedule.anti_windup is not what the gains give; tune again")
     return law, first
 
 

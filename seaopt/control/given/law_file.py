@@ -40,7 +40,7 @@ LAW_EXAMPLE = "sample_rate_hz = 1000, compute_delay_samples = 1, pid = { k_p = 2
 # Keys of a controller.json that are not its law.
 TUNING = {
     "schema", "title", "structure", "gains", "achieved", "met", "feasible", "active_constraints", "engineering",
-    "observer", "heat", "impedance", "link_feedforward", "blocked_by", "largest_bandwidth_hz", "possible", "notes",
+    "blocks", "heat", "blocked_by", "largest_bandwidth_hz", "possible", "notes",
     "measured_responses", "provenance", "fit_met", "guessed", "made_from", "guards",
 }  # fmt: skip
 PID_GAINS = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
@@ -142,7 +142,8 @@ class LawFile(_Strict):
     pid: _Pid | None = None
     command: _Command = _Command()
     spec: Any = None
-    compensation: Any = None
+    schedule: Any = None
+    terms: Any = None
 
     @model_validator(mode="before")
     @classmethod
@@ -164,8 +165,10 @@ class LawFile(_Strict):
             raise ValueError("should have both of reference and measurement, each with num and den")
         if (self.pid is not None) == (self.law is not None or self.reference is not None):
             raise ValueError("should have law (A, B, C, D), or reference and measurement (num, den), or pid (gains)")
-        if self.compensation is not None:
-            raise ValueError("should have no compensation, which no linear law has; ask for it in [controller]")
+        if self.terms is not None:
+            raise ValueError("should have no terms, which no linear law has; ask for compensation in [controller]")
+        if self.schedule is not None:
+            raise ValueError("should have no schedule: one law is measured against one [controller]")
         if isinstance(self.measured, list) and not self.measured:
             raise ValueError("should name what is measured")
         return self

@@ -14,6 +14,13 @@ from seaopt.control.laws.delay import LoopDelays, place_drive_delay
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
+from seaopt.control.laws.stored import (
+    CONTROLLER_SCHEMA,
+    check_achieved,
+    check_friction_margin,
+    check_link,
+    read_controller,
+)
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Prefilter, SpeedLoop
 from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
@@ -43,7 +50,6 @@ if TYPE_CHECKING:
 
 # Among what controller.json says is achieved:
 FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
-CONTROLLER_SCHEMA = "seaopt/controller/3"
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
@@ -391,6 +397,7 @@ class Controller(LoopDelays, Result, Worded):
         friction = {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope}
         content = {
             "schema": CONTROLLER_SCHEMA,
+            "met": self.met,
             "structure": self.structure,
             "gains": self.gains,
             "sample_time_s": self.sample_time_s,
@@ -398,22 +405,24 @@ class Controller(LoopDelays, Result, Worded):
             "drive_delay_s": self.drive_delay_s,
             "delay_samples": self.delay_samples,
             "measured": self.signals,
+            "blocks": {
+                "observer": None if self.observer is None else self.observer.to_dict(self.sample_time_s),
+                "link_feedforward": self.link,
+                "impedance": self.outer,
+            },
+            "schedule": None,
+            "terms": self.compensation,
+            "guards": {"gate": self.gate, "derate": self.derate},
             "law": self.law.to_dict(),
             "reference": reference,
             "measurement": paths[0] if len(paths) == 1 else paths,
             "command": self.command,
             "spec": self.spec.to_dict() | {"robust_to": self.robust_to},
             "achieved": _list_achieved(self.achieved) | friction | self._prefilter_figures(),
-            "met": self.met,
             "feasible": self.met,
             "active_constraints": self.active_constraints,
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
-            "observer": None if self.observer is None else self.observer.to_dict(self.sample_time_s),
             "heat": None if self.rating is None else self.rating.to_dict() | {"guard": self.heat_guard},
-            "link_feedforward": self.link,
-            "impedance": self.outer,
-            "compensation": self.compensation,
-            "guards": {"gate": self.gate, "derate": self.derate},
             "blocked_by": self.blocked_by,
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
             "possible": self.possible,
@@ -434,9 +443,6 @@ class Controller(LoopDelays, Result, Worded):
         Raises FileError: a field is missing or malformed, or one contradicts the law: gains, reference, measurement,
         achieved.
         """
-        # Deferred, as pydantic takes long to import.
-        from seaopt.control.laws.stored import check_achieved, check_friction_margin, check_link, read_controller
-
         stored = read_controller(content)
         spec, command, law = stored["spec"], stored["command"], stored["law"]
         design = friction = None

@@ -38,6 +38,8 @@ STEADY_PERIODS = 80.0  # of the bandwidth, after which that end begins
 OTHER_NOISE = "max_other_noise_gain"
 
 Sense = Literal["at most", "at least", "equal to"]
+Symbol = Literal["≤", "≥", "="]
+SYMBOLS: dict[Sense, Symbol] = {"at most": "≤", "at least": "≥", "equal to": "="}
 Scope = Literal["every plant", "design plant"]
 
 
@@ -142,9 +144,9 @@ class Limit:
     requirement: str = ""  # the name in a certificate, where it is another
 
     @property
-    def symbol(self) -> str:
+    def symbol(self) -> Symbol:
         """The sense as a sign."""
-        return {"at most": "≤", "at least": "≥", "equal to": "="}[self.sense]
+        return SYMBOLS[self.sense]
 
     @property
     def default_text(self) -> str:

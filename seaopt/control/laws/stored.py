@@ -35,15 +35,18 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError, FileError
+from seaopt.files import check_schema
 from seaopt.plants import Plant
 from seaopt.records import record
 
+CONTROLLER_SCHEMA = "seaopt/controller/3"
 FILE = "controller.json"
 NOTCH_GAINS = {"notch_frequency_hz", "notch_width", "notch_depth"}
 PREFILTER_GAINS = {PREFILTER, "prefilter_damping"}
 ROUNDINGS = 1024.0  # of the coefficients of what is multiplied out, on this machine and another
 FIGURES_AGREE = 1e-4  # a bandwidth where abs(F/F_ref) is flat is known to the root of rounding
 TUNE_AGAIN = "tune again"
+Terms = Annotated[Mapping[str, Any], Fields(of=Compensation)] | None
 
 
 @record(eq=False)
@@ -92,6 +95,15 @@ class StoredPlants:
     robust_to: tuple[str, ...] = ()
 
 
+@record(eq=False)
+class StoredBlocks:
+    """The blocks of a law besides its gains."""
+
+    observer: StoredObserver | None = None
+    link_feedforward: LinkPath | None = None
+    impedance: OuterLoop | None = None
+
+
 @record
 class StoredGuards:
     """The guards between the law and the hardware."""
@@ -101,40 +113,49 @@ class StoredGuards:
 
 
 @record(eq=False)
-class StoredController:
-    """A controller.json."""
+class StoredLoop:
+    """What every controller.json says of its loop, of a law and of a schedule."""
 
     structure: str
-    gains: dict[str, float]
     sample_time_s: float
     compute_delay_samples: Annotated[int, Constraints(ge=0)]
     drive_delay_s: Annotated[float, Constraints(ge=0.0)]
     delay_samples: float
-    law: StoredLaw
     measured: tuple[str, ...] | None = None
-    reference: TransferFunction
-    measurement: TransferFunction | tuple[TransferFunction, ...]
+    guards: StoredGuards = StoredGuards()
     command: Command
     spec: ControllerSpec
     feasible: bool
+    measured_responses: tuple[MeasuredFigures, ...] = ()
+
+
+@record(eq=False)
+class StoredController(StoredLoop):
+    """The controller.json of one law."""
+
+    gains: dict[str, float]
+    blocks: StoredBlocks
+    terms: Terms
+    law: StoredLaw
+    reference: TransferFunction
+    measurement: TransferFunction | tuple[TransferFunction, ...]
     active_constraints: tuple[str, ...]
     blocked_by: tuple[str, ...] = ()
     possible: PossibleBandwidths | None = None
-    observer: StoredObserver | None = None
     engineering: dict[str, StoredNumber] = field(default_factory=dict[str, StoredNumber])
-    measured_responses: tuple[MeasuredFigures, ...] = ()
-    impedance: OuterLoop | None = None
-    compensation: Annotated[Mapping[str, Any], Fields(of=Compensation)] | None = None
-    link_feedforward: LinkPath | None = None
-    guards: StoredGuards = StoredGuards()
+    schedule: None = None
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a `Controller` that a controller.json holds; not what it achieves. Raises FileError: a field
     is missing or malformed, or two contradict each other: the gains must give the law.
     """
+    check_schema(content, CONTROLLER_SCHEMA, FILE, remedy=TUNE_AGAIN)
+    if content.get("schedule") is not None:
+        raise FileError(f"{FILE}: is of a schedule, and not of one law; read it with ScheduledController.from_dict")
     table = from_content(StoredController, content, FILE, remedy=TUNE_AGAIN)
-    command, link, outer = table.command, table.link_feedforward, table.impedance
+    command, parts = table.command, table.blocks
+    link, outer = parts.link_feedforward, parts.impedance
     if unknown := {*content["spec"]} - {"robust_to"} - {field.name for field in fields(table.spec)}:
         raise _contradict(f"spec.{min(unknown)}", "is not known")
     # What is written as 30 is written as 30 again, not as 30.0.
@@ -146,16 +167,16 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "compute_delay_samples": spec.loop_delay_samples,
         "delay_samples": table.compute_delay_samples + table.drive_delay_s / table.sample_time_s,
     }
-    if outer is not None:
-        made["impedance"] = {"sample_time_s": ts}
-    if table.observer is not None:
-        nominal = Nominal(kept=table.observer.kept, inverse=table.observer.inverse)
-        observer = DisturbanceObserver(nominal=nominal, T_q=table.observer.T_q)
-        made["observer"] = observer.to_dict(ts)
+    blocks: dict[str, Any] = {} if outer is None else {"impedance": {"sample_time_s": ts}}
+    if parts.observer is not None:
+        nominal = Nominal(kept=parts.observer.kept, inverse=parts.observer.inverse)
+        observer = DisturbanceObserver(nominal=nominal, T_q=parts.observer.T_q)
+        blocks["observer"] = observer.to_dict(ts)
+    made["blocks"] = blocks
     check_agrees(content, made, FILE, remedy=TUNE_AGAIN, rtol=AGREES)
     law = table.law.build(ts)
     if (link is None) != (spec.link_feedforward is None):
-        raise _contradict("link_feedforward", "is not that of spec.link_feedforward")
+        raise _contradict("blocks.link_feedforward", "is not that of spec.link_feedforward")
     reads = _check_measured(table, law)
     _check_gains(table, law, observer, reads)
     scaled = {name: {"value": command.per_effort * table.gains.get(name, math.nan)} for name in table.engineering}
@@ -168,7 +189,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         command = replace(command, largest=largest)
     taken = ("structure", "gains", "sample_time_s", "compute_delay_samples", "drive_delay_s")
     taken += ("active_constraints", "blocked_by", "possible")
-    terms = table.compensation
+    terms = table.terms
     return {name: getattr(table, name) for name in taken} | {
         "law": law,
         "spec": spec,
@@ -195,15 +216,15 @@ def check_link(link: LinkPath, spec: ControllerSpec, plant: Plant) -> None:
     motion = None if free.sensing is None else free.sensing.link_position
     named = spec.link_feedforward is not None and spec.link_feedforward.measured is not None
     if motion is not None and not named and link.measured != motion:
-        raise _contradict("link_feedforward.measured", f'is "{link.measured}", and the link moves "{motion}"')
+        raise _contradict("blocks.link_feedforward.measured", f'is "{link.measured}", and the link moves "{motion}"')
     unit = free.outputs.get(link.measured, link.unit)
     if unit != link.unit:
-        raise _contradict("link_feedforward.unit", f'is "{link.unit}", and {link.measured} is in {unit}')
+        raise _contradict("blocks.link_feedforward.unit", f'is "{link.unit}", and {link.measured} is in {unit}')
 
 
 def _check_measured(table: StoredController, law: Law) -> tuple[str, ...]:
     """Return the outputs that the law reads, where they are not those of the specification; refuse another number."""
-    names, link = list_names(table.spec.measured), table.link_feedforward
+    names, link = list_names(table.spec.measured), table.blocks.link_feedforward
     reads = names if table.measured is None else table.measured
     further = () if link is None else (link.measured,)
     if len(reads) != len(names) + len(further) or reads[0] != names[0] or reads[len(names) :] != further:
@@ -217,7 +238,7 @@ def _check_gains(
     table: StoredController, law: Law, observer: DisturbanceObserver | None, reads: tuple[str, ...]
 ) -> None:
     """Refuse gains that do not give the law."""
-    gains, spec, link = table.gains, table.spec, table.link_feedforward
+    gains, spec, link = table.gains, table.spec, table.blocks.link_feedforward
     if spec.structure == CUSTOM:
         if gains:
             raise _contradict("gains", f"has {', '.join(sorted(gains))}, and a custom law has none")
@@ -246,7 +267,7 @@ def _check_gains(
         numbers = {key: value for key, value in asked.items() if value is not None}
         check_agrees(numbers, has, FILE, remedy=TUNE_AGAIN, place=f"spec.{name}", rtol=AGREES)
     if (observer is not None) != (spec.structure == "pid_dob") or (observer and gains["T_q"] != observer.T_q):
-        raise _contradict("observer", "is not that of structure and gains")
+        raise _contradict("blocks.observer", "is not that of structure and gains")
     if not Gains.from_names(gains, observer, speed, link).makes(law, spec.structure):
         raise _contradict("law", "is not what gains, observer and spec give")
 

@@ -30,11 +30,15 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import Result, Worded, record
 
-SCHEDULE_SCHEMA = "seaopt/schedule/2"
 PARTS = 4  # of every stretch between two points, at whose ends the limits are judged
 LEAST_BANDWIDTH = 0.9  # of the one asked, that the law has between the points
 SAME_GAIN = 0.01  # of its largest, by which a gain that is called the same may change
 LARGE_STEP = 1.0  # of a gain between neighbours, over the smaller of the two, from which it is remarked on
+# The keys of controller.json that hold a list, with an entry for each point; all others are those of the first.
+PER_POINT = (
+    "blocks", "terms", "law", "reference", "measurement", "achieved", "active_constraints", "engineering", "blocked_by",
+    "largest_bandwidth_hz", "possible",
+)  # fmt: skip
 Plants = Mapping[str, tuple[Plant, ParameterSet]]
 
 
@@ -242,44 +246,48 @@ class ScheduledController(Result, Worded):
         return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of schedule.json (schema seaopt/schedule/2)."""
+        """Return the content of controller.json (schema seaopt/controller/3)."""
+        first, *further = [controller.to_dict() for controller in self.controllers]
         return {
-            "schema": SCHEDULE_SCHEMA,
-            "over": self.over,
-            "unit": self.unit,
-            "points": list(self.points),
-            "fallback": self.fallback,
+            **first,
+            **{name: [first[name], *(each[name] for each in further)] for name in PER_POINT},
             "met": self.met,
             "feasible": self.met,
-            "broken": list(self.broken),
-            "notes": list(self.notes),
             "gains": {name: row.tolist() for name, row in self.table.gains.items()},
-            "anti_windup": self.runnable().anti_windup.tolist(),
-            "between": to_content(self.between),
-            "controllers": [controller.to_dict() for controller in self.controllers],
+            "schedule": {
+                "over": self.over,
+                "unit": self.unit,
+                "points": list(self.points),
+                "fallback": self.fallback,
+                "bandwidth_hz": list(self.bandwidths_hz),
+                "met": [controller.met for controller in self.controllers],
+                "anti_windup": self.runnable().anti_windup.tolist(),
+                "between": to_content(self.between),
+                "broken": list(self.broken),
+            },
+            "notes": list(self.notes),
         }
 
     @classmethod
     def from_dict(
         cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet, others: Plants | None = None
     ) -> ScheduledController:
-        """Return the schedule of a schedule.json; what it achieves is computed again. Raises FileError: a field is
-        missing or malformed, or contradicts another: the gains must be those of the controllers.
+        """Return the schedule of a controller.json; what it achieves is computed again. Raises FileError: a field is
+        missing or malformed, or contradicts another.
         """
-        from seaopt.control.scheduling.stored import read_schedule  # deferred: pydantic
+        from seaopt.control.scheduling.stored import read_points  # deferred: pydantic
 
-        stored = read_schedule(content)
-        controllers = tuple(
-            Controller.from_dict(tuned, plant, place_variable(plant, params, stored.over, point))
-            for point, tuned in zip(stored.points, content["controllers"], strict=True)
-        )
+        table, contents, _ = read_points(content)
         return cls(
-            over=stored.over,
-            unit=stored.unit,
-            points=tuple(stored.points),
-            controllers=controllers,
+            over=table.over,
+            unit=table.unit,
+            points=table.points,
+            controllers=tuple(
+                Controller.from_dict(tuned, plant, place_variable(plant, params, table.over, point))
+                for point, tuned in zip(table.points, contents, strict=True)
+            ),
             others=others or {},
-            fallback=stored.fallback,
+            fallback=table.fallback,
         ).with_places()
 
 

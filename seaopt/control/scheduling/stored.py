@@ -1,62 +1,114 @@
-"""What a schedule.json holds, and whether its fields agree with each other."""
+"""What the controller.json of a schedule holds: the columns of its controllers, and what joins them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from seaopt.codec import Constraints, Key, from_content
-from seaopt.control.laws.stored import TUNE_AGAIN, StoredController
-from seaopt.control.laws.structures import AGREES, LAW_GAINS
+from seaopt.codec import Constraints, from_content, join_schemas
+from seaopt.control.laws.stored import (
+    FILE,
+    TUNE_AGAIN,
+    StoredBlocks,
+    StoredController,
+    StoredLaw,
+    StoredLoop,
+    StoredNumber,
+    Terms,
+    read_controller,
+)
+from seaopt.control.laws.verdict import PossibleBandwidths
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.scheduling.gain_table import check_points
-from seaopt.control.scheduling.scheduled_controller import PlaceFigures
+from seaopt.control.scheduling.scheduled_controller import PER_POINT, PlaceFigures
 from seaopt.errors import ControlError, FileError
 from seaopt.records import record
 
 
 @record(eq=False)
-class StoredSchedule:
-    """A schedule.json."""
+class StoredPoints:
+    """What a schedule is over, and what holds at its points; `between` them what was looked at."""
 
-    json_keys = (
-        *(Key(field="document", name="schema"), "over", "unit", "points", "fallback", "feasible", "broken", "notes"),
-        *("gains", "anti_windup", "between", "controllers"),
-    )
-
-    document: Literal["seaopt/schedule/2"]
     over: str
     unit: str
     points: Annotated[tuple[float, ...], Constraints(min_length=2)]
     fallback: float
-    feasible: bool
-    broken: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-    gains: dict[str, tuple[float, ...]]
+    bandwidth_hz: tuple[float, ...]
+    met: tuple[bool, ...]
     anti_windup: tuple[float, ...]
     between: tuple[PlaceFigures, ...] = ()
-    controllers: tuple[StoredController, ...]
+    broken: tuple[str, ...]
 
 
-def read_schedule(content: Mapping[str, Any]) -> StoredSchedule:
-    """Return the fields of a schedule.json. Raises FileError: one is missing or malformed, or gains disagree."""
-    table = from_content(StoredSchedule, content, "schedule.json", remedy=TUNE_AGAIN)
+@record(eq=False)
+class StoredSchedule(StoredLoop):
+    """The controller.json of a schedule: lists have an entry for each point."""
+
+    schedule: StoredPoints
+    gains: dict[str, tuple[float, ...]]
+    blocks: tuple[StoredBlocks, ...]
+    terms: tuple[Terms, ...]
+    law: tuple[StoredLaw, ...]
+    reference: tuple[TransferFunction, ...]
+    measurement: tuple[TransferFunction | tuple[TransferFunction, ...], ...]
+    active_constraints: tuple[tuple[str, ...], ...]
+    blocked_by: tuple[tuple[str, ...], ...]
+    possible: tuple[PossibleBandwidths | None, ...]
+    engineering: tuple[dict[str, StoredNumber], ...]
+
+
+class Points(NamedTuple):
+    """A schedule as its file has it: its points, and at each the content and the fields of a controller."""
+
+    table: StoredPoints
+    contents: list[dict[str, Any]]
+    controllers: list[dict[str, Any]]
+
+
+def read_points(content: Mapping[str, Any]) -> Points:
+    """Return the points of a schedule's controller.json. Raises FileError: one is missing or malformed, or the law at
+    a point contradicts itself.
+    """
+    stored = from_content(StoredSchedule, content, FILE, remedy=TUNE_AGAIN)
+    table, columns = stored.schedule, {name: content[name] for name in PER_POINT}
     try:
         check_points(table.over, np.array(table.points))
     except ControlError as error:
-        raise FileError(f"schedule.json: {error}; {TUNE_AGAIN}") from error
-    count = len(table.points)
-    if len(table.controllers) != count or len(table.anti_windup) != count:
-        raise FileError(
-            f"schedule.json: has {count} points, {len(table.controllers)} controllers and {len(table.anti_windup)} "
-            f"numbers in anti_windup; {TUNE_AGAIN}"
-        )
+        raise FileError(f"{FILE}: {error}; {TUNE_AGAIN}") from error
     if table.fallback not in table.points:
-        raise FileError(f"schedule.json: fallback = {table.fallback:g} is none of the points; {TUNE_AGAIN}")
-    for name in dict.fromkeys((*LAW_GAINS, *table.gains, *table.controllers[0].gains)):
-        tuned = [controller.gains.get(name, np.nan) for controller in table.controllers]
-        stated = table.gains.get(name, [])
-        if len(stated) != count or not np.allclose(stated, tuned, rtol=AGREES, atol=0.0):
-            raise FileError(f"schedule.json: gains.{name} is not what the controllers have; {TUNE_AGAIN}")
-    return table
+        raise FileError(f"{FILE}: schedule.fallback = {table.fallback:g} is none of the points; {TUNE_AGAIN}")
+    joined = {f"schedule.{name}": getattr(table, name) for name in ("bandwidth_hz", "met", "anti_windup")}
+    for name, column in (columns | joined | {f"gains.{name}": row for name, row in stored.gains.items()}).items():
+        if len(column) != len(table.points):
+            raise FileError(f"{FILE}: {name} has {len(column)} entries for {len(table.points)} points; {TUNE_AGAIN}")
+    contents = [
+        {
+            **content,
+            **{name: column[k] for name, column in columns.items()},
+            "schedule": None,
+            "gains": {name: row[k] for name, row in stored.gains.items()},
+            "spec": {**content["spec"], "bandwidth_hz": content["schedule"]["bandwidth_hz"][k]},
+            "met": table.met[k],
+            "feasible": table.met[k],
+        }
+        for k in range(len(table.points))
+    ]
+    controllers: list[dict[str, Any]] = []
+    for point, each in zip(table.points, contents, strict=True):
+        try:
+            controllers.append(read_controller(each))
+        except FileError as error:
+            raise FileError(f"at {table.over} = {point:g}, {error}") from error
+    return Points(table, contents, controllers)
+
+
+def read_laws(content: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the fields of the controllers in a controller.json: of a law one, of a schedule one for each point."""
+    return read_points(content).controllers if content.get("schedule") else [read_controller(content)]
+
+
+def controller_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a controller.json: of one law, or of a schedule."""
+    return join_schemas(StoredController, StoredSchedule)

@@ -49,7 +49,7 @@ from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cy
 from seaopt.robustness.verification.scenarios import step_scenarios
 from seaopt.robustness.verification.verification import Verification, verify
 
-ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
+ROBUSTNESS_SCHEMA = "seaopt/robustness/3"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 NO_NOISE = (
     "simulated without sensor noise, which may dither a joint out of stiction; give certify(sensors=...), or sensors = "
@@ -304,47 +304,43 @@ class Certificate(Result, Worded):
 
     @classmethod
     def from_dict(
-        cls,
-        content: Mapping[str, Any],
-        controller: Controller,
-        models: Plants,
-        parameters: ParameterSet,
-        place: tuple[str, float] | None = None,
+        cls, content: Mapping[str, Any], controller: Controller, models: Plants, parameters: ParameterSet
     ) -> Certificate:
         """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated. Raises
         FileError: a field is missing or malformed, it was edited or written by hand, or nothing is required in it.
         """
-        from seaopt.robustness.certificate.stored import build_certificate  # deferred, as pydantic takes long to import
+        from seaopt.robustness.certificate import stored  # deferred: it reads these
 
-        return build_certificate(content, controller, models, parameters, place)
+        return stored.build_certificate(stored.read_certificate(content), content, controller, models, parameters)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of robustness.json (schema seaopt/robustness/2), with its digest."""
-        return seal(
-            {
-                "schema": ROBUSTNESS_SCHEMA,
-                "met": self.met,
-                "passed": self.met,
-                "requirements": [row.to_dict() for row in self.requirements],
-                "plants": {
-                    name: {key: getattr(figures, key) for key in _REPORTED}
-                    | (self.margins[name].to_dict() if name in self.margins else {})
-                    | {"worst": self._worst_dict(name)}
-                    for name, figures in self.plants.items()
-                },
-                "friction": {name: self._friction_dict(name) for name in self._frictions},
-                "compensation": list_compensation(self.compensation, self.compensation_draws),
-                "monte_carlo": to_content(self.monte_carlo),
-                "varied": to_content(self.varied),
-                "remarks": list(self.remarks),
-                "notes": list(self.notes),
-                "impedance": None if self.impedance is None else self.impedance.to_dict(),
-                "constrained": None if self.constrained is None else self.constrained.to_dict(),
-                "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
-                "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
-                "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
-            }
-        )
+        """Return the content of robustness.json (schema seaopt/robustness/3), with its digest."""
+        return seal({"schema": ROBUSTNESS_SCHEMA} | self.list_content() | {"schedule": None})
+
+    def list_content(self) -> dict[str, Any]:
+        """Return what a file has of the certificate of one law."""
+        return {
+            "met": self.met,
+            "passed": self.met,
+            "requirements": to_content(self.requirements),
+            "plants": {
+                name: {key: getattr(figures, key) for key in _REPORTED}
+                | (self.margins[name].to_dict() if name in self.margins else {})
+                | {"worst": self._worst_dict(name)}
+                for name, figures in self.plants.items()
+            },
+            "friction": {name: self._friction_dict(name) for name in self._frictions},
+            "compensation": list_compensation(self.compensation, self.compensation_draws),
+            "monte_carlo": to_content(self.monte_carlo),
+            "varied": to_content(self.varied),
+            "remarks": list(self.remarks),
+            "notes": list(self.notes),
+            "impedance": None if self.impedance is None else self.impedance.to_dict(),
+            "constrained": None if self.constrained is None else self.constrained.to_dict(),
+            "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
+            "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
+            "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
+        }
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_floor
 from seaopt.robustness.verification.linear import view_loop
 from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
-from seaopt.robustness.verification.playback import STEP_IN_FILE, Stage
+from seaopt.robustness.verification.playback import Stage
 from seaopt.units import LINEAR
 
 CONSTRAINED_STREAM = 0x3C  # the runs' own stream of random numbers, whatever the seed
@@ -146,8 +146,6 @@ class ConstrainedRuns(Result):
     left_out : tuple of str
         Bounded signals that a plant does not have, and conditions that are not drawn.
     """
-
-    json_names = STEP_IN_FILE
 
     runs: int
     failures: int

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from seaopt.codec import to_content
-from seaopt.control.laws.limits import LIMIT_ROUNDING
+from seaopt.codec import Constraints, Key, OrInfinite
+from seaopt.control.laws.limits import LIMIT_ROUNDING, Symbol
 from seaopt.formatting import format_count, format_number, format_values
 from seaopt.records import Result, record
 
@@ -78,12 +78,17 @@ class Requirement(Result):
     'swing stuck'
     """
 
+    json_keys = (
+        "name", "limit", "value", "met", "sense", "tolerance", "unit", "plant", "state", Key(field="at", name="place"),
+        "scenario", "draw", "text", "remedy", "count", "where",
+    )  # fmt: skip
+
     name: str
-    limit: float
-    value: float
+    limit: OrInfinite
+    value: OrInfinite
     met: bool
-    sense: str = "≤"
-    tolerance: float = KEPT_TO
+    sense: Symbol = "≤"
+    tolerance: Annotated[float, Constraints(ge=0.0, le=0.5)] = KEPT_TO
     unit: str = ""
     plant: str = ""
     state: str = ""
@@ -92,7 +97,12 @@ class Requirement(Result):
     draw: DrawnAt | None = None
     text: str = ""
     remedy: str = ""
-    count: int = 1
+    count: Annotated[int, Constraints(ge=1)] = 1
+
+    @property
+    def at(self) -> Annotated[dict[str, float], Constraints(min_length=1, max_length=1)] | None:
+        """The place as a file has it."""
+        return None if self.place is None else dict([self.place])
 
     @property
     def keeps(self) -> bool:
@@ -127,11 +137,6 @@ class Requirement(Result):
     def __str__(self) -> str:
         value, limit = (format_number(number, 6) for number in (self.value, self.limit))
         return f"{self.name} = {value}, must be {self.sense} {limit}{self.unit and f' {self.unit}'} ({self.where})"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the row of robustness.json."""
-        place = None if self.place is None else dict([self.place])
-        return to_content(self) | {"place": place, "where": self.where}
 
 
 def require_at_most(name: str, value: float, limit: float, **fields: Any) -> Requirement:

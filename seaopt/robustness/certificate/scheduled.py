@@ -16,7 +16,7 @@ What is said, and how it is known:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -40,7 +40,7 @@ from seaopt.records import Result, Worded, record
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
 from seaopt.robustness.certificate.cases import Cases, Evidence, Survey, pose_cases
-from seaopt.robustness.certificate.certificate import Certificate
+from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA, Certificate
 from seaopt.robustness.certificate.requirement import Requirement, require_at_least, require_at_most
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
@@ -48,7 +48,6 @@ from seaopt.robustness.verification.schedule_motion import Motion, describe_moti
 from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps, find_fastest, sweep_schedule
 from seaopt.units import unit_after
 
-SCHEDULE_ROBUSTNESS_SCHEMA = "seaopt/schedule_robustness/2"
 MOTION_RATE = "min_motion_rate"
 BOUND, SWEEP = 0.2, 5.0  # seconds that a stretch, and the sweeps of a plant, take as a rule
 
@@ -146,25 +145,34 @@ class ScheduleCertificate(Result, Worded):
         return (self.proof, self.assumption, *swept, *moved, *shared, *at_points)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of schedule_robustness.json (schema seaopt/schedule_robustness/2)."""
+        """Return the content of robustness.json (schema seaopt/robustness/3), with its digest."""
+        over = self.schedule.over
+        pairs = zip(self.values, self.places, strict=True)
+        written = [{"place": {over: value}} | place.list_content() for value, place in pairs]
         return seal(
             {
-                "schema": SCHEDULE_ROBUSTNESS_SCHEMA,
+                "schema": ROBUSTNESS_SCHEMA,
                 "met": self.met,
                 "passed": self.met,
-                "over": self.schedule.over,
-                "unit": self.schedule.unit,
-                "requirements": [row.to_dict() for row in self.requirements],
-                "places": [place.to_dict() for place in self.places],
+                "requirements": to_content(self.requirements),
+                "plants": _take_worst(written, "plants", lambda plant: plant["worst"]["severity"]),
+                "friction": _take_worst(written, "friction", lambda found: -found.get("least_slope", 0.0)),
                 "monte_carlo": to_content(self.monte_carlo),
-                "stretches": to_content(self.stretches),
-                "sweeps": to_content(self.sweeps),
-                "motions": to_content(self.motions),
-                "fastest_rate": self.fastest,
-                "rate_unit": self.rate_unit,
-                "proof": self.proof,
-                "assumption": self.assumption,
+                "passivity": None,
+                "simulation": None,
                 "notes": list(self.notes),
+                "schedule": {
+                    "over": over,
+                    "unit": self.schedule.unit,
+                    "places": written,
+                    "stretches": to_content(self.stretches),
+                    "sweeps": to_content(self.sweeps),
+                    "motions": to_content(self.motions),
+                    "fastest_rate": self.fastest,
+                    "rate_unit": self.rate_unit,
+                    "proof": self.proof,
+                    "assumption": self.assumption,
+                },
             }
         )
 
@@ -179,7 +187,7 @@ class ScheduleCertificate(Result, Worded):
         ranges: Ranges | None = None,
         others: ParameterSet | None = None,
     ) -> ScheduleCertificate:
-        """Return the certificate of a schedule_robustness.json; nothing is simulated.
+        """Return the certificate of a schedule's robustness.json; nothing is simulated.
 
         Linear figures are computed again. Arguments are those of `certify` of a schedule. Raises FileError: a field is
         missing or malformed, it was edited or written by hand, or nothing is required in it.
@@ -188,6 +196,17 @@ class ScheduleCertificate(Result, Worded):
 
         places = pose_places(schedule, plants, parameters, ranges or {}, others or ParameterSet())
         return build_schedule_certificate(content, schedule, places)
+
+
+def _take_worst(
+    written: Sequence[Mapping[str, Any]], key: str, rank: Callable[[Mapping[str, Any]], float]
+) -> dict[str, Any]:
+    """Return what the places have under a key, by plant: at its worst place, and which that is."""
+    worst: dict[str, Any] = {}
+    for name in dict.fromkeys(name for each in written for name in each[key]):
+        at = max((each for each in written if name in each[key]), key=lambda each: rank(each[key][name]))
+        worst[name] = {"place": at["place"], **at[key][name]}
+    return worst
 
 
 def pose_places(

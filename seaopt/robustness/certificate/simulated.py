@@ -26,7 +26,6 @@ from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, requ
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
-from seaopt.robustness.verification.playback import STEP_IN_FILE
 from seaopt.robustness.verification.verification import Verification, check_plants, check_sensors, verify
 
 Played = TypeVar("Played")
@@ -75,7 +74,7 @@ class Simulated(Result, Worded):
         """Return what goes into robustness.json under "simulation"."""
         played = {} if self.verification is None else self.verification.to_dict()
         names = ("large_signal", "sensors", "command_step", "seed", "left_out")
-        parts = {STEP_IN_FILE.get(name, name): to_content(getattr(self, name)) for name in names}
+        parts = {name: to_content(getattr(self, name)) for name in names}
         return {"met": self.met, "passed": self.met} | played | parts
 
     def passivity_dict(self) -> dict[str, Any] | None:

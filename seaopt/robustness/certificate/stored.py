@@ -1,4 +1,4 @@
-"""Certificates read from robustness.json and schedule_robustness.json; linear figures are computed again.
+"""Certificates read from robustness.json: linear figures are computed again, and nothing is simulated.
 
 Null stands for what is infinite: the value of a requirement that an unstable plant breaks, a bound that there is not.
 """
@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field, fields, replace
-from typing import Annotated, Any, Literal
+from typing import Any
 
 from seaopt.bench import Sensors
-from seaopt.codec import Constraints, OrInfinite, from_content
+from seaopt.codec import from_content, join_schemas
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.errors import FileError, SeaoptError
-from seaopt.files import check_seal, plain
+from seaopt.files import check_schema, check_seal, plain
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
@@ -22,7 +22,7 @@ from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.cases import DESIGN_NAMES, Cases
-from seaopt.robustness.certificate.certificate import NO_MODEL, Certificate
+from seaopt.robustness.certificate.certificate import NO_MODEL, ROBUSTNESS_SCHEMA, Certificate
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
     CompensationDraws,
@@ -31,7 +31,7 @@ from seaopt.robustness.certificate.compensation import (
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
-from seaopt.robustness.certificate.requirement import KEPT_TO, DrawnAt, Requirement
+from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
 from seaopt.robustness.certificate.scheduled import ScheduleCertificate
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
 from seaopt.robustness.uncertainty.draws import Varied
@@ -41,54 +41,11 @@ from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_wo
 from seaopt.robustness.verification.impedance_steps import ImpedanceStep
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.limit_cycles import FoundCycle
-from seaopt.robustness.verification.playback import STEP_IN_FILE
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
 from seaopt.robustness.verification.verification import Verification, make_stages
 
-FILE, SCHEDULE_FILE, CERTIFY_AGAIN = "robustness.json", "schedule_robustness.json", "certify again"
-OLDER_TOLERANCE = 0.5  # of a bandwidth, of which older files do not say whether a law was tuned for it
-
-
-@record
-class StoredRequirement:
-    """A figure against its limit; `where`, in words, is all that older files have of what follows it."""
-
-    name: str
-    limit: OrInfinite
-    value: OrInfinite
-    met: bool
-    where: str
-    sense: Literal["≤", "≥", "="] | None = None
-    tolerance: Annotated[float, Constraints(ge=0.0, le=0.5)] | None = None
-    unit: str = ""
-    plant: str | None = None
-    state: str = ""
-    place: Annotated[dict[str, float], Constraints(min_length=1, max_length=1)] | None = None
-    scenario: str = ""
-    draw: DrawnAt | None = None
-    text: str = ""
-    remedy: str = ""
-    count: Annotated[int, Constraints(ge=1)] = 1
-
-    def build(self) -> Requirement:
-        """Return the row; of an older file, which does not say it, one that is to be equal may be off by a half."""
-        sense, names = self.sense or find_sense(self.name), {each.name for each in fields(Requirement)}
-        older: dict[str, Any] = {
-            "plant": self.plant or "",
-            "sense": sense,
-            "tolerance": (OLDER_TOLERANCE if sense == "=" else KEPT_TO) if self.tolerance is None else self.tolerance,
-            "place": None if self.place is None else next(iter(self.place.items())),
-            "text": self.where if self.plant is None else self.text,
-        }
-        return Requirement(**{name: getattr(self, name) for name in names - older.keys()}, **older)
-
-
-def find_sense(name: str) -> str:
-    """Return what a requirement's value must be to its limit, as a sign, of a law that was tuned."""
-    if name in BY_REQUIREMENT:
-        return BY_REQUIREMENT[name].symbol
-    return "≥" if name == FRICTION_COMPENSATION or name.startswith("min_") else "≤"
+FILE, CERTIFY_AGAIN = "robustness.json", "certify again"
 
 
 @record
@@ -114,8 +71,6 @@ class StoredPlant:
 @record
 class StoredSimulation:
     """The devices of the scenarios, sweeps of amplitudes, and why something is missing."""
-
-    json_names = STEP_IN_FILE
 
     sensors: Sensors
     command_step: float
@@ -149,9 +104,9 @@ class StoredCompensation:
 
 @record(eq=False)
 class StoredCertificate:
-    """A robustness.json."""
+    """The robustness.json of one law, or a place in that of a schedule."""
 
-    requirements: list[StoredRequirement]
+    requirements: tuple[Requirement, ...]
     plants: dict[str, StoredPlant]
     monte_carlo: MonteCarlo
     varied: tuple[Varied, ...] = ()
@@ -162,31 +117,63 @@ class StoredCertificate:
     impedance: StoredImpedance | None = None
     compensation: dict[str, StoredCompensation] = field(default_factory=dict[str, StoredCompensation])
     constrained: ConstrainedRuns | None = None
+    schedule: None = None
+
+
+@record(eq=False)
+class StoredPlaces:
+    """What a schedule was certified at, between its points, and while its variable moves."""
+
+    over: str
+    places: tuple[StoredCertificate, ...]
+    stretches: tuple[StretchBound, ...]
+    sweeps: Mapping[str, tuple[Sweep, ...]]
+    motions: Mapping[str, Motion]
+
+
+@record(eq=False)
+class StoredScheduleCertificate:
+    """The robustness.json of a schedule; its plants and their friction are those of the worst place."""
+
+    requirements: tuple[Requirement, ...]
+    plants: dict[str, StoredPlant]
+    monte_carlo: MonteCarlo
+    schedule: StoredPlaces
 
 
 @record
 class StoredRequirements:
-    """The rows of a robustness.json, or of a schedule_robustness.json."""
+    """The rows of a robustness.json."""
 
-    requirements: list[StoredRequirement]
+    requirements: tuple[Requirement, ...]
+
+
+def robustness_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a robustness.json: of one law, or of a schedule."""
+    return join_schemas(StoredCertificate, StoredScheduleCertificate)
+
+
+def check_file(content: Mapping[str, Any]) -> None:
+    """Refuse a certificate of another version, and one that was edited or written by hand (FileError)."""
+    check_schema(content, ROBUSTNESS_SCHEMA, FILE, CERTIFY_AGAIN)
+    check_seal(content, FILE, CERTIFY_AGAIN)
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
     """Return what a certificate needs of a robustness.json; one that was edited or written by hand is refused."""
-    check_seal(content, FILE, CERTIFY_AGAIN)
+    check_file(content)
     return from_content(StoredCertificate, content, FILE, remedy=CERTIFY_AGAIN)
 
 
 def build_certificate(
+    stored: StoredCertificate,
     content: Mapping[str, Any],
     controller: Controller,
     models: Mapping[str, Plant],
     parameters: ParameterSet,
     place: tuple[str, float] | None = None,
 ) -> Certificate:
-    """Return the certificate of a robustness.json, as `Certificate.from_dict` does."""
-    stored = read_certificate(content)
-    requirements = read_requirements(stored.requirements)
+    """Return the certificate of what a robustness.json holds of one law, as `Certificate.from_dict` does."""
     if controller.design is not None:  # certified too where nobody listed it
         models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
     varied, names = stored.varied, [row.name for row in stored.varied]
@@ -201,7 +188,7 @@ def build_certificate(
         linear = {name: plants[name] for name in stored.plants}
         worst = {name: content["plants"][name]["worst"] for name in linear}
         certificate = Certificate(
-            requirements=requirements,
+            requirements=read_requirements(content),
             place=place,
             plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
             margins={
@@ -268,39 +255,28 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     return replace(certificate, simulated=simulated)
 
 
-@record(eq=False)
-class _StoredSchedule:
-    """A schedule_robustness.json."""
-
-    requirements: list[StoredRequirement]
-    places: tuple[Mapping[str, Any], ...]
-    monte_carlo: MonteCarlo
-    stretches: tuple[StretchBound, ...]
-    sweeps: Mapping[str, tuple[Sweep, ...]]
-    motions: Mapping[str, Motion]
-
-
 def build_schedule_certificate(
     content: Mapping[str, Any], schedule: ScheduledController, cases: Mapping[float, Cases]
 ) -> ScheduleCertificate:
-    """Return the certificate of a schedule_robustness.json, as `ScheduleCertificate.from_dict` does."""
-    check_seal(content, SCHEDULE_FILE, CERTIFY_AGAIN)
-    stored = from_content(_StoredSchedule, content, SCHEDULE_FILE, remedy=CERTIFY_AGAIN)
-    if len(stored.places) != len(cases):
-        raise FileError(
-            f"{SCHEDULE_FILE}: has {len(stored.places)} places, and the schedule {len(cases)}; {CERTIFY_AGAIN}"
-        )
+    """Return the certificate of a schedule's robustness.json, as `ScheduleCertificate.from_dict` does."""
+    check_file(content)
+    stored = from_content(StoredScheduleCertificate, content, FILE, remedy=CERTIFY_AGAIN)
+    found = stored.schedule
+    if len(found.places) != len(cases):
+        raise FileError(f"{FILE}: has {len(found.places)} places, and the schedule {len(cases)}; {CERTIFY_AGAIN}")
     return ScheduleCertificate(
         schedule=schedule,
         places=tuple(
-            build_certificate(place, posed.controller, posed.models, posed.unknown.nominal, (schedule.over, value))
-            for place, (value, posed) in zip(stored.places, cases.items(), strict=True)
+            build_certificate(place, written, at.controller, at.models, at.unknown.nominal, (schedule.over, value))
+            for place, written, (value, at) in zip(
+                found.places, content["schedule"]["places"], cases.items(), strict=True
+            )
         ),
         monte_carlo=stored.monte_carlo,
-        stretches=stored.stretches,
-        sweeps=stored.sweeps,
-        motions=stored.motions,
-        requirements=read_requirements(stored.requirements, SCHEDULE_FILE),
+        stretches=found.stretches,
+        sweeps=found.sweeps,
+        motions=found.motions,
+        requirements=read_requirements(content),
     )
 
 
@@ -311,19 +287,15 @@ def _measure_again(
     return combine_worst([measure_worst(controller, plant, nominal, at) for at in cases])
 
 
-def list_requirements(content: Mapping[str, Any], source: str) -> tuple[Requirement, ...]:
-    """Return the rows of a certificate as it was read from a file, judged again as `read_requirements` does."""
-    stored = from_content(StoredRequirements, content, source, remedy=CERTIFY_AGAIN)
-    return read_requirements(stored.requirements, source)
-
-
-def read_requirements(stored: Sequence[StoredRequirement], source: str = FILE) -> tuple[Requirement, ...]:
-    """Return the rows of a certificate. Refuses one without any, which would pass whatever it is of, and a row that is
-    called met but breaks its limit.
+def read_requirements(content: Mapping[str, Any], source: str = FILE) -> tuple[Requirement, ...]:
+    """Return the rows of a certificate as its file has them. Refuses one without any, which would pass whatever it is
+    of, and a row that is called met but breaks its limit.
     """
+    stored = from_content(StoredRequirements, content, source, remedy=CERTIFY_AGAIN).requirements
     if not stored:
         raise FileError(f"{source}: requirements is empty, and a certificate requires something; {CERTIFY_AGAIN}")
-    rows = tuple(row.build() for row in stored)
+    places = [next(iter((row.get("place") or {}).items()), None) for row in plain(content["requirements"])]
+    rows = tuple(replace(row, place=place) for row, place in zip(stored, places, strict=True))
     for row in rows:
         sense = find_sense(row.name)
         if row.sense not in (sense, "≥" if sense == "=" else sense):  # a law that is given may have more
@@ -337,3 +309,10 @@ def read_requirements(stored: Sequence[StoredRequirement], source: str = FILE) -
                 f"{row.limit:g}; {CERTIFY_AGAIN}"
             )
     return rows
+
+
+def find_sense(name: str) -> str:
+    """Return what a requirement's value must be to its limit, as a sign, of a law that was tuned."""
+    if name in BY_REQUIREMENT:
+        return BY_REQUIREMENT[name].symbol
+    return "≥" if name == FRICTION_COMPENSATION or name.startswith("min_") else "≤"

@@ -28,7 +28,6 @@ from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 
 RunSamples = Float[np.ndarray, "runs n"]
-STEP_IN_FILE = {"command_step": "current_step_A"}  # key of robustness.json, from when every command was a current
 
 
 @record(eq=False)

@@ -326,7 +326,7 @@ EDITS = [
     (("command", "per_effort"), "1", "command.per_effort = '1'"),
     (("measurement", "den"), [], "measurement.den = .."),
     (("active_constraints",), "ms", "active_constraints = 'ms'"),
-    (("observer",), {"T_q": 1.0}, "observer.kept is missing"),
+    (("blocks", "observer"), {"T_q": 1.0}, "blocks.observer.kept is missing"),
     (("engineering", "k_p", "value"), 1.0, "engineering.k_p.value is 1"),
 ]
 
@@ -369,9 +369,9 @@ NUMBERS = [
     *[("gains", name) for name in ("k_p", "k_i", "k_d", "T_f", "k_r", "c", "T_q", "notch_frequency_hz", "notch_width",
                                    "notch_depth", "prefilter_corner_hz", "prefilter_damping")],
     *[("engineering", name, "value") for name in ("k_p", "k_i", "k_d", "k_r")],
-    ("observer", "T_q"), ("observer", "bandwidth_hz"), ("observer", "kept", -1), ("observer", "inverse", 0, "num", 0),
-    *[("observer", name, end, 0) for name in ("Q_over_P_n",) for end in ("num", "den")], ("observer", "Q", "den", 1),
-    ("observer", "Q", "num", -1),
+    *[("blocks", "observer", *keys) for keys in (("T_q",), ("bandwidth_hz",), ("kept", -1), ("inverse", 0, "num", 0),
+                                                 ("Q_over_P_n", "num", 0), ("Q_over_P_n", "den", 0), ("Q", "den", 1),
+                                                 ("Q", "num", -1))],
 ]  # fmt: skip
 
 

@@ -80,10 +80,10 @@ def test_what_is_not_a_number_is_bridged(compiled):
 
 def test_it_is_stored_and_read_again(controller):
     content = json.loads(to_json(controller.to_dict()))
-    assert content["impedance"]["stiffness"] == 20_000.0
-    assert content["impedance"]["direction"] == -1.0
+    assert content["blocks"]["impedance"]["stiffness"] == 20_000.0
+    assert content["blocks"]["impedance"]["direction"] == -1.0
     read = Controller.from_dict(content, so.plants.high_impedance(), THOR)
     assert read.outer == controller.outer
-    content["impedance"]["stiffness"] = -1.0
+    content["blocks"]["impedance"]["stiffness"] = -1.0
     with pytest.raises(so.SeaoptError, match=r"impedance.*stiffness"):
         Controller.from_dict(content, so.plants.high_impedance(), THOR)

@@ -78,14 +78,13 @@ def test_the_stored_schedule_runs_as_the_one_that_was_stored(schedule):
 
 def test_a_table_that_was_edited_or_is_not_feasible_is_not_exported(tmp_path, schedule):
     content = json.loads(to_json(schedule.to_dict()))
+    missed = {"schedule": content["schedule"] | {"broken": ["max_sensitivity at phi = 0.1"]}, "feasible": False}
     with pytest.raises(ControlError, match="misses"):
-        so.export(content | {"feasible": False, "broken": ["max_sensitivity at phi = 0.1"]}, tmp_path)
+        so.export(content | missed, tmp_path)
     with pytest.raises(FileError, match="anti_windup"):
-        so.export(content | {"anti_windup": [0.5, 0.5, 0.5]}, tmp_path)
+        so.export(content | {"schedule": content["schedule"] | {"anti_windup": [0.5, 0.5, 0.5]}}, tmp_path)
     assert not list(tmp_path.iterdir())
-    so.export(
-        content | {"feasible": False, "broken": ["max_sensitivity at phi = 0.1"]}, tmp_path, allow_infeasible=True
-    )
+    so.export(content | missed, tmp_path, allow_infeasible=True)
     assert "NOT FEASIBLE" in (tmp_path / "force_law.h").read_text()
 
 

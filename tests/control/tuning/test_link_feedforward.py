@@ -158,7 +158,7 @@ def test_it_is_stored_and_checked(fed):
     content = json.loads(to_json(fed.to_dict()))
     again = so.Controller.from_dict(content, so.plants.high_impedance(), so.plants.thor())
     assert again.link == fed.link and again.feasible
-    content["link_feedforward"]["inertia"] *= 1.001
+    content["blocks"]["link_feedforward"]["inertia"] *= 1.001
     with pytest.raises(FileError, match="law is not what gains"):
         so.Controller.from_dict(content, so.plants.high_impedance(), so.plants.thor())
 
@@ -242,8 +242,8 @@ def test_the_path_is_printed_with_all_its_digits(fed, tmp_path):
 @pytest.mark.parametrize(("name", "value"), [("unit", "rad"), ("measured", "x_9")])
 def test_a_file_with_another_signal_of_the_link_is_refused(fed, name, value):
     content = json.loads(to_json(fed.to_dict()))
-    content["link_feedforward"][name] = value
-    content["measured"][-1] = content["link_feedforward"]["measured"]
+    content["blocks"]["link_feedforward"][name] = value
+    content["measured"][-1] = content["blocks"]["link_feedforward"]["measured"]
     with pytest.raises(FileError, match=rf"link_feedforward\.{name}"):
         so.Controller.from_dict(content, so.plants.high_impedance(), so.plants.thor())
 

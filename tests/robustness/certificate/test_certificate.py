@@ -69,7 +69,7 @@ def test_every_requirement_carries_its_numbers(certificate):
     assert ("spectral_radius", "stand") in names
     assert all(item.met for item in certificate.requirements)
     content = certificate.to_dict()
-    assert content["schema"] == "seaopt/robustness/2"
+    assert content["schema"] == "seaopt/robustness/3"
     assert set(content["plants"]["swing"]["worst"]["parameters"]) == {"J", "b_r", "eta", "I_p"}
 
 

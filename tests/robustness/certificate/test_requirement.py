@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from seaopt.codec import to_content
 from seaopt.files import to_json
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
-from seaopt.robustness.certificate.stored import list_requirements
+from seaopt.robustness.certificate.stored import read_requirements
 
 ROWS = [
     (Requirement(name="max_sensitivity", limit=1.6, value=1.5, met=True, plant="stand"), "stand"),
@@ -30,21 +31,15 @@ ROWS = [
 @pytest.mark.parametrize(("row", "words"), ROWS, ids=[row.name for row, _ in ROWS])
 def test_words_and_file_follow_from_the_fields(row, words):
     assert row.where == words
-    content = json.loads(to_json({"requirements": [row.to_dict()]}))
+    content = json.loads(to_json({"requirements": [to_content(row)]}))
     assert {"name", "limit", "sense", "value", "unit", "met", "plant", "state", "place", "draw", "where"} <= {
         *content["requirements"][0]
     }
-    (again,) = list_requirements(content, "robustness.json")
+    (again,) = read_requirements(content)
     assert again == row
 
 
 def test_a_whole_number_is_one_with_a_point():
     row = Requirement(name="max_sensitivity", limit=2, value=1, met=True)
-    assert json.dumps(row.to_dict()) == json.dumps(replace(row, limit=2.0, value=1.0).to_dict())
-    assert '"limit": 2.0' in json.dumps(row.to_dict())
-
-
-def test_an_older_file_has_words_alone():
-    row = {"name": "max_sensitivity", "limit": 1.6, "value": 1.5, "met": True, "where": "swing stuck"}
-    (old,) = list_requirements({"requirements": [row]}, "robustness.json")
-    assert (old.plant, old.where) == ("", "swing stuck")
+    assert json.dumps(to_content(row)) == json.dumps(to_content(replace(row, limit=2.0, value=1.0)))
+    assert '"limit": 2.0' in json.dumps(to_content(row))

@@ -12,7 +12,7 @@ from seaopt.files import seal
 from seaopt.robustness.certificate.stored import read_certificate
 
 CONTENT = {
-    "schema": "seaopt/robustness/2", "passed": True,
+    "schema": "seaopt/robustness/3", "passed": True,
     "requirements": [{"name": "max_sensitivity", "limit": 1.6, "value": None, "met": False, "where": "stand"}],
     "plants": {
         "stand": {"ms": 1.5, "worst": {"parameters": {}}},
