@@ -25,7 +25,6 @@ from seaopt.control.running import closed_loop
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.running.outer_run import enclose_law
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
-from seaopt.control.scheduling.scheduled_controller import SCHEDULE_SCHEMA
 from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import STRICT
 from tests.laws import law_of
@@ -192,7 +191,7 @@ def export_all(compiler, parts, controller, folder, monkeypatch):
         )  # fmt: skip
         if scheduled:
             monkeypatch.setattr(export_module, "read_runnable", lambda *_, law=law, of=stored: (law, dict_of(of)))
-            stored = {"schema": SCHEDULE_SCHEMA, "controllers": [{}], "broken": [], "feasible": True}
+            stored = {"schedule": {"broken": []}, "feasible": True}
         limit = law.command_limit
         export(stored, folder, name=name, gate=law.gate or False, derate=law.heat or False, command_limit=limit)
         given = "".join(f", in[{i}]" for i in range(1, inputs))
