@@ -269,6 +269,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=15.0, help="length of each log")
     parser.add_argument("--limit", type=float, default=60.0, help="processor time of a fit, s")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--exact", action="store_true", help="nothing is missing from any model")
     parser.add_argument("--logs", type=int, default=1, choices=(1, 2), help="2: a second one at half the amplitude")
     parser.add_argument("--locked", action="store_true", help="links held: no pendulums, whose fits take long")
     parser.add_argument("--json", type=Path)
@@ -279,6 +280,8 @@ def main() -> None:
         print("\n".join(summarise(kept)))
         return
     cases = list(draw_cases(options.first + options.fits, np.random.default_rng(options.seed), locked=options.locked))
+    if options.exact:
+        cases = [replace(case, effects={}) for case in cases]
     jobs = [
         (case, 1000 * options.seed + k, options.seconds, options.logs, options.limit) for k, case in enumerate(cases)
     ][options.first :]

@@ -43,7 +43,7 @@ ROUND, ROUNDS = 4, 5  # iterations of a refit between two looks at whether it he
 MOST_ROUNDS = 15  # where each of them halves the power that is left
 HELPS = 0.02  # of a residual's power beyond noise, that a round has to take from some output
 CHANCE = 10.0  # of log-likelihood, over the colour of the residual, that chance may give
-CLOSE = 1e-2  # over the size of the start: the second radius that a step may have
+CLOSE = 1e-3  # over the size of the start: the second radius that a step may have
 BASES = 3  # hypotheses, the best, beside which each other one is tried
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
 
