@@ -83,9 +83,10 @@ def read_points(content: Mapping[str, Any]) -> Points:
     for name, column in (columns | joined | {f"gains.{name}": row for name, row in stored.gains.items()}).items():
         if len(column) != len(table.points):
             raise FileError(f"{FILE}: {name} has {len(column)} entries for {len(table.points)} points; {TUNE_AGAIN}")
+    shared = {name: value for name, value in content.items() if name != "made_from"}  # the digest is of the whole
     contents = [
         {
-            **content,
+            **shared,
             **{name: column[k] for name, column in columns.items()},
             "schedule": None,
             "gains": {name: row[k] for name, row in stored.gains.items()},

@@ -13,7 +13,7 @@ from seaopt.control.laws.structures import Gains
 from seaopt.control.scheduling.runnable_schedule import make_runnable
 from seaopt.control.scheduling.scheduled_controller import list_inner
 from seaopt.errors import ControlError, FileError
-from seaopt.files import to_json
+from seaopt.files import seal, to_json
 from tests.schedules import read_knee, tune_knee
 
 ROWS = {
@@ -177,7 +177,8 @@ class TestTuneSchedule:
     def test_what_is_stored_is_read_back_the_same(self, schedule, plants, no_simulation):
         stand, swing, values = plants
         written = to_json(schedule.to_dict())
-        again = ScheduledController.from_dict(json.loads(written), stand, values, {"swing": (swing, values)})
+        sealed = json.loads(to_json(seal(schedule.to_dict())))
+        again = ScheduledController.from_dict(sealed, stand, values, {"swing": (swing, values)})
         assert repr(again) == repr(schedule) and to_json(again.to_dict()) == written
 
     def test_gains_that_are_not_those_of_the_controllers_are_refused(self, schedule, plants):
