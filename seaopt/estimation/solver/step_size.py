@@ -39,7 +39,7 @@ class StepError:
     @property
     def small(self) -> bool:
         """Whether it may be left out of account."""
-        return self.output <= STEP_ERROR_SIGMA and self.parameter <= TOLERATED * STEP_ERROR_PARAMETER
+        return max(self.output / STEP_ERROR_SIGMA, self.parameter / STEP_ERROR_PARAMETER) <= TOLERATED
 
 
 @record(eq=False)
