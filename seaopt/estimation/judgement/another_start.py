@@ -2,29 +2,31 @@
 
 Values that a log hardly tells apart, and residuals that are more than noise, leave a cost with valleys and shelves: two
 users with other first values then have other fits of one log, each with small intervals. A second search starts with
-every free parameter off by a factor, and what it finds counts where it explains the logs as well or better.
+every free parameter off by a factor, and what it finds counts where it explains the logs as well or better. It takes
+integration steps as coarse as the residual allows, and ends where it comes back to the fit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.second_log import find_excess
+from seaopt.estimation.problem.fit_problem import Evaluation
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import LITTLE
-from seaopt.estimation.solver.least_squares import Solution
-from seaopt.estimation.solver.settle import Solved, settle_roughly
-from seaopt.estimation.solver.step_size import StepError
+from seaopt.estimation.solver.settle import Solved, coarsen, measure_misfit, refine_to, settle_roughly
 from seaopt.units import unit_after
 
 OFF = 1.5  # times the fit's value and its inverse, in turn
 ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: what chance does not give
+FLAT = 0.02  # of a value, that an interval covers where a cost has a valley along it
 APART_STDS, APART = 4.0, 0.02  # by which values differ that are others
+RETURNED = 0.25  # of that, within which a search is back
 
 
 def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
@@ -32,24 +34,21 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
     minimum = fit.require_minimum("find_other_minimum")
     problem = minimum.problem
     excess = max((find_excess(fit, e.plant.name) for e in fit.experiments), default=0.0)
-    doubtful = bool(fit.identifiability.weak) or excess > LITTLE
+    weak = {name for direction in fit.identifiability.weak for name in direction}
+    doubtful = excess > LITTLE or any((fit.parameters[name].known or 0.0) > FLAT for name in weak)
     seen = fit.identifiability.rank == fit.identifiability.free > 0
     if not doubtful or not seen or problem.predicts:
         return
     try:
-        solved = _search(minimum)
+        solved = _search(fit, minimum)
     except SeaoptError:  # what cannot be simulated is no minimum
         return
-    if not np.isfinite(solved.misfit):
+    if solved is None or not np.isfinite(solved.misfit):
         return
-    gain = 0.5 * (_measure_misfit(minimum) - solved.misfit) / measure_colour(fit.covariance, fit.white_covariance)
+    colour = measure_colour(fit.covariance, fit.white_covariance)
+    gain = 0.5 * (measure_misfit(problem.evaluate(minimum.z)) - solved.misfit) / colour
     values = problem.unknowns.by_name(solved.solution.z)
-    moved: dict[str, tuple[float, float]] = {}
-    for name in fit.covariance.names:
-        parameter = fit.parameters[name]
-        away = abs(values[name] - parameter.value)
-        if away > max(APART_STDS * (parameter.total_std or 0.0), APART * abs(parameter.value)):
-            moved[name] = (values[name], parameter.std or 0.0)
+    moved = {name: (values[name], fit.parameters[name].std or 0.0) for name in _find_moved(fit, values)}
     if not moved or gain < -ENOUGH:
         return
     pairs = (f"{name} = {value:.4g}{unit_after(fit.parameters[name].unit)}" for name, (value, _) in moved.items())
@@ -63,20 +62,34 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
     yield FitFinding(severity="error", kind="starts", where=", ".join(moved), text=text, preferred=moved)
 
 
-def _search(minimum: Minimum) -> Solved:
-    """Return the better minimum from the given values, and from the fit's off by a factor, up and down in turn."""
-    problem, unknowns = minimum.problem, minimum.problem.unknowns
+def _find_moved(fit: Fit, values: Mapping[str, float], scale: float = 1.0) -> list[str]:
+    """Return the free parameters whose values are others than a fit's."""
+    away = {name: abs(values[name] - fit.parameters[name].value) for name in fit.covariance.names}
+    moved: list[str] = []
+    for name, distance in away.items():
+        parameter = fit.parameters[name]
+        if distance > scale * max(APART_STDS * (parameter.total_std or 0.0), APART * abs(parameter.value)):
+            moved.append(name)
+    return moved
+
+
+def _search(fit: Fit, minimum: Minimum) -> Solved | None:
+    """Return the better minimum from the given values, and from the fit's off by a factor, up and down in turn; None
+    where both come back to the fit.
+    """
+    coarse, _ = coarsen(minimum.problem, minimum.z)
+    unknowns = coarse.unknowns
     factors = np.where(np.arange(unknowns.shared) % 2, OFF, 1.0 / OFF)
+
+    def comes_back(evaluation: Evaluation) -> bool:
+        return not _find_moved(fit, unknowns.by_name(evaluation.z), RETURNED)
+
     solved: list[Solved] = []
     for values in (unknowns.start[: unknowns.shared], minimum.z[: unknowns.shared] * factors):
         start = minimum.z.copy()
         start[: unknowns.shared] = values
-        evaluation = problem.evaluate(np.clip(start, unknowns.low, unknowns.high))
-        solved.append(settle_roughly(problem, evaluation))
-    return min(solved, key=lambda each: each.misfit)
-
-
-def _measure_misfit(minimum: Minimum) -> float:
-    evaluation = minimum.problem.evaluate(minimum.z)
-    solution = Solution(z=minimum.z, evaluation=evaluation, status="converged", message="", iterations=0)
-    return Solved(problem=minimum.problem, solution=solution, step_error=StepError()).misfit
+        evaluation = coarse.evaluate(np.clip(start, unknowns.low, unknowns.high))
+        found = settle_roughly(coarse, evaluation, ends=comes_back, checked=True)
+        if not comes_back(found.solution.evaluation):
+            solved.append(refine_to(found, minimum.problem))
+    return min(solved, key=lambda each: each.misfit, default=None)

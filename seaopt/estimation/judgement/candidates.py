@@ -76,11 +76,13 @@ def list_candidates(
     alternatives: Sequence[Plant],
     *,
     poor: bool,
+    noticed: bool = True,
 ) -> Iterator[Candidate]:
-    """Yield the changes to try."""
+    """Yield the changes to try; channels are not swapped where nothing is `noticed` but that a parameter is suspect."""
     problem, experiments = minimum.problem, fit.experiments
     values = problem.params if poor else fit.parameters
-    yield from _swap_channels(experiments, values, poor=poor)
+    if noticed:
+        yield from _swap_channels(experiments, values, poor=poor)
     if poor:
         for plant in alternatives:  # the right one is soon found, and the wrong one takes long to refit
             yield from _change_plant(experiments, problem.params, plant)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float
@@ -25,7 +26,15 @@ from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment,
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.solver.settle import ROUGH_ITERATIONS, Solved, settle_roughly, sharpen
+from seaopt.estimation.solver.settle import (
+    ROUGH_ITERATIONS,
+    Solved,
+    coarsen,
+    measure_misfit,
+    refine_to,
+    settle_roughly,
+    sharpen,
+)
 from seaopt.formatting import join_words
 from seaopt.parameters import QUANTILE
 from seaopt.plants import Plant
@@ -36,6 +45,9 @@ ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that
 SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the cause, and others need not be tried
 HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
+# Of the samples: a misfit that is so much larger after some iterations, and a likelihood that is so much smaller at the
+# end, are no better with finer steps.
+HOPELESS, PATIENCE, ASTRAY = 1.4, 8, 0.05
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 
 
@@ -62,6 +74,7 @@ def find_causes(
     alternatives: Sequence[Plant],
     *,
     poor: bool,
+    noticed: bool = True,
     hypotheses: Sequence[Refit] = (),
     budget: float = np.inf,
     progress: Progress = ignore,
@@ -69,14 +82,17 @@ def find_causes(
     """Return what explains the logs better than the fit, the best first. `fit`: with its minimum; `residuals`: of the
     fit; `suspects`: what was fixed and is at odds with the logs; `alternatives`: other plants that may have been on the
     bench; `poor`: whether the fit explains so little that its estimates are no start: what searches does so from its
-    own; `hypotheses`: those that remove the excess; `budget`: evaluations after which nothing more is tried;
-    `progress`: called before each that is tried.
+    own; `noticed`: whether anything is wrong besides the suspects; `hypotheses`: those that remove the excess;
+    `budget`: evaluations after which nothing more is tried; `progress`: called before each that is tried.
     """
     minimum = fit.require_minimum("find_causes")
-    whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
+    fitted = minimum.problem.evaluate(minimum.z)
+    whole = _measure_powers(fitted, minimum.problem)
+    # Steps as coarse as the residual allows, until a refit is worth finer ones.
+    coarse = minimum.problem if _is_near_noise(fit) else coarsen(minimum.problem, minimum.z)[0]
     colour = measure_colour(fit.covariance, fit.white_covariance)
     causes: list[Cause] = []
-    candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor))
+    candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor, noticed=noticed))
     causes += _weigh_hypotheses(fit, hypotheses, whole, colour)
     begun = count_evaluations()
     for number, candidate in enumerate(candidates, start=1):
@@ -85,10 +101,12 @@ def find_causes(
             break
         progress(f"trying cause {number} of {len(candidates)}", max(spent, (number - 1) / len(candidates)))
         try:
-            solved = _refit(minimum, candidate)
+            solved = _refit(minimum, candidate, coarse, measure_misfit(fitted) + HOPELESS * fit.samples)
+            before = _measure_kept(fit, minimum, candidate.kept) if candidate.kept else whole
+            if solved is not None and _measure_gain(before, solved) > -ASTRAY * fit.samples:
+                solved = refine_to(solved, minimum.problem)
         except SeaoptError:  # what does not make a problem explains nothing
             continue
-        before = _measure_kept(fit, minimum, candidate.kept) if candidate.kept else whole
         cause = (
             None
             if solved is None
@@ -121,8 +139,18 @@ def _measure_kept(fit: Fit, minimum: Minimum, kept: Sequence[Experiment]) -> Flo
     return _measure_powers(problem.evaluate(z), problem)
 
 
-def _refit(minimum: Minimum, candidate: Candidate) -> Solved | None:
-    """Return the minimum with the change: from the fit's, or from where its method finds a start."""
+def _measure_gain(before: Float[np.ndarray, "outputs 2"], solved: Solved) -> float:
+    """Return the logarithm of a likelihood over the fit's; of other outputs there is no limit."""
+    after = _measure_powers(solved.solution.evaluation, solved.problem)
+    if len(after) != len(before):
+        return np.inf
+    return 0.5 * float(np.sum(before[:, 1] * (np.log(before[:, 0]) - np.log(after[:, 0]))))
+
+
+def _refit(minimum: Minimum, candidate: Candidate, coarse: FitProblem, most: float) -> Solved | None:
+    """Return the minimum with the change: from the fit's, or from where its method finds a start. `coarse`: the problem
+    with the steps to search with; `most`: the misfit above which a search is soon given up.
+    """
     old = minimum.problem
     problem = pose_problem(
         candidate.experiments,
@@ -140,7 +168,7 @@ def _refit(minimum: Minimum, candidate: Candidate) -> Solved | None:
     for i, name in enumerate(names):
         if i >= problem.unknowns.shared:  # parameters start from the candidate's own
             z[i] = fitted.get(name, z[i])
-    problem = problem.with_each(substeps=max(e.substeps for e in old.experiments))
+    problem = problem.with_each(substeps=max(e.substeps for e in coarse.experiments))
     if candidate.gains:
         z = _compare_gains(problem, z, candidate.gains)
     start = problem.evaluate(z)
@@ -150,8 +178,18 @@ def _refit(minimum: Minimum, candidate: Candidate) -> Solved | None:
             i = names.index(name)
             other[i] = np.clip(z[i] + samples * problem.experiments[0].period, problem.unknowns.low[i], None)
         start = min(start, problem.evaluate(other), key=lambda evaluation: evaluation.cost)
+    plants = {e.data.plant for e in old.experiments}
+    checked = all(e.data.plant in plants for e in problem.experiments)
+    tried = count(1)
+
+    def ends(evaluation: Evaluation) -> bool:
+        return next(tried) > PATIENCE and measure_misfit(evaluation) > most
+
+    def solve(problem: FitProblem, start: Evaluation) -> Solved:
+        return settle_roughly(problem, start, ends=ends, checked=checked)
+
     # Only the freed parameter's friction is sharpened: what the fit found out already needs no other search.
-    solved = settle_roughly(problem, start) if old.find_smoothing() else sharpen(problem, start, settle_roughly)
+    solved = solve(problem, start) if old.find_smoothing() else sharpen(problem, start, solve)
     return solved if np.isfinite(solved.misfit) else None
 
 

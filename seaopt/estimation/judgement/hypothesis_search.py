@@ -28,7 +28,7 @@ from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, minimise
-from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, estimate_sigma
+from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
 from seaopt.estimation.solver.step_size import choose_first_steps
 from seaopt.parameters import ParameterSet
 from seaopt.progress import Progress, ignore
@@ -45,6 +45,7 @@ HELPS = 0.02  # of a residual's power beyond noise, that a round has to take fro
 CHANCE = 10.0  # of log-likelihood, over the colour of the residual, that chance may give
 CLOSE = 1e-3  # over the size of the start: the second radius that a step may have
 BASES = 3  # hypotheses, the best, beside which each other one is tried
+SLIGHT = 0.2  # of that: a step that may gain half as much ends a round
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
 
 
@@ -145,7 +146,11 @@ class _Search:
 
     def run(self) -> list[Refit]:
         """Return the refits of single hypotheses, and of pairs with the best of them where none suffices."""
-        single = list(self.try_each(self.minimum.problem, self.base, self.fit.experiments, self.fit.parameters))
+        # Steps as coarse as the residual allows: that of a fit which explains little asks for few.
+        problem, fitted = self.minimum.problem, self.base
+        if self.first > REMOVED:
+            problem, fitted = coarsen(problem, self.minimum.z)
+        single = list(self.try_each(problem, fitted, self.fit.experiments, self.fit.parameters))
         refits = sorted(single, key=lambda refit: refit.excess)
         bases = refits[:BASES]
         partners = [refit.change.hypotheses[-1] for refit in bases]
@@ -159,7 +164,10 @@ class _Search:
             refits += self.try_each(
                 best.problem, best.evaluation, best.change.experiments, values, best.change, done, others
             )
-        return refits
+        if not refits:
+            return refits
+        best = min(refits, key=lambda refit: refit.excess)
+        return [*(refit for refit in refits if refit is not best), _settle(best, best.evaluation)]
 
     def try_each(
         self,
@@ -205,18 +213,22 @@ def _refit(
     """
     before = count_evaluations()
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
-    problem = problem.with_each(substeps=max(experiment.substeps for experiment in old.experiments))
-    problem = problem.with_values("sigma", {experiment.name: experiment.sigma for experiment in old.experiments})
+    for field in ("sigma", "substeps"):
+        problem = problem.with_values(field, {e.name: getattr(e, field) for e in old.experiments})
     start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
     if not np.isfinite(start.cost):
         return None
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
-    least, radius = _measure_powers(fitted), FIRST_RADIUS
+    at_fit = least = checked = _measure_powers(fitted)
+    radius = FIRST_RADIUS
     for number in range(MOST_ROUNDS):
         # The smaller the residual has become, the finer must be the steps.
-        problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
-        limits, first = (unknowns.low, unknowns.high), evaluation
-        solution = minimise(problem, evaluation, *limits, decrement=NEAR, max_iterations=ROUND, first_radius=radius)
+        if np.any(powers < HALF * checked):
+            problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS, roughly=True)
+            checked = powers
+        low, high, first = unknowns.low, unknowns.high, evaluation
+        near = NEAR if np.any(powers < HALF * at_fit) else max(NEAR, SLIGHT * helps * first.cost)
+        solution = minimise(problem, first, low, high, decrement=near, max_iterations=ROUND, first_radius=radius)
         evaluation = solution.evaluation
         if evaluation is first and solution.status == "max_iterations" and radius == FIRST_RADIUS:
             radius = CLOSE  # every step went too far
@@ -235,9 +247,24 @@ def _refit(
             break
         least = np.minimum(least, powers)
     excess = _measure_excess(problem, evaluation.z)
-    spent = count_evaluations() - before
     gain = _measure_gain(base, evaluation)
-    return Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, gain=gain, evaluations=spent)
+    refit = Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, gain=gain, evaluations=0)
+    if excess <= REMOVED:  # likelihoods near noise are compared, for which steps are finer
+        problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
+        if problem is not refit.problem:
+            refit = _settle(replace(refit, problem=problem), evaluation)
+    return replace(refit, evaluations=count_evaluations() - before)
+
+
+def _settle(refit: Refit, start: Evaluation) -> Refit:
+    """Return a refit at its minimum, which says how far what is missing moves the values."""
+    low, high = refit.problem.unknowns.low, refit.problem.unknowns.high
+    evaluation = minimise(refit.problem, start, low, high, decrement=NEAR, max_iterations=2 * ROUND).evaluation
+    if evaluation is refit.evaluation:
+        return refit
+    excess = _measure_excess(refit.problem, evaluation.z)
+    gain = refit.gain + _measure_gain(refit.evaluation, evaluation)
+    return replace(refit, evaluation=evaluation, excess=excess, gain=gain)
 
 
 def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> Evaluation:

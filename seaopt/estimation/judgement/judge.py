@@ -107,12 +107,12 @@ def judge(
         *find_other_minimum(fit),
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum).items() if test.p < DOUBTFUL}
-    wrong = (
-        bool(suspects)
-        or any(ratio > FAR for ratio in excess.values())  # noise of a colour is so, too
+    noticed = (
+        any(ratio > FAR for ratio in excess.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
         or fit.status != "converged"
     )
+    wrong = noticed or bool(suspects)
     little = any(finding.kind == "explained" for finding in findings)
     refitting, trying = divide(trying, OF_HYPOTHESES, OF_CAUSES)
     evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
@@ -127,6 +127,7 @@ def judge(
             suspects,
             alternatives,
             poor=little or fit.status == "not_identifiable",
+            noticed=noticed,
             hypotheses=search.able,
             budget=max(1, (OF_HYPOTHESES + OF_CAUSES) * evaluations - (count_evaluations() - begun)),
             progress=trying,

@@ -78,6 +78,7 @@ def minimise(
     follow: Callable[[M, Vector], M] | None = None,
     before: float = 0.0,
     flat: float = 0.0,
+    ends: Callable[[M], bool] | None = None,
 ) -> Solution[M]:
     """Minimise a sum of squares from `start`, inside the bounds.
 
@@ -87,7 +88,8 @@ def minimise(
     called with the model after each iteration; `follow`: (model, z) -> what it says of a z nearby if residuals are
     straight from there: then a last step needs no evaluation of its own once the whole steps before it have shown how
     straight they are; `before`: of the search that this one goes on from; `flat`: share of the cost that is no change:
-    a few steps in a row that make none end a search among kinks, whose gradient does not die out.
+    a few steps in a row that make none end a search among kinks, whose gradient does not die out; `ends`: tells of each
+    point whether it is all that is asked for.
     """
     current = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
     if not np.isfinite(current.cost):
@@ -161,6 +163,9 @@ def minimise(
             scale = np.maximum(scale, _column_norms(current))
         if callback is not None:
             callback(current)
+        if ends is not None and ends(current):
+            message = "what was asked for is found"
+            return Solution(z=current.z, evaluation=current, status="converged", message=message, iterations=iteration)
     return Solution(
         z=current.z, evaluation=current, status="max_iterations", iterations=max_iterations, message=STILL_MOVING
     )

@@ -47,12 +47,8 @@ class Solved:
 
     @property
     def misfit(self) -> float:
-        """A likelihood that does not depend on the sigmas that were assumed; infinite where the plant overflows."""
-        evaluation = self.solution.evaluation
-        if not np.isfinite(evaluation.cost):
-            return np.inf
-        rows = [(power.squares, power.counts) for power in evaluation.power.values()]
-        return float(sum(np.sum(n * np.log(np.maximum(s, 1e-300) / np.maximum(n, 1.0))) for s, n in rows))
+        """Of its evaluation: see `measure_misfit`."""
+        return measure_misfit(self.solution.evaluation)
 
     @property
     def follows_log(self) -> bool:
@@ -215,14 +211,30 @@ def measure_flatness(problem: FitProblem) -> float:
     return FLAT if any(experiment.model.sticks for experiment in problem.experiments) else 0.0
 
 
-def settle_roughly(problem: FitProblem, start: Evaluation, callback: Callback | None = None) -> Solved:
-    """Return a minimum near enough to be compared with others: sigma is estimated twice, the step chosen once."""
-    problem, evaluation = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
-    problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
+def coarsen(problem: FitProblem, z: Vector) -> tuple[FitProblem, Evaluation]:
+    """Return a problem with integration steps as coarse as its residual at z allows, and its evaluation there."""
+    problem = problem.with_each(substeps=1)
+    return choose_first_steps(problem, problem.evaluate(z), ROUGH_SUBSTEPS, roughly=True)
+
+
+def settle_roughly(
+    problem: FitProblem,
+    start: Evaluation,
+    callback: Callback | None = None,
+    ends: Callable[[Evaluation], bool] | None = None,
+    *,
+    checked: bool = False,
+) -> Solved:
+    """Return a minimum near enough to be compared with others: sigma is estimated twice, the step chosen once. `ends`:
+    tells of each point whether it is all that is asked for; `checked`: the steps are fine enough as they are.
+    """
+    evaluation = start
+    if not checked:
+        problem, evaluation = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
+        problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
     unknowns, solution, iterations = problem.unknowns, None, 0
     for attempt in range(ROUGH_ROUNDS):
-        problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
-        evaluation = problem.evaluate(evaluation.z)
+        problem, evaluation = _take_sigma(problem, evaluation)
         solution = minimise(
             bound_steps(problem, evaluation),
             evaluation,
@@ -232,13 +244,49 @@ def settle_roughly(problem: FitProblem, start: Evaluation, callback: Callback | 
             max_iterations=ROUGH_ITERATIONS,
             callback=_tell_round(callback, problem, attempt + 1),
             flat=measure_flatness(problem),
+            ends=ends,
         )
         evaluation, iterations = solution.evaluation, iterations + solution.iterations
-        if not np.isfinite(evaluation.cost):
+        if not np.isfinite(evaluation.cost) or (ends is not None and ends(evaluation)):
             break
     assert solution is not None
     solution = replace(solution, iterations=iterations)
     return Solved(problem=problem, solution=solution, step_error=StepError())
+
+
+def _take_sigma(problem: FitProblem, evaluation: Evaluation) -> tuple[FitProblem, Evaluation]:
+    """Return a problem with the sigmas of its residuals, which need no other passes where the loss is quadratic."""
+    problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
+    if not problem.loss.quadratic:
+        return problem, problem.evaluate(evaluation.z)
+    return problem, problem.assemble(evaluation.passes, evaluation.z)
+
+
+def refine_to(solved: Solved, fine: FitProblem) -> Solved:
+    """Return a rough minimum with integration steps as fine as a problem's, so that it can be compared with its own."""
+    steps = {e.name: e.substeps for e in fine.experiments}
+    problem = solved.problem.with_each(substeps=max(steps.values()))
+    if all(e.substeps >= problem.experiments[0].substeps for e in solved.problem.experiments):
+        return solved
+    problem, evaluation = _take_sigma(problem, problem.evaluate(solved.solution.z))
+    solution = minimise(
+        bound_steps(problem, evaluation),
+        evaluation,
+        problem.unknowns.low,
+        problem.unknowns.high,
+        decrement=NEAR,
+        max_iterations=ROUGH_ITERATIONS,
+        flat=measure_flatness(problem),
+    )
+    return Solved(problem=problem, solution=solution, step_error=StepError())
+
+
+def measure_misfit(evaluation: Evaluation) -> float:
+    """Return a likelihood that does not depend on the sigmas that were assumed; infinite where a plant overflows."""
+    if not np.isfinite(evaluation.cost):
+        return np.inf
+    rows = [(power.squares, power.counts) for power in evaluation.power.values()]
+    return float(sum(np.sum(n * np.log(np.maximum(s, 1e-300) / np.maximum(n, 1.0))) for s, n in rows))
 
 
 def explains_little(problem: FitProblem, power: Mapping[str, ResidualPower]) -> bool:

@@ -19,6 +19,7 @@ STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
 STEP_ERROR_PARAMETER = 0.1  # and in a parameter, in its standard deviations
 TOLERATED = 3.0  # times that, where no finer steps are left: an interval of 95 % then covers 94 %
 FIRST_STEP_ERROR = 0.1  # allowed in an output while sigma is not yet known
+ROUGH_STEP_ERROR = 0.05  # rms, of minima that are only compared: a part in 400 of a residual's power
 MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trust
 NEARBY = 10.0  # standard deviations, over which a step error does not change
 # Of an order: where a joint that sticks stops, residuals jump, and finer steps make that no better for ever.
@@ -55,18 +56,21 @@ Checks = Mapping[str, Check]  # by experiment, those that are known
 
 
 def choose_first_steps(
-    problem: FitProblem, start: Evaluation, most: int = MAX_SUBSTEPS
+    problem: FitProblem, start: Evaluation, most: int = MAX_SUBSTEPS, *, roughly: bool = False
 ) -> tuple[FitProblem, Evaluation]:
-    """Return the problem with steps that do for a first search, `most` per sample at most, and its evaluation there."""
+    """Return the problem with steps that do for a first search, `most` per sample at most, and its evaluation there.
+
+    `roughly`: for a minimum that is only compared, so that a jump here and there, where a joint stops, does not count.
+    """
     while True:
-        finer = problem.map(lambda experiment, evaluation=start: _choose_first_steps(experiment, evaluation, most))
+        finer = problem.map(lambda e, evaluation=start: _choose_first_steps(e, evaluation, most, roughly=roughly))
         if finer == [experiment.count_steps(start.z) for experiment in problem.experiments]:
             return problem, start
         problem = _with_substeps(problem, finer)
         start = problem.evaluate(start.z)
 
 
-def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most: int) -> int:
+def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most: int, *, roughly: bool) -> int:
     """Return the steps that an experiment's first samples ask for."""
     z, fine = evaluation.passes.z, []
     if experiment.model.linear or experiment.count_steps(z) >= most:
@@ -75,8 +79,11 @@ def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most:
     for segment in experiment.segments:
         stop = min(segment.samples.n, FIRST_SAMPLES)
         fine.append(halved.run(segment, z, stop=stop, sums=False, outputs=True))
-    error = _measure_output_error(experiment, z, evaluation.passes.by_experiment[experiment.name], fine)
-    return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR, experiment), most)
+    coarse, allowed = evaluation.passes.by_experiment[experiment.name], FIRST_STEP_ERROR
+    error = _measure_output_error(experiment, z, coarse, fine, rms=roughly)
+    if roughly:
+        allowed = ROUGH_STEP_ERROR
+    return min(_choose_steps(experiment.count_steps(z), StepError(output=error), allowed, experiment), most)
 
 
 def hold_bristles(problem: FitProblem) -> FitProblem:
@@ -227,12 +234,18 @@ def _floored_sigma(experiment: FitExperiment) -> PerOutput:
 
 
 @np.errstate(all="ignore")
-def _measure_output_error(experiment: FitExperiment, z: Vector, coarse: Sequence[Pass], fine: Sequence[Pass]) -> float:
-    """Return the largest integration error in an output of an experiment, in sigma; see `measure_step_error`."""
+def _measure_output_error(
+    experiment: FitExperiment, z: Vector, coarse: Sequence[Pass], fine: Sequence[Pass], *, rms: bool = False
+) -> float:
+    """Return the largest integration error in an output of an experiment, or its rms, in sigma: see
+    `measure_step_error`.
+    """
     scale = experiment.point(z).gain / _floored_sigma(experiment)
     worst = 0.0
     for rough, halved in zip(coarse, fine, strict=True):
         assert rough.outputs is not None and halved.outputs is not None
-        change = float(np.max(np.abs(scale * (rough.outputs - halved.outputs)))) * _whole_error(experiment)
+        apart = scale * (rough.outputs - halved.outputs)
+        change = np.sqrt(np.max(np.mean(apart**2, axis=0))) if rms else np.max(np.abs(apart))
+        change = float(change) * _whole_error(experiment)
         worst = max(worst, change if np.isfinite(change) else np.inf)
     return worst

@@ -140,3 +140,6 @@ def test_a_last_step_is_followed_without_an_evaluation_and_ends_where_scipy_does
     assert followed.status == all_made.status == "converged"
     assert len(seen) < plain
     assert np.max(np.abs(followed.z - best) / std) < 1e-4
+    near = 1.01 * all_made.evaluation.cost
+    ended = minimise(Exponential(), start, -bounds, bounds, ends=lambda here: here.cost < near)
+    assert ended.evaluation.cost < near and ended.iterations < all_made.iterations
