@@ -132,10 +132,11 @@ def find_critical(link: ControlledLink, velocity_filter_s: float, stiffness: flo
 def _place(loop: MovingLoop, p: Poles) -> tuple[Poles, Poles]:
     """Return K_v and D_v of double poles at z = exp(-p)."""
     z, outer = np.exp(-p), loop.outer
-    inner = z[:, None, None] * np.eye(loop.position.size) - loop.fixed
-    once = np.linalg.solve(inner, loop.reference[:, None])
+    system, position = loop.block, loop.block.c[0]
+    inner = z[:, None, None] * np.eye(len(system.a)) - system.a
+    once = np.linalg.solve(inner, system.b)
     twice = np.linalg.solve(inner, once)[:, :, 0]
-    x, slope = once[:, :, 0] @ loop.position, -(twice @ loop.position)
+    x, slope = once[:, :, 0] @ position, -(twice @ position)
     with np.errstate(divide="ignore", invalid="ignore"):
         n, n_slope = -1.0 / (outer.direction * x), slope / (outer.direction * x**2)
         d = n_slope / outer.difference_slope(z)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float
 from seaopt.control.impedance.critical_damping import CriticalImpedances, scan_critical
 from seaopt.control.impedance.link import ControlledLink, find_link
 from seaopt.control.impedance.moving_loop import close_link
-from seaopt.control.impedance.sampled_port import Angles, PortResponses, PortTerms, SampledPort
+from seaopt.control.impedance.sampled_port import Angles, PortTerms, SampledPort
 from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.outer_loop import Impedance
@@ -213,18 +214,18 @@ def needed_damper(port: SampledPort, impedance: Impedance) -> float:
         return np.inf
     scale, theta, high = _find_scales(port.link, None)[1], port.angles(), np.inf
     for _ in range(DAMPER_ROUNDS):
-        high = _bisect_damper(port.respond(theta), impedance, LEAST_DAMPER * scale, MOST_DAMPER * scale)
+        high = _bisect_damper(port.terms(theta, 0.0), impedance, LEAST_DAMPER * scale, MOST_DAMPER * scale)
         if not np.isfinite(high):
             return high
         theta = np.union1d(theta, port.refine(impedance, high, theta))
     return high
 
 
-def _bisect_damper(at: PortResponses, impedance: Impedance, low: float, high: float) -> float:
+def _bisect_damper(at: PortTerms, impedance: Impedance, low: float, high: float) -> float:
     """Return the least damper between two with which an impedance is passive at some angles; infinite beyond them."""
 
     def holds(damper: float) -> bool:
-        return bool(np.min(at.weigh(damper).margin_of(impedance)) > 0.0)
+        return bool(np.min(replace(at, damper=damper).margin_of(impedance)) > 0.0)
 
     if not holds(high):
         return np.inf

@@ -60,30 +60,36 @@ FAILING = 40  # frequencies at which an environment is looked for
 
 @record(eq=False)
 class PortTerms:
-    """c_k = p_k + W q_k at m angles and k aliases, for one damper at the link."""
+    """a_k b_k = p_k + W q_k at m angles and k aliases, and what takes energy there, with one damper at the link."""
 
     theta: Angles
-    # p_k and q_k, the aliases in the order -N to N, then all those beyond on either side as one each
-    by_force: Aliases
-    by_place: Aliases
+    by_force: Aliases  # p_k, the aliases in the order -N to N
+    by_place: Aliases  # q_k
     weights: Complex[np.ndarray, "2 m"]  # W per stiffness and per damping
-    dissipates: bool  # something takes energy between the samples; nothing is passive without that
+    resistance: Float[np.ndarray, "m k"]  # the actuator's own Re G_22, and the least of it at the highest frequencies
+    least_resistance: float
+    damper: float  # at the link
 
     def margin(self, stiffness: Points, damping: Points) -> Float[np.ndarray, "n m"]:
         """Return (|2 + sum c_k|^2 - (sum |c_k|)^2)/4 at every angle for n pairs of gains, positive where it is passive.
         Of one alias it is 1 + Re c: 1 without control, 0 where nothing is left of the damping. Of the far aliases the
-        sizes of p_k and W q_k are added, which is more than that of their sum. Where nothing dissipates it is -inf.
+        sizes of p_k and W q_k are added, which is more than that of their sum. Where nothing takes energy between the
+        samples it is -inf.
         """
-        if not self.dissipates:
+        dissipated, floor = self.damper + self.resistance, self.damper + self.least_resistance
+        if not floor > 0.0:
             return np.full((stiffness.size, self.theta.size), -np.inf)
+        by_force, by_place = (
+            _add_beyond(part / dissipated, dissipated / floor, self.theta) for part in (self.by_force, self.by_place)
+        )
         near = slice(ALIASES - NEAR, ALIASES + NEAR + 1)
-        far = np.ones(self.by_force.shape[1], dtype=bool)
+        far = np.ones(by_force.shape[1], dtype=bool)
         far[near] = False
-        p_all, q_all = np.sum(self.by_force, axis=1), np.sum(self.by_place, axis=1)
-        p_far, q_far = (np.sum(np.abs(part[:, far]), axis=1) for part in (self.by_force, self.by_place))
+        p_all, q_all = np.sum(by_force, axis=1), np.sum(by_place, axis=1)
+        p_far, q_far = (np.sum(np.abs(part[:, far]), axis=1) for part in (by_force, by_place))
         w = stiffness[:, None] * self.weights[0] + damping[:, None] * self.weights[1]
         whole, sizes = np.abs(2.0 + p_all + w * q_all), p_far + np.abs(w) * q_far
-        for p, q in zip(self.by_force[:, near].T, self.by_place[:, near].T, strict=True):
+        for p, q in zip(by_force[:, near].T, by_place[:, near].T, strict=True):
             sizes += np.abs(p + w * q)
         return 0.25 * (whole - sizes) * (whole + sizes)
 
@@ -95,30 +101,6 @@ class PortTerms:
         """Return the least margin over the angles, for n pairs of gains."""
         blocks = (slice(i, i + BLOCK) for i in range(0, stiffness.size, BLOCK))
         return np.concatenate([np.min(self.margin(stiffness[some], damping[some]), axis=1) for some in blocks])
-
-
-@record(eq=False)
-class PortResponses:
-    """a_k b_k = p_k + W q_k at m angles and k aliases, and the actuator's own Re G_22, without a damper at the link."""
-
-    theta: Angles
-    by_force: Aliases
-    by_place: Aliases
-    weights: Complex[np.ndarray, "2 m"]
-    resistance: Float[np.ndarray, "m k"]
-    least_resistance: float
-
-    def weigh(self, damper: float) -> PortTerms:
-        """Return the terms with a damper at the link."""
-        dissipated, floor = damper + self.resistance, damper + self.least_resistance
-        by_force, by_place = self.by_force, self.by_place
-        if floor > 0.0:
-            by_force, by_place = (
-                _add_beyond(part / dissipated, dissipated / floor, self.theta) for part in (by_force, by_place)
-            )
-        return PortTerms(
-            theta=self.theta, by_force=by_force, by_place=by_place, weights=self.weights, dissipates=floor > 0.0
-        )
 
 
 @record(eq=False)
@@ -151,8 +133,8 @@ class SampledPort:
         even = np.concatenate([np.geomspace(lowest, 0.3, 160), np.linspace(0.3, np.pi, 160)])
         return np.unique(np.concatenate([even, folded[folded >= lowest]]))
 
-    def respond(self, theta: Angles) -> PortResponses:
-        """Return what the condition is made of at angles, whatever gains and damper."""
+    def terms(self, theta: Angles, damper: float) -> PortTerms:
+        """Return the terms at angles with a damper at the link."""
         link, period = self.link, self.link.sample_time_s
         orders = np.arange(-ALIASES, ALIASES + 1)
         omega = (theta[:, None] + 2 * np.pi * orders) / period
@@ -171,18 +153,15 @@ class SampledPort:
         drive = -at(response.motor_to_port) * (-np.expm1(-1j * theta) * closed)[:, None] / (s * period)
         outer = link.speed_filter(self.velocity_filter_s)
         gain = link.direction * reference
-        return PortResponses(
+        return PortTerms(
             theta=theta,
             by_force=drive * moved,
             by_place=drive / s,
             weights=np.array([gain, gain * outer.difference(z)]),
             resistance=np.maximum(np.real(at(response.motion_to_port)), 0.0),
             least_resistance=self._find_floor(),
+            damper=damper,
         )
-
-    def terms(self, theta: Angles, damping: float) -> PortTerms:
-        """Return the terms at angles with a damper at the link."""
-        return self.respond(theta).weigh(damping)
 
     def worst(self, impedance: Impedance, damper: float, theta: Angles) -> tuple[float, float]:
         """Return the least margin of an impedance with a damper at the link, also between the angles, and its angle."""

@@ -334,13 +334,13 @@ class Law:
             for number, path in enumerate(measurements, start=1)
         }
         parts = [split(name, tf) for name, tf in paths_by_name.items()]
-        m = max(part.chain.size for part in parts)
+        m = max(gains.size for gains, _, _ in parts)
         chain = np.zeros((m, len(parts)))
-        for column, part in enumerate(parts):
-            chain[: part.chain.size, column] = part.chain
+        for column, (gains, _, _) in enumerate(parts):
+            chain[: gains.size, column] = gains
         sign = np.array([1.0] + [-1.0] * len(measurements))
         through = sign * np.array([tf.num[0] for tf in paths_by_name.values()], dtype=float)
-        a, b, c = realise_rest(parts)
+        a, b, c = realise_rest([part[1:] for part in parts])
         made = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s)
 
         def find_wrong(law: Law) -> str | None:

@@ -25,7 +25,6 @@ from scipy.linalg import block_diag, matrix_balance, schur, solve_sylvester
 
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
-from seaopt.records import record
 
 EPS = float(np.finfo(float).eps)
 POLE_AT_ONE = 64 * EPS  # a denominator this small at q = 1, against its coefficients, has a root there
@@ -39,16 +38,10 @@ TINY = 1e-300
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
-@record(eq=False)
-class SplitLaw:
-    """A transfer function taken apart: g_1 ... g_m, Y and R."""
-
-    chain: Float[np.ndarray, " m"]
-    remainder: Float[np.ndarray, " _"]
-    den: Float[np.ndarray, " _"]
+Split = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # g_1 ... g_m, Y and R
 
 
-def split(name: str, tf: TransferFunction) -> SplitLaw:
+def split(name: str, tf: TransferFunction) -> Split:
     """Take a transfer function apart as the module's docstring does, m as small as the numerator lets it be. Raises
     ControlError: a coefficient is not finite, den[0] is not 1, or slow poles make a root at 1 of rounding.
     """
@@ -56,7 +49,7 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
         raise ControlError(f"{name}: num or den has a number that is not finite, or den[0] is not 1; tune again")
     if not np.any(num):
-        return SplitLaw(chain=np.zeros(0), remainder=np.zeros(1), den=np.ones(1))
+        return np.zeros(0), np.zeros(1), np.ones(1)
     for _ in range(_count_roots_at_one(name, den)):
         den, m = np.cumsum(den)[:-1], m + 1
         if num.size > 1 and _has_root_at_one(num, ZERO_AT_ONE):
@@ -71,7 +64,7 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     numerator[: removed.size] -= removed
     for _ in range(m):
         numerator = np.cumsum(numerator)[:-1]
-    return SplitLaw(chain=chain[1:], remainder=numerator, den=den)
+    return chain[1:], numerator, den
 
 
 def refuse_slow_poles(name: str) -> ControlError:
@@ -98,25 +91,25 @@ def _count_roots_at_one(name: str, den: Float[np.ndarray, " n"]) -> int:
 
 
 def realise_rest(
-    parts: list[SplitLaw],
+    parts: list[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]],
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-    """Return Y/R of all in observer form, each of its input: on shared states where R is the same, else side by side.
-    The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles have digits
-    that they do not have in z, with its states scaled.
+    """Return Y/R of all parts (Y, R) in observer form, each of its input: on shared states where R is the same, else
+    side by side. The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles
+    have digits that they do not have in z, with its states scaled.
     """
     groups: dict[tuple[float, ...], list[int]] = {}  # by denominator
-    for number, part in enumerate(parts):
-        groups.setdefault(tuple(part.den), []).append(number)
+    for number, (_, den) in enumerate(parts):
+        groups.setdefault(tuple(den), []).append(number)
     blocks: list[Float[np.ndarray, "_ _"]] = []
     drives: list[Float[np.ndarray, "_ k"]] = []
     rows: list[Float[np.ndarray, " _"]] = []
     for den, numbers in groups.items():
-        n = max(len(den), *(parts[number].remainder.size for number in numbers)) - 1
+        n = max(len(den), *(parts[number][0].size for number in numbers)) - 1
         whole = np.pad(den, (0, n + 1 - len(den)))
         a, b = np.eye(n, k=1), np.zeros((n, len(parts)))
         a[:, :1] -= _shift(whole)[1:, None]
         for number in numbers:
-            num = parts[number].remainder
+            num, _ = parts[number]
             b[:, number] = _shift((np.pad(num, (0, n + 1 - num.size)) - num[0] * whole)[1:])
         a, scale = _scale(a)
         blocks.append(np.eye(n) + a)

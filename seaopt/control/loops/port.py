@@ -86,14 +86,19 @@ class PortModel:
             motion_to_port=taken[:, 1] - s * self.mass,
         )
 
+    def load(
+        self, taken: Float[np.ndarray, " n"], pushed: float
+    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]:
+        """Return the plant from motor force to what is read, its port loaded: F_e = taken x + pushed F_m."""
+        n, of_force = self.motor.size, self.read[:, -1]
+        a, b = self.a + np.outer(self.force, taken), self.motor + self.force * pushed
+        return a, b, self.read[:, :n] + np.outer(of_force, taken), self.read[:, n] + of_force * pushed
+
     def hold_link(self, sample_time_s: float, delay_samples: int) -> DigitalPlant:
         """Return the sampled plant from motor force to what is fed back with link 2 at rest."""
-        n, at = self.motor.size, self.force[self.speed]
-        taken, pulled = -self.a[self.speed] / at, -self.motor[self.speed] / at  # F_e of x and of F_m
-        a, b = self.a + np.outer(self.force, taken), self.motor + self.force * pulled
-        read, of_motor, of_force = self.read[:, :n], self.read[:, n], self.read[:, n + 1]
-        c, d = read + np.outer(of_force, taken), of_motor + of_force * pulled
-        moving = np.arange(n) != self.speed  # states that cannot move are left out
+        at = self.force[self.speed]
+        a, b, c, d = self.load(-self.a[self.speed] / at, -self.motor[self.speed] / at)
+        moving = np.arange(b.size) != self.speed  # states that cannot move are left out
         while np.any(still := moving & ~np.any(a[:, moving], axis=1) & (b == 0.0)):
             moving &= ~still
         linear = a[moving][:, moving][None], b[moving][None], c[:, moving][None], d[None]
@@ -102,7 +107,7 @@ class PortModel:
 
     def find_poles(self) -> Complex[np.ndarray, " n"]:
         """Return the poles with link 2 at rest (rad/s)."""
-        moved = self.a - np.outer(self.force, self.a[self.speed]) / self.force[self.speed]
+        moved = self.load(-self.a[self.speed] / self.force[self.speed], 0.0)[0]
         return np.linalg.eigvals(moved).astype(complex)
 
     def _beside(self, f: Frequencies) -> Frequencies:
@@ -130,41 +135,34 @@ def probe_of(plant: Plant) -> Plant:
 def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: float) -> PortModel:
     """Return a plant's port, driven by the command for an effort. Raises ControlError: no such port or output."""
     probe = probe_of(plant)
-    values, rows, port = probe.complete(params), find_rows(probe, measured), bare_port(probe)
+    values, rows = probe.complete(params), find_rows(probe, measured)
+    effort, coordinate, rate, inertia = bare_port(probe)
     a, b, c, d = state_space(probe, values)
-    external, states = list(probe.inputs).index(port.effort), list(probe.states)
+    external, states = list(probe.inputs).index(effort), list(probe.states)
     return PortModel(
         a=a,
         motor=per_effort * b[:, 0],
         force=b[:, external].copy(),
         read=np.column_stack([c[rows], per_effort * d[rows, 0], d[rows, external]]),
-        speed=states.index(port.rate),
-        place=states.index(port.coordinate),
-        mass=values[port.inertia].value,
+        speed=states.index(rate),
+        place=states.index(coordinate),
+        mass=values[inertia].value,
         delay_s=float(find_delay(plant, read_conditions(plant, params))),
-        place_unit=probe.states[port.coordinate],
+        place_unit=probe.states[coordinate],
     )
 
 
-@record
-class BarePort:
-    """The names of a probe's port: the world's effort, the link's coordinate and rate, and its inertia."""
-
-    effort: str
-    coordinate: str
-    rate: str
-    inertia: str
-
-
-def bare_port(probe: Plant) -> BarePort:
-    """Return the names of a probe's port. Raises ControlError: the probe does not state them."""
+def bare_port(probe: Plant) -> tuple[str, str, str, str]:
+    """Return the names of a probe's port: the world's effort, the link's coordinate and rate, and its inertia. Raises
+    ControlError: the probe does not state them.
+    """
     port = probe.port
     if port is None or not (port.effort and port.coordinate and port.rate) or len(port.payload) != 1:
         raise ControlError(
             f"the probe {probe.name} does not say what its port is; give it ports = (Port(effort, coordinate, rate, "
             "motion, payload),), the payload being one inertia"
         )
-    return BarePort(effort=port.effort, coordinate=port.coordinate, rate=port.rate, inertia=port.payload[0])
+    return port.effort, port.coordinate, port.rate, port.payload[0]
 
 
 def hold_response(f: Frequencies, sample_time_s: float, delay_samples: int) -> Response:

@@ -120,19 +120,19 @@ def attach_environment(plant: Plant) -> Plant:
     are `SPRING`'s and `DAMPER`'s, with underscores as long as the probe has the same name.
     """
     probe = probe_of(plant)
-    port = bare_port(probe)
+    effort, coordinate, rate, _ = bare_port(probe)
     command, unit = next(iter(probe.inputs.items()))
     taken = {*probe.states, *probe.inputs, *probe.parameters, *probe.friction}
-    called = mechanics_of(probe.states[port.coordinate])
+    called = mechanics_of(probe.states[coordinate])
     spring, damper = (
         _rename(replace(parameter, unit=unit), taken)
         for parameter, unit in ((SPRING, called.stiffness), (DAMPER, called.damping))
     )
 
     def pull(x: Any, u: Any, p: Any) -> Any:
-        force = -getattr(p, spring.name) * getattr(x, port.coordinate)
-        force -= getattr(p, damper.name) * getattr(x, port.rate)
-        return SimpleNamespace(**(dict.fromkeys(probe.inputs, 0.0) | vars(u) | {port.effort: force}))
+        force = -getattr(p, spring.name) * getattr(x, coordinate)
+        force -= getattr(p, damper.name) * getattr(x, rate)
+        return SimpleNamespace(**(dict.fromkeys(probe.inputs, 0.0) | vars(u) | {effort: force}))
 
     return Plant(
         name=f"{plant.name} against an environment",

@@ -38,13 +38,13 @@ def test_the_damping_is_that_of_a_search(stiffness: float, controller: so.Contro
     found = critical_impedance(controller, FREE, KNEE, stiffness, velocity_filter_s=1e-3)
     loop = close_link(find_link(controller, FREE, KNEE), 1e-3)
     rows = found.damping * np.linspace(0.9, 1.1, 41)
-    a, drive = loop.matrix(np.full(rows.size, stiffness), rows), loop.reference * stiffness
+    a, drive = loop.matrix(np.full(rows.size, stiffness), rows), loop.block.b[:, 0] * stiffness
     ends = np.linalg.solve(np.eye(drive.size) - a, np.broadcast_to(drive[:, None], (rows.size, drive.size, 1)))
     x, most = np.zeros((rows.size, drive.size, 1)), np.zeros(rows.size)
     for _ in range(6000):
         x = a @ x + drive[:, None]
-        most = np.maximum(most, x[:, :, 0] @ loop.position)
-    damping = rows[np.argmax(most <= (ends[:, :, 0] @ loop.position) * (1.0 + 1e-8))]
+        most = np.maximum(most, x[:, :, 0] @ loop.block.c[0])
+    damping = rows[np.argmax(most <= (ends[:, :, 0] @ loop.block.c[0]) * (1.0 + 1e-8))]
     assert damping == pytest.approx(found.damping, rel=0.04)
     assert render(controller, FREE, KNEE, found).overshoot < 1e-4
 
