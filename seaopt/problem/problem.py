@@ -13,7 +13,7 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
-from seaopt.control.laws.delay import DelayedSpec, find_drive, find_drive_delay, take_own_delays
+from seaopt.control.laws.delay import LoopSpec, find_drive, find_drive_delay, take_own_delays
 from seaopt.control.loops.sampled_plant import add_drive_delay, list_names
 from seaopt.errors import LogError, ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
@@ -215,7 +215,7 @@ class Problem:
             *guess_remarks(self.table.guessed, self.ranges, plants, parameters),
         ]
 
-    def values(self, source: Fit | ParameterSet, spec: DelayedSpec | None = None) -> ParameterSet:
+    def values(self, source: Fit | ParameterSet, spec: LoopSpec | None = None) -> ParameterSet:
         """Return the values to design with: a fit's, the file's for what it does not have.
 
         The drive's delay is as the file's specification says, or another that is asked.
@@ -225,7 +225,7 @@ class Problem:
         return values if spec is None else add_drive_delay(values, find_drive_delay(spec, self.design_plant, source))
 
     def robust_to(
-        self, source: Fit | ParameterSet, spec: DelayedSpec | None = None
+        self, source: Fit | ParameterSet, spec: LoopSpec | None = None
     ) -> dict[str, tuple[Plant, ParameterSet]]:
         """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges.
 

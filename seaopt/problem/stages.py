@@ -34,8 +34,7 @@ from seaopt.control import (
 from seaopt.control.laws.delay import (
     DELAY_KEYS,
     NEGLIGIBLE,
-    DelayedSpec,
-    count_loop_samples,
+    LoopSpec,
     find_drive_delay,
     settle_delays,
 )
@@ -312,7 +311,7 @@ def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> Plausibil
 
 
 def list_plants(
-    problem: Problem, source: Fit | ParameterSet, spec: DelayedSpec | None = None
+    problem: Problem, source: Fit | ParameterSet, spec: LoopSpec | None = None
 ) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
     """Return design and robust plants, models and measured responses; `spec`: its delays replace the problem's."""
     measured, plants = problem.measure_responses(source), problem.robust_to(source, spec)
@@ -357,7 +356,7 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
     return complete_controller(problem, controller, source)
 
 
-def _choose_delays(spec: DelayedSpec, given: GivenLaw) -> dict[str, Any]:
+def _choose_delays(spec: LoopSpec, given: GivenLaw) -> dict[str, Any]:
     """Return the delays that a law's file states; the problem's of the drive where it states none."""
     stated = dict.fromkeys(DELAY_KEYS) | dict(given.delays)
     if stated["delay_samples"] is None and stated["drive_delay_s"] is None:
@@ -365,13 +364,13 @@ def _choose_delays(spec: DelayedSpec, given: GivenLaw) -> dict[str, Any]:
     return stated
 
 
-def _check_drive_delay(problem: Problem, given: GivenLaw, spec: DelayedSpec, source: Fit | ParameterSet) -> None:
+def _check_drive_delay(problem: Problem, given: GivenLaw, spec: LoopSpec, source: Fit | ParameterSet) -> None:
     """Refuse a law whose loop is shorter than the problem says, and of which nobody tells how long the drive takes."""
     assert problem.spec is not None
     in_file, drive = problem.spec, find_drive_delay(spec, problem.design_plant, source)
     if given.delays.get("drive_delay_s") is not None or (in_file.delay_samples is not None and drive):
         return
-    counted = count_loop_samples(spec) / spec.sample_rate_hz + drive
+    counted = spec.loop_delay_samples / spec.sample_rate_hz + drive
     if in_file.delay_samples is not None and spec.delay_samples is None:
         least = in_file.delay_samples / in_file.sample_rate_hz
         said = f"delay_samples = {in_file.delay_samples}, the whole loop"

@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, TypeVar
 
 import casadi as ca
 import numpy as np
 
+from seaopt.control.laws.limits import Limit
 from seaopt.control.loops.sampled_plant import (
     DRIVE_DELAY,
-    Measured,
     add_drive_delay,
     drop_drive_delay,
     list_names,
@@ -36,33 +36,44 @@ from seaopt.plants.plant import require_plant
 from seaopt.records import record
 
 
-@runtime_checkable
-class DelayedSpec(Protocol):
-    """The timing of a specification; see the options of these names."""
+class LoopSpec:
+    """What the specifications of a law and of a plan have in common; see the options of these names."""
 
+    __slots__ = ()
     __dataclass_fields__: ClassVar[dict[str, Any]]
+    measured: Any
+    bandwidth_hz: Any
+    sample_rate_hz: Any
+    compute_delay_samples: Any
+    drive_delay_s: Any
+    delay_samples: Any
+    current_limit_A: Any
+    command_limit: Any
 
     @property
-    def compute_delay_samples(self) -> int | None:
-        """Whole samples from a reading to the command being put out; None: not given."""
+    def limits(self) -> tuple[Limit, ...]:
+        """The rows that a loop is judged by."""
+        raise NotImplementedError
 
     @property
-    def drive_delay_s(self) -> float | None:
-        """Seconds from the command to its effect; None: that of the fit."""
+    def sample_time_s(self) -> float:
+        """Seconds between samples."""
+        return 1.0 / self.sample_rate_hz
 
     @property
-    def delay_samples(self) -> int | None:
-        """The older key: both together, in whole samples; None: not given."""
+    def loop_delay_samples(self) -> int:
+        """Whole samples of delay that a loop is closed with besides the drive's: as given, or 1."""
+        samples = self.compute_delay_samples if self.delay_samples is None else self.delay_samples
+        return 1 if samples is None else samples
 
     @property
-    def sample_rate_hz(self) -> float:
-        """The rate of the controller."""
-        ...
+    def limit_asked(self) -> float | None:
+        """The limit of the command that is asked for, in its unit; None for none."""
+        return self.command_limit if self.current_limit_A is None else self.current_limit_A
 
-    @property
-    def measured(self) -> Measured:
-        """The outputs that the controller reads."""
-        ...
+    def allowed(self, limit: Limit) -> float | None:
+        """Return the value that a limit allows; None where it is not imposed."""
+        return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
 
 
 class LoopDelays:
@@ -107,13 +118,13 @@ class Drive:
         return Covariance(names=(*names, DRIVE_DELAY), matrix=joint.matrix[np.ix_(rows, rows)])
 
 
-SpecT = TypeVar("SpecT", bound=DelayedSpec)
+SpecT = TypeVar("SpecT", bound=LoopSpec)
 DELAY_KEYS = ("compute_delay_samples", "drive_delay_s", "delay_samples")
 TOLD_STDS = 3.0  # by which two fitted delays differ that are two
 NEGLIGIBLE = 0.01  # of a sample: a delay that is beyond another by less is as long
 
 
-def check_delays(spec: DelayedSpec, most: int) -> None:
+def check_delays(spec: LoopSpec, most: int) -> None:
     """Refuse delays that are none, or two that say the same."""
     for name in ("compute_delay_samples", "delay_samples"):
         value: Any = getattr(spec, name)
@@ -137,18 +148,12 @@ def check_delays(spec: DelayedSpec, most: int) -> None:
         )
 
 
-def count_loop_samples(spec: DelayedSpec) -> int:
-    """Return the whole samples that a controller waits: as given, or 1."""
-    samples = spec.compute_delay_samples if spec.delay_samples is None else spec.delay_samples
-    return 1 if samples is None else samples
-
-
-def count_response_samples(spec: DelayedSpec, measured: MeasuredResponse) -> float:
+def count_response_samples(spec: LoopSpec, measured: MeasuredResponse) -> float:
     """Return the samples that a measured response is turned by: the program's, for the drive's delay is in it. Raises
     ControlError: the older key is given, the whole loop, and the log alone has more.
     """
     if spec.delay_samples is None:
-        return count_loop_samples(spec)
+        return spec.loop_delay_samples
     late = spec.delay_samples - measured.clock.delay_s * spec.sample_rate_hz
     if late < -NEGLIGIBLE:
         raise ControlError(
@@ -159,22 +164,22 @@ def count_response_samples(spec: DelayedSpec, measured: MeasuredResponse) -> flo
     return max(late, 0.0)
 
 
-def find_given_drive_delay(spec: DelayedSpec) -> float | None:
+def find_given_drive_delay(spec: LoopSpec) -> float | None:
     """Return the drive's delay that a specification states; none is left where the whole loop is given."""
     return spec.drive_delay_s if spec.delay_samples is None else 0.0
 
 
-def place_drive_delay(spec: DelayedSpec, params: ParameterSet, drive_delay_s: float) -> ParameterSet:
+def place_drive_delay(spec: LoopSpec, params: ParameterSet, drive_delay_s: float) -> ParameterSet:
     """Return parameters with a drive's delay where they have none of their own; without any where samples count it."""
     return add_drive_delay(params, drive_delay_s) if spec.delay_samples is None else drop_drive_delay(params)
 
 
-def find_drive_delay(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> float:
+def find_drive_delay(spec: LoopSpec, plant: Plant, source: Fit | ParameterSet) -> float:
     """Return the drive's delay: as the specification states it, or as the fit or the parameters have it."""
     return find_drive(spec, plant, source).delay_s
 
 
-def find_drive(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> Drive:
+def find_drive(spec: LoopSpec, plant: Plant, source: Fit | ParameterSet) -> Drive:
     """Return the drive's delay, and of a fit the experiment that tells it: the one with the longest."""
     stated = find_given_drive_delay(spec)
     if stated is not None:
@@ -187,7 +192,7 @@ def find_drive(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> D
 
 
 def split_delayed(
-    spec: DelayedSpec, design: Plant, plants: Mapping[str, Plant], source: Fit | ParameterSet
+    spec: LoopSpec, design: Plant, plants: Mapping[str, Plant], source: Fit | ParameterSet
 ) -> dict[str, Plant]:
     """Return plants with the delays that their own experiments have; one twice whose experiments differ. The parameters
     have the longest delay of the design plant, from which each plant's own is counted.
@@ -213,7 +218,7 @@ def split_delayed(
 
 
 def take_own_delays(
-    spec: DelayedSpec, design: Plant, plants: Mapping[str, Any], source: Fit | ParameterSet
+    spec: LoopSpec, design: Plant, plants: Mapping[str, Any], source: Fit | ParameterSet
 ) -> dict[str, Any]:
     """Return plants with the longest delay of their own experiments; what comes with values of its own as it is."""
     if not isinstance(plants, Mapping):
@@ -258,7 +263,7 @@ def describe_delays(
     return f"{computing} + drive delay {1e3 * drive_delay_s:.4g} ms = {total:.4g} samples"
 
 
-def warn_delays(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> tuple[str, ...]:
+def warn_delays(spec: LoopSpec, plant: Plant, source: Fit | ParameterSet) -> tuple[str, ...]:
     """Return warnings of an older key, of a delay that counts twice, and of less in all than the experiments have."""
     warnings: list[str] = []
     if spec.delay_samples is not None:
@@ -280,7 +285,7 @@ def warn_delays(spec: DelayedSpec, plant: Plant, source: Fit | ParameterSet) -> 
         return tuple(warnings)
     settled, _ = settle_delays(spec, plant, source)
     fitted, rate = source.delay_s(plant), spec.sample_rate_hz
-    counted = count_loop_samples(settled) + find_drive_delay(spec, plant, source) * rate
+    counted = settled.loop_delay_samples + find_drive_delay(spec, plant, source) * rate
     if counted < fitted * rate - NEGLIGIBLE:
         name = "delay_samples" if spec.delay_samples is not None else "drive_delay_s"
         warnings.append(

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from seaopt.codec import to_content
 from seaopt.control.laws.command import Command
-from seaopt.control.laws.delay import check_delays, count_loop_samples, count_response_samples
+from seaopt.control.laws.delay import LoopSpec, check_delays, count_response_samples
 from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, FIELDS, LIMITS, Limit, list_given_limits
 from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.structures import (
@@ -47,7 +47,7 @@ def _limit(name: str, **described: Any) -> Any:
 
 
 @record(keywords=True)
-class ControllerSpec:
+class ControllerSpec(LoopSpec):
     """A bandwidth and the limits of `seaopt.control.laws.limits`: left out, each has its default; False lifts one.
 
     Raises
@@ -261,28 +261,9 @@ class ControllerSpec:
         return SpeedLoop(differenced=reads[: len(names)] != names) if self.structure == CASCADE else None
 
     @property
-    def loop_delay_samples(self) -> int:
-        """Whole samples of delay that a loop is closed with besides the drive's: as given, or 1."""
-        return count_loop_samples(self)
-
-    @property
-    def limit_asked(self) -> float | None:
-        """The limit of the command that is asked for, in its unit; None for none."""
-        return self.command_limit if self.current_limit_A is None else self.current_limit_A
-
-    @property
     def limits(self) -> tuple[Limit, ...]:
         """The rows that a loop is judged by."""
         return list_given_limits(self.bandwidth_tolerance) if self.structure == CUSTOM else LIMITS
-
-    @property
-    def sample_time_s(self) -> float:
-        """Seconds between samples."""
-        return 1.0 / self.sample_rate_hz
-
-    def allowed(self, limit: Limit) -> float | None:
-        """Return the value that a limit allows; None where it is not imposed."""
-        return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
 
     def level(self, name: str) -> float | None:
         """Return the value that the limit of a name allows; None where it is not imposed."""

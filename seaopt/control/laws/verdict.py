@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from seaopt.control.laws.delay import LoopSpec
 from seaopt.control.laws.limits import OTHER_NOISE, Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
@@ -19,24 +19,6 @@ from seaopt.records import record
 
 BLOCKED_CHARACTERS = 145  # of the limits that a message names, so that it stays below three lines of 80
 NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
-
-
-@runtime_checkable
-class LimitSpec(Protocol):
-    """The part of a specification that limits need."""
-
-    @property
-    def bandwidth_hz(self) -> float:
-        """The bandwidth that is asked for."""
-        ...
-
-    @property
-    def limits(self) -> Sequence[Limit]:
-        """The rows that a loop is judged by."""
-        ...
-
-    def allowed(self, limit: Limit) -> float | None:
-        """Return the value that a limit allows; None where it is not imposed."""
 
 
 @record(eq=False)
@@ -112,7 +94,7 @@ class PossibleBandwidths:
         return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
 
 
-def judge(spec: LimitSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[LimitVerdict]:
+def judge(spec: LoopSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[LimitVerdict]:
     """Judge a loop by a scope's imposed limits; with `stuck`, by those that also hold where friction sticks."""
     verdicts: list[LimitVerdict] = []
     for limit in spec.limits:
@@ -125,7 +107,7 @@ def judge(spec: LimitSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = Fa
     return verdicts
 
 
-def judge_all(spec: LimitSpec, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[LimitVerdict]:
+def judge_all(spec: LoopSpec, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[LimitVerdict]:
     """Judge every plant's loop, and the design plant's, which is the first, by its own limits too. Of several
     `design_states` the first is the design plant sliding, the others the same plant stuck by friction.
     """
@@ -162,7 +144,7 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[LimitVerdict]) -> list[
 
 
 def explain_broken(
-    spec: LimitSpec, verdicts: Sequence[LimitVerdict], design: MeasuredLoop, loop: Loop | DiscLoop
+    spec: LoopSpec, verdicts: Sequence[LimitVerdict], design: MeasuredLoop, loop: Loop | DiscLoop
 ) -> list[str]:
     """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
     `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says more.
@@ -241,7 +223,7 @@ def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[Desi
     return rows
 
 
-def _explain(spec: LimitSpec, verdict: LimitVerdict, design: MeasuredLoop, loop: Loop | DiscLoop) -> str:
+def _explain(spec: LoopSpec, verdict: LimitVerdict, design: MeasuredLoop, loop: Loop | DiscLoop) -> str:
     limit, port = verdict.limit, design.port
     if limit.name == "stability":
         return limit.name
@@ -261,7 +243,7 @@ def _explain(spec: LimitSpec, verdict: LimitVerdict, design: MeasuredLoop, loop:
     return f"{limit.name} {verdict.value:.{digits}g} of {verdict.allowed:g}"
 
 
-def _reached(spec: LimitSpec, verdict: LimitVerdict, loop: Loop | DiscLoop) -> str:
+def _reached(spec: LoopSpec, verdict: LimitVerdict, loop: Loop | DiscLoop) -> str:
     """Return how far a curve is off its level: where it first crosses says little when it lies along the level."""
     curve = verdict.limit.curve
     assert curve is not None and curve.until_hz is not None

@@ -566,7 +566,7 @@ def _design(
 
 def limit_command(spec: MPCSpec, plant: Plant, values: ParameterSet) -> float:
     """Return the limit of the command: what is asked for, and no more than the plant's actuation takes."""
-    return min(spec.limit_asked, find_range(plant, values) or np.inf)
+    return min(spec.limit_asked or np.inf, find_range(plant, values) or np.inf)
 
 
 def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec, limit: float) -> float:

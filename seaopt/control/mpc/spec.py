@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control.laws.delay import check_delays, count_loop_samples
+from seaopt.control.laws.delay import LoopSpec, check_delays
 from seaopt.control.laws.limits import BY_NAME, Limit
 from seaopt.control.laws.spec import ControllerSpec, Level
 from seaopt.control.mpc.noise import NoiseModel
@@ -45,7 +45,7 @@ def _shared(name: str) -> Any:
 
 
 @record(keywords=True)
-class MPCSpec:
+class MPCSpec(LoopSpec):
     """Limits of the plan, and bandwidth and margins while none of them is active.
 
     Raises
@@ -170,30 +170,9 @@ class MPCSpec:
         return self.decay / (2.0 * math.pi * self.bandwidth_hz)
 
     @property
-    def loop_delay_samples(self) -> int:
-        """Whole samples of delay that a loop is closed with besides the drive's: as given, or 1."""
-        return count_loop_samples(self)
-
-    @property
     def limits(self) -> tuple[Limit, ...]:
         """The rows that its loop is judged by."""
         return MPC_LIMITS
-
-    def allowed(self, limit: Limit) -> float | None:
-        """Return the value that one of `MPC_LIMITS` allows; None where it is not imposed."""
-        return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
-
-    @property
-    def limit_asked(self) -> float:
-        """The limit of the command that is asked for, in its unit."""
-        limit = self.command_limit if self.current_limit_A is None else self.current_limit_A
-        assert limit is not None
-        return limit
-
-    @property
-    def sample_time_s(self) -> float:
-        """Seconds between samples."""
-        return 1.0 / self.sample_rate_hz
 
     @property
     def samples(self) -> int:
