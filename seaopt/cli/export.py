@@ -17,10 +17,11 @@ from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.plausibility import GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
-from seaopt.control.mpc.export import SOURCES, set_gate, write_code
+from seaopt.control.mpc.export import HEAT, SOURCES, set_gate, set_heat, write_code
 from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ControlError, ProblemError
 from seaopt.files import exists, read_json, to_json
+from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.reporting.sections.verdict import UNMET
 
 
@@ -102,6 +103,10 @@ def export_controller(
 def _list_typed(content: Mapping[str, Any], options: Mapping[str, Any]) -> list[str]:
     """Return the parts of the law that options make another than that of the certificate."""
     guards, gate = content.get("guards") or {}, options["gate"]
+    if "mpc" in content:  # whose guards are among the numbers of its code
+        code = read_code(content["mpc"]["code"])
+        same = gate is None or set_gate(code, gate or None, content["sample_time_s"]).to_dict() == code.to_dict()
+        guards = {"gate": to_content(gate) if same and gate else None, "derate": code.heat is not None}
     differs = {
         "the gate": gate is not None and (to_content(gate) if gate else None) != guards.get("gate"),
         "the heat guard": options["derate"] is not None and options["derate"] != guards.get("derate", False),
@@ -179,23 +184,28 @@ def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -
 
 def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tuple[Path, ...]:
     """Write the C code of predictive control; limits and names are those that it was designed with."""
-    if not content["feasible"] and not options.pop("allow_infeasible", False):
+    if not options.pop("allow_infeasible", False) and not content["feasible"]:
         missed = join_labels(content["active_constraints"])
         raise ProblemError(f"the controller misses {missed}; tune one that does not, or type --allow-infeasible")
-    gate = options.pop("gate")
+    gate, derate = options.pop("gate"), options.pop("derate")
     typed = {name for name, value in options.items() if value not in (None, False) and name != "precision"}
     if typed - {"name"} or options["name"] != "force_law":
         raise ProblemError(
             "the C code of predictive control has the limits and the names that it was designed with: force_mpc_...; "
-            "leave out all options but --precision and those of --gate"
+            "leave out all options but --precision, --derate and those of --gate"
         )
     if options["precision"] not in ("double", "float"):
         raise ProblemError(f'precision = "{options["precision"]}" is not known; use "double" or "float"')
     code = read_code(content["mpc"]["code"])
     if gate is not None:
         code = set_gate(code, gate or None, content["sample_time_s"])
+    if derate is not None:
+        guard = derate if isinstance(derate, HeatGuard) else read_guard(content)
+        if derate and guard is None:
+            raise ProblemError("--derate: nothing is known of the motor's heat; tune on a plant with the part thermal")
+        code = set_heat(code, guard if derate else None)
     folder = write_code(code, target, single_precision=options["precision"] == "float")
-    return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h"))
+    return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h", *([] if code.heat is None else [HEAT])))
 
 
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:

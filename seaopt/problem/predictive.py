@@ -29,7 +29,7 @@ def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
 
 
 def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
-    stated = sorted(controller.model_fields_set - {"plant", "measured", "structure", "gate", *SHARED})
+    stated = sorted(controller.model_fields_set - {"plant", "measured", "structure", "gate", "derate", *SHARED})
     if stated:
         raise ProblemError(f'controller.{stated[0]} shapes gains, and structure = "mpc" has none; take it out')
     if not isinstance(controller.measured, str):

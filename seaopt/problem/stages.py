@@ -148,8 +148,7 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
             f"{problem.response_names[0]}; name a plant there"
         )
     mpc = force_mpc(problem.design_plant, source, problem.mpc)
-    gate = _make_gate(problem, mpc)
-    return mpc if gate is None else replace(mpc, gate=gate)
+    return replace(mpc, gate=_make_gate(problem, mpc), heat=mpc.heat_guard if _derates(problem, mpc) else None)
 
 
 def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:
@@ -276,13 +275,18 @@ def _list_terms(problem: Problem, values: ParameterSet) -> dict[str, Any]:
 
 def _guard(problem: Problem, controller: Controller) -> Controller:
     """Return a controller with the problem's gate and heat guard."""
+    return replace(controller, gate=_make_gate(problem, controller), derate=_derates(problem, controller))
+
+
+def _derates(problem: Problem, controller: Controller | ForceMPC) -> bool:
+    """Tell whether the file asks to lower the limit as the winding warms up."""
     derate = problem.controller_table.derate
     if derate and controller.heat_guard is None:
         raise ProblemError(
             f"{problem.source}: controller.derate: nothing is known of the motor's heat; give the design plant the "
             "part thermal and a current to command, or leave it out"
         )
-    return replace(controller, gate=_make_gate(problem, controller), derate=derate)
+    return derate
 
 
 def complete_schedule(

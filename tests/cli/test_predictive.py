@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -11,7 +12,7 @@ import seaopt as so
 from seaopt.control import export_mpc
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import to_json
-from seaopt.problem.stages import design_mpc
+from seaopt.problem.stages import check_mpc_file, design_mpc
 
 PLANNED = """
 schema = 1
@@ -73,6 +74,52 @@ def test_it_is_designed_certified_and_exported(planned, seaopt):
     content = json.loads((planned / "out" / "controller.json").read_text(encoding="utf-8"))
     with pytest.raises(so.SeaoptError, match="seaopt export"):
         so.export(content, planned / "law")
+
+
+WARMED = """
+schema = 1
+[parameters]
+R = 0.7
+R_wc = 1.3
+R_ca = 3.1
+C_w = 0.2
+C_c = 1.5
+[plant.stand]
+kind = "rotary"
+link = "locked"
+parts = ["thermal"]
+[controller]
+plant = "stand"
+measured = "tau_s"
+structure = "mpc"
+bandwidth_hz = 10
+max_sensitivity = 2.0
+max_complementary = 2.0
+current_limit_A = 12.0
+derate = true
+"""
+
+
+def test_a_plan_derates_as_its_file_and_its_options_say(folder, seaopt):
+    (folder / "warm.toml").write_text(WARMED, encoding="utf-8")
+    assert seaopt("tune", "warm.toml", "-o", "out").returncode == 0
+    problem, stored = so.read_problem(folder / "warm.toml"), folder / "out" / "controller.json"
+    mpc = design_mpc(problem, problem.parameters)
+    check_mpc_file(problem, mpc, stored, "")
+    with pytest.raises(so.SeaoptError, match=r"mpc\.code is not what"):
+        check_mpc_file(problem, replace(mpc, heat=None), stored, "")
+    export_mpc(mpc, folder / "python")
+    for typed, there in (((), True), (("--no-derate",), False), (("--derate-margin", "20"), True)):
+        out = seaopt("export", "out", "--c", "code", "--allow-infeasible", *typed)
+        assert out.returncode in (0, 1) and ("code/heat.h" in out.stdout) == there
+        data = (folder / "code" / "force_mpc_data.h").read_text(encoding="utf-8")
+        assert f"#define FORCE_MPC_HEAT {int(there)}" in data
+        if not typed:
+            assert (folder / "code" / "heat.h").read_bytes() == (folder / "python" / "heat.h").read_bytes()
+    assert (folder / "code" / "heat.h").read_bytes() != (folder / "python" / "heat.h").read_bytes()
+    (folder / "cold.toml").write_text(WARMED.replace('parts = ["thermal"]', ""), encoding="utf-8")
+    out = seaopt("tune", "cold.toml", "-o", "cold")
+    assert out.returncode == 2 and "nothing is known of the motor's heat" in out.stderr
 
 
 def test_what_blocks_a_plan_is_said_of_the_bandwidth_that_is_asked(planned, seaopt):

@@ -18,11 +18,13 @@ from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
 from seaopt.control.mpc.quadratic_program import PENALTY, WIDE, factor_program, stack_hessian
 from seaopt.files import plain, write_text
+from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.records import record
 
 CName = Annotated[str, Constraints(pattern=r"^[A-Za-z_]+$")]
 CText = Annotated[str, Constraints(pattern=r'^[^"\\\r\n]*$')]  # stands between quotation marks in C
 SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "arithmetic.h", "example.c")
+HEAT = "heat.h"  # of a controller with a heat guard
 
 
 @record(eq=False)
@@ -35,6 +37,7 @@ class MPCCode:
     arrays: Mapping[CName, Float[np.ndarray, "..."]]
     hessian: Float[np.ndarray, "nv nv"]  # hessian, rows: of the program
     rows: Float[np.ndarray, "r nv"]
+    heat: HeatGuard | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as they stand in controller.json."""
@@ -70,6 +73,8 @@ def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = Fa
     for name in SOURCES:
         write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
     write_text(target / "force_mpc_data.h", _format_data(code, single_precision))
+    if code.heat is not None:
+        write_text(target / HEAT, _format_heat(code.heat))
     return target
 
 
@@ -108,7 +113,12 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         hessian=stack_hessian(prediction),
         rows=prediction.rows,
     )
-    return set_gate(code, mpc.gate, spec.sample_time_s)
+    return set_heat(set_gate(code, mpc.gate, spec.sample_time_s), mpc.heat)
+
+
+def set_heat(code: MPCCode, heat: HeatGuard | None) -> MPCCode:
+    """Return the numbers of a controller's C code with a heat guard in place of the one that they have."""
+    return replace(code, sizes={**code.sizes, "HEAT": int(heat is not None)}, heat=heat)
 
 
 def set_gate(code: MPCCode, gate: PlausibilityGate | None, sample_time_s: float) -> MPCCode:
@@ -141,6 +151,22 @@ def _format_data(code: MPCCode, single_precision: bool) -> str:
             "",
         ]
     )
+
+
+def _format_heat(heat: HeatGuard) -> str:
+    """Return the estimate of the winding's temperature as C: its numbers, in double, and the text that laws have."""
+    names = {
+        "RESISTANCE": heat.resistance, "RESISTANCE_SLOPE": heat.slope, "ALLOWED_RISE": heat.allowed_rise,
+        "APPROACH": heat.share,
+    }  # fmt: skip
+    code = resources.files("seaopt.control.deploy").joinpath("templates", "heat.c").read_text(encoding="utf-8")
+    lines = [
+        f"/* Rises in K above an ambient temperature of {heat.ambient:g} degC. */",
+        f"static const double HEAT_A[2][2] = {{{{{heat.a_11!r}, {heat.a_12!r}}}, {{{heat.a_21!r}, {heat.a_22!r}}}}};",
+        f"static const double HEAT_B[2] = {{{heat.b_1!r}, {heat.b_2!r}}};",
+        *(f"static const double {name} = {value!r};" for name, value in names.items()),
+    ]
+    return "\n".join([*lines, "", code])
 
 
 def _format_number(value: float) -> str:

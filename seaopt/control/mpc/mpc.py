@@ -25,7 +25,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import field, replace
 from itertools import pairwise
-from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -35,6 +34,7 @@ from seaopt.control.laws.command import Command, command_of, limit_notes
 from seaopt.control.laws.delay import LoopDelays, settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
+from seaopt.control.laws.realisation import check_guards
 from seaopt.control.laws.spec import describe_lifted
 from seaopt.control.laws.verdict import LimitVerdict, explain_broken, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
@@ -66,7 +66,8 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.plants.memo import memo
-from seaopt.plants.motor.thermal import freeze_heat
+from seaopt.plants.motor.heat_guard import HeatGuard
+from seaopt.plants.motor.thermal import freeze_heat, rate_motor
 from seaopt.plants.plant import find_range, name_input, require_plant
 from seaopt.records import Result, Worded, record
 from seaopt.units import mechanics_of, name_command, show_command, unit_after
@@ -100,6 +101,8 @@ class ForceMPC(LoopDelays, Result, Worded):
     gate : PlausibilityGate, optional
         Which measurements are believed, the first if it is in range; the others are predicted, and at a fault the
         current goes to zero.
+    heat : HeatGuard, optional
+        What lowers the limit of the command as the winding warms up; the plan keeps the lowered one.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
     """
@@ -114,11 +117,18 @@ class ForceMPC(LoopDelays, Result, Worded):
     shift: Float[np.ndarray, "n n"]
     solver: QuadraticProgram
     gate: PlausibilityGate | None = None
+    heat: HeatGuard | None = None
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _design, (*self.design, self.spec, self.gate, self.warnings)  # what it remembers does not pickle
+        return _design, (
+            *self.design,
+            self.spec,
+            self.gate,
+            self.heat,
+            self.warnings,
+        )  # what it remembers does not pickle
 
     @property
     @memo
@@ -199,6 +209,13 @@ class ForceMPC(LoopDelays, Result, Worded):
         return limit_command(self.spec, *self.design)
 
     @property
+    def heat_guard(self) -> HeatGuard | None:
+        """The guard of the design plant's motor; None without the part "thermal", or where no current is commanded."""
+        if self.design[0].winding is None or self.actuation.unit != "A":
+            return None
+        return HeatGuard.of_rating(rate_motor(*self.design, self.command_limit), self.sample_time_s)
+
+    @property
     def achieved(self) -> LoopFigures:
         """Of the design plant while no limit is active, sliding where it has friction."""
         return self.measured_loops[0].figures
@@ -268,15 +285,16 @@ class ForceMPC(LoopDelays, Result, Worded):
         began = time.perf_counter()
         references = self._read_references(reference_N)
         limit, last, seen = self.command_limit, state.current_A, state.gate
+        most = limit if self.heat is None else min(limit, self.heat.limit(state.heat))
         if self.gate is not None:
             _, seen = self.gate.screen(seen, measurement_N)
             measurement_N = np.nan if seen.held else measurement_N
         measurement_N = measurement_N if is_number(measurement_N) else np.nan
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
         drift = float(ahead[-1])
-        u_s, targets = self._targets(drift, references)
+        u_s, targets = self._targets(drift, references, most)
         xi = ahead[: self.rest.size] - self.rest * (u_s + drift)
-        q, low, high = self.program(xi, u_s, last, drift, targets)
+        q, low, high = self.program(xi, u_s, last, drift, targets, most)
         shifted = self.shift @ state.plan
         solution = self.solver.solve(q, low, high, state.sides, self.spec.max_iterations)
         theta, status = solution.x, self._fault(solution, low, high)
@@ -289,7 +307,8 @@ class ForceMPC(LoopDelays, Result, Worded):
         if self.gate is not None and seen.fault:
             status, age, sides = "sensor fault", self.spec.samples, np.zeros_like(sides)
             planned = np.full(shifted.size, self.gate.ramp(last, self.spec.sample_time_s))
-        current = self.admissible(float(planned[0]), last)
+        current = self.admissible(float(planned[0]), last, most)
+        heat = state.heat if self.heat is None else self.heat.warm(state.heat, current)
         kalman = self._command(state.kalman, corrected, innovation, current)
         return MPCStep(
             current_A=current,
@@ -297,7 +316,7 @@ class ForceMPC(LoopDelays, Result, Worded):
             status=status or solution.status,
             target_N=float(targets[-1]),
             slack=0.0 if status else SLACK_UNIT * float(np.max(theta[shifted.size :], initial=0.0)),
-            state=MPCState(kalman=kalman, current_A=current, plan=planned, sides=sides, age=age, gate=seen),
+            state=MPCState(kalman=kalman, current_A=current, plan=planned, sides=sides, age=age, gate=seen, heat=heat),
             force_N=float(self.kalman.C[0] @ corrected),
             iterations=solution.iterations,
             step_time_s=time.perf_counter() - began,
@@ -310,19 +329,25 @@ class ForceMPC(LoopDelays, Result, Worded):
         result = self.step(state, reference_N, measurement_N)
         return result.current_A, result.state
 
-    def admissible(self, current_A: float, last_A: float) -> float:
+    def admissible(self, current_A: float, last_A: float, most_A: float) -> float:
         """Return the current nearest to one given that slew and size allow after the last."""
-        limit, slew = self.command_limit, self.spec.slew_per_sample_A
-        return float(np.clip(np.clip(current_A, last_A - slew, last_A + slew), -limit, limit))
+        slew = self.spec.slew_per_sample_A
+        return float(np.clip(np.clip(current_A, last_A - slew, last_A + slew), -most_A, most_A))
 
     def program(
-        self, xi: Float[np.ndarray, " nx"], u_s: float, last_A: float, drift: float, targets: Float[np.ndarray, " r"]
+        self,
+        xi: Float[np.ndarray, " nx"],
+        u_s: float,
+        last_A: float,
+        drift: float,
+        targets: Float[np.ndarray, " r"],
+        most_A: float,
     ) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows.
 
         `xi`: the state's distance from its target. `u_s`, `last_A`, `drift`: the command at rest, the last one, and the
         estimate of its disturbance. `targets`: the force's, from the first sample that a command reaches on, as far as
-        they are known.
+        they are known. `most_A`: the limit of the command at this sample.
         """
         prediction, limit, ones = self.prediction, self.command_limit, np.ones(self.prediction.knots.size)
         slopes = np.zeros(len(prediction.M))
@@ -333,8 +358,8 @@ class ForceMPC(LoopDelays, Result, Worded):
         gradient = prediction.F @ np.append(xi, last_A - u_s) + prediction.R @ delta
         under, over = prediction.outputs.limits(np.append(xi, last_A - u_s), u_s + drift, WIDE)
         q = np.concatenate([gradient, np.full(len(prediction.outputs.names), PENALTY)])
-        low = np.concatenate([(-1.0 - u_s / limit) * ones, slopes - 1.0, under])
-        high = np.concatenate([(1.0 - u_s / limit) * ones, slopes + 1.0, over])
+        low = np.concatenate([(-most_A / limit - u_s / limit) * ones, slopes - 1.0, under])
+        high = np.concatenate([(most_A / limit - u_s / limit) * ones, slopes + 1.0, over])
         return q, low, high
 
     def _read_references(self, references_N: float | Float[np.ndarray, " r"]) -> Float[np.ndarray, " p"]:
@@ -360,9 +385,11 @@ class ForceMPC(LoopDelays, Result, Worded):
             ahead = self.kalman.advance(ahead, older, newer)
         return corrected, innovation, ahead
 
-    def _targets(self, drift: float, references: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " r"]]:
+    def _targets(
+        self, drift: float, references: Float[np.ndarray, " p"], most_A: float
+    ) -> tuple[float, Float[np.ndarray, " r"]]:
         """Return the current at rest for the last reference, and the nearest forces to all that the limits can hold."""
-        ends = self.prediction.outputs.admissible_rest(drift, self.command_limit)
+        ends = self.prediction.outputs.admissible_rest(drift, most_A)
         currents = np.clip(references / self.static_gain - drift, *ends)
         first = min(self.kalman.delay_samples, references.size - 1)
         return float(currents[-1]), self.static_gain * (currents[first:] + drift)
@@ -442,7 +469,12 @@ class ForceMPC(LoopDelays, Result, Worded):
 
 
 def force_mpc(
-    plant: Plant, params: ParameterSet | Fit, spec: MPCSpec, *, gate: PlausibilityGate | None = None
+    plant: Plant,
+    params: ParameterSet | Fit,
+    spec: MPCSpec,
+    *,
+    gate: PlausibilityGate | None = None,
+    heat: HeatGuard | None = None,
 ) -> ForceMPC:
     """Return a force controller that plans within current and slew limits.
 
@@ -458,6 +490,8 @@ def force_mpc(
         Limits and bandwidth.
     gate : PlausibilityGate, optional
         Which measurements are believed.
+    heat : HeatGuard, optional
+        What lowers the limit of the command, a current, as the winding warms up.
 
     Raises
     ------
@@ -478,14 +512,14 @@ def force_mpc(
     require_plant(plant, "plant", ControlError)
     require_type(params, (ParameterSet, Fit), "params", "give a ParameterSet or a Fit", ControlError)
     require_type(spec, MPCSpec, "spec", "give an MPCSpec", ControlError)
-    require_type(gate, (PlausibilityGate, NoneType), "gate", "give a PlausibilityGate", ControlError)
+    check_guards(gate, heat, name_input(plant))
     if spec.measured not in plant.outputs:
         raise ControlError(
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
         )
     warnings = warn_delays(spec, plant, params)
     spec, values = settle_delays(spec, plant, params, plans=True)
-    return _design(plant, values, spec, gate, warnings)
+    return _design(plant, values, spec, gate, heat, warnings)
 
 
 def _find_possible(mpc: ForceMPC) -> float | None:
@@ -506,6 +540,7 @@ def _design(
     values: ParameterSet,
     spec: MPCSpec,
     gate: PlausibilityGate | None = None,
+    heat: HeatGuard | None = None,
     warnings: tuple[str, ...] = (),
 ) -> ForceMPC:
     """Return the controller of a specification whose delay is settled; friction slides in its model."""
@@ -560,6 +595,7 @@ def _design(
         shift=shift,
         solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate,
+        heat=heat,
         warnings=warnings,
     )
 

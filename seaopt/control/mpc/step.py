@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from seaopt.control.laws.plausibility import GateState
 from seaopt.control.mpc.estimator import EstimatorState
+from seaopt.plants.motor.heat_guard import COLD
 from seaopt.records import record
 
 
@@ -27,6 +28,8 @@ class MPCState:
         Samples since a program was solved: so old is the plan. Of one that never was: the horizon.
     gate : GateState
         What the plausibility gate, where there is one, has seen; its `status` is "ok", "held" or "fault".
+    heat : (float, float)
+        Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
     """
 
     kalman: EstimatorState
@@ -35,6 +38,7 @@ class MPCState:
     sides: Int[np.ndarray, " m"]
     age: int
     gate: GateState = GateState()
+    heat: tuple[float, float] = COLD
 
 
 @record(eq=False)

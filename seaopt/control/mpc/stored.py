@@ -48,7 +48,7 @@ def _is_same(stored: Any, expected: Any) -> bool:
     """Tell whether numbers of C code are the same but for the rounding of another machine."""
     if isinstance(expected, Mapping):
         return stored.keys() == expected.keys() and all(_is_same(stored[name], expected[name]) for name in expected)
-    if isinstance(expected, str):
+    if expected is None or isinstance(expected, str):
         return stored == expected
     a, b = np.array(stored, dtype=float), np.array(expected, dtype=float)
     return a.shape == b.shape and bool(np.all(np.abs(a - b) <= AGREES * np.max(np.abs(b), initial=0.0)))

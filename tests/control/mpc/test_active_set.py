@@ -94,7 +94,7 @@ def draw_vectors(mpc, rng, most_A=9.0):
     """Return gradient and bounds of a plan from a random state: deflections and speeds far beyond the bounds too."""
     xi = np.array([rng.uniform(-6e-3, 6e-3), rng.uniform(-0.2, 0.2)])
     u_s, last, drift = rng.uniform(-9, 9), rng.uniform(-most_A, most_A), rng.uniform(-1, 1)
-    return mpc.program(xi, u_s, last, drift, np.array([mpc.static_gain * (u_s + drift)]))
+    return mpc.program(xi, u_s, last, drift, np.array([mpc.static_gain * (u_s + drift)]), mpc.command_limit)
 
 
 @pytest.mark.parametrize("samples", [100, pytest.param(3000, marks=pytest.mark.slow)])

@@ -232,16 +232,6 @@ def test_the_c_code_does_the_same(compiler, stand, thor, mpc, tmp_path, single, 
     assert np.all(rows[:, 1] == 1)
 
 
-def test_a_law_is_given_a_state_of_the_plant_where_it_asks_for_one(stand, thor):
-    seen = []
-    run = close_loop(
-        lambda s, r, y, q: (seen.append(q) or r / 240.0, s), None, stand, thor, np.full(20, 100.0), place="q"
-    )  # fmt: skip
-    assert seen == run.state[:, 0].tolist() and seen[-1] > 0.0
-    with pytest.raises(ControlError, match='place = "phi" is not a state of high_impedance'):
-        close_loop(lambda *_: (0.0, None), None, stand, thor, np.zeros(5), place="phi")
-
-
 def test_an_open_loop_is_the_simulation(swing, thor):
     current = 0.2 * np.sin(np.arange(800) / 25.0)
     log = so.Log.from_arrays(time=TS * np.arange(800), I=np.concatenate([[0.0, 0.0], current])[:800])

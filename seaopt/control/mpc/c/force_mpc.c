@@ -3,6 +3,9 @@
 #include <string.h>
 
 #include "arithmetic.h"
+#if FORCE_MPC_HEAT
+#include "heat.h"
+#endif
 
 #define STATES FORCE_MPC_STATES
 #define PLANT (FORCE_MPC_PLANT_STATES)
@@ -22,6 +25,16 @@ static int finite_number(real x) { return x - x == 0; }
 static int is_number(real x) { return x >= (real)-1e15 && x <= (real)1e15; }
 
 static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
+
+/* The limit of the command at this sample. */
+static real limit_of(const force_mpc *s) {
+#if FORCE_MPC_HEAT
+  return (real)s->limit;
+#else
+  (void)s;
+  return mpc_limit;
+#endif
+}
 
 /* z := A z + B newer + B' older: where a drive's delay is no whole number of samples, the older command still acts */
 static void advance(real *z, real older, real newer) {
@@ -50,9 +63,9 @@ static real row(const real *theta, int i) {
 }
 
 /* Ends of the commands at rest that keep the bounds of signals: the least and the largest. */
-static void admissible_rest(real drift, real *low, real *high) {
-  *low = -mpc_limit;
-  *high = mpc_limit;
+static void admissible_rest(real limit, real drift, real *low, real *high) {
+  *low = -limit;
+  *high = limit;
 #if SIGNALS
   for (int i = 0; i < SIGNALS; i++) {
     if (mpc_static[i] == 0) continue;
@@ -61,8 +74,8 @@ static void admissible_rest(real drift, real *low, real *high) {
     if (least > *low) *low = least;
     if (most < *high) *high = most;
   }
-  *low = clip(*low, -mpc_limit, mpc_limit);
-  *high = clip(*high, -mpc_limit, mpc_limit);
+  *low = clip(*low, -limit, limit);
+  *high = clip(*high, -limit, limit);
   if (*low > *high) *low = *high = (*low + *high) / 2;
 #endif
   (void)drift;
@@ -71,9 +84,10 @@ static void admissible_rest(real drift, real *low, real *high) {
 /* Limits of all rows. */
 static void limit_rows(const force_mpc *s, const real *error, real rest, real drift, real *low,
                        real *high) {
+  real share = limit_of(s) / mpc_limit;
   for (int i = 0; i < KNOTS; i++) {
-    low[i] = -1 - rest / mpc_limit;
-    high[i] = 1 - rest / mpc_limit;
+    low[i] = -share - rest / mpc_limit;
+    high[i] = share - rest / mpc_limit;
   }
 #if FORCE_MPC_SLEWS
   for (int i = KNOTS; i < LIMITS; i++) {
@@ -95,7 +109,7 @@ static void limit_rows(const force_mpc *s, const real *error, real rest, real dr
     high[i] = mpc_wide;
   }
 #endif
-  (void)s, (void)error, (void)drift;
+  (void)error, (void)drift;
 }
 
 /* Put the solution into `plan` if it can be used; return whether it can. */
@@ -165,7 +179,11 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   memcpy(ahead, s->z, sizeof ahead);
   for (int i = 0; i < DELAY; i++) advance(ahead, s->past[i], s->past[i + 1]);
   real drift = ahead[STATES - 1];
-  admissible_rest(drift, &least, &most);
+#if FORCE_MPC_HEAT
+  s->limit = cool_command(s->rise_winding, s->rise_case);
+  if (!(s->limit < (double)mpc_limit)) s->limit = (double)mpc_limit;
+#endif
+  admissible_rest(limit_of(s), drift, &least, &most);
   real last = s->reference, rest = 0;
   for (int i = 0; i <= PREVIEW; i++) {
     if (i < count && is_number(references[i])) last = references[i];
@@ -201,7 +219,10 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
 #if FORCE_MPC_SLEWS
   command = clip(command, s->command - mpc_slew, s->command + mpc_slew);
 #endif
-  s->command = clip(command, -mpc_limit, mpc_limit);
+  s->command = clip(command, -limit_of(s), limit_of(s));
+#if FORCE_MPC_HEAT
+  warm(&s->rise_winding, &s->rise_case, (double)s->command);
+#endif
   s->past[DELAY + 1] = s->command;
   advance(s->z, s->past[0], s->past[1]);
   memmove(s->past, s->past + 1, (DELAY + 1) * sizeof *s->past);

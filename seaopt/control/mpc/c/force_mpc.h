@@ -23,6 +23,10 @@ typedef struct {
   unsigned long refused;          /* measurements in a row that were not believed */
   force_mpc_real measurement;          /* the last that was */
   int known;                      /* whether there was one */
+#if FORCE_MPC_HEAT
+  double rise_winding, rise_case; /* K above the ambient, as estimated; a reset takes both for cold */
+  double limit;                   /* of the command at this sample: it falls as the winding warms up */
+#endif
 } force_mpc;
 
 /* The measurement was used; it was predicted instead; a fault: the command goes to zero until a reset. The last is
