@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from seaopt.logs import read_log as read_log
     from seaopt.logs import write_log as write_log
     from seaopt.machine import accept as accept
+    from seaopt.machine import bring_up as bring_up
     from seaopt.parameters import Parameter as Parameter
     from seaopt.parameters import ParameterSet as ParameterSet
     from seaopt.plants import Plant as Plant
@@ -99,6 +100,7 @@ _HOME = {
     "read_problem": "seaopt.problem",
     "write_report": "seaopt.reporting",
     "fit_fleet": "seaopt.fleet",
+    "bring_up": "seaopt.machine",
     "accept": "seaopt.machine",
     "testing": "seaopt.testing",
     "SeaoptError": "seaopt.errors",
@@ -109,7 +111,7 @@ __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
     "PredictionError", "Fit", "fit", "diagnose", "compare", "profile", "bootstrap", "design_experiment",
     "ControllerSpec", "Controller", "corners", "tune", "assess", "export", "Certificate", "certify", "verify",
-    "demo_path", "read_problem", "write_report", "fit_fleet", "accept", "testing", "SeaoptError",
+    "demo_path", "read_problem", "write_report", "fit_fleet", "bring_up", "accept", "testing", "SeaoptError",
 ]  # fmt: skip
 
 

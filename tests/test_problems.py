@@ -295,3 +295,10 @@ def test_gains_from_a_log(tmp_path):
     sensitivity = 1 / (1 + law * late * k / (mass * s**2 + damping * s + k))
     assert np.abs(sensitivity).max() == pytest.approx(controller.achieved.ms, rel=0.01)
     assert np.abs(law * sensitivity).max() == pytest.approx(controller.achieved.noise_gain, rel=0.01)
+
+
+@pytest.mark.slow
+def test_commissioning_is_accepted_stage_by_stage(tmp_path):
+    certificate, accepted = script("commissioning").commission(tmp_path)
+    assert certificate.met and accepted == [True, True, True]
+    assert (tmp_path / "stage_1" / "reference.c").is_file() and (tmp_path / "full.csv").is_file()

@@ -5,32 +5,55 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from seaopt.cli.inspect import parse_pairs
 from seaopt.cli.progress import show_progress
 from seaopt.cli.provenance import FILES
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
-from seaopt.control import Controller
+from seaopt.control import Controller, ControllerSpec
 from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
-from seaopt.machine import Acceptance, accept
+from seaopt.machine import Acceptance, accept, bring_up, write_bring_up
+from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
+from seaopt.problem import certify_problem, tune_problem
 from seaopt.problem.loop_logs import REFERENCE, read_loop_log
+from seaopt.problem.stages import list_plants
 from seaopt.reporting.sections import judge
+from seaopt.robustness import Certificate, JointTuning
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
+BRING_UP = "bringup"  # the folder of the stages
 
 
 def accept_logs(
-    problem: Path, logs: Sequence[Path], folder: Path, *, reference: str | None, json: bool, amount: Amount
+    problem: Path,
+    logs: Sequence[Path],
+    folder: Path,
+    *,
+    reference: str | None,
+    stage: str | None,
+    json: bool,
+    amount: Amount,
 ) -> bool:
-    """Judge logs under the folder's controller, write and print what they give; return whether it is accepted."""
+    """Judge logs under the folder's controller, or that of a stage of its bring-up, write and print what they give;
+    return whether it is accepted.
+    """
     session = Session(problem, folder)
     controller, errors = _take_controller(session), Terminal(stderr=True)
+    path = folder / FILES["tune"]
+    if stage is not None:
+        path = folder / BRING_UP / stage / FILES["tune"]
+        if not path.is_file():
+            raise ProblemError(f"--stage {stage}: {path} is not there; make it: seaopt bringup {problem} -o {folder}")
+        plant = list_plants(session.problem, session.parameters())[0]
+        controller = Controller.from_dict(read_json(path, SCHEMAS["tune"]), plant, session.values())
     units = _list_units(controller)
     with show_progress(errors, "judging the logs", errors.say) as tell:
         tell("reading the logs", 0.0)
@@ -38,7 +61,7 @@ def accept_logs(
         result = accept(
             controller,
             read,
-            others=_find_others(folder, controller),
+            others=_find_others(folder, path, controller),
             uncertainty=session.parameters(),
             ranges=session.problem.ranges,
         )
@@ -75,11 +98,11 @@ def _list_units(controller: Controller) -> dict[str, str]:
     return {REFERENCE: command.reference_unit, command.input: command.unit, **read}
 
 
-def _find_others(folder: Path, controller: Controller) -> dict[str, Controller]:
-    """Return the other controllers that lie in a folder, and one level below, by their files."""
+def _find_others(folder: Path, own: Path, controller: Controller) -> dict[str, Controller]:
+    """Return the other controllers that lie in a folder, and two levels below, by their files."""
     others: dict[str, Controller] = {}
-    for path in sorted([*folder.glob("*.json"), *folder.glob("*/*.json")]):
-        if path == folder / FILES["tune"] or not path.is_file():
+    for path in sorted([*folder.glob("*.json"), *folder.glob("*/*.json"), *folder.glob(f"{BRING_UP}/*/*.json")]):
+        if path == own or not path.is_file():
             continue
         try:
             stored = read_controller(read_json(path, SCHEMAS["tune"]))
@@ -98,3 +121,66 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[st
     title = f"Acceptance: {session.problem.title}"
     write_acceptance_page(result, session.folder / PAGE, title=title, files=files, command=command)
     return content
+
+
+def plan_bring_up(
+    problem: Path, folder: Path, *, share: float, bias: float, limits: Sequence[str], json: bool, amount: Amount
+) -> bool:
+    """Plan the stages of the folder's controller, write and print them; return whether each has a certified law."""
+    session = Session(problem, folder)
+    controller, source, errors = _take_controller(session), session.parameters(), Terminal(stderr=True)
+
+    def tune_stage(spec: ControllerSpec) -> Controller:
+        tuned = tune_problem(replace(session.problem, spec=spec), source)
+        tuned = tuned.controller if isinstance(tuned, JointTuning) else tuned
+        assert isinstance(tuned, Controller)
+        return tuned
+
+    def certify_stage(law: Controller) -> Certificate:
+        judged = certify_problem(session.problem, law, source)
+        assert isinstance(judged, Certificate)
+        return judged
+
+    with show_progress(errors, "planning the stages", errors.say) as tell:
+        plan = bring_up(
+            controller,
+            session.problem.certified_plants(),
+            source,
+            ranges=session.problem.ranges,
+            share=share,
+            bias=bias,
+            limits=_parse_limits(limits),
+            tune_stage=tune_stage,
+            certify_stage=certify_stage,
+            progress=tell,
+        )
+    target = folder / BRING_UP
+    write_bring_up(plan, target)
+    page = write_bring_up_page(
+        plan,
+        target / "bringup.html",
+        title=f"Bring-up: {session.problem.title}",
+        files=[Path(session.problem.source)],
+        command=shlex.join(["seaopt", *sys.argv[1:]]),
+    )
+    if json:
+        sys.stdout.write(to_json(plan.to_dict()))
+        return plan.met
+    console = Terminal()
+    verdict = judge(plan)
+    show_verdicts(console, [] if verdict is None else [verdict], verbose=amount == "verbose")
+    if amount != "quiet":
+        show_sections(console, plan, verbose=amount == "verbose")
+        console.list_files([target / "bringup.json", page, *(target / stage.name for stage in plan.stages)])
+    return plan.met
+
+
+def _parse_limits(texts: Sequence[str]) -> dict[str, float]:
+    """Return NAME=VALUE pairs as numbers."""
+    limits: dict[str, float] = {}
+    for name, text in parse_pairs("--limit", texts).items():
+        try:
+            limits[name] = float(text)
+        except ValueError:
+            raise ProblemError(f"--limit {name}={text}: is not a number; type such as --limit {name}=1500") from None
+    return limits

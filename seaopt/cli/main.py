@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
-from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from seaopt.cli.terminal import Amount, prepare_streams
-from seaopt.errors import ControlError, FileError, InternalError, LogError, SeaoptError, UnitError
+from seaopt.cli.terminal import Amount, add_remedy, end, leave_pipe, list_notes, prepare_streams
+from seaopt.errors import ControlError, InternalError, SeaoptError
 from seaopt.formatting import printable
 
 if TYPE_CHECKING:
     from seaopt.cli.session import Session
 
 INTERRUPTED = 130  # exit codes, as a shell's
-PIPE_CLOSED = 141
 DEFECT = 70  # exit code: EX_SOFTWARE of sysexits.h
-# A command, a line of TOML, an option or the word that was meant stands in it.
-TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]|did you mean \"")
 
 
 ORDER = (  # of the commands in the help: as they are used
     "demo", "new", "inspect", "run", "fit", "tune", "certify", "report", "export", "validate", "fleet", "simulate",
-    "frf", "accept", "schema",
+    "frf", "bringup", "accept", "schema",
 )  # fmt: skip
 
 
@@ -51,7 +45,7 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except BrokenPipeError:  # Typer would leave with 1, which says that something is not met
-            _leave_pipe()
+            leave_pipe()
         except KeyboardInterrupt as stop:
             sys.stderr.write("\nseaopt: interrupted" + (f"; {stop}" if stop.args else "") + "\n")
         raise SystemExit(INTERRUPTED)
@@ -501,6 +495,37 @@ def fleet(
 
 
 @app.command()
+def bringup(
+    problem: ProblemFile,
+    output: Folder = OUT,
+    share: Annotated[
+        float, typer.Option(metavar="SHARE", help="Of each limit, what the reference's excitation may take.")
+    ] = 0.5,
+    bias: Annotated[float, typer.Option(metavar="VALUE", help="Mean of the reference, in its SI unit.")] = 0.0,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="Largest magnitude of an output: force, travel. Repeatable."),
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Plan the first time on the machine: stages of the law in DIR, references, what to log and to expect."""
+    from seaopt.cli.machine import plan_bring_up
+
+    met = plan_bring_up(
+        problem,
+        output,
+        share=share,
+        bias=bias,
+        limits=limit or (),
+        json=json,
+        amount=_choose_amount(quiet, verbose),
+    )
+    _exit_unless(met)
+
+
+@app.command()
 def accept(
     problem: ProblemFile,
     logs: Annotated[
@@ -511,6 +536,10 @@ def accept(
         str | None,
         typer.Option(metavar="COLUMN", help="Column of the law's reference; reference or ref if left out."),
     ] = None,
+    stage: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="A stage of seaopt bringup, whose law ran; the full law if left out."),
+    ] = None,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -518,7 +547,15 @@ def accept(
     """Judge logs taken under the law in DIR: is it this law, and does the machine do what was certified."""
     from seaopt.cli.machine import accept_logs
 
-    met = accept_logs(problem, logs, output, reference=reference, json=json, amount=_choose_amount(quiet, verbose))
+    met = accept_logs(
+        problem,
+        logs,
+        output,
+        reference=reference,
+        stage=stage,
+        json=json,
+        amount=_choose_amount(quiet, verbose),
+    )
     _exit_unless(met)
 
 
@@ -549,48 +586,13 @@ def main() -> None:
         finally:
             sys.stdout.flush()
     except SeaoptError as error:
-        _end(_add_remedy(error), _list_notes(error))
+        end(add_remedy(error, ORDER), list_notes(error))
     except InternalError as error:
-        _end(str(error), _list_notes(error), DEFECT)
+        end(str(error), list_notes(error), DEFECT)
     except BrokenPipeError:
-        _leave_pipe()
+        leave_pipe()
     except MemoryError:
-        _end("does not fit in memory; take a shorter log, fewer columns, or fewer samples")
+        end("does not fit in memory; take a shorter log, fewer columns, or fewer samples")
     except OSError as error:  # files are written with errors of our own: this is stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more
-        _end(f"stdout: cannot be written ({error.strerror or error}); free its disk, or write elsewhere")
-
-
-def _leave_pipe() -> NoReturn:
-    """Leave without a word, as what reads stdout has; the exit code is that of no verdict."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more
-    raise SystemExit(PIPE_CLOSED) from None
-
-
-def _add_remedy(error: SeaoptError) -> str:
-    """Return an error's text, with where to look at its end where it names nothing to type itself."""
-    text, command = str(error), next((word for word in sys.argv[1:] if word in ORDER), "")
-    if TYPED.search(text):
-        return text
-    if isinstance(error, LogError) and command != "inspect":
-        return f"{text}; to see what is in the log type seaopt inspect LOG"
-    if isinstance(error, LogError | FileError | UnitError) or command in ("", "inspect", "new", "export", "schema"):
-        return f"{text}; for what may be given type seaopt {f'{command} ' if command else ''}--help"
-    return f"{text}; for every key and what it means type seaopt schema problem"
-
-
-def _list_notes(error: BaseException | None) -> list[str]:
-    """Return the notes of an error and of those that it was raised from, line by line."""
-    notes: list[str] = []
-    while error is not None:
-        notes += [line for note in getattr(error, "__notes__", ()) for line in note.splitlines()]
-        error = error.__cause__
-    return notes
-
-
-def _end(text: str, notes: Iterable[str] = (), exit_code: int = 2) -> NoReturn:
-    """Write one line on stderr, as a terminal may see it, with notes below; leave, with the exit code of bad input."""
-    with suppress(OSError):  # the exit code tells it where stderr cannot be written
-        for line in (f"seaopt: {' '.join(text.split())}", *notes):
-            sys.stderr.write(f"{printable(line)}\n")
-    raise SystemExit(exit_code)
+        end(f"stdout: cannot be written ({error.strerror or error}); free its disk, or write elsewhere")

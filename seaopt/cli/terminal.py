@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 from rich.console import Console
 from rich.text import Text
 
+from seaopt.errors import FileError, LogError, SeaoptError, UnitError
 from seaopt.formatting import printable
 from seaopt.reporting.sections.data import Table
 from seaopt.reporting.sections.text import Line, render_table, wrap
 
 Amount = Literal["quiet", "usual", "verbose"]  # how much is printed
+# A command, a line of TOML, an option or the word that was meant stands in it.
+TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]|did you mean \"")
+PIPE_CLOSED = 141  # exit code, as a shell's
 
 
 class Terminal(Console):
@@ -85,3 +90,38 @@ def _is_open(number: int) -> bool:
     except OSError:
         return False
     return True
+
+
+def leave_pipe() -> NoReturn:
+    """Leave without a word, as what reads stdout has; the exit code is that of no verdict."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more
+    raise SystemExit(PIPE_CLOSED) from None
+
+
+def list_notes(error: BaseException | None) -> list[str]:
+    """Return the notes of an error and of those that it was raised from, line by line."""
+    notes: list[str] = []
+    while error is not None:
+        notes += [line for note in getattr(error, "__notes__", ()) for line in note.splitlines()]
+        error = error.__cause__
+    return notes
+
+
+def end(text: str, notes: Iterable[str] = (), exit_code: int = 2) -> NoReturn:
+    """Write one line on stderr, as a terminal may see it, with notes below; leave, with the exit code of bad input."""
+    with suppress(OSError):  # the exit code tells it where stderr cannot be written
+        for line in (f"seaopt: {' '.join(text.split())}", *notes):
+            sys.stderr.write(f"{printable(line)}\n")
+    raise SystemExit(exit_code)
+
+
+def add_remedy(error: SeaoptError, commands: Collection[str]) -> str:
+    """Return an error's text, with where to look at its end where it names nothing to type itself."""
+    text, command = str(error), next((word for word in sys.argv[1:] if word in commands), "")
+    if TYPED.search(text):
+        return text
+    if isinstance(error, LogError) and command != "inspect":
+        return f"{text}; to see what is in the log type seaopt inspect LOG"
+    if isinstance(error, LogError | FileError | UnitError) or command in ("", "inspect", "new", "export", "schema"):
+        return f"{text}; for what may be given type seaopt {f'{command} ' if command else ''}--help"
+    return f"{text}; for every key and what it means type seaopt schema problem"

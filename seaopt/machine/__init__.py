@@ -1,8 +1,13 @@
-"""The law on the machine: what logs recorded under it say."""
+"""The law on the machine: the stages of its bring-up, and what logs recorded under it say."""
 
 from seaopt.machine.acceptance import Acceptance, accept
+from seaopt.machine.bringup import Band, BringUp, Stage, bring_up
+from seaopt.machine.bringup_files import write_bring_up
 from seaopt.machine.differences import Difference, Differences
 from seaopt.machine.replay import Cause, Replay
 from seaopt.machine.response import Judged, Response
 
-__all__ = ["Acceptance", "Cause", "Difference", "Differences", "Judged", "Replay", "Response", "accept"]
+__all__ = [
+    "Acceptance", "Band", "BringUp", "Cause", "Difference", "Differences", "Judged", "Replay", "Response", "Stage",
+    "accept", "bring_up", "write_bring_up",
+]  # fmt: skip

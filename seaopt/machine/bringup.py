@@ -1,0 +1,330 @@
+"""Bring-up: the stages in which a law goes onto its machine, a fraction of its bandwidth first, each as certified."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.codec import to_content
+from seaopt.control import Controller, ControllerSpec, draw
+from seaopt.control.laws.delay import find_drive
+from seaopt.errors import ControlError, SeaoptError, require_number, require_type
+from seaopt.estimation import Fit
+from seaopt.machine.excitation import Excitation, design_excitation
+from seaopt.machine.response import LEAST_PHASES, has_dry_friction
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.progress import Progress, ignore
+from seaopt.records import Result, Worded, record
+from seaopt.robustness import Certificate, certify, tune_certified
+
+BRINGUP_SCHEMA = "seaopt/bringup/1"
+FRACTIONS = (0.25, 0.5)
+UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
+DRAWS, SEED = 60, 1
+STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
+STOP = 1.3  # times what is predicted: where to stop
+PERIODS, PERIODS_OF_PHASES = 10, 4  # of one set of phases, and of each of six
+
+
+@record
+class Band:
+    """A response over time or frequency, and between what it lies on the draws."""
+
+    at: tuple[float, ...]  # s or Hz
+    nominal: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
+@record(eq=False)
+class Stage:
+    """One law on its way to the machine.
+
+    Parameters
+    ----------
+    name : str
+        Of its folder.
+    controller : Controller
+    certificate : Certificate
+    excitation : Excitation
+        The reference to play.
+    tracking, sensitivity : Band
+        Sizes of Y/R and S at the lines.
+    step : Band
+        The regulated output after a step of one.
+    step_size : float or None
+        The largest step whose command stays within its limit; None without one.
+    stop : mapping of str to float
+        Largest magnitudes; beyond them the stage is to be stopped.
+    note : str
+        In what the stage differs from what was planned.
+    """
+
+    name: str
+    controller: Controller
+    certificate: Certificate
+    excitation: Excitation
+    tracking: Band
+    sensitivity: Band
+    step: Band
+    step_size: float | None
+    stop: Mapping[str, float]
+    note: str = ""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What to log in each tick."""
+        terms = self.controller.compensation
+        further = () if terms is None else terms.reads
+        return ("reference", *self.controller.signals, *further, self.controller.command.input)
+
+
+@record(eq=False, repr=False)
+class BringUp(Result, Worded):
+    """The stages of a bring-up, the full law last."""
+
+    stages: tuple[Stage, ...]
+
+    @property
+    def met(self) -> bool:
+        """Whether the law of every stage is certified."""
+        return all(stage.certificate.met for stage in self.stages)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of bringup.json (schema seaopt/bringup/1)."""
+        return to_content(
+            {"schema": BRINGUP_SCHEMA, "met": self.met, "stages": [_describe(each) for each in self.stages]}
+        )
+
+
+def _describe(stage: Stage) -> dict[str, Any]:
+    excitation, controller = stage.excitation, stage.controller
+    return {
+        "name": stage.name,
+        "note": stage.note,
+        "met": stage.certificate.met,
+        "bandwidth_hz": controller.spec.bandwidth_hz,
+        "command_limit": controller.command_limit,
+        "channels": stage.channels,
+        "rate_hz": 1.0 / controller.sample_time_s,
+        "reference": {
+            "amplitude": excitation.amplitude,
+            "bias": excitation.bias,
+            "unit": controller.command.reference_unit,
+            "period_s": excitation.waves.shape[1] * excitation.sample_time_s,
+            "periods": excitation.periods,
+            "phases": len(excitation.waves),
+            "frequency_hz": excitation.frequency_hz,
+        },
+        "peaks": excitation.peaks,
+        "limits": excitation.limits,
+        "stop": stage.stop,
+        "step_size": stage.step_size,
+        "expected": {"tracking": stage.tracking, "sensitivity": stage.sensitivity, "step": stage.step},
+    }
+
+
+def bring_up(
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    uncertainty: Fit | ParameterSet,
+    *,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    samples: int = 1375,
+    fractions: Sequence[float] = FRACTIONS,
+    share: float = 0.5,
+    bias: float = 0.0,
+    limits: Mapping[str, float] | None = None,
+    certificate: Certificate | None = None,
+    tune_stage: Callable[[ControllerSpec], Controller] | None = None,
+    certify_stage: Callable[[Controller], Certificate] | None = None,
+    seed: int = SEED,
+    progress: Progress = ignore,
+) -> BringUp:
+    """Plan the stages in which a controller's law goes onto its machine.
+
+    Parameters
+    ----------
+    controller : Controller
+        The full law, as tuned.
+    plants : mapping of name to Plant
+        As in `certify`.
+    uncertainty : Fit or ParameterSet
+        What it was tuned and certified with.
+    ranges, samples
+        As in `certify`.
+    fractions : sequence of float
+        Of the bandwidth, of each stage before the full law. Where none can be had there, the nearest above is taken;
+        where there is none, the same law with that fraction of its effort.
+    share : float
+        Of each limit that the reference's excitation may take with the full law; in the stages before, times their
+        fraction.
+    bias : float
+        The reference's mean, in its unit.
+    limits : mapping of str to float, optional
+        Largest magnitudes of outputs of the design plant: force and travel.
+    certificate : Certificate, optional
+        Of the full law, where there is one.
+    tune_stage, certify_stage : callable, optional
+        How a stage's law is tuned and certified, where more than plants and ranges count.
+    seed : int
+        Of phases and draws.
+    progress : callable, optional
+        As in `certify`.
+
+    Returns
+    -------
+    BringUp
+
+    Raises
+    ------
+    ControlError
+        The controller does not know its design plant, nothing is limited, or an argument is out of range.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
+    >>> plan = so.bring_up(controller, {"stand": stand}, thor, samples=20, fractions=(0.5,))
+    >>> [(stage.name, stage.controller.spec.bandwidth_hz) for stage in plan.stages]
+    [('stage_1', 15.0), ('full', 30.0)]
+    """
+    require_type(controller, Controller, "controller", "give what tune returned", ControlError)
+    if controller.design is None:
+        raise ControlError("the controller does not know its design plant; read it with Controller.from_dict")
+    for fraction in fractions:
+        if not 0.0 < require_number(fraction, "fractions", ControlError) < 1.0:
+            raise ControlError(f"fractions has {fraction:g}, which is not between 0 and 1; give such as (0.25, 0.5)")
+    if not 0.0 < require_number(share, "share", ControlError) <= 1.0:
+        raise ControlError(f"share = {share:g} is not between 0 and 1; give the part of each limit to use: 0.5")
+
+    def certify_one(law: Controller) -> Certificate:
+        return certify(law, plants, uncertainty, ranges=ranges, samples=samples, seed=seed)
+
+    def tune_one(spec: ControllerSpec) -> Controller:
+        assert controller.design is not None
+        plant = controller.design[0]
+        options = {"ranges": ranges, "samples": samples, "seed": seed + 1}
+        tuned = tune_certified(plant, uncertainty, spec, plants, **options).controller
+        assert isinstance(tuned, Controller)  # of one specification
+        return tuned
+
+    certifying, tuning = certify_stage or certify_one, tune_stage or tune_one
+    options: dict[str, Any] = {"share": share, "bias": bias, "limits": dict(limits or {}), "seed": seed}
+    draws = _draw(controller, uncertainty, ranges, seed)
+    stages: list[Stage] = []
+    count = len(fractions) + 1
+    for number, fraction in enumerate(sorted(fractions), start=1):
+        progress(f"stage {number} of {count}", (number - 1) / count)
+        law, judged, note = _find_stage(controller, fraction, tuning, certifying)
+        part = options | {"share": share * fraction}
+        stages.append(_make_stage(f"stage_{number}", law, judged, note, draws, part))
+    progress(f"stage {count} of {count}", 1.0 - 1.0 / count)
+    judged = certifying(controller) if certificate is None else certificate
+    stages.append(_make_stage("full", controller, judged, "", draws, options))
+    return BringUp(stages=tuple(stages))
+
+
+def _draw(
+    controller: Controller, uncertainty: Fit | ParameterSet, ranges: Mapping[str, tuple[float, float]] | None, seed: int
+) -> list[dict[str, float]]:
+    assert controller.design is not None
+    try:
+        return draw(uncertainty, DRAWS, seed, ranges, find_drive(controller.spec, controller.design[0], uncertainty))
+    except ControlError:  # nothing is uncertain
+        return []
+
+
+def _find_stage(
+    controller: Controller,
+    fraction: float,
+    tuning: Callable[[ControllerSpec], Controller],
+    certifying: Callable[[Controller], Certificate],
+) -> tuple[Controller, Certificate, str]:
+    """Return the law of a stage, its certificate, and in what it is another one than planned."""
+    spec = controller.spec
+    for factor in UPWARDS:
+        band = spec.bandwidth_hz * fraction * factor
+        if band >= 0.95 * spec.bandwidth_hz:
+            break
+        low, high = spec.bandwidth_range_hz
+        changes: dict[str, Any] = {"bandwidth_hz": band, "bandwidth_range_hz": (min(low, band), high)}
+        if isinstance(spec.min_sensitivity_bandwidth_hz, float | int) and spec.min_sensitivity_bandwidth_hz:
+            changes["min_sensitivity_bandwidth_hz"] = spec.min_sensitivity_bandwidth_hz * band / spec.bandwidth_hz
+        try:
+            law = tuning(replace(spec, **changes))
+            if not law.met:
+                continue
+            judged = certifying(law)
+        except SeaoptError:
+            continue
+        if judged.met:
+            note = "" if factor == 1.0 else f"{band:.3g} Hz is the nearest to {spec.bandwidth_hz * fraction:.3g} Hz"
+            return law, judged, note
+    limit = controller.command_limit
+    if limit is None:
+        raise ControlError(
+            f"no law near {fraction:g} of {spec.bandwidth_hz:g} Hz is certified, and the command has no limit to "
+            "lower; give current_limit_A (command_limit)"
+        )
+    key = "current_limit_A" if spec.current_limit_A is not None else "command_limit"
+    lower = replace(controller, spec=replace(spec, **{key: fraction * limit}))
+    note = (
+        f"the full law with {100.0 * fraction:g} % of its effort: none near {fraction:g} of its bandwidth is certified"
+    )
+    return lower, certifying(lower), note
+
+
+def _make_stage(
+    name: str,
+    controller: Controller,
+    certificate: Certificate,
+    note: str,
+    draws: Sequence[Mapping[str, float]],
+    options: Mapping[str, Any],
+) -> Stage:
+    dry = has_dry_friction(controller)
+    phases, periods = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
+    excitation = design_excitation(controller, phases=phases, periods=periods, **options)
+    assert controller.design is not None
+    plant, values = controller.design
+    complete = {**plant.complete(values), **values}
+    sets = [values]
+    for each in draws:
+        known = [replace(complete[key], value=value) for key, value in each.items() if key in complete]
+        sets.append(values.with_parameters(*known))
+    loops = [controller.close(plant, each) for each in sets]
+    f = excitation.frequency_hz
+    count = round(STEP_PERIODS / controller.spec.bandwidth_hz / controller.sample_time_s)
+    runs = [loop.simulate(np.ones(count)) for loop in loops]
+    steps, effort = (np.array([run[k] for run in runs]) for k in (0, 1))
+    limit = controller.command_limit
+    time = controller.sample_time_s * np.arange(count)
+    return Stage(
+        name=name,
+        controller=controller,
+        certificate=certificate,
+        excitation=excitation,
+        tracking=_band(f, np.abs([loop.tracking(f) for loop in loops])),
+        sensitivity=_band(f, np.abs([loop.sensitivity(f) for loop in loops])),
+        step=_band(time, steps),
+        step_size=None if limit is None else float(limit / controller.per_effort / np.max(np.abs(effort))),
+        stop={key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
+        note=note,
+    )
+
+
+def _band(at: Float[np.ndarray, " m"], rows: Any) -> Band:
+    rows = np.asarray(rows)
+    return Band(
+        at=tuple(at.tolist()),
+        nominal=tuple(rows[0].tolist()),
+        low=tuple(np.min(rows, axis=0).tolist()),
+        high=tuple(np.max(rows, axis=0).tolist()),
+    )

@@ -1,0 +1,106 @@
+"""The files of a bring-up: of each stage the law, its reference as a table and as C, and what to expect."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from seaopt.control import export
+from seaopt.files import write_json, write_text
+from seaopt.logs import Log, write_log
+from seaopt.machine.bringup import Band, BringUp, Stage
+
+PER_LINE = 8
+HEADER = """/* The reference of a stage of bring-up, made by seaopt: {phases} set(s) of phases, a period of
+ * {period} ticks, at {rate} Hz.
+ * Call stage_reference(tick) once per tick, from 0; it ends after STAGE_TICKS ticks, and is zero from there on. */
+#ifndef STAGE_REFERENCE_H
+#define STAGE_REFERENCE_H
+#define STAGE_TICKS {ticks}UL
+double stage_reference(unsigned long tick); /* {unit} */
+#endif
+"""
+SOURCE = """#include "reference.h"
+
+#define PERIOD {period}UL
+#define PERIODS {periods}UL
+#define PHASES {phases}UL
+
+static const double fade[PERIOD] = {{
+{fade}
+}};
+static const double wave[PHASES][PERIOD] = {{
+{waves}
+}};
+
+double stage_reference(unsigned long tick)
+{{
+    const unsigned long played = PHASES * PERIODS * PERIOD;
+    if (tick < PERIOD) return fade[tick] * wave[0][tick];
+    if (tick < PERIOD + played) return wave[(tick - PERIOD) / (PERIODS * PERIOD)][tick % PERIOD];
+    if (tick < STAGE_TICKS) return fade[STAGE_TICKS - 1UL - tick] * wave[PHASES - 1UL][tick % PERIOD];
+    return 0.0;
+}}
+"""
+
+
+def write_bring_up(plan: BringUp, folder: Path | str) -> tuple[Path, ...]:
+    """Write a folder for each stage, and bringup.json beside them.
+
+    Parameters
+    ----------
+    plan : BringUp
+        Of `bring_up`.
+    folder : path
+        Made if it does not exist.
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    FileError
+        The folder cannot be written.
+    """
+    target = Path(folder)
+    files = [write_json(target / "bringup.json", plan.to_dict())]
+    for stage in plan.stages:
+        files += _write_stage(stage, target / stage.name)
+    return tuple(files)
+
+
+def _write_stage(stage: Stage, folder: Path) -> list[Path]:
+    excitation, unit = stage.excitation, stage.controller.command.reference_unit
+    reference = excitation.reference
+    time = excitation.sample_time_s * np.arange(reference.size)
+    log = Log.from_arrays(time=time, reference=reference, units={"reference": unit}, source=stage.name)
+    period, phases = excitation.waves.shape[1], len(excitation.waves)
+    rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(period) / period)
+    waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.waves)
+    words = {"phases": phases, "period": period, "periods": excitation.periods, "ticks": reference.size, "unit": unit}
+    header = HEADER.format(**words, rate=f"{1.0 / excitation.sample_time_s:.10g}")
+    source = SOURCE.format(**words, fade=_list_numbers(rise), waves=waves)
+    return [
+        *export(stage.controller, folder, allow_infeasible=True),
+        write_json(folder / "controller.json", stage.controller.to_dict()),
+        write_log(log, folder / "reference.csv"),
+        write_text(folder / "reference.h", header),
+        write_text(folder / "reference.c", source),
+        write_text(folder / "expected_step.csv", _table("time [s]", stage.step)),
+        write_text(folder / "expected_tracking.csv", _table("frequency [Hz]", stage.tracking)),
+    ]
+
+
+def _list_numbers(values: np.ndarray) -> str:
+    texts = [f"{value:.9g}" for value in values.tolist()]
+    texts = [text if any(mark in text for mark in ".en") else f"{text}.0" for text in texts]
+    return ",\n".join(", ".join(texts[k : k + PER_LINE]) for k in range(0, len(texts), PER_LINE))
+
+
+def _table(first: str, band: Band) -> str:
+    rows = zip(band.at, band.nominal, band.low, band.high, strict=True)
+    lines = [f"{first},nominal,low,high", *(",".join(f"{value:.7g}" for value in row) for row in rows)]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,181 @@
+"""A bring-up in words: sections for print, terminal and notebook, and the page to take to the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from seaopt.files import write_text
+from seaopt.formatting import format_count, format_number, join_words
+from seaopt.machine.bringup import Band, BringUp, Stage
+from seaopt.reporting.figures.panel import BAND, BLUE, Panel, frequency_panel, to_decibel
+from seaopt.reporting.page.chart import make_chart
+from seaopt.reporting.page.provenance import describe_provenance
+from seaopt.reporting.page.render import render_parts, render_template
+from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
+from seaopt.units import unit_after
+
+PARTS = {"stages": "Stages", "provenance": "Provenance"}
+ALWAYS = (
+    "a signal is beyond its figure below.",
+    "`held` grows, or `status` is the fault of the gate: the law has lost its reading.",
+    "a tone is heard, or the command alternates from tick to tick: the loop is near its limit.",
+)
+NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
+
+
+def judge(result: BringUp, commands: Commands) -> Verdict | None:
+    """Return the verdict: whether the law of every stage is certified."""
+    good = [stage for stage in result.stages if stage.certificate.met]
+    reasons = tuple(
+        Reason(what="the certificate of its law failed", where=stage.name)
+        for stage in result.stages
+        if not stage.certificate.met
+    )
+    text = f"Bring-up: {len(good)} of {format_count(len(result.stages), 'stage')} with a certified law"
+    return Verdict(met=result.met, text=text, reasons=reasons)
+
+
+def summarise(result: BringUp) -> list[KeyFigure]:
+    """Return the bandwidth of each stage."""
+    return [
+        KeyFigure(
+            name=stage.name, value=f"{format_number(stage.controller.spec.bandwidth_hz, 3)} Hz", against=stage.note
+        )
+        for stage in result.stages
+    ]
+
+
+def describe(result: BringUp) -> list[Section]:
+    """Return a table of the stages, then each with what to play, to log, to expect, and when to stop."""
+    rows = tuple(_list_row(stage) for stage in result.stages)
+    head = ("stage", "law", "bandwidth (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
+    overview = Section(
+        title="Stages",
+        part="stages",
+        tables=(Table(head=head, rows=rows, align="<<>>>>>"),),
+        remarks=(*(f"Stop a stage when {text}" for text in ALWAYS), NEXT),
+    )
+    return [overview, *(_describe_stage(stage) for stage in result.stages)]
+
+
+def _list_row(stage: Stage) -> tuple[Any, ...]:
+    controller, excitation = stage.controller, stage.excitation
+    unit, limit = unit_after(controller.command.reference_unit), controller.command_limit
+    ms = format_number(max(stage.sensitivity.low), 3), format_number(max(stage.sensitivity.high), 3)
+    return (
+        stage.name,
+        mark_met(stage.certificate.met, "certified", "not certified"),
+        format_number(controller.spec.bandwidth_hz, 3),
+        "none" if limit is None else controller.command.show(limit),
+        f"{format_number(excitation.bias, 3)} ± {format_number(excitation.amplitude, 3)}{unit}",
+        format_number(excitation.reference.size * excitation.sample_time_s, 3),
+        " to ".join(dict.fromkeys(ms)),
+    )
+
+
+def _describe_stage(stage: Stage) -> Section:
+    controller, excitation = stage.controller, stage.excitation
+    period = excitation.waves.shape[1] * excitation.sample_time_s
+    f = excitation.frequency_hz
+    step = stage.step
+    top = format_number(max(step.low), 3), format_number(max(step.high), 3)
+    outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
+    units = {controller.command.input: controller.command.unit, **outputs}
+    sentences = [
+        *([f"{stage.note[0].upper()}{stage.note[1:]}."] if stage.note else []),
+        f"Flash {stage.name}/force_law.c, play {stage.name}/reference.csv (or reference.c): it fades in over "
+        f"{format_number(period, 3)} s, then {format_count(len(excitation.waves), 'set')} of phases of "
+        f"{excitation.periods} periods of {format_number(period, 3)} s, {f.size} lines from {format_number(f[0], 3)} "
+        f"to {format_number(f[-1], 3)} Hz, then it fades out.",
+        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}.",
+        f"Expect: a step of the reference{_say_size(stage)} peaks at {' to '.join(dict.fromkeys(top))} of its size "
+        f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
+    ]
+    rows = tuple(
+        (
+            name,
+            f"{format_number(peak, 3)}{unit_after(units.get(name, ''))}",
+            f"{format_number(stage.stop[name], 3)}{unit_after(units.get(name, ''))}",
+            format_number(excitation.limits.get(name), 3, ""),
+        )
+        for name, peak in excitation.peaks.items()
+    )
+    table = Table(head=("signal", "expected at most", "stop beyond", "limit"), rows=rows, align="<>>>")
+    return Section(title=f"Stage {stage.name}", part="stages", sentences=tuple(sentences), tables=(table,))
+
+
+def _say_size(stage: Stage) -> str:
+    """Return up to which size a step is one of the linear loop."""
+    unit = unit_after(stage.controller.command.reference_unit)
+    return "" if stage.step_size is None else f" of up to {format_number(stage.step_size, 3)}{unit}"
+
+
+def _list_panels(stage: Stage) -> Iterator[Panel]:
+    unit = stage.controller.spec.regulated
+
+    def draw_step(axis: Any) -> None:
+        _draw_band(axis, stage.step, lambda values: np.asarray(values))
+
+    def draw_tracking(axis: Any) -> None:
+        _draw_band(axis, stage.tracking, to_decibel)
+
+    yield Panel(
+        name=f"step_{stage.name}", title=f"{stage.name}: step", draw=draw_step, x="time [s]",
+        y=(f"{unit} over the step [-]",), tight=True,
+        caption="The step must lie in the band, which is that of the certificate's draws.",
+    )  # fmt: skip
+    yield frequency_panel(
+        name=f"tracking_{stage.name}", title=f"{stage.name}: tracking", draw=draw_tracking, y=("|Y/R| [dB]",),
+        tight=True, caption="The measured response must lie in the band.",
+    )  # fmt: skip
+
+
+def _draw_band(axis: Any, band: Band, scale: Any) -> None:
+    axis.fill_between(band.at, scale(band.low), scale(band.high), color=BAND, label="draws")
+    axis.plot(band.at, scale(band.nominal), color=BLUE, linewidth=1.3, label="expected")
+
+
+def write_bring_up_page(
+    result: BringUp, path: Path | str, *, title: str = "Bring-up", files: Sequence[Path | str] = (), command: str = ""
+) -> Path:
+    """Write an HTML page of a bring-up, to be printed; it needs no network and no other file.
+
+    Parameters
+    ----------
+    result : BringUp
+        Of `bring_up`.
+    path : path
+        The page.
+    title : str
+        Heading of the page.
+    files : sequence of path
+        What it was made of: the problem file.
+    command : str
+        What was typed to make it, to be stated.
+
+    Raises
+    ------
+    FileError
+        The folder cannot be written.
+    """
+    plates = [
+        {"heading": stage.name, "text": "", "charts": [make_chart(panel) for panel in _list_panels(stage)]}
+        for stage in result.stages
+    ]
+    html = render_template(
+        "page.html.jinja",
+        title=title,
+        parts=PARTS,
+        verdicts=[judge(result, Commands())],
+        glance=summarise(result),
+        described=render_parts([*describe(result), describe_provenance((), files, command)], PARTS),
+        plates={"stages": plates},
+        doubt="",
+        controller=None,
+        header=None,
+    )
+    return write_text(Path(path), html)

@@ -1,0 +1,113 @@
+"""The stages of a bring-up: what is played stays within its limits, its C is the table, its logs are accepted."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.machine.bringup_files import write_bring_up
+from tests.machine.simulator import Bench, Machine
+
+SHARE = 0.4
+MAIN = r"""#include <stdio.h>
+#include "reference.h"
+int main(void)
+{
+    unsigned long k;
+    for (k = 0; k <= STAGE_TICKS; k++) printf("%.17g\n", stage_reference(k));
+    return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def plan(controller):
+    return so.bring_up(
+        controller,
+        {"stand": so.plants.high_impedance()},
+        so.plants.thor(),
+        samples=20,
+        share=SHARE,
+        limits={"F1": 900.0},
+    )
+
+
+def test_the_stages_lead_up_to_the_full_law_and_each_is_certified(plan, controller):
+    assert [stage.controller.spec.bandwidth_hz for stage in plan.stages] == [7.5, 15.0, 30.0]
+    assert plan.met and plan.stages[-1].controller is controller
+    assert all(stage.certificate.controller is stage.controller for stage in plan.stages)
+
+
+def test_what_is_played_stays_within_its_share_of_current_and_force(plan, compiler, tmp_path):
+    for stage in plan.stages:
+        bench = Bench(compiler, tmp_path, stage.controller, stage.name)
+        log = bench.log(Machine(), stage.excitation.reference, noise=0.0)
+        settled = log.between(2.0 * stage.excitation.waves.shape[1] * 1e-3, log.time[-1])
+        for name, limit in (("I", 9.0), ("F1", 900.0)):
+            peak = np.max(np.abs(settled[name]))
+            share = SHARE * stage.controller.spec.bandwidth_hz / 30.0
+            assert peak <= 1.02 * share * limit and np.isclose(peak, stage.excitation.peaks[name], rtol=0.05)
+            assert np.max(np.abs(log[name])) < stage.stop[name]
+
+
+def test_the_log_of_each_stage_is_accepted_and_that_of_another_stage_is_not(plan, compiler, tmp_path):
+    first, second, _ = plan.stages
+    bench = Bench(compiler, tmp_path, first.controller)
+    log = bench.log(Machine(), first.excitation.reference)
+    assert so.accept(first.controller, [log]).met
+    other = so.accept(second.controller, [log], others={"stage_1/controller.json": first.controller})
+    assert not other.met and other.replays[0].causes[0].what == "stage_1/controller.json"
+
+
+def test_a_step_of_the_machine_lies_in_the_band(plan, compiler, tmp_path):
+    stage = plan.stages[0]
+    size = 0.99 * stage.step_size
+    log = Bench(compiler, tmp_path, stage.controller).log(Machine(), np.full(len(stage.step.at), size), noise=0.0)
+    assert np.allclose(log["F1"] / size, stage.step.nominal, atol=2e-3)
+    assert np.isclose(np.max(np.abs(log["I"])), 0.99 * 9.0, rtol=1e-6)
+
+
+def test_the_files_are_there_and_the_c_of_the_reference_is_the_table(plan, compiler, tmp_path):
+    files = write_bring_up(plan, tmp_path)
+    assert json.loads((tmp_path / "bringup.json").read_text())["schema"] == "seaopt/bringup/1"
+    folder = tmp_path / "stage_1"
+    assert {"force_law.c", "reference.csv", "reference.c", "expected_step.csv"} <= {path.name for path in files}
+    (folder / "main.c").write_text(MAIN)
+    flags = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
+    subprocess.run([*compiler, *flags, "main.c", "reference.c", "-o", "play"], cwd=folder, check=True)
+    played = subprocess.run([str(folder / "play")], capture_output=True, text=True, check=True).stdout
+    table = so.read_log(folder / "reference.csv")["reference"]
+    played = np.array(played.split(), dtype=float)
+    assert played[-1] == 0.0 and np.allclose(played[:-1], table, atol=1e-6 * np.max(np.abs(table)))
+
+
+def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(controller):
+    def refuse(spec):
+        raise so.SeaoptError("none")
+
+    plan = so.bring_up(
+        controller,
+        {"stand": so.plants.high_impedance()},
+        so.plants.thor(),
+        fractions=(0.25,),
+        tune_stage=refuse,
+        certify_stage=lambda law: so.certify(law, {"stand": so.plants.high_impedance()}, so.plants.thor(), samples=5),
+    )
+    stage = plan.stages[0]
+    assert stage.controller.command_limit == 2.25 and "effort" in stage.note
+    assert np.array_equal(stage.controller.law.a, controller.law.a)
+
+
+def test_what_cannot_be_played_is_refused(controller):
+    options = {"plants": {"stand": so.plants.high_impedance()}, "uncertainty": so.plants.thor(), "samples": 5}
+    for wrong, says in (
+        ({"fractions": (1.5,)}, "between 0 and 1"),
+        ({"share": 0.0}, "share = 0"),
+        ({"fractions": (), "bias": 5000.0}, "bias = 5000"),
+    ):
+        with pytest.raises(so.SeaoptError, match=says):
+            so.bring_up(controller, **options, **wrong)
