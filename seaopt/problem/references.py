@@ -98,7 +98,6 @@ def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         )
     for key, there in (
         ('controller.structure = "mpc"', law.structure == "mpc"),
-        ("impedance", table.impedance is not None),
         ("expect.controller", expect is not None and expect.controller is not None),
         ("expect.certificate", expect is not None and expect.certificate is not None),
     ):

@@ -41,6 +41,7 @@ from seaopt.control.laws.delay import (
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.mpc.stored import check_described
+from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.errors import ControlError, ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
@@ -250,16 +251,26 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     """Return a controller with the problem's outer loop, its guards, and with what it compensates. Raises
     SeaoptError: as `seaopt.control.add_compensation`, or the stiffness has no critically damped impedance.
     """
-    outer, values = problem.table.impedance, problem.values(source)
-    if outer is not None:
-        plant, filter_s = problem.plants[outer.plant], outer.velocity_filter_s
-        if outer.damping == "critical":
-            impedance = critical_impedance(controller, plant, values, outer.stiffness, velocity_filter_s=filter_s)
-        else:
-            impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
-        controller = add_impedance(controller, plant, values, impedance, name=outer.plant)
+    values = problem.values(source)
+    (controller,) = _add_impedance(problem, [(controller, values)])
     controller, terms = _guard(problem, controller), _list_terms(problem, values)
     return add_compensation(controller, **terms) if terms else controller
+
+
+def _add_impedance(problem: Problem, laws: Sequence[tuple[Controller, ParameterSet]]) -> list[Controller]:
+    """Return controllers, each with the parameters of its place, with one outer loop; critical damping is the largest
+    that one of them needs.
+    """
+    outer = problem.table.impedance
+    if outer is None:
+        return [controller for controller, _ in laws]
+    plant, filter_s = problem.plants[outer.plant], outer.velocity_filter_s
+    if outer.damping == "critical":
+        each = [critical_impedance(law, plant, at, outer.stiffness, velocity_filter_s=filter_s) for law, at in laws]
+        impedance = max(each, key=lambda one: one.damping)
+    else:
+        impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
+    return [add_impedance(law, plant, at, impedance, name=outer.plant) for law, at in laws]
 
 
 def _list_terms(problem: Problem, values: ParameterSet) -> dict[str, Any]:
@@ -295,11 +306,17 @@ def complete_schedule(
     """Return a schedule with the problem's guards, the gate that of the point where the plant moves the furthest, and
     with what it compensates.
     """
-    guarded = [_guard(problem, controller) for controller in schedule.controllers]
+    values = problem.values(source)
+    link = (
+        problem.plants[problem.table.impedance.plant] if problem.table.impedance is not None else problem.design_plant
+    )
+    placed = [place_variable(link, values, schedule.over, point) for point in schedule.points]
+    laws = _add_impedance(problem, list(zip(schedule.controllers, placed, strict=True)))
+    guarded = [_guard(problem, controller) for controller in laws]
     gates = [controller.gate for controller in guarded if controller.gate is not None]
     widest = max(gates, key=lambda gate: gate.max_step_N, default=None)
     guarded = replace(schedule, controllers=tuple(replace(each, gate=widest) for each in guarded))
-    terms = _list_terms(problem, problem.values(source))
+    terms = _list_terms(problem, values)
     return compensate_schedule(guarded, **terms) if terms else guarded
 
 

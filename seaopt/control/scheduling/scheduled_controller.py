@@ -191,7 +191,8 @@ class ScheduledController(Result, Worded):
             (i, t), terms = self.table.find_stretch(value), [each.compensation for each in self.controllers]
             low, high = terms[i], terms[i + 1]
             mixed = None if low is None or high is None else low.mix(high, t)
-            frozen = replace(frozen, compensation=mixed, gate=first.gate, derate=first.derate)
+            kept = {"outer": first.outer, "gate": first.gate, "derate": first.derate}
+            frozen = replace(frozen, compensation=mixed, **kept)
         if not self.table.nominals:
             return frozen
         share = self.table.find_numbers(value, **{SHARE: self.runnable().anti_windup})[SHARE]
@@ -297,13 +298,18 @@ def make_table(over: str, unit: str, points: Sequence[float], controllers: Seque
     for point, controller in zip(points, controllers, strict=True):
         gains, speed, observer = controller.gains, controller.speed_loop, controller.observer
         made = set(gains) >= set(LAW_GAINS) and Gains.from_names(gains, observer, speed, controller.link)
-        whole = made and controller.outer is None and made.makes(controller.law, controller.spec.structure)
+        whole = made and made.makes(controller.law, controller.spec.structure)
         alike = set(gains) == set(first.gains) and (controller.link is None) == (first.link is None)
         if not alike or not whole:
             raise ControlError(
                 f"the controller at {over} = {point:g} is more than its gains, or has other parts than that at "
                 f"{points[0]:g}, and only gains are interpolated; use the same structure, notch and prefilter at all "
                 "points, and no other parts"
+            )
+        if controller.outer != first.outer:
+            raise ControlError(
+                f"the controller at {over} = {point:g} renders another impedance than that at {points[0]:g}, and a "
+                "schedule has one outer loop; give all of them one damping"
             )
         if not is_alike(controller.compensation, first.compensation):
             raise ControlError(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import math
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +17,16 @@ from seaopt.control import (
     CompensateFriction,
     CompensateGravity,
     CompensateRipple,
+    Impedance,
     ScheduledController,
+    add_impedance,
     compensate_schedule,
+    export,
     tune_schedule,
 )
 from seaopt.errors import ControlError
 from seaopt.files import to_json
-from tests.c_code import CompiledSchedule
+from tests.c_code import STRICT, CompiledSchedule
 
 N, K_TAU, ETA, J_M, B_R, F_C, V_S, K_S, J_L, D_L, L, G = (
     100.0, 0.0369, 0.7, 1.5e-5, 4e-4, 0.002, 1.0, 280.0, 0.2, 0.1, 0.2, 9.81
@@ -89,35 +94,36 @@ def test_the_terms_are_those_of_the_load_at_its_place(schedule, plain):
         before = motor
 
 
-def swing_leg(law, start, seconds, loads):
-    """Return the link's angle under a law, the leg by Runge-Kutta's method in steps of a tenth of a sample."""
+def move_leg(x, current, load):
+    """Return the rates of theta_m, its rate, theta_l and its rate."""
+    torque = K_S * (x[0] / N - x[2])
+    rubs = B_R * x[1] + F_C * math.tanh(x[1] / V_S)
+    push = (K_TAU * ETA * current - rubs - torque / N) / J_M
+    return np.array([x[1], push, x[3], (torque - D_L * x[3] - load * G * L * math.sin(x[2])) / J_L])
+
+
+def step_leg(x, current, load):
+    """Return the leg a sample later, by Runge-Kutta's method in steps of a tenth of it."""
+    h = TS / 10
+    for _ in range(10):
+        a = move_leg(x, current, load)
+        b = move_leg(x + h / 2 * a, current, load)
+        c = move_leg(x + h / 2 * b, current, load)
+        x = x + h / 6 * (a + 2 * b + 2 * c + move_leg(x + h * c, current, load))
+    return x
+
+
+def swing_leg(law, start, loads):
+    """Return the link's angle under a law that is asked for no torque."""
     weight = loads[0] * G * L * math.sin(start)
-    x = np.array([N * (start + weight / K_S), 0.0, start, 0.0])  # theta_m, its rate, theta_l, its rate
-
-    def move(x, current, load):
-        torque = K_S * (x[0] / N - x[2])
-        rubs = B_R * x[1] + F_C * math.tanh(x[1] / V_S)
-        push = (K_TAU * ETA * current - rubs - torque / N) / J_M
-        return np.array([x[1], push, x[3], (torque - D_L * x[3] - load * G * L * math.sin(x[2])) / (J_L + 0.0 * load)])
-
-    current = weight / (N * K_TAU * ETA)
-    reads = () if law.compensation is None else law.compensation.reads
+    x = np.array([N * (start + weight / K_S), 0.0, start, 0.0])
+    command, reads = weight / (N * K_TAU * ETA), () if law.compensation is None else law.compensation.reads
     further = [{"theta_l": start}[name] for name in reads]
-    state, waiting, angles = (
-        law.reset(0.0 if further else weight, weight, loads[0], current, readings=further),
-        current,
-        [],
-    )
+    state, angles = law.reset(0.0 if further else weight, weight, loads[0], command, readings=further), []
     for load in loads:
-        torque = K_S * (x[0] / N - x[2])
+        torque, waiting = K_S * (x[0] / N - x[2]), command
         command, state = law.step(state, 0.0, torque, load, [{"theta_l": x[2]}[name] for name in reads])
-        for _ in range(10):
-            h = TS / 10
-            a = move(x, waiting, load)
-            b = move(x + h / 2 * a, waiting, load)
-            c = move(x + h / 2 * b, waiting, load)
-            x = x + h / 6 * (a + 2 * b + 2 * c + move(x + h * c, waiting, load))
-        waiting = command
+        x = step_leg(x, waiting, load)
         angles.append(x[2])
     return np.array(angles)
 
@@ -127,7 +133,7 @@ def test_a_leg_whose_load_grows_stays_where_it_is(plain, leg):
     _, swing, values = leg
     carried = compensate_schedule(plain, gravity=CompensateGravity(fraction=1.0), link=(swing, values))
     loads = np.linspace(2.0, 8.0, 1500)
-    falls, stays = (swing_leg(each.runnable(), 0.5, 1.5, loads) for each in (plain, carried))
+    falls, stays = (swing_leg(each.runnable(), 0.5, loads) for each in (plain, carried))
     assert np.max(np.abs(stays - 0.5)) < 0.12 < 0.4 < np.max(np.abs(falls - 0.5))
 
 
@@ -180,3 +186,51 @@ def test_it_is_certified_at_its_places_with_what_it_compensates(schedule, leg):
         certificate = so.certify(heavy, {"stand": stand, "swing": swing}, values, **options)
         rows = [row for row in certificate.requirements if row.name == "gravity_compensation"]
         assert len(rows) == len(certificate.places) and all(row.met for row in rows) == met
+
+
+def test_a_scheduled_leg_stands_where_a_stiffness_holds_its_load(plain, leg, compiler, tmp_path):
+    """At rest K (x_0 - x) = m g L sin x, for every load on the way; the outer loop in C is that of its equations."""
+    _, swing, values = leg
+    stiffness, damping, filter_s, target = 60.0, 4.0, 0.005, 0.6
+    impedance = Impedance(stiffness=stiffness, damping=damping, velocity_filter_s=filter_s)
+    laws = [add_impedance(each, swing, values, impedance, name="swing") for each in plain.controllers]
+    stiff = replace(plain, controllers=tuple(laws))
+    export(stiff, tmp_path, name="law")
+    run, begin = load_outer(compiler, tmp_path)
+    law = stiff.runnable()
+    loads = np.concatenate([np.full(1000, 2.0), np.linspace(2.0, 8.0, 3000), np.full(1000, 8.0)])
+    x, state, command, speed, before, angles = np.zeros(4), law.reset(place=2.0), 0.0, 0.0, 0.0, []
+    begin()
+    for load in loads:
+        speed, before = (filter_s * speed + (x[2] - before)) / (filter_s + TS), x[2]
+        asked = stiffness * (target - x[2]) - damping * speed
+        assert run(target, x[2]) == pytest.approx(asked, rel=1e-9, abs=1e-9)
+        torque, waiting = K_S * (x[0] / N - x[2]), command
+        command, state = law.step(state, asked, torque, load)
+        x = step_leg(x, waiting, load)
+        angles.append(x[2])
+    slow, weights = np.array(angles)[1500:4000:50], loads[1500:4000:50] * G * L
+    np.testing.assert_allclose(stiffness * (target - slow), weights * np.sin(slow), atol=0.5)
+    assert abs(stiffness * (target - angles[-1]) - 8.0 * G * L * math.sin(angles[-1])) < N * F_C
+
+
+def load_outer(compiler, folder):
+    """Return the outer loop and the reset of exported code."""
+    code = folder / "wrap.c"
+    code.write_text(
+        '#include "law.h"\nstatic law_law law;\nvoid begin(void) { law_init(&law); }\n'
+        "double outer(double wanted, double position) { return law_outer(&law, wanted, position); }\n"
+    )
+    flags = [*STRICT, "-O1", "-shared", "-fPIC", str(folder / "law.c"), str(code), "-o", str(folder / "outer.so")]
+    subprocess.run([*compiler, *flags], check=True)
+    library = ctypes.CDLL(str(folder / "outer.so"))
+    library.outer.argtypes, library.outer.restype = [ctypes.c_double] * 2, ctypes.c_double
+    return library.outer, library.begin
+
+
+def test_a_schedule_whose_points_render_different_impedances_is_refused(plain, leg):
+    _, swing, values = leg
+    pairs = zip(plain.controllers, (2.0, 3.0, 3.0), strict=True)
+    laws = [add_impedance(each, swing, values, Impedance(stiffness=60.0, damping=d)) for each, d in pairs]
+    with pytest.raises(ControlError, match="another impedance than that at 2"):
+        _ = replace(plain, controllers=tuple(laws)).table
