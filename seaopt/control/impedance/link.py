@@ -14,13 +14,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.outer_loop import Impedance, OuterLoop
 from seaopt.control.loops.port import PortModel, port_of
 from seaopt.control.loops.sampled_plant import DigitalPlant, linearise_sets
+from seaopt.control.systems.resolvent import Resolvent
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -119,12 +120,7 @@ def _read_load(port: PortModel, linear: tuple[Float[np.ndarray, "..."], ...], na
     s = 2j * np.pi * f
     response = port.response(f)
     drive = response.motor_to_port * np.exp(s * port.delay_s)  # `linear` has no delay
-    moved: Complex[np.ndarray, " m"] = (
-        np.linalg.solve(
-            s[:, None, None] * np.eye(b.size) - a, np.broadcast_to(b[:, None].astype(complex), (f.size, b.size, 1))
-        )[:, :, 0]
-        @ c[0]
-    )
+    moved = Resolvent.of(a, b[:, None], c).respond(s)[0, 0]
     whole = -drive / (s * moved)
     size = np.abs(whole)
     terms = np.column_stack([s, np.ones_like(s), 1.0 / s]) / size[:, None]
