@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import fields
 from typing import Any, Literal
 
 from seaopt.codec import to_content
@@ -24,7 +23,7 @@ from seaopt.control.laws.structures import (
     SpeedLoop,
     Structure,
 )
-from seaopt.control.loops.compensation.link_feedforward import LinkFeedforward
+from seaopt.control.loops.compensation.link_feedforward import LOWEST_HZ, LinkFeedforward
 from seaopt.control.loops.measured.plant import MeasuredPlant, sample_measured
 from seaopt.control.loops.sampled_plant import Measured, list_names
 from seaopt.errors import ControlError, suggestion
@@ -38,7 +37,6 @@ LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
 LIFTABLE = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz")
 MAX_DELAY_SAMPLES = 1000
 HIGHEST_CORNER = 0.45  # of the sample rate: of a filter that is part of the law
-LOWEST_HZ = 1e-3  # limits are kept from here
 
 
 def _limit(name: str, **described: Any) -> Any:
@@ -216,33 +214,24 @@ class ControllerSpec(LoopSpec):
                 f"prefilter = {prefilter!r} is not known; {suggestion(str(prefilter), PREFILTER_ORDERS)}; or give a "
                 "Prefilter"
             )
-        highest = HIGHEST_CORNER * self.sample_rate_hz
-        if notch is not None:
-            _check_numbers("notch", asdict(notch), {"frequency_hz": highest, "width": 10.0, "depth": 1.0})
-        if (chosen := self.reference_filter) is not None:
-            if chosen.order not in PREFILTER_ORDERS:
-                raise ControlError(
-                    f'prefilter.order = "{chosen.order}" is not known; use "first_order" or "second_order"'
-                )
-            if chosen.damping is not None and not chosen.is_second_order:
-                raise ControlError(
-                    f"prefilter.damping = {chosen.damping!r} is of a filter of second order; leave it out, or give "
-                    'order = "second_order"'
-                )
-            numbers = {"corner_hz": chosen.corner_hz, "damping": chosen.damping}
-            _check_numbers("prefilter", numbers, {"corner_hz": highest, "damping": 10.0})
-        if path is not None:
-            numbers = {
-                "fraction": path.fraction,
-                "corner_hz": path.corner_hz,
-                "high_pass_hz": path.high_pass_hz or None,
-            }
-            largest = {"fraction": 2.0, "corner_hz": highest, "high_pass_hz": highest}
-            _check_numbers("link_feedforward", numbers, largest)
-            if path.measured in list_names(self.measured):
-                raise ControlError(
-                    f'link_feedforward.measured = "{path.measured}" is fed back already; measure the link\'s motion'
-                )
+        chosen, highest = self.reference_filter, HIGHEST_CORNER * self.sample_rate_hz
+        for name, part in (("notch", notch), ("prefilter", chosen), ("link_feedforward", path)):
+            if part is None:
+                continue
+            check_options(part, ControlError, f"{name}.")
+            for field in fields(part):
+                value = getattr(part, field.name)
+                if field.name.endswith("_hz") and value and not LOWEST_HZ <= value <= highest:
+                    raise ControlError(f"{name}.{field.name} = {value!r} is not {LOWEST_HZ:g} to {highest:g}")
+        if chosen is not None and chosen.damping is not None and not chosen.is_second_order:
+            raise ControlError(
+                f"prefilter.damping = {chosen.damping!r} is of a filter of second order; leave it out, or give "
+                'order = "second_order"'
+            )
+        if path is not None and path.measured in list_names(self.measured):
+            raise ControlError(
+                f'link_feedforward.measured = "{path.measured}" is fed back already; measure the link\'s motion'
+            )
 
     @property
     def reference_filter(self) -> Prefilter | None:
@@ -316,20 +305,6 @@ class ControllerSpec(LoopSpec):
             del values["delay_samples"]
             values["compute_delay_samples"] = self.loop_delay_samples
         return values | {name: to_content(values[name]) for name in ("notch", "prefilter", "link_feedforward")}
-
-
-def _check_numbers(name: str, numbers: Mapping[str, Any], largest: Mapping[str, float]) -> None:
-    """Refuse the numbers of a filter that are not above zero and up to the largest; what is None is tuned. Frequencies
-    are not below those that limits are kept from.
-    """
-    for field, value in numbers.items():
-        if value is None:
-            continue
-        least = LOWEST_HZ if field.endswith("_hz") else 0.0
-        numeric = not isinstance(value, bool) and isinstance(value, (int, float))
-        if not numeric or not 0.0 < value <= largest[field] or value < least:
-            lower = f"{least:g} to" if least else "above 0 and up to"
-            raise ControlError(f"{name}.{field} = {value!r} is not {lower} {largest[field]:g}")
 
 
 def check_command_limits(current_limit_A: float | None, command_limit: float | None) -> None:

@@ -79,7 +79,7 @@ from jaxtyping import Complex, Float
 
 from seaopt.codec import to_content
 from seaopt.control.laws.assembly import Assembly, Columns
-from seaopt.control.loops.compensation.link_feedforward import LinkPath
+from seaopt.control.loops.compensation.link_feedforward import LOWEST_HZ, LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -113,11 +113,14 @@ HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal l
 class Notch:
     """A notch; what is left out is tuned."""
 
-    frequency_hz: float | None = option("Its centre; tuned where left out.", default=None, unit="Hz")
+    frequency_hz: float | None = option("Its centre; tuned where left out.", default=None, unit="Hz", least=LOWEST_HZ)
     width: float | None = option(
-        "Damping ratio of its poles: it is 2 width frequency_hz wide; tuned where left out.", default=None
+        "Damping ratio of its poles: it is 2 width frequency_hz wide; tuned where left out.",
+        default=None,
+        above=0.0,
+        most=10.0,
     )
-    depth: float | None = option("Gain at its centre, up to 1; tuned where left out.", default=None)
+    depth: float | None = option("Gain at its centre; tuned where left out.", default=None, above=0.0, most=1.0)
 
     def biquad(self, sample_time_s: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Return numerator and denominator, denominator not normalised; every field must have a value."""
@@ -135,8 +138,12 @@ class Prefilter:
     """A low-pass in series with the reference; what is left out is tuned."""
 
     order: PrefilterOrder = option("Without or with a damping.", default="first_order", stated=True)
-    corner_hz: float | None = option("Where its asymptotes meet; tuned where left out.", default=None, unit="Hz")
-    damping: float | None = option("Damping ratio of one of second order; tuned where left out.", default=None)
+    corner_hz: float | None = option(
+        "Where its asymptotes meet; tuned where left out.", default=None, unit="Hz", least=LOWEST_HZ
+    )
+    damping: float | None = option(
+        "Damping ratio of one of second order; tuned where left out.", default=None, above=0.0, most=10.0
+    )
 
     @property
     def is_second_order(self) -> bool:

@@ -64,6 +64,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.roles import Sensing
 from seaopt.records import record
 
+LOWEST_HZ = 1e-3  # limits are kept from here
 FIT_FREQUENCIES = 12
 LARGEST_MISFIT = 0.2  # of the effort, between a tenth of the bandwidth and it
 FRACTIONS = np.round(np.linspace(0.0, 1.0, 101), 2)
@@ -80,17 +81,22 @@ class LinkFeedforward:
         default=None,
     )
     fraction: float | None = option(
-        "Share of the effort that the model says; as much as the limits leave where left out.", default=None
+        "Share of the effort that the model says; as much as the limits leave where left out.",
+        default=None,
+        above=0.0,
+        most=2.0,
     )
     corner_hz: float | None = option(
         "Corner of the low-pass; the bandwidth where left out. Noise on the signal grows with its square and more.",
         default=None,
         unit="Hz",
+        least=LOWEST_HZ,
     )
     high_pass_hz: float | None = option(
         "Frequency below which nothing is fed forward; a tenth of the bandwidth where left out, 0 for none.",
         default=None,
         unit="Hz",
+        least=0.0,
     )
 
     def place(self, path: LinkPath, bandwidth_hz: float) -> LinkPath:
