@@ -62,6 +62,11 @@ class Candidate:
     # samples show a gain of many units by chance.
     kept: tuple[Experiment, ...] = ()
     frees: Mapping[str, float] = field(default_factory=dict[str, float])  # whose values to state, less these offsets
+    smoothed: Parameter | None = None  # what is freed, if it is a speed over which friction is smoothed
+
+    def jumps(self, values: Values, stds: Values) -> bool:
+        """Tell whether the refit makes of smoothed friction a jump, or nearly."""
+        return self.smoothed is not None and _is_sharp(self.smoothed, values, stds)
 
     def describe(self, values: Values, stds: Values) -> str | None:
         """Return what the refit shows; None where it shows nothing."""
@@ -117,14 +122,19 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
             params=free_more(fit, (name,)).update(**{name: start}),
             says=partial(_state_value, parameter, name in speeds),
             frees={name: 0.0},
+            smoothed=parameter if name in speeds else None,
         )
+
+
+def _is_sharp(parameter: Parameter, values: Values, stds: Values) -> bool:
+    return values[parameter.name] < max(2.0 * stds[parameter.name], SHARPER * parameter.value)
 
 
 def _state_value(parameter: Parameter, smooths: bool, values: Values, stds: Values) -> str:
     """Return what a parameter should have been; `smooths`: it is a speed over which friction is smoothed."""
     name, unit, value = parameter.name, unit_after(parameter.unit), values[parameter.name]
     instead = f"in place of {parameter.value:.4g}{unit}"
-    if smooths and value < max(2.0 * stds[name], SHARPER * parameter.value):
+    if smooths and _is_sharp(parameter, values, stds):
         return (
             f"friction that jumps at rest, or nearly: {name} = {value:.1g}{unit} or less {instead}; let it jump, with "
             "sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"

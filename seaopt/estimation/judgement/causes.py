@@ -64,6 +64,7 @@ class Cause:
     material: bool
     preferred: Mapping[str, tuple[float, float]]  # value and std that the refit gives what it frees
     refit: Refit | None = None  # of a hypothesis about what the model lacks
+    jumps: bool = False  # friction that is smoothed: it is to stick, and its speed is not to be freed
     unknowns: int  # how many its refit had
 
 
@@ -271,12 +272,16 @@ def _weigh(
     if moved:
         _, name = max(moved)
         effects.append(f"moves {name} from {fit.parameters[name].value:.4g} to {values[name]:.4g}")
+    jumps = candidate.jumps(values, stds)
     return Cause(
         text=f"{text} ({' and '.join(effects)})" if effects else text,
         where=candidate.where,
         gain=gain,
         solved=bool(np.all(after[:, 0] < SOLVED * before[:, 0])),
-        preferred={name: (values[name] - shift, stds[name]) for name, shift in candidate.frees.items()},
+        preferred={}
+        if jumps
+        else {name: (values[name] - shift, stds[name]) for name, shift in candidate.frees.items()},
+        jumps=jumps,
         material=bool(moved) or candidate.certain or (left < HALVED and not (inside and _is_near_noise(fit))),
         unknowns=len(values),
     )

@@ -29,7 +29,7 @@ from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_am
 from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import count_evaluations
-from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
+from seaopt.estimation.result.findings import LET_STICK, FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
@@ -439,6 +439,6 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
     yield replace(
         finding,
         preferred={name: value for cause in rivals for name, value in cause.preferred.items()},
-        proposal=refit and refit.proposal,
-        python=refit and refit.python,
+        proposal=LET_STICK if rivals[0].jumps else refit and refit.proposal,
+        python="plant = so.plants.let_stick(plant)" if rivals[0].jumps else refit and refit.python,
     )

@@ -16,6 +16,7 @@ from seaopt.records import PlotAccessor, Worded, record
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+LET_STICK = "[plant.NAME]\nsticks = true"  # proposal of a cause: friction that is smoothed jumps at rest
 GUESS = "guess"  # kind of the finding that names unverified values
 
 
@@ -37,7 +38,7 @@ class FitFinding:
     text: str  # with the remedy
     # value and std of what a "cause" frees, by name
     preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
-    # what adds a "cause" that a part brings: lines of a problem file for a plant NAME, and calls
+    # what adds a "cause" that a part brings, or lets friction jump: lines of a problem file for a plant NAME, and calls
     proposal: str | None = None
     python: str | None = None
 

@@ -1,9 +1,13 @@
 """What a fit tells while it runs."""
 
+import json
+
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.estimation.result.fit_result import Fit
+from seaopt.files import to_json
 
 PLANT = so.plants.rotary(link="locked")
 VALUES = PLANT.defaults.update(f_c=0.02, v_s=0.0625, J_m=4e-5)
@@ -50,3 +54,14 @@ def test_what_sticks_or_is_short_gets_no_advice(plant, samples):
 def test_causes_that_are_tried_are_told():
     with pytest.raises(Heard, match="cause"):
         so.fit([make_experiment(so.plants.let_stick(PLANT), 3000, 1.0)], VALUES.free("b_r"), progress=stop_at_cause)
+
+
+@pytest.mark.slow
+def test_a_fit_that_is_read_from_a_file_advises_to_stick_as_a_fresh_one_does():
+    params = VALUES.update(v_s=1.2, b_r=2e-4).free("f_c")
+    fresh = so.fit([make_experiment(PLANT, 4000)], params)
+    read = Fit.from_dict(json.loads(to_json(fresh.to_dict())))
+    for result in (fresh, read):
+        (cause,) = (finding for finding in result.findings if finding.kind == "cause")
+        assert (cause.proposal, cause.preferred) == ("[plant.NAME]\nsticks = true", {})
+        assert "sticks = true in [plant.NAME]" in str(result).split("\n\n")[0].replace("\n", " ")

@@ -6,10 +6,9 @@ import math
 from collections.abc import Iterable, Iterator
 
 from seaopt.estimation import Fit
-from seaopt.estimation.result.findings import DerivedFigure, LogValues
+from seaopt.estimation.result.findings import LET_STICK, DerivedFigure, LogValues
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.parameters import Parameter
-from seaopt.plants.friction import list_smoothing
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
 from seaopt.units import unit_after
 
@@ -257,13 +256,13 @@ def _list_cures(fit: Fit) -> tuple[str, ...]:
     """Return the lines to write for the likely cause that is named first. What is not told from zero is not to be
     freed, nor how sharp friction is: a search for that takes long and ends nowhere.
     """
-    cause = next((finding for finding in fit.findings if finding.kind == "cause" and finding.preferred), None)
+    causes = (each for each in fit.findings if each.kind == "cause" and (each.preferred or each.proposal == LET_STICK))
+    cause = next(causes, None)
     if cause is None:
         return ()
-    speeds = {name for experiment in fit.experiments for name in list_smoothing(experiment.plant)}
+    sticking = ["sticks = true in [plant.NAME]"] if cause.proposal == LET_STICK else []
     apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
-    lines = ("sticks = true in [plant.NAME]" if name in speeds else spell_cure(name, apart[name]) for name in apart)
-    return tuple(filter(None, lines))
+    return tuple(filter(None, [*sticking, *(spell_cure(name, value) for name, value in apart.items())]))
 
 
 def spell_cure(name: str, value: float) -> str:
