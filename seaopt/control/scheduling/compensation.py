@@ -51,7 +51,7 @@ def compensate_schedule(
     longest = max((len(term.gravity.coefficients) for term in terms if term.gravity is not None), default=0)
     made = [_fit_terms(each.compensation, speed, longest) for each in controllers]
     controllers = [replace(each, compensation=term) for each, term in zip(controllers, made, strict=True)]
-    make_table(schedule.over, schedule.unit, schedule.points, controllers)  # refuses terms that are not alike
+    make_table(schedule.over, schedule.unit, schedule.points, tuple(controllers))  # refuses terms that are not alike
     return replace(schedule, controllers=tuple(controllers))
 
 

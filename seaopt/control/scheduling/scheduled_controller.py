@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +22,6 @@ from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
 from seaopt.control.scheduling.step_order import SHARE
-from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import feed_link
 from seaopt.control.tuning.tuner import describe_law, make_task
 from seaopt.errors import ControlError, suggestion
@@ -292,7 +292,8 @@ class ScheduledController(Result, Worded):
         ).with_places()
 
 
-def make_table(over: str, unit: str, points: Sequence[float], controllers: Sequence[Controller]) -> GainTable:
+@lru_cache(maxsize=8)
+def make_table(over: str, unit: str, points: tuple[float, ...], controllers: tuple[Controller, ...]) -> GainTable:
     """Return the gains of controllers at points. Raises ControlError: they cannot be interpolated; rates differ."""
     first = controllers[0]
     for point, controller in zip(points, controllers, strict=True):
@@ -354,21 +355,17 @@ def freeze(
     gains, law = table.find_gains(value), table.law(value)
     task = feed_link(task, gains.link)
 
-    def describe(task: Task) -> Controller:
-        loops = task.measure_law(
-            law,
-            filter_samples=gains.T_f / table.sample_time_s if gains.k_d else math.inf,
-            integral_rad_s=gains.integral_rad_s if table.integrates else math.inf,
-        )
-        return describe_law(task, law, loops, (plant, params), gains=table.interpolate(value), observer=gains.observer)
-
-    frozen = describe(task)
-    band = frozen.achieved.bandwidth_hz
-    if band is None or not math.isfinite(band):
-        return frozen
-    low, high = spec.bandwidth_range_hz
-    reached = replace(spec, bandwidth_hz=band, bandwidth_range_hz=(min(low, band), max(high, band)))
-    return describe(replace(task, spec=reached))
+    loops = task.measure_law(
+        law,
+        filter_samples=gains.T_f / table.sample_time_s if gains.k_d else math.inf,
+        integral_rad_s=gains.integral_rad_s if table.integrates else math.inf,
+    )
+    band = loops[0].figures.bandwidth_hz
+    if band is not None and math.isfinite(band):
+        low, high = spec.bandwidth_range_hz
+        reached = replace(spec, bandwidth_hz=band, bandwidth_range_hz=(min(low, band), max(high, band)))
+        task = replace(task, spec=reached)
+    return describe_law(task, law, loops, (plant, params), gains=table.interpolate(value), observer=gains.observer)
 
 
 def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) -> ParameterSet:

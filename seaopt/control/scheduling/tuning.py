@@ -140,7 +140,7 @@ def tune_schedule(
             controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws))
         else:
             controllers.append(make_controller(task, x, loops, (plant, at_point)))
-    make_table(over, unit, places.tolist(), controllers)  # refuses gains that cannot be interpolated
+    make_table(over, unit, tuple(places.tolist()), tuple(controllers))  # refuses gains that cannot be interpolated
     schedule = ScheduledController(
         over=over,
         unit=unit,

@@ -97,7 +97,8 @@ def batch_figures(
             delays = np.zeros(block.stop - block.start) + find_delay(plant, at)
             continuous = linearise(plant, values[:, block], at, controller.signals, controller.command.per_effort)
             pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, delays.size, CURVE_BLOCK)]
-            parts += pool.map(
+            run = pool.map if len(pieces) > 1 else map  # a thread costs more than few draws take
+            parts += run(
                 lambda piece, matrices=continuous, delay=delays: _close_piece(
                     controller, tuple(matrix[piece] for matrix in matrices), delay[piece], peaks
                 ),
