@@ -6,7 +6,8 @@ way there. Reading makes a pydantic model of the annotations, which checks a fil
 property is computed again: `check_agrees` compares it with the file's.
 
 - a float is a number; `OrInfinite`, `OrMinusInfinite` and `OrNaN` are null in the file where they are not finite
-- a tuple of any length is a list, a tuple of two a range, a Mapping a table, a jaxtyping array lists of numbers
+- a tuple of any length is a list, a tuple of two a range, a Mapping a table, a jaxtyping array lists of numbers, one
+  that is complex a table of its parts `re` and `im`
 - `Constraints` beside a type in `Annotated` is what its values keep to
 - a class whose instances are not made of their own keys alone has a class method `_from_json`, whose argument's
   annotation says what the file holds: Mapping[str, Any] is its own fields, `Fields` those of another record
@@ -22,7 +23,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
-from jaxtyping import AbstractArray
+from jaxtyping import AbstractArray, Float
 
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_seal, plain
@@ -84,6 +85,8 @@ def to_content(value: Any) -> Any:
         return {key: to_content(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [to_content(item) for item in cast(Sequence[Any], value)]
+    if isinstance(value, np.ndarray) and np.iscomplexobj(value):
+        return {"re": np.real(value), "im": np.imag(value)}
     return value
 
 
@@ -213,7 +216,7 @@ def _translate(hint: Any) -> Any:
     if origin in (dict, Mapping):
         return dict[_translate(arguments[0]), _translate(arguments[1])]
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
-        return _translate_array(hint, Number)
+        return _translate_array(hint, Flag if "bool" in hint.dtypes else Number)
     if hasattr(hint, "_from_json"):
         held = get_type_hints(hint._from_json, include_extras=True)["content"]
         held = Annotated[held, Fields(of=hint)] if held == Mapping[str, Any] else held
@@ -249,9 +252,13 @@ def _translate_marked(hint: Any, marks: Sequence[Any]) -> Any:
 def _translate_array(hint: type[AbstractArray], number: Any) -> Any:
     from pydantic import AfterValidator
 
+    if "complex128" in hint.dtypes:
+        parts = dict[str, _translate_marked(Float[np.ndarray, hint.dim_str], [NullIs(value=math.nan)])]
+        return Annotated[parts, AfterValidator(lambda read: read["re"] + 1j * read["im"])]
+
     def convert(rows: Any) -> np.ndarray:
         try:
-            array = np.array(rows, dtype=float)
+            array = np.array(rows, dtype=bool if "bool" in hint.dtypes else float)
         except ValueError:
             raise ValueError("should have rows of one length") from None
         return array if free else array.reshape(array.shape + (0,) * (len(hint.dims) - array.ndim))  # [] has no columns

@@ -29,9 +29,9 @@ from seaopt.plants.friction import friction_slopes, remembers, split_friction
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.bounds.bracket import Bracket
-from seaopt.robustness.certificate.compensation import CompensationDraws, describe_compensation, list_compensation
+from seaopt.robustness.certificate.compensation import describe_compensation, list_compensation
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
-from seaopt.robustness.certificate.friction import FrictionDraws
+from seaopt.robustness.certificate.friction import MarginDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.certificate.requirement import LIMIT_CYCLE, Requirement, require_at_most
 from seaopt.robustness.certificate.simulated import (
@@ -98,11 +98,11 @@ class Certificate(Result, Worded):
         Proven bounds on the worst case; empty if bounds were not requested.
     friction : mapping of name to FrictionMargin
         Of each model with friction: for how steep a friction stability is shown, between sliding and stuck.
-    friction_draws : mapping of name to FrictionDraws
+    friction_draws : mapping of name to MarginDraws
         The same over draws, of those models for which it is shown at the nominal parameters, or that have none there.
     compensation : mapping of name to CompensationMargin
         Of each model, where friction is compensated from the speed: for how steep a compensation stability is shown.
-    compensation_draws : mapping of name to CompensationDraws
+    compensation_draws : mapping of name to MarginDraws
         The same over draws, of those models for which it is shown at the nominal parameters.
     impedance : CertifiedImpedance or None
         What the controller's outer loop renders, where it has one.
@@ -133,9 +133,9 @@ class Certificate(Result, Worded):
     cycles: Mapping[str, tuple[FoundCycle, ...]] = field(default_factory=dict[str, tuple[FoundCycle, ...]])
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
-    friction_draws: Mapping[str, FrictionDraws] = field(default_factory=dict[str, FrictionDraws])
+    friction_draws: Mapping[str, MarginDraws] = field(default_factory=dict[str, MarginDraws])
     compensation: Mapping[str, CompensationMargin] = field(default_factory=dict[str, CompensationMargin])
-    compensation_draws: Mapping[str, CompensationDraws] = field(default_factory=dict[str, CompensationDraws])
+    compensation_draws: Mapping[str, MarginDraws] = field(default_factory=dict[str, MarginDraws])
     impedance: CertifiedImpedance | None = None
     constrained: ConstrainedRuns | None = None
     place: tuple[str, float] | None = None

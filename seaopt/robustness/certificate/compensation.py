@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.codec import OrInfinite
 from seaopt.control import Controller, Law, Loop, runnable
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
 from seaopt.control.loops.compensation.stability import CompensationMargin
@@ -34,7 +33,6 @@ from seaopt.control.loops.sampled_plant import find_rest, sample
 from seaopt.control.running.outer_run import enclose_controller
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
-from seaopt.formatting import format_values
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
@@ -42,7 +40,7 @@ from seaopt.plants.plant import output_function
 from seaopt.progress import Progress
 from seaopt.records import record
 from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
-from seaopt.robustness.certificate.friction import MARGIN_DRAWS, find_least_margin
+from seaopt.robustness.certificate.friction import MarginDraws, draw_margins
 from seaopt.robustness.certificate.measured_draws import judge_draws
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_least, require_at_most
 from seaopt.robustness.uncertainty.worst import place_values
@@ -57,25 +55,12 @@ NEUTRAL = 1e-6  # beyond 1, of an eigenvalue that neither grows nor decays, by r
 FROM_REFERENCE = "friction is compensated from the reference, outside the loop: its stability is the law's without it"
 
 
-@record
-class CompensationDraws:
-    """For how many draws stability is shown with friction compensated, and the least slope for which it is."""
-
-    samples: int
-    shown: int
-    least_slope: OrInfinite  # of the draw with the least; zero where stability is not shown for one
-    parameters: dict[str, float]  # of that draw
-
-    def __str__(self) -> str:
-        where = f", the least at {format_values(self.parameters)}" if self.parameters else ""
-        return f"over draws, it is shown for {self.shown} of {self.samples}{where}"
-
-
 def measure_compensation(survey: Survey, _: Progress) -> Evidence:
     """Return whether the loop stays stable with what is compensated, on every plant and over draws."""
     cases, controller = survey.cases, survey.cases.controller
     margins = find_nominal_compensation(controller, cases.models, cases.unknown.nominal)
-    draws = find_compensation_at_draws(survey, margins)
+    shown = {name: partial(_find_margins, each.multiplier) for name, each in margins.items() if each.shown}
+    draws = draw_margins(survey, shown)
     gravity, ripple = find_gravity_cases(survey), find_ripple_cases(survey)
     return Evidence(
         requirements=(
@@ -108,28 +93,6 @@ def find_nominal_compensation(
     }
 
 
-def find_compensation_at_draws(
-    survey: Survey, nominal: Mapping[str, CompensationMargin]
-) -> dict[str, CompensationDraws]:
-    """Return the same over draws, of the plants for which it is shown at the nominal parameters."""
-    enough, count = {name: each for name, each in nominal.items() if each.shown}, min(survey.samples, MARGIN_DRAWS)
-    if not enough or not count:
-        return {}
-    draws = survey.cases.unknown.list_draws(count, survey.rng)
-    margins: dict[str, CompensationDraws] = {}
-    for name, nominal_margin in enough.items():
-        judge = partial(_find_margins, nominal_margin.multiplier)
-        shown, margin, parameters = find_least_margin(judge, _take_slope, survey, name, draws)
-        margins[name] = CompensationDraws(
-            samples=count, shown=shown, least_slope=_take_slope(margin), parameters=parameters
-        )
-    return margins
-
-
-def _take_slope(margin: CompensationMargin) -> float:
-    return margin.slope
-
-
 def _find_margins(first: str, cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[CompensationMargin]:
     """Return the margins of one plant at draws, a multiplier tried first."""
     return find_compensation_margins(
@@ -138,7 +101,7 @@ def _find_margins(first: str, cases: Shared[Cases], name: str, draws: Sequence[D
 
 
 def describe_compensation(
-    controller: Controller, margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
+    controller: Controller, margins: Mapping[str, CompensationMargin], draws: Mapping[str, MarginDraws]
 ) -> tuple[str, ...]:
     """Return whether stability is shown with what a controller compensates, one sentence for each plant."""
     if controller.compensation is None or controller.compensation.friction is None:
@@ -151,7 +114,7 @@ def describe_compensation(
 
 
 def list_compensation(
-    margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
+    margins: Mapping[str, CompensationMargin], draws: Mapping[str, MarginDraws]
 ) -> dict[str, dict[str, Any]]:
     """Return what robustness.json has of them, by plant."""
     return {
@@ -307,7 +270,7 @@ def _read_position(plant: Plant, params: ParameterSet, output: str) -> float:
 
 
 def compensation_requirements(
-    controller: Controller, margins: Mapping[str, CompensationMargin], draws: Mapping[str, CompensationDraws]
+    controller: Controller, margins: Mapping[str, CompensationMargin], draws: Mapping[str, MarginDraws]
 ) -> list[Requirement]:
     """Return that stability is shown with friction compensated from the speed, at nominal values and over draws. Where
     it is, or is not, says the largest fraction of Coulomb friction that is shown at the compensation's speed.

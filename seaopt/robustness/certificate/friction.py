@@ -35,7 +35,7 @@ Margin = TypeVar("Margin", FrictionMargin | None, CompensationMargin)
 
 
 @record
-class FrictionDraws:
+class MarginDraws:
     """For how many draws stability is shown for all friction of their sector, and the least margin."""
 
     samples: int
@@ -75,56 +75,51 @@ def find_nominal_margins(
     return {name: margin for name, margin in margins.items() if margin is not None}
 
 
-def find_margins_at_draws(survey: Survey, nominal: Mapping[str, FrictionMargin]) -> dict[str, FrictionDraws]:
+def find_margins_at_draws(survey: Survey, nominal: Mapping[str, FrictionMargin]) -> dict[str, MarginDraws]:
     """Return margins at draws, of plants whose nominal margin is shown or enough, or that rub at draws alone."""
-    unknown, required, count = survey.cases.unknown, survey.min_friction_margin, min(survey.samples, MARGIN_DRAWS)
+    unknown, required = survey.cases.unknown, survey.min_friction_margin
     varied = [row.name for row in unknown.varied()]
     enough = {
         name: nominal.get(name)
         for name, model in survey.cases.models.items()
         if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
     }
-    if not count or not enough:
-        return {}
-    draws = unknown.list_draws(count, survey.rng)
-    margins: dict[str, FrictionDraws] = {}
-    for name, nominal_margin in enough.items():
-        judge = partial(_find_margins, nominal_margin)
-        shown, margin, parameters = find_least_margin(judge, _take_slope, survey, name, draws)
-        margins[name] = FrictionDraws(
+    return draw_margins(survey, {name: partial(_find_margins, margin) for name, margin in enough.items()})
+
+
+def draw_margins(
+    survey: Survey, judges: Mapping[str, Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Margin]]]
+) -> dict[str, MarginDraws]:
+    """Return what plants' judgements make of draws; draws that do not differ in what a plant has are judged once."""
+    count, made = min(survey.samples, MARGIN_DRAWS), dict[str, MarginDraws]()
+    draws = survey.cases.unknown.list_draws(count, survey.rng) if count and judges else []
+    for name, judge in judges.items() if draws else ():
+        of_plant = select_own(survey.cases, name, draws)
+        distinct = {tuple(draw.items()): draw for draw in of_plant}
+        of_draw = dict(zip(distinct, judge_draws(judge, survey, name, list(distinct.values())), strict=True))
+        margins = [of_draw[tuple(draw.items())] for draw in of_plant]
+        slopes = [_take_slope(margin) for margin in margins]
+        least = int(np.argmin(slopes))
+        margin = margins[least]
+        made[name] = MarginDraws(
             samples=count,
-            shown=shown,
-            least_slope=_take_slope(margin),
+            shown=sum(each is None or each.shown for each in margins),
+            least_slope=slopes[least],
             factor=np.inf if margin is None else margin.factor,
-            parameters=parameters,
+            parameters=of_plant[least],
         )
-    return margins
+    return made
 
 
-def _take_slope(margin: FrictionMargin | None) -> float:
-    return np.inf if margin is None else margin.least_slope  # without friction there is nothing to show
+def _take_slope(margin: FrictionMargin | CompensationMargin | None) -> float:
+    if margin is None:  # without friction there is nothing to show
+        return np.inf
+    return margin.slope if isinstance(margin, CompensationMargin) else margin.least_slope
 
 
 def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool:
     """Tell whether the nominal parameters leave something to look for at draws; without friction there they do."""
     return margin is None or margin.shown or (required is not None and margin.least_slope >= required)
-
-
-def find_least_margin(
-    judge: Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Margin]],
-    slope: Callable[[Margin], float],
-    survey: Survey,
-    name: str,
-    draws: Sequence[Draw],
-) -> tuple[int, Margin, dict[str, float]]:
-    """Return for how many draws of one plant stability is shown, the margin of the least slope, and its draw."""
-    of_plant = select_own(survey.cases, name, draws)
-    distinct = {tuple(draw.items()): draw for draw in of_plant}  # of what this plant has, draws may not differ
-    judged = judge_draws(judge, survey, name, list(distinct.values()))
-    of_draw = dict(zip(distinct, judged, strict=True))
-    margins = [of_draw[tuple(draw.items())] for draw in of_plant]
-    least = int(np.argmin([slope(margin) for margin in margins]))
-    return sum(margin is None or margin.shown for margin in margins), margins[least], of_plant[least]
 
 
 def _find_margins(
@@ -137,7 +132,7 @@ def _find_margins(
 
 
 def friction_requirements(
-    margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None, unit: str
+    margins: Mapping[str, FrictionMargin], draws: Mapping[str, MarginDraws], least: float | None, unit: str
 ) -> list[Requirement]:
     """Return that stability is shown for friction as steep as asked, nominal and drawn; infinite without friction."""
     if least is None:

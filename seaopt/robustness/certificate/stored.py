@@ -25,11 +25,10 @@ from seaopt.robustness.certificate.cases import DESIGN_NAMES, Cases
 from seaopt.robustness.certificate.certificate import NO_MODEL, ROBUSTNESS_SCHEMA, Certificate
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
-    CompensationDraws,
     find_nominal_compensation,
 )
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
-from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
+from seaopt.robustness.certificate.friction import MarginDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
 from seaopt.robustness.certificate.scheduled import ScheduleCertificate
@@ -81,9 +80,9 @@ class StoredSimulation:
 
 @record
 class StoredFriction:
-    """The margin of a plant with friction, of which all but draws and limit cycles is found again."""
+    """A plant's margin with friction, or with it compensated: all but draws and limit cycles is found again."""
 
-    draws: FrictionDraws | None = None
+    draws: MarginDraws | None = None
     limit_cycles: tuple[FoundCycle, ...] = ()
 
 
@@ -93,13 +92,6 @@ class StoredImpedance:
 
     draws: ImpedanceDraws | None = None
     steps: tuple[ImpedanceStep, ...] = ()
-
-
-@record
-class StoredCompensation:
-    """The margin of a plant whose friction is compensated from the speed, of which all but the draws is found again."""
-
-    draws: CompensationDraws | None = None
 
 
 @record(eq=False)
@@ -115,7 +107,7 @@ class StoredCertificate:
     remarks: tuple[str, ...] = ()
     friction: dict[str, StoredFriction] = field(default_factory=dict[str, StoredFriction])
     impedance: StoredImpedance | None = None
-    compensation: dict[str, StoredCompensation] = field(default_factory=dict[str, StoredCompensation])
+    compensation: dict[str, StoredFriction] = field(default_factory=dict[str, StoredFriction])
     constrained: ConstrainedRuns | None = None
     schedule: None = None
 

@@ -14,13 +14,12 @@ The same gains are predicted by describing functions (`amplitude_prediction`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from seaopt.codec import Fields, Key, OrInfinite, OrNaN
+from seaopt.codec import NullIs
 from seaopt.control import Controller, runnable
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.peaks import HALF_POWER
@@ -42,21 +41,6 @@ STATIC_HZ = 1e-3  # stands for 0 Hz
 LEAST_FRICTION, MOST_FRICTION, FRICTION_AMPLITUDES = 0.1, 50.0, 9  # times the dry friction: from stuck to sliding
 SLOWEST_STUCK = 15.0  # times slower than the bandwidth: where sweeps begin on a plant with friction
 PREDICTED_POINTS = 80
-
-
-@record(eq=False)
-class _StoredSweep:
-    """A sweep of amplitudes as its file holds it."""
-
-    plant: str
-    unit: str
-    amplitude_N: tuple[float, ...]
-    bandwidth_hz: tuple[float | None, ...]
-    predicted_hz: tuple[float | None, ...]
-    friction_N: float
-    saturation_map: Mapping[str, tuple[OrInfinite, ...]]
-    gain: Mapping[str, tuple[tuple[OrNaN, ...], ...]]
-    saturated: tuple[tuple[bool, ...], ...]
 
 
 @record(eq=False, repr=False)
@@ -88,43 +72,17 @@ class LargeSignal(Worded):
     """
 
     plot = PlotAccessor()
-    json_keys = (
-        "plant", "unit", "amplitude_N", "bandwidth_hz", "predicted_hz", "friction_N", "saturation_map",
-        Key(field="gain_parts", name="gain"), "saturated",
-    )  # fmt: skip
 
     plant: str
     frequency_hz: Float[np.ndarray, " f"]
     amplitude_N: Float[np.ndarray, " a"]
     gain: Complex[np.ndarray, "a f"]
     saturated: Bool[np.ndarray, "a f"]
-    onset_N: Float[np.ndarray, " f"]
+    onset_N: Annotated[Float[np.ndarray, " f"], NullIs(value=math.inf)]
     bandwidth_hz: tuple[float | None, ...]
     predicted_hz: tuple[float | None, ...]
     friction_N: float
     unit: str = LINEAR.unit
-
-    @property
-    def saturation_map(self) -> dict[str, Float[np.ndarray, " f"]]:
-        """The amplitudes from which the command saturates, by frequency, as a file has them."""
-        return {"frequency_hz": self.frequency_hz, "amplitude_N": self.onset_N}
-
-    @property
-    def gain_parts(self) -> dict[str, Float[np.ndarray, "a f"]]:
-        """The gain's real and imaginary parts, as a file has them."""
-        return {"re": np.real(self.gain), "im": np.imag(self.gain)}
-
-    @classmethod
-    def _from_json(cls, content: Annotated[Mapping[str, Any], Fields(of=_StoredSweep)]) -> LargeSignal:
-        saturation_map, gain = content["saturation_map"], content["gain"]
-        return cls(
-            **{name: content[name] for name in ("plant", "unit", "bandwidth_hz", "predicted_hz", "friction_N")},
-            frequency_hz=np.array(saturation_map["frequency_hz"]),
-            amplitude_N=np.array(content["amplitude_N"]),
-            gain=np.array(gain["re"]) + 1j * np.array(gain["im"]),
-            saturated=np.array(content["saturated"], dtype=bool),
-            onset_N=np.array(saturation_map["amplitude_N"]),
-        )
 
 
 def large_signal(
