@@ -210,7 +210,7 @@ def bring_up(
     def tune_one(spec: ControllerSpec) -> Controller:
         assert controller.design is not None
         plant = controller.design[0]
-        options = {"ranges": ranges, "samples": samples, "seed": seed + 1}
+        options: dict[str, Any] = {"ranges": ranges, "samples": samples, "seed": seed + 1}
         tuned = tune_certified(plant, uncertainty, spec, plants, **options).controller
         assert isinstance(tuned, Controller)  # of one specification
         return tuned

@@ -224,7 +224,7 @@ def _explain(
     ]
     excess = before - noise
     rated = [(difference, max(0.0, 1.0 - max(after - noise, 0.0) / excess)) for difference, after in tried]
-    rated.sort(key=lambda pair: -pair[1])
+    rated.sort(key=lambda pair: ALIKE * (pair[0].kind == "mode") - pair[1])  # a mode has four sizes
     listed: list[Difference] = []
     for difference, share in rated:
         twin = next(

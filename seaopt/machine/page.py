@@ -163,7 +163,8 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
     aside = ", ".join(_say_extent(part) for part in response.measured)
     remarks = [
         f"Each statement holds with a probability of {100.0 * response.confidence:g} %. Limits are those of the "
-        "specification with 5 % of grace, of the bandwidth 10 %. Nothing is said between the lines and beyond them."
+        "specification with 5 % of grace, of the bandwidth 10 %; with dry friction that of the plant that is stuck. "
+        "Nothing is said between the lines and beyond them."
     ]
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")

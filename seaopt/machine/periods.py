@@ -69,10 +69,13 @@ def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
     n = moving.size
     spectrum = np.abs(np.fft.rfft(moving, 2 * n)) ** 2
     like = np.fft.irfft(spectrum)[: n // 2 + 2]
-    like /= like[0]
+    like *= n / (like[0] * (n - np.arange(like.size)))  # as many rows at every lag
     inner = like[1:-1]
     peaks = 1 + np.flatnonzero((inner >= like[:-2]) & (inner >= like[2:]) & (inner > LIKE))
-    for lag in peaks[peaks >= SHORTEST].tolist():
+    near = np.unique(
+        np.concatenate([peaks - 1, peaks, peaks + 1])
+    )  # where a stretch ends the peak is beside the period
+    for lag in near[near >= SHORTEST].tolist():
         if np.mean(_find_repeated(reference, lag, size)) > REPEATS:
             return int(lag)
     return None

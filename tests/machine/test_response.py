@@ -10,9 +10,10 @@ import scipy.stats
 
 import seaopt as so
 from seaopt.machine.discs import Ratio
+from seaopt.machine.excitation import design_excitation
 from seaopt.machine.periods import cut_periods, find_period
 from seaopt.machine.ticks import take_ticks
-from tests.machine.simulator import Machine, multisine
+from tests.machine.simulator import Bench, Machine, multisine
 
 LINES = np.unique(np.round(np.geomspace(1, 150, 40)).astype(int))
 REFERENCE = multisine(1000, LINES, 10, 60.0, 3, bias=300.0)
@@ -126,3 +127,34 @@ def test_what_is_divided_by_nothing_sure_has_the_set_of_fieller():
     unsure = ~ratio.sure
     held, known = np.mean((np.abs(centre - truth) <= radius)[unsure]), np.mean(np.isfinite(radius[unsure]))
     assert np.mean(unsure) > 0.5 and held > 0.86 and known < 1.0
+
+
+FRICTION = 40.0
+
+
+@pytest.fixture(scope="module")
+def dry(compiler, tmp_path_factory):
+    """Return the bench of a law for a plant with dry friction, and its reference of six sets of phases."""
+    values = so.plants.thor().update(f_c=FRICTION, v_s=5e-3)
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0)
+    law = so.tune(so.plants.high_impedance(), values, spec)
+    played = design_excitation(law, share=0.5, bias=0.0, phases=6, periods=4, limits={"F1": 600.0}, seed=1)
+    return Bench(compiler, tmp_path_factory.mktemp("dry"), law), played.reference
+
+
+@pytest.mark.slow
+def test_with_dry_friction_the_machine_is_predicted_at_the_amplitude_that_was_played(dry):
+    bench, reference = dry
+    machine = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
+    right = so.accept(bench.controller, [bench.log(machine, reference)])
+    assert right.met and right.response.at_amplitude_only and right.differences.misfit < 2.0, right
+    stiff = so.accept(bench.controller, [bench.log(replace(machine, coulomb=2.0 * FRICTION), reference)])
+    first = stiff.differences.found[0]
+    assert not stiff.met and "f_c" in (first.name, *first.alike) and first.explains > 0.95, stiff
+
+
+def test_with_dry_friction_fewer_than_six_sets_of_phases_confirm_nothing(dry):
+    bench, reference = dry
+    log = bench.log(replace(Machine(), coulomb=FRICTION, smoothing=5e-3), reference[:8000])
+    response = so.accept(bench.controller, [log]).response
+    assert response.needs_phases and {row.outcome for row in response.judged} == {"undecided"}
