@@ -17,7 +17,7 @@ from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.plausibility import GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
-from seaopt.control.mpc.export import HEAT, SOURCES, set_gate, set_heat, write_code
+from seaopt.control.mpc.export import SOURCES, set_gate, set_heat, write_code
 from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ControlError, ProblemError
 from seaopt.files import exists, read_json, to_json
@@ -205,7 +205,7 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
             raise ProblemError("--derate: nothing is known of the motor's heat; tune on a plant with the part thermal")
         code = set_heat(code, guard if derate else None)
     folder = write_code(code, target, single_precision=options["precision"] == "float")
-    return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h", *([] if code.heat is None else [HEAT])))
+    return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h", *code.parts))
 
 
 def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:

@@ -6,6 +6,7 @@ from seaopt.control import MPCSpec
 from seaopt.errors import ProblemError
 from seaopt.options import list_options
 from seaopt.problem.option_tables import make_record
+from seaopt.problem.references import RESPONSE
 from seaopt.problem.schema import MPC, ControllerTable, MPCTable, ProblemTable
 
 PLANNED = {field.name for field in list_options(MPCSpec)}
@@ -29,7 +30,10 @@ def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
 
 
 def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
-    stated = sorted(controller.model_fields_set - {"plant", "measured", "structure", "gate", "derate", *SHARED})
+    taken = {"plant", "measured", "structure", "gate", "derate", *SHARED}
+    if all(name.startswith(RESPONSE) for name in controller.robust_to):  # which its linear region is certified on
+        taken.add("robust_to")
+    stated = sorted(controller.model_fields_set - taken)
     if stated:
         raise ProblemError(f'controller.{stated[0]} shapes gains, and structure = "mpc" has none; take it out')
     if not isinstance(controller.measured, str):
@@ -37,7 +41,5 @@ def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
             f'controller.measured = {list(controller.measured)}: structure = "mpc" reads one output; write measured = '
             f'"{controller.measured[0]}"'
         )
-    if table.impedance is not None:
-        raise ProblemError('[impedance] closes its loop around gains, and structure = "mpc" has none; take it out')
     if table.robustness is not None and table.robustness.retune:
         raise ProblemError('robustness.retune tunes gains, and structure = "mpc" has none; take it out')

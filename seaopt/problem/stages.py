@@ -149,7 +149,12 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
             f"{problem.response_names[0]}; name a plant there"
         )
     mpc = force_mpc(problem.design_plant, source, problem.mpc)
-    return replace(mpc, gate=_make_gate(problem, mpc), heat=mpc.heat_guard if _derates(problem, mpc) else None)
+    heat = mpc.heat_guard if _derates(problem, mpc) else None
+    mpc = replace(mpc, gate=_make_gate(problem, mpc), heat=heat)
+    if problem.table.impedance is None:
+        return mpc
+    (rendered,) = _add_impedance(problem, [(linear_controller(mpc), problem.values(source))])
+    return replace(mpc, outer=rendered.outer)
 
 
 def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:

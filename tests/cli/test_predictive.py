@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import seaopt as so
 from seaopt.control import export_mpc
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import to_json
-from seaopt.problem.stages import check_mpc_file, design_mpc
+from seaopt.problem.stages import certify_problem, check_mpc_file, design_mpc, tune_problem
 
 PLANNED = """
 schema = 1
@@ -74,6 +75,61 @@ def test_it_is_designed_certified_and_exported(planned, seaopt):
     content = json.loads((planned / "out" / "controller.json").read_text(encoding="utf-8"))
     with pytest.raises(so.SeaoptError, match="seaopt export"):
         so.export(content, planned / "law")
+
+
+def test_a_measured_response_is_certified_on_in_the_linear_region(folder):
+    chirp = """
+[[experiment]]
+name = "chirp"
+plant = "stand"
+virtual = { seed = 1, duration_s = 30, rate_hz = 1000, noise_std = { F1 = 1.0 }, excitation = { chirp = { amplitude = 2.0, f0_hz = 0.1, f1_hz = 200 } } }
+"""  # noqa: E501
+    text = PLANNED.replace("bandwidth_hz = 20", 'bandwidth_hz = 20\nrobust_to = ["frf:chirp"]')
+    (folder / "measured.toml").write_text(text + chirp, encoding="utf-8")
+    problem = so.read_problem(folder / "measured.toml")
+    controller = tune_problem(problem, problem.parameters)
+    certificate = certify_problem(problem, controller, problem.parameters)
+    assert any(row.plant == "frf:chirp" and row.name == "max_sensitivity" for row in certificate.requirements)
+    assert certificate.constrained.runs == 1
+
+
+RENDERED = """
+schema = 1
+[plant.stand]
+kind = "rotary"
+link = "locked"
+[plant.free]
+kind = "rotary"
+[controller]
+plant = "stand"
+measured = "tau_s"
+structure = "mpc"
+bandwidth_hz = 10
+max_sensitivity = 2.0
+max_complementary = 2.0
+current_limit_A = 9.0
+[impedance]
+plant = "free"
+stiffness = 20
+damping = 2.0
+velocity_filter_s = 0.005
+[robustness]
+samples = 3
+constrained_runs = 1
+"""
+
+
+def test_a_plan_renders_an_impedance_that_is_certified_and_exported(folder):
+    (folder / "rendered.toml").write_text(RENDERED, encoding="utf-8")
+    problem = so.read_problem(folder / "rendered.toml")
+    controller = tune_problem(problem, problem.parameters)
+    assert controller.outer.stiffness == 20.0 and controller.outer.plant == "free"
+    mpc = design_mpc(problem, problem.parameters)
+    assert pickle.loads(pickle.dumps(mpc)).outer == mpc.outer == controller.outer
+    rendering = so.certify(mpc, problem.certified_plants(), problem.parameters, samples=3, runs=1).impedance
+    assert rendering.plant == "free" and rendering.rendering.impedance.damping == 2.0
+    export_mpc(mpc, folder / "code")
+    assert "OUTER_STIFFNESS" in (folder / "code" / "outer.h").read_text(encoding="utf-8")
 
 
 WARMED = """

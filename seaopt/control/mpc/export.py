@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from seaopt.codec import Constraints, to_content
 from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
@@ -24,7 +25,6 @@ from seaopt.records import record
 CName = Annotated[str, Constraints(pattern=r"^[A-Za-z_]+$")]
 CText = Annotated[str, Constraints(pattern=r'^[^"\\\r\n]*$')]  # stands between quotation marks in C
 SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "arithmetic.h", "example.c")
-HEAT = "heat.h"  # of a controller with a heat guard
 
 
 @record(eq=False)
@@ -38,6 +38,14 @@ class MPCCode:
     hessian: Float[np.ndarray, "nv nv"]  # hessian, rows: of the program
     rows: Float[np.ndarray, "r nv"]
     heat: HeatGuard | None = None
+    outer: OuterLoop | None = None
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """The files of what stands around the plan, by name."""
+        heat, outer = self.heat, self.outer
+        files = {"heat.h": heat and _format_heat(heat), "outer.h": outer and _format_outer(outer)}
+        return {name: text for name, text in files.items() if text}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as they stand in controller.json."""
@@ -73,8 +81,8 @@ def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = Fa
     for name in SOURCES:
         write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
     write_text(target / "force_mpc_data.h", _format_data(code, single_precision))
-    if code.heat is not None:
-        write_text(target / HEAT, _format_heat(code.heat))
+    for name, part in code.parts.items():
+        write_text(target / name, part)
     return target
 
 
@@ -86,7 +94,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "COMPUTE_DELAY_SAMPLES": mpc.compute_delay_samples,
         "KNOTS": prediction.knots.size, "ROWS": len(prediction.rows), "SLEWS": len(prediction.M),
         "SIGNALS": len(outputs.names), "SAMPLES": outputs.samples, "PREVIEW": spec.preview_samples,
-        "HORIZON": spec.samples, "MAX_ITERATIONS": spec.max_iterations,
+        "HORIZON": spec.samples, "MAX_ITERATIONS": spec.max_iterations, "OUTER": int(mpc.outer is not None),
     }  # fmt: skip
     numbers = {
         "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
@@ -112,6 +120,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         arrays={name: value for name, value in arrays.items() if value.size},
         hessian=stack_hessian(prediction),
         rows=prediction.rows,
+        outer=mpc.outer,
     )
     return set_heat(set_gate(code, mpc.gate, spec.sample_time_s), mpc.heat)
 
@@ -159,14 +168,27 @@ def _format_heat(heat: HeatGuard) -> str:
         "RESISTANCE": heat.resistance, "RESISTANCE_SLOPE": heat.slope, "ALLOWED_RISE": heat.allowed_rise,
         "APPROACH": heat.share,
     }  # fmt: skip
-    code = resources.files("seaopt.control.deploy").joinpath("templates", "heat.c").read_text(encoding="utf-8")
     lines = [
         f"/* Rises in K above an ambient temperature of {heat.ambient:g} degC. */",
         f"static const double HEAT_A[2][2] = {{{{{heat.a_11!r}, {heat.a_12!r}}}, {{{heat.a_21!r}, {heat.a_22!r}}}}};",
         f"static const double HEAT_B[2] = {{{heat.b_1!r}, {heat.b_2!r}}};",
         *(f"static const double {name} = {value!r};" for name, value in names.items()),
     ]
-    return "\n".join([*lines, "", code])
+    return "\n".join([*lines, "", _read_template("heat.c")])
+
+
+def _format_outer(outer: OuterLoop) -> str:
+    """Return the outer loop as C: its numbers, the direction in its gains, and the text that laws have."""
+    numbers = {
+        "OUTER_STIFFNESS": outer.direction * outer.stiffness, "OUTER_DAMPING": outer.direction * outer.damping,
+        "OUTER_POLE": outer.pole, "OUTER_RATE": outer.rate,
+    }  # fmt: skip
+    lines = [f"static const real {name} = {_format_number(value)};" for name, value in numbers.items()]
+    return "\n".join([f"/* {outer.describe()}. */", *lines, "", _read_template("outer.c")])
+
+
+def _read_template(name: str) -> str:
+    return resources.files("seaopt.control.deploy").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _format_number(value: float) -> str:

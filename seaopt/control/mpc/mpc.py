@@ -41,6 +41,7 @@ from seaopt.control.loops.absolute_stability import FrictionMargin, friction_mar
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, read_conditions, sample
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
@@ -103,6 +104,9 @@ class ForceMPC(LoopDelays, Result, Worded):
         current goes to zero.
     heat : HeatGuard, optional
         What lowers the limit of the command as the winding warms up; the plan keeps the lowered one.
+    outer : OuterLoop, optional
+        What makes the reference of a stiffness and a damping at the link (`seaopt.control.add_impedance`); its `step`
+        comes before this one's.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
     """
@@ -118,17 +122,13 @@ class ForceMPC(LoopDelays, Result, Worded):
     solver: QuadraticProgram
     gate: PlausibilityGate | None = None
     heat: HeatGuard | None = None
+    outer: OuterLoop | None = None
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _design, (
-            *self.design,
-            self.spec,
-            self.gate,
-            self.heat,
-            self.warnings,
-        )  # what it remembers does not pickle
+        parts = self.gate, self.heat, self.outer, self.warnings
+        return _design, (*self.design, self.spec, *parts)  # what it remembers does not pickle
 
     @property
     @memo
@@ -519,7 +519,7 @@ def force_mpc(
         )
     warnings = warn_delays(spec, plant, params)
     spec, values = settle_delays(spec, plant, params, plans=True)
-    return _design(plant, values, spec, gate, heat, warnings)
+    return _design(plant, values, spec, gate, heat, None, warnings)
 
 
 def _find_possible(mpc: ForceMPC) -> float | None:
@@ -541,6 +541,7 @@ def _design(
     spec: MPCSpec,
     gate: PlausibilityGate | None = None,
     heat: HeatGuard | None = None,
+    outer: OuterLoop | None = None,
     warnings: tuple[str, ...] = (),
 ) -> ForceMPC:
     """Return the controller of a specification whose delay is settled; friction slides in its model."""
@@ -596,6 +597,7 @@ def _design(
         solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate,
         heat=heat,
+        outer=outer,
         warnings=warnings,
     )
 

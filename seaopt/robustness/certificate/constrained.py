@@ -90,7 +90,7 @@ def linear_controller(mpc: ForceMPC) -> Controller:
     """
     law = mpc.law  # its integrator apart: rounding leaves that pole on either side of the unit circle
     split = Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
-    return assess(split, *mpc.design, linear_spec(mpc.spec))
+    return replace(assess(split, *mpc.design, linear_spec(mpc.spec)), outer=mpc.outer)
 
 
 def linear_spec(spec: MPCSpec) -> ControllerSpec:

@@ -24,6 +24,14 @@ static int finite_number(real x) { return x - x == 0; }
 /* Of what is given: finite, and within a range in which nothing that follows overflows. */
 static int is_number(real x) { return x >= (real)-1e15 && x <= (real)1e15; }
 
+#if FORCE_MPC_OUTER
+#include "outer.h"
+
+real force_mpc_outer(force_mpc *s, real reference, real position) {
+  return outer_reference(&s->outer_state, &s->outer_known, &s->outer_last, reference, position);
+}
+#endif
+
 static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
 
 /* The limit of the command at this sample. */

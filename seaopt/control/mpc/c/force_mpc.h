@@ -23,6 +23,10 @@ typedef struct {
   unsigned long refused;          /* measurements in a row that were not believed */
   force_mpc_real measurement;          /* the last that was */
   int known;                      /* whether there was one */
+#if FORCE_MPC_OUTER
+  force_mpc_real outer_state, outer_last; /* what is taken off the link's next difference, the last reference asked */
+  int outer_known;
+#endif
 #if FORCE_MPC_HEAT
   double rise_winding, rise_case; /* K above the ambient, as estimated; a reset takes both for cold */
   double limit;                   /* of the command at this sample: it falls as the winding warms up */
@@ -42,6 +46,12 @@ void force_mpc_reset(force_mpc *s);
  * (FORCE_MPC_DELAYS has both), so do not wait for it.
  * A measurement that is not finite or beyond +-1e15 is predicted; such a reference leaves the last one. */
 force_mpc_real force_mpc_step(force_mpc *s, force_mpc_real reference, force_mpc_real measurement);
+
+#if FORCE_MPC_OUTER
+/* Once a sample, before force_mpc_step: the reference that renders the impedance, of where the link is to be and where it
+ * is, in m or rad, read in the same sample as the measurement. Where either is no number the last one stands. */
+force_mpc_real force_mpc_outer(force_mpc *s, force_mpc_real reference, force_mpc_real position);
+#endif
 
 /* The same with references known ahead: `count` of them, of this sample and of those that follow, the last of which is
  * held. More than 1 + FORCE_MPC_PREVIEW are not read. */
