@@ -59,14 +59,10 @@ def critical_impedance(
 
     Parameters
     ----------
-    controller : Controller
-        Tuned, or a law of one's own (`seaopt.assess`).
-    plant, parameters
-        The actuator with its link, which moves; linearised at rest, sliding where it has friction.
+    controller, plant, parameters, velocity_filter_s
+        As `seaopt.control.passive_region`.
     stiffness : float
         K_v, N/m or N m/rad.
-    velocity_filter_s : float, optional
-        T_v of the speed; one sample if left out.
 
     Returns
     -------

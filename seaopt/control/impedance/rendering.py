@@ -154,14 +154,10 @@ def render(
 
     Parameters
     ----------
-    controller : Controller
-        Tuned, or a law of one's own (`seaopt.assess`).
-    plant, parameters
-        The actuator with its link, which moves; linearised at rest, sliding where it has friction.
+    controller, plant, parameters, link_damping
+        As `seaopt.control.passive_region`.
     impedance : Impedance
         Stiffness, damping and the filter of the speed.
-    link_damping : float, optional
-        The damper at the link, in place of its own.
 
     Returns
     -------
@@ -215,12 +211,8 @@ def add_impedance(
 
     Parameters
     ----------
-    controller : Controller
-        Tuned, or a law of one's own (`seaopt.assess`).
-    plant, parameters
-        The actuator with its link, which moves.
-    impedance : Impedance
-        Stiffness, damping and the filter of the speed.
+    controller, plant, parameters, impedance
+        As `seaopt.control.render`.
     name : str
         Of the plant, among those that are certified; the first whose link moves if left out.
 

@@ -42,6 +42,7 @@ from jaxtyping import Complex, Float
 from scipy.special import polygamma
 
 from seaopt.control.impedance.link import ControlledLink
+from seaopt.control.loops.absolute_stability import refine_angles
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.outer_loop import Impedance
 from seaopt.records import record
@@ -122,11 +123,8 @@ class SampledPort:
         """Return angles from nearly static to the Nyquist frequency, close about the modes of plant and loop."""
         period = self.link.sample_time_s
         held = self.held_poles()
-        closed = np.log(held[np.abs(held) > 1e-6]) / period
-        poles = self.link.port.find_poles()
-        at, width = np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
-        at = 2 * np.pi * np.concatenate([at, np.abs(closed.imag) / (2 * np.pi)])
-        width = 2 * np.pi * np.concatenate([width, np.abs(closed.real) / (2 * np.pi)])
+        poles = np.concatenate([self.link.port.find_poles(), np.log(held[np.abs(held) > 1e-6]) / period])
+        at, width = np.abs(np.imag(poles)), np.abs(np.real(poles))
         around = at[:, None] + width[:, None] * np.concatenate([-NEAR_MODES, [0.0], NEAR_MODES])
         folded = np.abs((around.ravel() * period + np.pi) % (2 * np.pi) - np.pi)
         lowest = 2 * np.pi * LOWEST_HZ * period
@@ -171,7 +169,7 @@ class SampledPort:
             at = int(np.argmin(margin))
             if margin[at] < least:
                 least, worst = float(margin[at]), float(angles[at])
-            angles = _about_dips(angles, margin)
+            angles = refine_angles(angles, margin, DIPS, POINTS_PER_DIP)
         return least, worst
 
     def find_failing_hz(self, impedance: Impedance, damper: float) -> Float[np.ndarray, " m"]:
@@ -185,22 +183,13 @@ class SampledPort:
 
     def refine(self, impedance: Impedance, damper: float, theta: Angles) -> Float[np.ndarray, " new"]:
         """Return new angles about those at which an impedance is least passive."""
-        return _about_dips(theta, self.terms(theta, damper).margin_of(impedance))
+        return refine_angles(theta, self.terms(theta, damper).margin_of(impedance), DIPS, POINTS_PER_DIP)
 
     def _find_floor(self) -> float:
         """Return what the actuator's own port dissipates at the highest frequencies: its spring's damper."""
         f = np.array([1e6, 1e7]) / self.link.sample_time_s
         low, high = np.maximum(np.real(self.link.port.response(f).motion_to_port), 0.0)
         return float(high) if high > 0.5 * low > 0.0 else 0.0
-
-
-def _about_dips(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
-    """Return new angles, about the least values."""
-    beside = np.concatenate([values[:1], values, values[-1:]])
-    dips = np.flatnonzero(values <= np.minimum(beside[:-2], beside[2:]))
-    dips = dips[np.argsort(values[dips], kind="stable")][:DIPS]
-    low, high = np.maximum(dips - 1, 0), np.minimum(dips + 1, values.size - 1)
-    return np.unique(np.linspace(theta[low], theta[high], POINTS_PER_DIP))
 
 
 def _add_beyond(terms: Aliases, over_floor: Float[np.ndarray, "m k"], theta: Angles) -> Complex[np.ndarray, "m new"]:

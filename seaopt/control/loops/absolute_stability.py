@@ -319,13 +319,15 @@ def choose_angles(loop: FrictionLoop) -> Angles:
     return np.unique(np.concatenate([even, folded[folded >= LOWEST_ANGLE]]))
 
 
-def refine_angles(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
+def refine_angles(
+    theta: Angles, values: Angles, most_dips: int = REFINED_DIPS, points: int = POINTS_PER_DIP
+) -> Float[np.ndarray, " new"]:
     """Return new angles, about the least values of a test."""
     beside = np.concatenate([values[:1], values, values[-1:]])
     dips = np.flatnonzero(values <= np.minimum(beside[:-2], beside[2:]))
-    dips = dips[np.argsort(values[dips], kind="stable")][:REFINED_DIPS]
+    dips = dips[np.argsort(values[dips], kind="stable")][:most_dips]
     low, high = np.maximum(dips - 1, 0), np.minimum(dips + 1, values.size - 1)
-    return np.unique(np.linspace(theta[low], theta[high], POINTS_PER_DIP))
+    return np.unique(np.linspace(theta[low], theta[high], points))
 
 
 def list_multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:

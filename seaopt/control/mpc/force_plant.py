@@ -22,6 +22,11 @@ class ForcePlant:
     gain: float  # N/A at rest
     sample_time_s: float
 
+    @property
+    def rest(self) -> Float[np.ndarray, " nx"]:
+        """The state at rest per unit of command."""
+        return np.linalg.solve(np.eye(self.b.size) - self.a, self.b + self.late)
+
     def add_command(self) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
         """Return A and b of the plant with its last command as a state, driven by the command's increments."""
         nx = self.b.size

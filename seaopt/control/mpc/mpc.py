@@ -592,7 +592,7 @@ def _design(
         regulator=regulator,
         prediction=prediction,
         static_gain=gain,
-        rest=np.linalg.solve(np.eye(nx) - digital.a, digital.b),
+        rest=sampled.rest,
         shift=shift,
         solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate,

@@ -90,7 +90,7 @@ def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
     from scipy.optimize import brentq  # deferred: scipy is slow to load
 
     A, b = plant.add_command()
-    resting = np.linalg.solve(np.eye(plant.b.size) - plant.a, plant.b + plant.late) / plant.gain  # x_s per newton
+    resting = plant.rest / plant.gain  # x_s per newton
     below, row = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW), np.append(plant.c, 0.0)
 
     def tracking(candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
