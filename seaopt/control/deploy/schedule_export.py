@@ -76,11 +76,12 @@ def describe_schedule(
     rows = {**table.columns, SHARE: law.anti_windup, **_list_varying(law)}
     signals = [f"read_{identifier(name)}" for name in (first["reads"] or list_names(first["spec"].measured))[1:]]
     terms = law.compensation or Compensation(sample_time_s=law.sample_time_s)
-    at_rest = {term.reads for term in (terms.gravity, terms.ripple) if term is not None}
+    integrators = table.integrates or "T_v" in table.gains or bool(table.nominals)
+    at_rest = {term.reads for term in (terms.gravity, terms.ripple if integrators else None) if term is not None}
     resets = [f"read_{identifier(name)}" for name in terms.reads if name in at_rest]
     return {
         **_trace(law, f"reference_{name_unit(first['command'])}", list(rows), signals, number),
-        "integrators": table.integrates or "T_v" in table.gains or bool(table.nominals),
+        "integrators": integrators,
         "resets": [name for name in resets if name not in signals],
         "over": strip_markup(table.over),
         "over_unit": strip_markup(table.unit),
