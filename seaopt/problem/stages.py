@@ -435,23 +435,28 @@ def certify_problem(
         return certify(controller, plants, source, seed=table.seed, measured=measured)
     law = controller.controllers[0] if isinstance(controller, ScheduledController) else controller
     read = list_readings(law, plants)
-    options: dict[str, Any] = {
-        "ranges": problem.ranges, "others": problem.parameters, "samples": table.samples, "seed": table.seed,
-        "max_failure_probability": table.max_failure_probability, "command_step": table.step,
-        "sensors": problem.sensors.of(read),  # the file may name those of its other laws
-        "executor": executor, "progress": progress,
-    }  # fmt: skip
-    options |= {"bounds": Budget() if table.bounds else None, "min_friction_margin": table.min_friction_margin}
-    if isinstance(controller, ScheduledController):
-        assert problem.schedule is not None
-        return certify(controller, plants, source, min_rate=problem.schedule.min_rate, measured=measured, **options)
-    if problem.mpc is None:
-        certificate = certify(controller, plants, source, measured=measured, **options)
-    else:
-        options |= {"runs": table.constrained_runs, "bound_tolerance": table.bound_tolerance}
-        certificate = certify(design_mpc(problem, source), plants, source, measured=measured, **options)
+    certificate = certify(
+        controller if problem.mpc is None else design_mpc(problem, source),
+        plants,
+        source,
+        ranges=problem.ranges,
+        others=problem.parameters,
+        samples=table.samples,
+        seed=table.seed,
+        max_failure_probability=table.max_failure_probability,
+        min_friction_margin=table.min_friction_margin,
+        min_rate=None if problem.schedule is None else problem.schedule.min_rate,
+        runs=table.constrained_runs,
+        bound_tolerance=table.bound_tolerance,
+        bounds=Budget() if table.bounds else None,
+        sensors=problem.sensors.of(read),  # the file may name those of its other laws
+        command_step=table.step,
+        measured=measured,
+        executor=executor,
+        progress=progress,
+    )
     unread = [name for name in problem.sensors.names if name not in read]
-    if not unread:
+    if not unread or isinstance(certificate, ScheduleCertificate):
         return certificate
     note = f"errors of {', '.join(unread)} in sensors are in no run: the law reads {', '.join(read)}"
     return replace(certificate, remarks=(*certificate.remarks, note))

@@ -12,7 +12,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from types import NoneType
-from typing import Any, overload
+from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -68,13 +68,37 @@ CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, wh
 STEPS, SIMULATIONS = 1.0, 3.5  # seconds that a plant takes as a rule
 
 
+class CertifyKeywords(TypedDict, total=False):
+    """The keywords of `certify`, for type checkers: which certificate it returns is up to its subject."""
+
+    ranges: Ranges | None
+    others: ParameterSet | None
+    samples: int
+    seed: int
+    confidence: float
+    max_failure_probability: float | None
+    min_friction_margin: float | None
+    min_rate: float | None
+    runs: int
+    bound_tolerance: float
+    bounds: Budget | None
+    simulations: bool
+    sensors: Sensors | None
+    command_step: float
+    measured: Mapping[str, MeasuredResponse] | None
+    executor: Executor | None
+    progress: Progress
+
+
 @overload
 def certify(
-    subject: ScheduledController, plants: Plants, parameters: Source, **options: Any
+    subject: ScheduledController, plants: Plants, parameters: Source, **options: Unpack[CertifyKeywords]
 ) -> ScheduleCertificate: ...
 @overload
-def certify(subject: Controller | ForceMPC, plants: Plants, parameters: Source, **options: Any) -> Certificate: ...
-def certify(  # pyright: ignore[reportInconsistentOverload]  # of which keywords there are, once
+def certify(
+    subject: Controller | ForceMPC, plants: Plants, parameters: Source, **options: Unpack[CertifyKeywords]
+) -> Certificate: ...
+def certify(
     subject: Controller | ForceMPC | ScheduledController,
     plants: Plants,
     parameters: Source,
