@@ -365,6 +365,12 @@ def with_everything(tuned):
     return json.loads(to_json(controller.to_dict()))
 
 
+def test_a_file_with_its_terms_beside_its_blocks_is_refused(with_everything):
+    older = {name: value for name, value in with_everything.items() if name not in ("blocks", "terms")}
+    with pytest.raises(FileError, match=r"key (blocks|terms) is missing; tune again"):
+        read_controller(older | with_everything["blocks"] | {"compensation": with_everything["terms"]})
+
+
 NUMBERS = [
     *[("gains", name) for name in ("k_p", "k_i", "k_d", "T_f", "k_r", "c", "T_q", "notch_frequency_hz", "notch_width",
                                    "notch_depth", "prefilter_corner_hz", "prefilter_damping")],

@@ -56,3 +56,8 @@ def test_a_mistake_is_one_line_with_place_value_and_remedy(keys, value, words):
     message = str(raised.value)
     assert message.startswith("robustness.json: ") and words in message
     assert message.endswith("; certify again") and "\n" not in message
+
+
+def test_a_file_of_an_older_version_is_refused_with_what_to_do():
+    with pytest.raises(FileError, match=r'"seaopt/robustness/3"; certify again'):
+        read_certificate(seal(CONTENT | {"schema": "seaopt/robustness/2"}))
