@@ -13,7 +13,7 @@ from seaopt.control.laws.command import Command, actuation_notes, limit_notes, n
 from seaopt.control.laws.delay import LoopDelays, place_drive_delay
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.plausibility import PlausibilityGate
-from seaopt.control.laws.spec import ControllerSpec, describe_lifted
+from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.stored import (
     CONTROLLER_SCHEMA,
     check_achieved,
@@ -243,14 +243,9 @@ class Controller(LoopDelays, Result, Worded):
         return f"{self.spec.bandwidth_hz:g} Hz is blocked by {blocked}{remedy}"
 
     @property
-    def lifted_notes(self) -> tuple[str, ...]:
-        """A remark on every limit that the specification lifts."""
-        return describe_lifted(self.spec)
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
-        always = (*self.lifted_notes, *map(str, self.measured))
+        always = (*self.spec.lifted_notes, *map(str, self.measured))
         if self.design is None:
             return always
         plant, values = self.design

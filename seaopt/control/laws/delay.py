@@ -16,7 +16,7 @@ from typing import Any, ClassVar, TypeVar
 import casadi as ca
 import numpy as np
 
-from seaopt.control.laws.limits import Limit
+from seaopt.control.laws.limits import BY_NAME, LIFTABLE, Limit
 from seaopt.control.loops.sampled_plant import (
     DRIVE_DELAY,
     add_drive_delay,
@@ -74,6 +74,16 @@ class LoopSpec:
     def allowed(self, limit: Limit) -> float | None:
         """Return the value that a limit allows; None where it is not imposed."""
         return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
+
+    @property
+    def lifted(self) -> tuple[str, ...]:
+        """The limits with a default that are not imposed."""
+        return tuple(name for name in LIFTABLE if getattr(self, name, None) is False and BY_NAME[name].is_default)
+
+    @property
+    def lifted_notes(self) -> tuple[str, ...]:
+        """A remark on each of them."""
+        return tuple(f"{name} = false: this limit is not imposed" for name in self.lifted)
 
 
 class LoopDelays:

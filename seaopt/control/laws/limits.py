@@ -338,6 +338,7 @@ LIMITS = (
 BY_NAME = {limit.name: limit for limit in LIMITS}
 BY_REQUIREMENT = {limit.requirement or limit.name: limit for limit in LIMITS}
 FIELDS = tuple(limit for limit in LIMITS if limit.has_field)
+LIFTABLE = (*(limit.name for limit in FIELDS if limit.above is not None), "min_sensitivity_bandwidth_hz")
 
 
 @cache

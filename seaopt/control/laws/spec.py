@@ -9,7 +9,7 @@ from typing import Any, Literal
 from seaopt.codec import to_content
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.delay import LoopSpec, check_delays, count_response_samples
-from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, FIELDS, LIMITS, Limit, list_given_limits
+from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, BY_NAME, LIFTABLE, LIMITS, Limit, list_given_limits
 from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.structures import (
     CASCADE,
@@ -33,8 +33,6 @@ from seaopt.options import check_options, option
 from seaopt.records import record
 
 Level = float | Literal[False] | None  # of a limit: None is its default, False lifts it
-LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
-LIFTABLE = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz")
 MAX_DELAY_SAMPLES = 1000
 HIGHEST_CORNER = 0.45  # of the sample rate: of a filter that is part of the law
 
@@ -259,11 +257,6 @@ class ControllerSpec(LoopSpec):
         return self.allowed(BY_NAME[name])
 
     @property
-    def lifted(self) -> tuple[str, ...]:
-        """The limits with a default that are not imposed."""
-        return list_lifted(self)
-
-    @property
     def sensitivity_bandwidth_limit_hz(self) -> float:
         """The smallest allowed sensitivity bandwidth: as given, or bandwidth_hz/5."""
         return self.level("min_sensitivity_bandwidth_hz") or 0.0
@@ -317,13 +310,3 @@ def check_command_limits(current_limit_A: float | None, command_limit: float | N
         if value is not None and not 0.0 < value <= LARGEST and value != math.inf:
             kind = "not positive" if not value > 0.0 else f"above {LARGEST:g}"
             raise ControlError(f"{name} = {value:g} is {kind}; give the motor's limit")
-
-
-def list_lifted(spec: object) -> tuple[str, ...]:
-    """Return the limits with a default that a specification, of whatever law, does not impose."""
-    return tuple(name for name in LIFTABLE if getattr(spec, name, None) is False and BY_NAME[name].is_default)
-
-
-def describe_lifted(spec: object) -> tuple[str, ...]:
-    """Return a remark on every limit that a specification lifts."""
-    return tuple(f"{name} = false: this limit is not imposed" for name in list_lifted(spec))

@@ -91,7 +91,6 @@ SpeedLaw = Literal["P", "PI"]
 PrefilterOrder = Literal["first_order", "second_order"]
 PREFILTER_ORDERS: tuple[PrefilterOrder, ...] = ("first_order", "second_order")
 ReferenceWeights = Literal["tuned", "error", "measurement"]
-REFERENCE_WEIGHTS: tuple[ReferenceWeights, ...] = ("tuned", "error", "measurement")
 CASCADE: Structure = "cascade"
 TUNED: tuple[Structure, ...] = ("pd", "pid", "pid_dob", CASCADE)
 CUSTOM: Structure = "custom"  # a law that is given, and that no gains describe

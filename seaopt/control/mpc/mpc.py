@@ -35,7 +35,6 @@ from seaopt.control.laws.delay import LoopDelays, settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.realisation import check_guards
-from seaopt.control.laws.spec import describe_lifted
 from seaopt.control.laws.verdict import LimitVerdict, explain_broken, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
 from seaopt.control.loops.friction_loop import make_friction_loops
@@ -250,7 +249,7 @@ class ForceMPC(LoopDelays, Result, Worded):
         """Remarks besides the limits, one sentence each."""
         proof = () if self.friction is None else (f"{self.friction}, while no limit is active",)
         limit = limit_notes(self.actuation, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
-        return (*describe_lifted(self.spec), *self.warnings, *limit, *proof)
+        return (*self.spec.lifted_notes, *self.warnings, *limit, *proof)
 
     @property
     def start(self) -> MPCState:

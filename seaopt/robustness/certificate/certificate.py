@@ -372,7 +372,7 @@ class Certificate(Result, Worded):
             and draws.failure_probability_bound > UNINFORMATIVE_BOUND
         ):
             yield f"so few draws say little: a failure probability below {draws.failure_probability_bound:.2g}"
-        yield from self.controller.lifted_notes
+        yield from self.controller.spec.lifted_notes
         if self.models and not self.controller.spec.allowed(BY_NAME["max_reference_peak"]):
             yield "the overshoot of steps is not judged: no max_reference_peak is asked for"
 

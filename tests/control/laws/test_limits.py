@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
-from seaopt.control.laws.spec import LIFTABLE
+from seaopt.control.laws.limits import BY_NAME, FIELDS, LIFTABLE, LIMITS, MeasuredLoop, PortFigures
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal
 from seaopt.control.laws.verdict import (
     explain_broken,
