@@ -48,6 +48,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import record
 from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import PEAK_GRACE, SETTLED
+from seaopt.units import show_command
 
 SHARES = tuple(2.0**power for power in range(-7, 0))  # of the least bandwidth: frequencies of the sweeps
 PULSE_PERIODS = 10.0  # of the least bandwidth, that a pulse lasts, and a pause
@@ -251,9 +252,15 @@ class RestStart:
 
     def run(self, plant: Plant, values: ParameterSet, references: Rows, places: Signal | float = math.nan) -> LoopRun:
         """Return runs of the loop from there, of a plant that has these states; references count from there, and
-        `places` are for a plant that does not have the variable.
+        `places` are for a plant that does not have the variable. Raises SimulationError: to hold it there takes
+        more than the command's limit.
         """
         law, value = self.schedule.runnable(), self.value
+        if abs(self.command) > law.command_limit:
+            needed, limit = (show_command(value, *law.command) for value in (abs(self.command), law.command_limit))
+            raise SimulationError(
+                f"{needed} holds it at {self.schedule.over} = {self.value:.4g}, above the limit of {limit}"
+            )
         fed = np.array([self.readings[name] for name in self.schedule.controllers[0].signals])
         loop = SampledLoop(
             plant=plant,

@@ -1,11 +1,15 @@
 """A plant that moves its own scheduling variable, against SciPy's integrator with the law written out here."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from seaopt.robustness.verification import schedule_motion
 from seaopt.robustness.verification.schedule_motion import describe_motion, move_schedule
+from seaopt.robustness.verification.schedule_sweep import sweep_schedule
 from tests.schedules import read_knee, tune_knee
 
 L_A, K, MASS, B, FORCE = 0.0725, 655e3, 294.0, 11600.0, 240.0  # problems/lever_knee.toml
@@ -100,3 +104,16 @@ def test_a_link_too_heavy_for_the_rate_asked_shows_less():
 def test_a_plant_that_holds_the_variable_is_not_pushed():
     schedule, (stand, _, values) = tune_knee(), read_knee()
     assert move_schedule(schedule, "stand", stand, values, RATE) is None
+
+
+def test_a_weight_beyond_the_command_is_a_finding_and_no_error():
+    """The law cannot be started where the plant rests: 0.23 A hold the shank in the middle."""
+    schedule, (_, swing, values) = tune_knee(), read_knee()
+    weak = [replace(law, spec=replace(law.spec, current_limit_A=0.2)) for law in schedule.controllers]
+    schedule = replace(schedule, controllers=tuple(weak))
+    motion = move_schedule(schedule, "swing", swing, values, RATE)
+    middle = 0.5 * schedule.points[-1]
+    needed = MGL * math.sin(middle) / (L_A * math.cos(middle)) / FORCE
+    assert f"{needed:.4g} A" in motion.fault and motion.rate == 0.0
+    (sweep,) = sweep_schedule(replace(schedule, points=(0.4, 0.5, 0.65)), "swing", swing, values)
+    assert "limit of 0.2 A" in sweep.fault
