@@ -367,17 +367,12 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
             f"the law measures {regulated}, and [controller] of {problem.source} {problem.spec.regulated}; "
             f'correct one of them: measured = "{regulated}"'
         )
-    if problem.designs_on_response:
-        raise ProblemError(
-            f"{problem.source}: a law of one's own is measured on a model, and [controller] is designed on "
-            f"{problem.response_names[0]}; name a plant there, and the response in robust_to"
-        )
     at_its_rate = replace(problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, measured=measured)
     spec = replace(at_its_rate, **_choose_delays(problem.spec, given))
     _check_drive_delay(problem, given, spec, source)
-    design, values = problem.design_plant, problem.values(source, spec)
-    _, robust_to = list_plants(problem, source, spec)
-    law = given.to_effort(command_of(design, values, spec.regulated).per_effort)
+    values = problem.values(source, spec)
+    design, robust_to = list_plants(problem, source, spec)
+    law = given.to_effort(command_of(problem.design_plant, values, spec.regulated).per_effort)
     controller = assess(law, design, values, spec, robust_to, draws=problem.draws(source))
     return complete_controller(problem, controller, source)
 
@@ -432,7 +427,9 @@ def certify_problem(
     """
     table, plants, measured = problem.robustness, problem.certified_plants(), problem.measure_responses(source)
     if isinstance(controller, Controller) and problem.designs_on_response:
-        return certify(controller, plants, source, seed=table.seed, measured=measured)
+        if not plants:
+            return certify(controller, plants, source, seed=table.seed, measured=measured)
+        controller = replace(controller, design=(problem.design_plant, problem.values(source)))
     law = controller.controllers[0] if isinstance(controller, ScheduledController) else controller
     read = list_readings(law, plants)
     certificate = certify(

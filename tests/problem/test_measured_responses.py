@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -61,6 +62,47 @@ def test_a_response_is_read_with_the_delay_that_its_experiment_has(write):
 
 
 @pytest.mark.slow
+def test_an_observer_has_the_plant_on_the_bench_for_its_nominal_one(write):
+    """The static gain of its inverse is that which was measured, as the reference's weight is."""
+    path = write("frf:chirp", "")
+    path.write_text(path.read_text().replace("max_sens", 'structure = "pid_dob"\nmax_sens'))
+    problem = so.read_problem(path)
+    controller = tune_problem(problem, problem.parameters)
+    design, _ = list_plants(problem, problem.parameters)
+    measured = controller.spec.see_response(design, controller.command).static_gain
+    assert controller.met and controller.observer is not None
+    assert controller.observer.nominal.static_inverse == pytest.approx(1.0 / measured, rel=1e-9)
+    # Open loop of the test's own: the sampled stand of the model, which is what was measured but for noise.
+    loop = controller.close(problem.design_plant, problem.parameters)
+    assert np.max(np.abs(loop.eigenvalues())) < 1.0
+    assert loop.figures().ms < 1.7 and loop.figures().bandwidth_hz == pytest.approx(30.0, rel=0.05)
+
+
+def test_models_beside_the_response_are_certified_too(write):
+    """The response has the design's limits, models those of every plant: a bandwidth is asked of the response alone."""
+    path = write("frf:chirp", "")
+    text = path.read_text().replace("samples = 50", 'samples = 5\nplants = ["stand"]\nparameters = { k = [6e5, 7e5] }')
+    path.write_text(text)
+    problem = so.read_problem(path)
+    controller = tune_problem(problem, problem.parameters)
+    certificate = certify_problem(problem, controller, problem.parameters)
+    bands = [row for row in certificate.requirements if row.name == "bandwidth_hz"]
+    assert [row.text.startswith("on measured points") for row in bands] == [True]
+    assert certificate.monte_carlo.samples == 5 and set(certificate.plants) == {"stand"}
+    assert certificate.met, [row for row in certificate.requirements if not row.met]
+
+
+def test_a_law_of_ones_own_is_measured_on_the_response(write, tmp_path):
+    path = write("frf:chirp", "")
+    problem = so.read_problem(path)
+    tuned = tune_problem(problem, problem.parameters)
+    own = so.control.assess(
+        tuned.law, list_plants(problem, problem.parameters)[0], problem.parameters, problem.spec
+    )  # fmt: skip
+    assert own.structure == "custom" and own.design is None
+    assert own.achieved.ms == pytest.approx(tuned.achieved.ms, rel=1e-9)
+
+
 def test_a_schedule_keeps_its_limits_on_a_response_at_the_point_where_it_was_taken(write, tmp_path):
     """The stand was measured with its own spring, which is a point; the other spring is known of the model alone."""
     path, own = write(), 655000

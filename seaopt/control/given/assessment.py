@@ -12,19 +12,19 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.sampled_plant import find_signals, list_names
-from seaopt.control.tuning.tuner import RobustTo, describe_law, make_task
+from seaopt.control.tuning.tuner import RobustTo, describe_law, make_task, name_design
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.plant import require_plant
 
 SAME_RATE = 1e-9  # share by which a law's sample rate may be off the specification's
 
 
 def assess(
     law: Any,
-    plant: Plant,
+    plant: Plant | MeasuredResponse,
     params: Fit | ParameterSet,
     spec: ControllerSpec,
     robust_to: RobustTo | None = None,
@@ -70,9 +70,9 @@ def assess(
     if isinstance(law, Plant):
         raise ControlError("law = a Plant; the law comes first, as in certify: assess(law, plant, params, spec)")
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
-    require_plant(plant, "plant", ControlError)
+    design = name_design(plant)
     law = law if isinstance(law, Law) else Law.from_control(law)
-    names, signals = list_names(spec.measured), find_signals(plant, spec.measured)
+    names, signals = list_names(spec.measured), find_signals(design, spec.measured)
     if law.d.size != 1 + len(names):
         raise ControlError(
             f"law reads {law.d.size - 1} signals, and measured = {list(names)} names {len(names)}; give one of the "
@@ -86,9 +86,9 @@ def assess(
             f"{spec.sample_rate_hz:g}; give sample_rate_hz = {1.0 / law.sample_time_s:g}, or sample the law again"
         )
     law = replace(law, sample_time_s=spec.sample_time_s)
-    robust_to = take_own_delays(spec, plant, robust_to or {}, params)
-    spec, values = settle_delays(spec, plant, params)
+    robust_to = take_own_delays(spec, design, robust_to or {}, params)
+    spec, values = settle_delays(spec, design, params)
     spec = replace(spec, structure=CUSTOM, notch=None, prefilter=None, link_feedforward=None, reference_weights="tuned")
-    task = make_task(plant, plant.complete(values), spec, robust_to, draws)
+    task = make_task(plant, design.complete(values), spec, robust_to, draws)
     loops = task.measure_law(law, filter_samples=count_filter_samples(law), integral_rad_s=find_integral_rate(law))
     return describe_law(task, law, loops, (plant, values), gains={})

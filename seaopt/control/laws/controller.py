@@ -214,6 +214,11 @@ class Controller(LoopDelays, Result, Worded):
         return loop.figures().bandwidth_hz
 
     @property
+    def designs_on_response(self) -> bool:
+        """Whether it was designed on a measured response; `design`, where there is one, is then what was measured."""
+        return self.design is None or bool(self.measured and self.measured[0].name not in self.robust_to)
+
+    @property
     def judged_on(self) -> str:
         """The plant of `achieved`: the design plant, or the worst in a measured response's discs."""
         return "worst measured" if self.design is None and self.measured else "design plant"

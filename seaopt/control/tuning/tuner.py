@@ -71,6 +71,7 @@ from seaopt.plants.friction import (
     friction_states,
     list_fall_parameters,
     split_friction,
+    take_sliding,
 )
 from seaopt.plants.motor.thermal import rate_motor
 from seaopt.plants.plant import require_plant
@@ -313,8 +314,9 @@ def make_task(
         )
     names = (*first, *(name for name, _ in pairs), *seen)
     nominal = port = None
+    if spec.structure == "pid_dob":
+        nominal = _find_nominal(spec, plants[0], design, values, signals, gain)
     if isinstance(plants[0], DigitalPlant):
-        nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
         port = None if spec.passive_band_hz is None else port_of(pairs[0][1][0], values, signals, gain)
     speed_loop = spec.find_speed_loop(signals)
     further: tuple[TransferFunction | SpeedLoop, ...] = () if speed_loop is None else (speed_loop,)
@@ -394,12 +396,26 @@ def aim_task(task: Task, spec: ControllerSpec) -> Task:
     return feed_link(task, _limit_fraction(feedforward.place(task.link, spec.bandwidth_hz), spec, task.plants))
 
 
+def _find_nominal(
+    spec: ControllerSpec,
+    first: DigitalPlant | MeasuredPlant,
+    design: Plant,
+    values: CompletedParameters,
+    signals: tuple[str, ...],
+    gain: float,
+) -> Nominal:
+    """Return an observer's nominal plant: the design plant; of a measured response what was on the bench, with the
+    gain at rest that was measured, as the reference is weighted by that.
+    """
+    if isinstance(first, DigitalPlant):
+        return Nominal.of(first)
+    model = take_sliding(design, values)
+    nominal = Nominal.of(sample(model, values, signals, gain, spec.sample_time_s, spec.loop_delay_samples))
+    return nominal.scaled(nominal.inverse_gain / (first.static_gain * nominal.static_inverse))
+
+
 def _check_measured_design(spec: ControllerSpec) -> None:
     """Refuse what takes a model of the design plant, where that is a measured response."""
-    if spec.structure == "pid_dob":
-        raise ControlError(
-            'structure = "pid_dob" has a model of the design plant in it, and that is a measured response; use "pid"'
-        )
     if spec.passive_band_hz is not None or spec.level(FRICTION) is not None:
         name = "passive_band_hz" if spec.passive_band_hz is not None else FRICTION
         raise ControlError(

@@ -49,11 +49,12 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
     )
     varied = [row.name for row in cases.unknown.varied()]
     figures = {name: controller.close(plant, nominal).figures() for name, plant in cases.plants.items()}
+    of_model = survey.point and not controller.designs_on_response  # else of the response
     stated = cases.plants if survey.point else {}  # of margins nothing is required, and some take long
     amplitudes = _remark_amplitude(cases, design) if survey.point else ()
     return Evidence(
         requirements=(
-            *(design_requirements(controller, design, of_design, varied) if survey.point else ()),
+            *(design_requirements(controller, design, of_design, varied) if of_model else ()),
             *(row for name, spot in cases.spots.items() for row in plant_requirements(controller, spot, figures[name])),
         ),
         fields={
@@ -68,7 +69,7 @@ def measure_responses(survey: Survey, _: Progress) -> Evidence:
     """Judge the loop on every measured response; a law that was designed on one by all limits on the first."""
     controller, measured = survey.cases.controller, survey.measured
     rows: list[Requirement] = []
-    if controller.design is None:
+    if controller.designs_on_response:
         rows += measured_requirements(controller, *next(iter(measured.items())), "design plant")
     for name, response in measured.items():
         rows += measured_requirements(controller, name, response)
