@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -42,6 +43,9 @@ ALIKE = 0.05  # of what the best cause takes away: causes that are as good
 TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 FEWEST_FLAT = 10  # readings at the edge of a range, some in a row
 MODE_DAMPINGS = (0.02, 0.1)
+SEEN = 5.0  # std by which a line differs where a mode is looked for
+MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does
+LEAST_DAMPING, MOST_DAMPED = math.log(1e-4), 0.3
 MOST = 4  # causes that are listed
 Lines = Complex[np.ndarray, " m"]
 Values = Mapping[str, float]
@@ -223,8 +227,8 @@ def _explain(
         *_try_shapes(comparison, model),
     ]
     excess = before - noise
+    tried.sort(key=lambda pair: pair[1] * (MODE_COST if pair[0].kind == "mode" else 1.0))
     rated = [(difference, max(0.0, 1.0 - max(after - noise, 0.0) / excess)) for difference, after in tried]
-    rated.sort(key=lambda pair: ALIKE * (pair[0].kind == "mode") - pair[1])  # a mode has four sizes
     listed: list[Difference] = []
     for difference, share in rated:
         twin = next(
@@ -325,32 +329,45 @@ def _try_shapes(comparison: Comparison, model: Lines) -> Iterator[Tried]:
 
 
 def _try_mode(comparison: Comparison, model: Lines, fit: Callable[..., tuple[np.ndarray, float]]) -> Iterator[Tried]:
-    """Yield the mode, a pair of zeros and one of poles, that fits best of several starts."""
-    f = comparison.f
+    """Yield the mode that fits best: a mass on a spring beside the drive, or a pair of zeros and one of poles. The
+    force that a mass on a spring takes of the motion is added to the inverse of the response without hold and delay.
+    """
+    f, controller = comparison.f, comparison.controller
+    late = (controller.delay_samples + 0.5) * controller.sample_time_s
+    held = np.sinc(f * controller.sample_time_s) * np.exp(-2j * np.pi * f * late)
+    moved = -model / held * (2.0 * np.pi * f) ** 2
+    low, high = math.log(0.5 * f[0]), math.log(2.0 * np.max(f))
 
-    def pair(hertz: float, damping: float) -> Lines:
+    def pair(hertz: Any, damping: Any) -> Lines:
         return 1.0 - (f / hertz) ** 2 + 2j * damping * f / hertz
 
-    def shape(x: Float[np.ndarray, " k"]) -> Lines:
-        zero, pole = np.exp(x[0]), np.exp(x[1])
-        return pair(zero, np.exp(x[2])) / pair(pole, np.exp(x[3]))
+    def take(x: Float[np.ndarray, " k"], k: int) -> tuple[Any, Any]:
+        return np.exp(np.clip(x[k], low, high)), np.exp(np.clip(x[k + 1], LEAST_DAMPING, 0.0))
+
+    def absorb(x: Float[np.ndarray, " k"]) -> Lines:
+        hertz, damping = take(x, 0)
+        return 1.0 / (1.0 + x[2] * scale * moved * (1.0 + 2j * damping * f / hertz) / pair(hertz, damping))
+
+    def divide(x: Float[np.ndarray, " k"]) -> Lines:
+        return pair(*take(x, 0)) / pair(*take(x, 2))
 
     misfit = np.abs((comparison.response - model) / comparison.std)
-    starts = {float(f[k]) for k in np.argsort(-misfit)[:4]}
-    best: tuple[np.ndarray, float] | None = None
-    for hertz in starts:
-        for ratio in (0.95, 1.05):
-            for damping in MODE_DAMPINGS:
-                x, after = fit(shape, [math.log(hertz), math.log(hertz * ratio), math.log(damping), math.log(damping)])
-                inside = f[0] < math.exp(x[0]) < f[-1] and f[0] < math.exp(x[1]) < f[-1]
-                if inside and max(x[2], x[3]) < math.log(0.5) and (best is None or after < best[1]):
-                    best = x, after
+    best: tuple[float, float, float | None] | None = None
+    apart = np.where(misfit > SEEN, np.abs(comparison.response / model - 1.0), 0.0)
+    for line in np.unique(np.concatenate([np.argsort(-misfit)[:2], np.argsort(-apart)[:2]])):
+        at, scale = math.log(f[line]), 1.0 / abs(moved[line])
+        for damping in map(math.log, MODE_DAMPINGS):
+            starts = [(absorb, [at, damping, sign * 0.1]) for sign in (1.0, -1.0)]
+            starts += [(divide, [at, damping, at + step, damping]) for step in (-0.05, 0.05)]
+            for shape, start in starts:
+                x, after = fit(shape, start)
+                hertz, damped = take(x, 0)
+                inside = f[0] < hertz < np.max(f) and damped < MOST_DAMPED
+                if inside and (best is None or after < best[0]):
+                    best = after, float(hertz), float(hertz / take(x, 2)[0]) if shape is divide else None
     if best is not None:
-        zero, pole = math.exp(best[0][0]), math.exp(best[0][1])
-        # A pair costs four sizes in place of one.
-        yield (
-            Difference(
-                kind="mode", name="mode", value=zero, low=None, high=None, unit="Hz", explains=0.0, size=zero / pole
-            ),
-            best[1] + 3.0,
+        after, hertz, apart = best
+        mode = Difference(
+            kind="mode", name="mode", value=hertz, low=None, high=None, unit="Hz", explains=0.0, size=apart
         )
+        yield mode, after + 3.0  # it has some sizes where others have one

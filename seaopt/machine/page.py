@@ -77,8 +77,8 @@ def say_difference(each: Difference) -> str:
         case "delay":
             return f"the loop is {1e3 * each.value:+.3g} ms later than certified"
         case "mode":
-            apart = 100.0 * abs(1.0 / (each.size or 1.0) - 1.0)
-            return f"there is a mode at {format_number(each.value, 3)} Hz, its pole {apart:.2g} % away from it"
+            pole = "" if each.size is None else f", its pole at {format_number(each.value / each.size, 3)} Hz"
+            return f"there is a mode at {format_number(each.value, 3)} Hz{pole}"
         case "gain":
             turned = "the sign of the drive is turned; " if each.value < 0.0 else ""
             return f"{turned}the force per command is {format_number(each.value, 3)} times the certified one{also}"
