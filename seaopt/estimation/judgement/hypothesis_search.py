@@ -12,8 +12,8 @@ What this may cost is counted in evaluations of the problem, so that the same lo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -105,12 +105,13 @@ class Search:
 
     able: tuple[Refit, ...] = ()
     trials: tuple[HypothesisTrial, ...] = ()
+    nearest: Mapping[str, float] = field(default_factory=dict)  # all unknowns of the best refit
 
     @property
-    def partial(self) -> HypothesisTrial | None:
-        """The best trial where none removes a large excess: the truth is no nearer to the fit's values than to its."""
+    def partial(self) -> Mapping[str, float] | None:
+        """The best refit's values where none removes a large excess: the truth is as near to them as to the fit."""
         best = None if self.able else next(iter(self.trials), None)
-        return best if best is not None and best.excess < best.excess_before > REMOVED else None
+        return self.nearest if best is not None and best.excess < best.excess_before > REMOVED else None
 
     def yield_to_another(self) -> Search:
         """Return the search where another cause explains the logs better, so that none is adopted."""
@@ -138,7 +139,7 @@ class _Search:
 
     def __init__(self, fit: Fit, minimum: Minimum, first: float, end: int, budget: int, progress: Progress) -> None:
         self.fit, self.minimum, self.end, self.budget, self.progress = fit, minimum, end, budget, progress
-        self.first, self.helps = first, HELPS * (1.0 - first**-2)
+        self.first, self.helps = first, HELPS * (1.0 - max(first, 1.0) ** -2)
         self.sizes = measure_sizes(fit)
         # Which no refit tells from other values; but far from the logs sensitivities say little.
         self.silent = {effect.part for effect in fit.silent if first <= REMOVED}
@@ -213,8 +214,8 @@ def _refit(
     """
     before = count_evaluations()
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
-    for field in ("sigma", "substeps"):
-        problem = problem.with_values(field, {e.name: getattr(e, field) for e in old.experiments})
+    for name in ("sigma", "substeps"):
+        problem = problem.with_values(name, {e.name: getattr(e, name) for e in old.experiments})
     start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
     if not np.isfinite(start.cost):
         return None
@@ -337,8 +338,9 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
     tied.sort(key=lambda refit: (refit.evaluation.z.size, refit.excess))
     others = sorted((refit for refit in refits if refit not in tied), key=lambda refit: refit.excess)
     outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *["tried" for _ in others]]
-    rows = zip([*tied, *others], outcomes, strict=True)
-    return Search(able=tuple(tied), trials=tuple(_state(refit, outcome, first) for refit, outcome in rows))
+    ranked = [*tied, *others]
+    trials = tuple(_state(refit, outcome, first) for refit, outcome in zip(ranked, outcomes, strict=True))
+    return Search(able=tuple(tied), trials=trials, nearest=ranked[0].values if ranked else {})
 
 
 def _state(refit: Refit, outcome: Outcome, first: float) -> HypothesisTrial:

@@ -119,7 +119,7 @@ def judge(
     doubtful = _hangs_on_little(fit, findings)
     search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting, doubtful=doubtful)
     if search.partial is not None:
-        fit, findings = _reach(fit, findings, error, search.partial.parameters)
+        fit, findings = _reach(fit, findings, error, search.partial)
     if wrong or search.able:
         causes = find_causes(
             fit,

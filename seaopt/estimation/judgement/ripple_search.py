@@ -23,7 +23,7 @@ from seaopt.plants.friction import friction_matrices, remove_friction
 from seaopt.plants.plant import Plant, state_space
 
 MOST = 1200  # wave numbers that are tried
-LONGEST = 10_000  # samples, of a segment's beginning, that are looked at: each wave number costs two spectra of them
+LONGEST = 10_000  # samples, where the motor travels most: each wave number costs two spectra of them
 FINE = 8  # steps on either side of the best
 LEAST = 0.1  # of a residual's power that a ripple has to account for
 TURNS = 0.25  # of a period, the most that the motor moves in a sample
@@ -43,8 +43,8 @@ def find_ripple(
 
     `position`: of the motor as the fit has it, over segment `number`.
     """
-    position = position[:LONGEST]
-    raw = left.segments[number].raw.T[:, : position.size]
+    looked = _find_travel(position)
+    position, raw = position[looked], left.segments[number].raw.T[:, looked]
     raw = np.nan_to_num(raw - np.nanmean(raw, axis=1, keepdims=True))
     size = np.sqrt(np.sum(raw**2, axis=1))
     travel, moved = float(np.ptp(position)), np.abs(np.gradient(position))
@@ -74,6 +74,13 @@ def find_ripple(
     best = max(best + step * np.linspace(-1.0, 1.0, 2 * FINE + 1), key=lambda wave: weigh(wave)[0])
     share, a, b = weigh(best)
     return {"a_g": a, "b_g": b, "n_g": float(best)} if share > LEAST else {}
+
+
+def _find_travel(position: Float[np.ndarray, " n"]) -> slice:
+    """Return the samples, at most LONGEST, over which a position travels most: a motor at rest shows no cogging."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(position)))])
+    begin = int(np.argmax(travelled[LONGEST - 1 :] - travelled[: 1 - LONGEST])) if position.size > LONGEST else 0
+    return slice(begin, begin + LONGEST)
 
 
 def _respond(plant: Plant, params: ParameterSet, outputs: tuple[str, ...], period: float, n: int) -> Spectra:

@@ -20,13 +20,15 @@ SERVO = {"k_p": 0.25, "k_d": 0.006, "g_s": 1.0}  # A per rad of the motor, and p
 STEPS = 4
 
 
-def record(*, cog=(0.0, 0.0, 0.0), slip=(0.0, 1.0), bristle=0.0, sag=None, late=None, seconds=6.0):
+def record(*, cog=(0.0, 0.0, 0.0), slip=(0.0, 1.0), bristle=0.0, sag=None, late=None, seconds=6.0, rest_s=0.0):
     """Return a log. `cog`: sine, cosine and wave number; `slip`: stiffness and limit of a spring that slips; `bristle`:
     stiffness of what the joint bends by; `sag`: the supply's resistance, the input then being a duty; `late`: samples
-    of the firmware's own between which its command stands still, the input then being a goal.
+    of the firmware's own between which its command stands still, the input then being a goal; `rest_s`: in front.
     """
     p, (a, b, wave), (k_h, y_h) = TRUTH, cog, slip
-    t, chirp = drive(seconds, RATE_HZ, 2.5, seed=1, top_hz=25.0)
+    _, chirp = drive(seconds, RATE_HZ, 2.5, seed=1, top_hz=25.0)
+    chirp = np.concatenate([np.zeros(round(rest_s * RATE_HZ)), chirp])
+    t = np.arange(chirp.size) / RATE_HZ
     inputs = chirp if sag is None and late is None else chirp / 8.0 if sag is not None else 3.0 * chirp
     held = [0.0, 0]  # the servo's command, and the steps that it has stood for
 
@@ -102,6 +104,12 @@ def check(result, part, **expected):
 
 def test_magnets_are_named_with_their_wave_number():
     check(fit(record(cog=(0.006, 0.003, 12.0))), "cogging", a_g=0.006, b_g=0.003, n_g=12.0)
+
+
+@pytest.mark.slow
+def test_magnets_are_named_where_a_long_rest_is_in_front(monkeypatch):
+    monkeypatch.setattr("seaopt.estimation.judgement.ripple_search.LONGEST", 2000)
+    check(fit(record(cog=(0.006, 0.003, 12.0), rest_s=6.0)), "cogging", a_g=0.006, b_g=0.003, n_g=12.0)
 
 
 @pytest.mark.slow
