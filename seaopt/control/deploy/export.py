@@ -33,7 +33,7 @@ from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_s
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
-from seaopt.control.laws.realisation import RunnableLaw, check_guards, choose_limit, find_raised_limit, realise
+from seaopt.control.laws.realisation import RunnableLaw, check_guards, choose_limit, find_raised_limit, realise, wind_up
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
@@ -142,11 +142,10 @@ def export(
         stored, figures, heat = _read(content)
         templates, missed, met, kind = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"
         law = realise(
-            stored["law"],
+            **wind_up(stored, tracking_time_s),
             per_effort=stored["command"].per_effort,
             command_limit=choose_limit(stored["command"], stored["spec"], limit),
             command=(stored["command"].input, stored["command"].unit),
-            tracking_time_s=tracking_time_s,
             compensation=stored["compensation"],
         )
     heat = derate if isinstance(derate, HeatGuard) else heat

@@ -112,8 +112,8 @@ class Controller(LoopDelays, Result, Worded):
     derate : bool
         The exported law lowers its limit as the winding warms up.
     share : float or None
-        Of a schedule with an observer, frozen: how its integral winds up there, T_s/(T_t + T_s). The observer sees the
-        limited command then (`seaopt.control.scheduling.step_order`).
+        Of a schedule, frozen: how its integral winds up there, T_s/(T_t + T_s). An observer sees the limited command
+        then (`seaopt.control.scheduling.step_order`).
     """
 
     plot = PlotAccessor()
@@ -413,7 +413,7 @@ class Controller(LoopDelays, Result, Worded):
             "schedule": None,
             "terms": self.compensation,
             "guards": {"gate": self.gate, "derate": self.derate},
-            "law": self.law.to_dict(),
+            "law": self.law.to_dict() | ({} if self.share is None else {"share": self.share}),
             "reference": reference,
             "measurement": paths[0] if len(paths) == 1 else paths,
             "command": self.command,

@@ -355,7 +355,8 @@ def runnable(
         Of the command, in its unit: the specification's if left out, and no more than the range of the command;
         infinite where none of them is given.
     tracking_time_s : float, optional
-        T_t of the anti-windup; the module's docstring has the default.
+        T_t of the anti-windup; the module's docstring has the default. Not of a schedule's law, frozen, which has its
+        share.
     gate : PlausibilityGate or False, optional
         Which readings are believed; the controller's own if left out, none with False.
     heat : HeatGuard or False, optional
@@ -375,21 +376,36 @@ def runnable(
     >>> round(current, 6)
     9.0
     """
-    law, share = controller.law, controller.share
-    if share is not None:
-        gains = Gains.from_names(controller.gains, controller.observer, link=controller.link)
-        law = gains.law(controller.spec.structure, controller.sample_time_s, share).balanced()
+    parts = {name: getattr(controller, name) for name in ("law", "share", "gains", "observer", "link", "spec")}
     return realise(
-        law,
-        excess=share is not None,
+        **wind_up(parts, tracking_time_s),
         per_effort=controller.command.per_effort,
         command_limit=choose_limit(controller.command, controller.spec, command_limit),
         command=(controller.command.input, controller.command.unit),
-        tracking_time_s=tracking_time_s,
         gate=controller.gate if gate is None else gate or None,
         heat=(controller.heat_guard if controller.derate else None) if heat is None else heat or None,
         compensation=controller.compensation,
     )
+
+
+def wind_up(controller: Mapping[str, Any], tracking_time_s: float | None) -> dict[str, Any]:
+    """Return what `realise` takes of a controller's law and anti-windup, from its fields: of a schedule's law, frozen,
+    as the schedule winds up there. Raises ControlError: a tracking time is given beside its share.
+    """
+    law, share = controller["law"], controller["share"]
+    if share is None:
+        return {"law": law, "tracking_time_s": tracking_time_s}
+    if tracking_time_s is not None:
+        raise ControlError(
+            f"tracking_time_s = {tracking_time_s:g}: the law is a schedule's, frozen, and winds up as that does; leave "
+            "it out"
+        )
+    excess = controller["observer"] is not None
+    if excess:
+        gains = Gains.from_names(controller["gains"], controller["observer"], link=controller["link"])
+        law = gains.law(controller["spec"].structure, law.sample_time_s, share).balanced()
+    tracking_time_s = law.sample_time_s * (1.0 / share - 1.0) if share else None
+    return {"law": law, "tracking_time_s": tracking_time_s, "excess": excess}
 
 
 def choose_limit(command: Command, spec: ControllerSpec, requested: float | None) -> float | None:

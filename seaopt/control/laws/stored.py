@@ -51,12 +51,13 @@ Terms = Annotated[Mapping[str, Any], Fields(of=Compensation)] | None
 
 @record(eq=False)
 class StoredLaw:
-    """The law: a state space from (reference, measured) to effort."""
+    """The law: a state space from (reference, measured) to effort, and a frozen schedule's share of anti-windup."""
 
     A: Float[np.ndarray, "_ _"]
     B: Float[np.ndarray, "_ _"]
     C: Float[np.ndarray, "_ _"]
     D: Float[np.ndarray, "_ _"]
+    share: Annotated[float, Constraints(ge=0.0, le=0.5)] | None = None
 
     def __post_init__(self) -> None:
         n, k = len(self.A), self.D.shape[1]
@@ -192,6 +193,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     terms = table.terms
     return {name: getattr(table, name) for name in taken} | {
         "law": law,
+        "share": table.law.share,
         "spec": spec,
         "command": command,
         "met": table.feasible,

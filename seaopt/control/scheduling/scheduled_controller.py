@@ -193,7 +193,7 @@ class ScheduledController(Result, Worded):
             mixed = None if low is None or high is None else low.mix(high, t)
             kept = {"outer": first.outer, "gate": first.gate, "derate": first.derate}
             frozen = replace(frozen, compensation=mixed, **kept)
-        if not self.table.nominals:
+        if value in self.points and not self.table.nominals:
             return frozen
         share = self.table.find_numbers(value, **{SHARE: self.runnable().anti_windup})[SHARE]
         return replace(frozen, share=share)

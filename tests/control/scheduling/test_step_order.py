@@ -6,6 +6,7 @@ The plain law is another realisation (balanced, its integrators a chain), and ru
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from scipy.signal import bilinear, lfilter
 import seaopt as so
 from seaopt.control import (
     Compensation,
+    Controller,
     GainTable,
     LinkFeedforward,
     LinkPath,
     Notch,
     Prefilter,
     ScheduledController,
+    export,
     realise,
     runnable,
     tune_schedule,
@@ -30,7 +33,7 @@ from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.scheduling.runnable_schedule import make_runnable
 from seaopt.errors import ControlError
 from seaopt.files import to_json
-from tests.c_code import CompiledSchedule
+from tests.c_code import CompiledSchedule, LoadedLaw
 from tests.schedules import read_knee
 
 TS, POINTS = 1e-3, (0.0, 0.7, 1.15)
@@ -240,7 +243,7 @@ def test_standing_still_a_tuned_one_is_what_runs_at_its_place(schedule, limited)
     size = np.array([0.02, 0.006] if law.measured > 1 else [1.0, 0.3])
     if schedule.table.order.link:
         size = np.array([20.0, 3e-6])
-    for place in (low, 0.6 * low + 0.4 * high) if schedule.table.nominals or not limited else (low,):
+    for place in (low, 0.6 * low + 0.4 * high):
         plain = runnable(schedule.at(place), command_limit=limit)
         state, other, pairs = law.reset(place=place), plain.reset(), np.zeros((800, 2))
         for k, pair in enumerate(pairs):
@@ -249,6 +252,28 @@ def test_standing_still_a_tuned_one_is_what_runs_at_its_place(schedule, limited)
             pair[1], other = plain.step(other, r, y if y.size > 1 else float(y[0]))
         np.testing.assert_allclose(*pairs.T, atol=1e-11 * np.max(np.abs(pairs)))
         assert not limited or 0.05 < np.mean(np.abs(pairs[:, 0]) == law.command_limit) < 0.95
+
+
+def test_frozen_its_file_and_its_c_wind_up_as_it_runs(schedule, compiler, tmp_path):
+    low, high = schedule.points
+    place = 0.6 * low + 0.4 * high
+    frozen, law = schedule.at(place), schedule.runnable()
+    content = json.loads(to_json(frozen.to_dict()))
+    again = Controller.from_dict(content, *frozen.design)
+    assert again.share == frozen.share
+    export(content, tmp_path, name="law", allow_infeasible=True)
+    compiled = LoadedLaw(compiler, tmp_path, "law", again.law.d.size)
+    state, rng, pairs = law.reset(place=place), np.random.default_rng(4), np.zeros((800, 2))
+    size = np.array([0.02, 0.006] if law.measured > 1 else [1.0, 0.3])
+    size = np.array([20.0, 3e-6]) if schedule.table.order.link else size
+    for k, pair in enumerate(pairs):
+        r, y = size[0] * (rng.normal() + 30.0 * (k < 300)), size[-law.measured :] * rng.normal(size=law.measured)
+        pair[0], state = law.step(state, r, y, place)
+        pair[1] = compiled.step(r, *y)
+    np.testing.assert_allclose(*pairs.T, atol=1e-11 * np.max(np.abs(pairs)))
+    for refusing in (runnable, partial(export, folder=tmp_path)):
+        with pytest.raises(ControlError, match="winds up as that does"):
+            refusing(frozen, tracking_time_s=0.5)
 
 
 def test_what_is_added_is_outside_the_law_and_its_observer(schedule):
