@@ -46,6 +46,8 @@ def say_cause(cause: Cause) -> str:
             return f"the {cause.what} {'comes' if cause.what == 'command' else 'come'} {value} {cause.unit} late"
         case "sign":
             return f"the sign of {cause.what} is turned"
+        case "open loop":
+            return f"the command does not follow {cause.what}: the loop is open"
         case "unit":
             return f"{cause.what} is in another unit: {value} times what it should be"
         case "factor":

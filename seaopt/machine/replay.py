@@ -392,6 +392,7 @@ def _list_factors(setting: Setting) -> Iterator[Alternative]:
         for value in dict.fromkeys([-1.0, *usual]):
             unit = next((each for each in UNITS if abs(value / each - 1.0) < SAME_FACTOR), None)
             kind = "sign" if abs(value + 1.0) < SAME_FACTOR else "factor" if unit is None else "unit"
+            kind = "open loop" if abs(value) < SAME_FACTOR and what in setting.controller.signals else kind
             value = -1.0 if kind == "sign" else value if unit is None else unit
             yield Alternative(
                 kind=kind,
@@ -422,7 +423,7 @@ def _fit_factors(setting: Setting) -> dict[str, float]:
     for name, column in columns.items():
         target = ticks.command - (0.0 if column is together else together - column)
         solved = np.linalg.lstsq(np.column_stack([column, modes])[free], target[free], rcond=1e-10)[0]
-        if np.isfinite(solved[0]) and abs(solved[0]) > 1e-9:
+        if np.isfinite(solved[0]) and (solved[0] or name in setting.controller.signals):
             factors[name] = float(solved[0])
     return factors
 

@@ -101,6 +101,12 @@ def test_a_missing_feedforward_is_named(compiler, tmp_path, controller):
     assert (cause.kind, cause.what) == ("feedforward", "reference")
 
 
+def test_a_loop_that_is_open_by_mistake_is_named(controller, bench):
+    log = bench.log(replace(Machine(), reading_sign=0.0), REFERENCE)
+    cause = cause_of(controller, log)
+    assert (cause.kind, cause.what) == ("open loop", "F1")
+
+
 def test_what_a_log_lacks_is_said_with_what_to_record(controller, bench):
     log = bench.log(Machine(), REFERENCE)
     lacks = {"reference": "--reference COLUMN", "I": "as it returned it", "F1": "log in each tick F1"}
