@@ -84,6 +84,8 @@ def check_calls(function):
         if dataclasses.is_dataclass(function) and "__init__" in vars(function):
             function.__init__ = check_calls(function.__init__)
         return function
+    if inspect.isgeneratorfunction(function):  # checked where it is first advanced, among somebody else's shapes
+        return function
     number, checked = numbers.setdefault(function.__code__, len(numbers)), None
 
     @functools.wraps(function)
