@@ -127,7 +127,6 @@ class StoredLoop:
     command: Command
     spec: ControllerSpec
     feasible: bool
-    measured_responses: tuple[MeasuredFigures, ...] = ()
 
 
 @record(eq=False)
@@ -143,6 +142,7 @@ class StoredController(StoredLoop):
     active_constraints: tuple[str, ...]
     blocked_by: tuple[str, ...] = ()
     possible: PossibleBandwidths | None = None
+    measured_responses: tuple[MeasuredFigures, ...] = ()
     engineering: dict[str, StoredNumber] = field(default_factory=dict[str, StoredNumber])
     schedule: None = None
 

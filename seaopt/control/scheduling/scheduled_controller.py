@@ -37,7 +37,7 @@ LARGE_STEP = 1.0  # of a gain between neighbours, over the smaller of the two, f
 # The keys of controller.json that hold a list, with an entry for each point; all others are those of the first.
 PER_POINT = (
     "blocks", "terms", "law", "reference", "measurement", "achieved", "active_constraints", "engineering", "blocked_by",
-    "largest_bandwidth_hz", "possible",
+    "largest_bandwidth_hz", "possible", "measured_responses",
 )  # fmt: skip
 Plants = Mapping[str, tuple[Plant, ParameterSet]]
 

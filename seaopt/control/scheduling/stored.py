@@ -20,6 +20,7 @@ from seaopt.control.laws.stored import (
     read_controller,
 )
 from seaopt.control.laws.verdict import PossibleBandwidths
+from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.scheduling.gain_table import check_points
 from seaopt.control.scheduling.scheduled_controller import PER_POINT, PlaceFigures
@@ -56,6 +57,7 @@ class StoredSchedule(StoredLoop):
     active_constraints: tuple[tuple[str, ...], ...]
     blocked_by: tuple[tuple[str, ...], ...]
     possible: tuple[PossibleBandwidths | None, ...]
+    measured_responses: tuple[tuple[MeasuredFigures, ...], ...]
     engineering: tuple[dict[str, StoredNumber], ...]
 
 

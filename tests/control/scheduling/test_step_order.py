@@ -29,12 +29,13 @@ from seaopt.control import (
 )
 from seaopt.control.laws.structures import Gains, SpeedLoop
 from seaopt.control.loops.compensation.ripple_term import RippleTerm
+from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.scheduling.runnable_schedule import make_runnable
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from tests.c_code import CompiledSchedule, LoadedLaw
-from tests.schedules import read_knee
+from tests.schedules import read_knee, tune_knee
 
 TS, POINTS = 1e-3, (0.0, 0.7, 1.15)
 PID = {
@@ -308,6 +309,19 @@ def test_a_file_of_it_reads_back_the_same(schedule):
     written = to_json(schedule.to_dict())
     again = ScheduledController.from_dict(json.loads(written), *schedule.design, schedule.others)
     assert to_json(again.to_dict()) == written
+
+
+def test_a_measured_response_stays_at_its_point_in_the_file():
+    figures = MeasuredFigures(
+        name="frf:chirp", confidence=0.95, points=3, band_hz=(1.0, 3.0), bandwidth_hz=(30.0, None), stable=True, ms=1.5,
+        ms_hz=2.0, mt=1.2, disk_margin=0.8, noise_gain=2.0, reference_peak=1.1, droop_db=0.0,
+    )  # fmt: skip
+    schedule = tune_knee()
+    first, second, third = schedule.controllers
+    schedule = replace(schedule, controllers=(first, replace(second, measured=(figures,)), third))
+    written = to_json(schedule.to_dict())
+    again = ScheduledController.from_dict(json.loads(written), *schedule.design, schedule.others)
+    assert [each.measured for each in again.controllers] == [(), (figures,), ()]
 
 
 @pytest.mark.parametrize(("precision", "share"), [("double", 1e-13), ("float", 2e-3)])
