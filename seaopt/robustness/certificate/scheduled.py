@@ -158,7 +158,7 @@ class ScheduleCertificate(Result, Worded):
                 "passed": self.met,
                 "requirements": to_content(self.requirements),
                 "plants": _take_worst(written, "plants", lambda plant: plant["worst"]["severity"]),
-                "friction": _take_worst(written, "friction", lambda found: -found.get("least_slope", 0.0)),
+                "friction": _take_worst(written, "friction", _rank_friction),
                 "monte_carlo": to_content(self.monte_carlo),
                 "passivity": None,
                 "simulation": None,
@@ -201,7 +201,7 @@ class ScheduleCertificate(Result, Worded):
 
 
 def _take_worst(
-    written: Sequence[Mapping[str, Any]], key: str, rank: Callable[[Mapping[str, Any]], float]
+    written: Sequence[Mapping[str, Any]], key: str, rank: Callable[[Mapping[str, Any]], Any]
 ) -> dict[str, Any]:
     """Return what the places have under a key, by plant: at its worst place, and which that is."""
     worst: dict[str, Any] = {}
@@ -209,6 +209,17 @@ def _take_worst(
         at = max((each for each in written if name in each[key]), key=lambda each: rank(each[key][name]))
         worst[name] = {"place": at["place"], **at[key][name]}
     return worst
+
+
+def _rank_friction(found: Mapping[str, Any]) -> tuple[bool, float]:
+    """Return how bad a place's friction is: first whether it is not shown to be harmless, then the least
+    slope that is, at the nominal parameters and at draws.
+    """
+    drawn = found.get("draws")
+    slopes = [] if drawn is None else [drawn["least_slope"]]
+    if "slopes" in found:  # as `FrictionMargin.least_slope`
+        slopes.append(min((slope for slope in found["slopes"] if slope > 0.0), default=0.0))
+    return not found["sector_stable"], -min(slopes, default=np.inf)
 
 
 def pose_places(

@@ -10,6 +10,7 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control import tune_schedule
+from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.errors import ControlError, FileError
 from seaopt.executors import Shared
 from seaopt.files import to_json
@@ -18,7 +19,7 @@ from seaopt.robustness import ScheduleCertificate
 from seaopt.robustness.certificate import scheduled
 from seaopt.robustness.certificate.cases import CertifyOptions, Survey, add_design
 from seaopt.robustness.certificate.certify import _require_responses
-from seaopt.robustness.certificate.friction import FRICTION
+from seaopt.robustness.certificate.friction import FRICTION, MarginDraws
 from seaopt.robustness.certificate.measured_draws import measure_draws
 from seaopt.robustness.certificate.scheduled import pose_places, require_motion, require_rate
 from seaopt.robustness.verification import limit_cycles, schedule_sweep, verification
@@ -184,6 +185,19 @@ def test_friction_is_looked_at_on_a_plant_that_moves_the_variable_and_over_draws
     for share in (0.01, 0.3, 1.0):
         at = {"I_p": 0.36, "mgL": 11.8, "d": 2.0, "phi": 0.2}
         assert find_radius(cases.controller, values, at, share * min(margin.least_slope, 1e12)) < 1.0
+
+
+def test_its_file_states_friction_at_the_worst_place(certificate):
+    """Where it is not shown to be harmless, whatever slope is; else where the least is shown, nominal or drawn."""
+    drawn = MarginDraws(samples=9, shown=9, least_slope=30.0, factor=1.0, parameters={})
+    places, worst = list(certificate.places), []
+    ever_worse = [(50.0, 2.0, {}), (40.0, 2.0, {}), (np.inf, 2.0, {"swing": drawn}), (60.0, 0.9, {})]
+    for k, (slope, factor, draws) in enumerate(ever_worse):
+        margin = FrictionMargin(slopes=(slope,), factor=factor, frequency_hz=1.0, multiplier="circle")
+        places[k] = replace(places[k], friction={"swing": margin}, friction_draws=draws)
+        content = replace(certificate, places=tuple(places)).to_dict()
+        worst.append(content["friction"]["swing"]["place"]["phi"])
+    assert worst == list(certificate.values[:4])
 
 
 def test_a_rate_is_required_where_it_is_asked_and_the_slowest_sweep_always(certificate):
