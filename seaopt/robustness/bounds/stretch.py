@@ -69,6 +69,10 @@ def bound_stretch(
     name: str, middle: Controller, table: GainTable, plant: Plant, params: ParameterSet, low: float, high: float
 ) -> StretchBound:
     """Bound Ms of a schedule on a stretch between points, `middle` at its middle, on a plant without friction."""
+    terms = middle.compensation
+    if terms is not None and any(name in plant.outputs for name in terms.reads):
+        reason = "what a compensation feeds back of gravity, ripple or speed is not bounded"
+        return StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=reason)
     frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s
     change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
     if np.isinf(change):

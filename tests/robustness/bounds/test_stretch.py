@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.control import Compensation
+from seaopt.control.loops.compensation.ripple_term import RippleTerm
 from seaopt.robustness.bounds.stretch import bound_stretch
 from tests.schedules import read_knee, tune_knee
 
@@ -46,6 +48,18 @@ def test_of_a_plant_without_the_variable_the_law_alone_changes():
     bound = bound_stretch("it", schedule.at(0.05), schedule.table, straight, values, 0.0, 0.1)
     found = [schedule.at(s).close(straight, values).figures().ms for s in np.linspace(0.0, 0.1, 5)]
     assert bound.shown and max(found) <= bound.ms <= 1.15 * max(found)
+
+
+def test_terms_that_feed_back_are_not_bounded():
+    """The bound is of the law without them; one whose signal a plant does not have is a constant on it."""
+    schedule, (stand, swing, values) = tune_knee(), read_knee()
+    term = RippleTerm(cycles=(1,), cos=(0.7,), sin=(0.2,), period=1.0, reads="phi", unit="rad", fraction=1.0)
+    added = Compensation(sample_time_s=1e-3, ripple=term)
+    middle = replace(schedule.at(0.05), compensation=added)
+    assert "phi" in swing.outputs and "phi" not in stand.outputs
+    for plant, shown in ((swing, False), (stand, True)):
+        bound = bound_stretch("it", middle, schedule.table, plant, values.update(phi=0.05), 0.0, 0.1)
+        assert bound.shown == shown and ("not bounded" in bound.reason) != shown
 
 
 def test_a_law_that_changes_too_much_on_a_stretch_is_not_said_to_be_stable():
