@@ -11,8 +11,10 @@ import pytest
 
 import seaopt as so
 from seaopt.control.given.law_file import read_law
+from seaopt.files import to_json
 from seaopt.logs import assess_quality
 from seaopt.signals import Signal
+from tests.schedules import tune_knee
 
 PROBLEM = """
 schema = 1
@@ -47,6 +49,12 @@ def test_a_wrong_value_is_refused_by_its_key(tmp_path, before, after, words):
     (tmp_path / "p.toml").write_text(PROBLEM.replace(before, after), encoding="utf-8")
     with pytest.raises(so.SeaoptError, match=words):
         so.read_problem(tmp_path / "p.toml").controller_spec()
+
+
+def test_a_schedules_controller_json_is_refused_as_a_law_by_what_it_is(tmp_path):
+    (tmp_path / "controller.json").write_text(to_json(tune_knee().to_dict()), encoding="utf-8")
+    with pytest.raises(so.SeaoptError, match="should have no schedule: one law is measured"):
+        read_law(tmp_path / "controller.json")
 
 
 @pytest.mark.parametrize("top", [2.0, 1e300, 1e-300])

@@ -41,7 +41,7 @@ LAW_EXAMPLE = "sample_rate_hz = 1000, compute_delay_samples = 1, pid = { k_p = 2
 TUNING = {
     "schema", "title", "structure", "gains", "achieved", "met", "feasible", "active_constraints", "engineering",
     "blocks", "heat", "blocked_by", "largest_bandwidth_hz", "possible", "notes",
-    "measured_responses", "provenance", "fit_met", "guessed", "made_from", "guards",
+    "measured_responses", "provenance", "fit_met", "guessed", "made_from", "guards", "schedule",
 }  # fmt: skip
 PID_GAINS = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
 
@@ -142,12 +142,13 @@ class LawFile(_Strict):
     pid: _Pid | None = None
     command: _Command = _Command()
     spec: Any = None
-    schedule: Any = None
     terms: Any = None
 
     @model_validator(mode="before")
     @classmethod
     def _leave_out(cls, content: Any) -> Any:
+        if isinstance(content, dict) and content.get("schedule") is not None:  # whose law, terms ... are lists
+            raise ValueError("should have no schedule: one law is measured against one [controller]")
         return {key: content[key] for key in content if key not in TUNING} if isinstance(content, dict) else content
 
     @model_validator(mode="after")
@@ -167,8 +168,6 @@ class LawFile(_Strict):
             raise ValueError("should have law (A, B, C, D), or reference and measurement (num, den), or pid (gains)")
         if self.terms is not None:
             raise ValueError("should have no terms, which no linear law has; ask for compensation in [controller]")
-        if self.schedule is not None:
-            raise ValueError("should have no schedule: one law is measured against one [controller]")
         if isinstance(self.measured, list) and not self.measured:
             raise ValueError("should name what is measured")
         return self
