@@ -102,14 +102,18 @@ def export_controller(
 
 def _list_typed(content: Mapping[str, Any], options: Mapping[str, Any]) -> list[str]:
     """Return the parts of the law that options make another than that of the certificate."""
-    guards, gate = content.get("guards") or {}, options["gate"]
+    gate = options["gate"]
     if "mpc" in content:  # whose guards are among the numbers of its code
         code = read_code(content["mpc"]["code"])
-        same = gate is None or set_gate(code, gate or None, content["sample_time_s"]).to_dict() == code.to_dict()
-        guards = {"gate": to_content(gate) if same and gate else None, "derate": code.heat is not None}
+        other = gate is not None and set_gate(code, gate or None, content["sample_time_s"]).to_dict() != code.to_dict()
+        derates = code.heat is not None
+    else:
+        guards = content.get("guards") or {}
+        other = gate is not None and (to_content(gate) if gate else None) != guards.get("gate")
+        derates = guards.get("derate", False)
     differs = {
-        "the gate": gate is not None and (to_content(gate) if gate else None) != guards.get("gate"),
-        "the heat guard": options["derate"] is not None and options["derate"] != guards.get("derate", False),
+        "the gate": other,
+        "the heat guard": options["derate"] is not None and options["derate"] != derates,
         "the anti-windup": options["tracking_time_s"] is not None,
     }
     return [name for name, differ in differs.items() if differ]

@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import pytest
 
+import seaopt as so
 from seaopt.cli.export import _list_typed
 from seaopt.codec import to_content
-from seaopt.control import PlausibilityGate
+from seaopt.control import MPCSpec, PlausibilityGate, force_mpc
+from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json
 
 
@@ -68,6 +70,16 @@ def test_a_gate_that_is_typed_as_the_file_has_it_is_the_certified_one(largest, t
     content = {"guards": {"gate": to_content(gate), "derate": False}}
     options = {"gate": replace(gate, max_step_N=largest), "derate": None, "tracking_time_s": None}
     assert _list_typed(content, options) == typed
+
+
+def test_a_gate_that_is_left_out_of_predictive_control_is_not_the_certified_one():
+    plant = so.plants.rotary(link="locked")
+    gate = PlausibilityGate(range_N=(-300.0, 300.0), max_step_N=60.0, max_held=4, ramp_A_per_s=300.0)
+    spec = MPCSpec(current_limit_A=3.0, measured="tau_s", bandwidth_hz=10.0, max_sensitivity=2.0)
+    for made, differs in ((gate, ["the gate"]), (None, [])):
+        content = {"mpc": describe_mpc(force_mpc(plant, plant.defaults, spec, gate=made)), "sample_time_s": 1e-3}
+        assert _list_typed(content, {"gate": False, "derate": None, "tracking_time_s": None}) == differs
+        assert _list_typed(content, {"gate": gate, "derate": None, "tracking_time_s": None}) != differs
 
 
 def one_line(out):
