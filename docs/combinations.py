@@ -1,0 +1,168 @@
+"""Write docs/reference/combinations.md: which parts go together, each tried: `python docs/combinations.py`."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from typer.testing import CliRunner
+
+from seaopt.cli.main import app
+from seaopt.control import read_law
+from seaopt.errors import SeaoptError
+from seaopt.problem import read_problem
+from seaopt.problem.stages import assess_problem, certify_problem, design_mpc, tune_problem
+
+PAGE = Path(__file__).resolve().parent / "reference" / "combinations.md"
+FILE = """
+schema = 1
+title = "leg"
+[parameters]
+N = 100
+K_tau = 0.0369
+eta = 0.7
+J_m = { value = 2.4e-5, prior_std = 1e-6 }
+b_r = 4e-4
+f_c = COULOMB
+v_s = 1.0
+k_s = 280
+J_l = 0.25
+d_l = 0.1
+m = 4.0
+L = 0.2
+[plant.stand]
+kind = "rotary"
+link = "locked"
+PARTS
+[plant.swing]
+kind = "rotary"
+link = "pendulum"
+PARTS
+EXPERIMENT
+[controller]
+plant = "PLANT"
+measured = MEASURED
+STRUCTURE
+sample_rate_hz = 1000
+compute_delay_samples = 1
+current_limit_A = 9.0
+CONTROLLER
+SCHEDULE
+TABLES
+[robustness]
+plants = [CERTIFIED]
+samples = 6
+ROBUSTNESS
+"""
+LIMITS = "bandwidth_hz = 16\nmax_sensitivity = 1.7\nmax_noise_gain = 60\nrobust_to = [ROBUST_TO]"
+SCHEDULE = '[controller.schedule]\nover = "k_s"\npoints = [280, 320]'
+EXPERIMENT = """[[experiment]]
+name = "chirp"
+plant = "stand"
+virtual = { seed = 1, duration_s = 40, rate_hz = 1000, noise_std = { tau_s = 0.01 }, excitation = { chirp = { amplitude = 2.0, f0_hz = 0.1, f1_hz = 150 }, noise = { std = 1.0, band_hz = 200 } } }
+"""
+OWN = {  # a PI at 1 kHz
+    "sample_time_s": 1e-3, "compute_delay_samples": 1,
+    "reference": {"num": [1.02, -0.98], "den": [1.0, -1.0]}, "measurement": {"num": [0.52, -0.48], "den": [1.0, -1.0]},
+}  # fmt: skip
+BOTH = '["tau_s", "thetad_m"]'
+LAWS: Mapping[str, Mapping[str, str]] = {
+    "`pid`": {"STRUCTURE": f'structure = "pid"\n{LIMITS}'},
+    "`pid_dob`": {"STRUCTURE": f'structure = "pid_dob"\n{LIMITS}'},
+    "`cascade`": {"STRUCTURE": f'structure = "cascade"\n{LIMITS}', "MEASURED": BOTH},
+    "schedule of `pid`": {"STRUCTURE": f'structure = "pid"\n{LIMITS}', "SCHEDULE": SCHEDULE},
+    "schedule of `pid_dob`": {"STRUCTURE": f'structure = "pid_dob"\n{LIMITS}', "SCHEDULE": SCHEDULE},
+    "schedule of `cascade`": {"STRUCTURE": f'structure = "cascade"\n{LIMITS}', "SCHEDULE": SCHEDULE, "MEASURED": BOTH},
+    "predictive control": {"STRUCTURE": 'structure = "mpc"\nbandwidth_hz = 16'},
+    "designed on `frf:`": {
+        "STRUCTURE": f'structure = "pid"\n{LIMITS}', "PLANT": "frf:chirp", "EXPERIMENT": EXPERIMENT, "CERTIFIED": "",
+    },
+    "a law of your own": {"STRUCTURE": f'structure = "pid"\n{LIMITS}'},
+}  # fmt: skip
+PARTS: Mapping[str, Mapping[str, str]] = {
+    "nothing else": {},
+    "`notch`": {"CONTROLLER": "notch = true"},
+    "`prefilter`": {"CONTROLLER": 'prefilter = "second_order"'},
+    "`link_feedforward`": {"CONTROLLER": "link_feedforward = true", "ROBUST_TO": '"swing"'},
+    "friction, from the reference": {"CONTROLLER": "compensate = { friction = { fraction = 0.4 } }", "COULOMB": "0.002"},
+    "friction, from the speed": {"CONTROLLER": 'compensate = { friction = { fraction = 0.4, from = "speed" } }', "COULOMB": "0.002"},
+    "weight of the link": {"CONTROLLER": 'compensate = { gravity = { plant = "swing", fraction = 0.8 } }'},
+    "`[impedance]`": {"TABLES": '[impedance]\nplant = "swing"\nstiffness = 30\ndamping = "critical"'},
+    "`[controller.gate]`": {"TABLES": "[controller.gate]\nrange_N = [-300, 300]"},
+    "`derate`": {"CONTROLLER": "derate = true", "PARTS": 'parts = ["thermal"]'},
+    "`frf:` in `robust_to`": {"ROBUST_TO": '"frf:chirp"', "EXPERIMENT": EXPERIMENT},
+    "plants to certify on": {"CERTIFIED": '"swing"'},
+    "`retune`": {"ROBUSTNESS": "retune = 2"},
+    "`seaopt tune --sweep`": {},
+}
+DEFAULTS = {"PLANT": "stand", "MEASURED": '"tau_s"', "ROBUST_TO": "", "CERTIFIED": '"stand"', "COULOMB": "0", "ROBUSTNESS": "retune = 0"}
+HEAD = """# What goes with what
+
+Each law with each part, tried as a problem file by `python docs/combinations.py`, which writes this page; a slow test runs it again. A part works where the cell has a tick: it is tuned (of a law of
+your own measured) with the part. A number is the reason for which it is refused, below.
+Of a law of your own, notch, prefilter and link feedforward of `[controller]` are not used: the law is what it is.
+
+"""
+
+
+def write_file(law: str, part: str) -> str:
+    """Return the problem file of a combination."""
+    text, keys = FILE, [*dict.fromkeys((*LAWS[law], *PARTS[part], *DEFAULTS, "CONTROLLER", "SCHEDULE", "TABLES"))]
+    for key in [*keys, "ROBUST_TO", "PARTS", "EXPERIMENT", "ROBUSTNESS"]:
+        text = text.replace(key, PARTS[part].get(key, LAWS[law].get(key, DEFAULTS.get(key, ""))))
+    return text
+
+
+def try_combination(law: str, part: str, folder: Path) -> str:
+    """Return why a combination is refused; empty where it works."""
+    path = folder / "leg.toml"
+    path.write_text(write_file(law, part), encoding="utf-8")
+    if "sweep" in part and "own" not in law:
+        done = CliRunner().invoke(app, ["tune", str(path), "-o", str(folder / "out"), "--sweep", "16:18:2"])
+        if isinstance(done.exception, SeaoptError):
+            return tell(str(done.exception), folder)
+        return tell(done.stderr, folder) if done.exit_code == 2 else ""
+    try:
+        problem = read_problem(path)
+        source = problem.parameters
+        if "own" in law:
+            if "sweep" in part or "retune" in part:
+                return "a law of your own is given: nothing of it is tuned"
+            (folder / "own.json").write_text(json.dumps(OWN))
+            assess_problem(problem, read_law(folder / "own.json"), source)
+        elif problem.mpc is not None:
+            design_mpc(problem, source)
+        else:
+            tuned = tune_problem(problem, source)
+            if problem.designs_on_response and "plants" in part:
+                certify_problem(problem, tuned, source)
+    except SeaoptError as error:
+        return tell(str(error), folder)
+    return ""
+
+
+def tell(text: str, folder: Path) -> str:
+    """Return a message in one line, without the file's name."""
+    line = " ".join(text.replace(str(folder), "").split())
+    return re.sub(r"^(seaopt: )?(/?leg[.]toml: )*", "", line)
+
+
+def write_page() -> str:
+    """Return the page."""
+    reasons: dict[str, int] = {}
+    lines = [f"| | {' | '.join(LAWS)} |", f"|---|{':-:|' * len(LAWS)}"]
+    with TemporaryDirectory() as folder:
+        for part in PARTS:
+            cells: list[str] = []
+            for law in LAWS:
+                reason = try_combination(law, part, Path(folder))
+                cells.append("✓" if not reason else str(reasons.setdefault(reason, len(reasons) + 1)))
+            lines.append(f"| {part} | {' | '.join(cells)} |")
+    return HEAD + "\n".join(lines) + "\n\n" + "\n".join(f"{n}. {text}" for text, n in reasons.items()) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(write_page(), encoding="utf-8")
