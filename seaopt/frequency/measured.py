@@ -17,8 +17,8 @@ noise, and what disturbed it is as strong throughout.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -67,6 +67,9 @@ class MeasuredResponse:
         Between 0 and 1.
     averages : array, shape (m,)
         Segments averaged: many short ones where the response is smooth, few long ones where it is not.
+    values : mapping of name to float
+        Of the plant's parameters and states, what is known to have been otherwise there than in the rest of the data: a
+        schedule places the response by its variable here.
 
     Examples
     --------
@@ -91,6 +94,7 @@ class MeasuredResponse:
     radius: Lines
     confidence: float
     averages: Int[np.ndarray, " m"]
+    values: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def band_hz(self) -> tuple[float, float]:

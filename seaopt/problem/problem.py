@@ -146,7 +146,8 @@ class Problem:
             table = next(experiment for experiment in self.table.experiment if f"{RESPONSE}{experiment.name}" == name)
             try:
                 experiment = self._make_experiment(table)
-                responses[name] = measure_response(
+                there = experiment.apply_own(self.values(source))
+                response = measure_response(
                     experiment.plant,
                     experiment.log,
                     list_names(self.controller_table.measured)[0],
@@ -156,6 +157,7 @@ class Problem:
                         period=experiment.log.period, hold=experiment.hold, delay_s=_find_delay(experiment, source)
                     ),
                 )
+                responses[name] = replace(response, values={key: there[key].value for key in experiment.parameters})
             except SeaoptError as error:
                 raise type(error)(f"{self.source}: {name}: {error}") from error
         return responses

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import seaopt as so
 from seaopt.cli.main import app
+from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError, ProblemError
 from seaopt.problem.stages import certify_problem, list_plants, tune_problem
 
@@ -59,6 +60,22 @@ def test_a_response_is_read_with_the_delay_that_its_experiment_has(write):
     rows = [row for row in certificate.requirements if row.where.startswith("frf:chirp: on measured points, at 95 %")]
     assert {row.name for row in rows} == {"spectral_radius", "max_sensitivity", "max_complementary"}
     assert certificate.passed
+
+
+def test_a_response_counts_where_its_experiment_was_taken(write):
+    """The experiment's own value, else that of the parameters, else the default of its plant."""
+    path = write()
+    for more, values in (("", {}), ("\nparameters = { k = 750000 }", {"k": 750000.0})):
+        path.write_text(path.read_text().replace("delay_s = 0.001", f"delay_s = 0.001{more}"))
+        problem = so.read_problem(path)
+        response = problem.measure_responses(problem.parameters)["frf:chirp"]
+        assert response.values == values
+    bare = replace(response, values={})
+    given = so.plants.thor().update(k=7e5)
+    assert find_response_place("k", "frf:chirp", response, given) == 750000.0
+    assert find_response_place("k", "frf:chirp", bare, given) == 7e5
+    own = so.plants.high_impedance().defaults["k"].value
+    assert find_response_place("k", "frf:chirp", bare, so.ParameterSet()) == own
 
 
 @pytest.mark.slow
@@ -115,7 +132,12 @@ def test_a_schedule_keeps_its_limits_on_a_response_at_the_point_where_it_was_tak
     certificate = certify_problem(problem, schedule, problem.parameters)
     rows = [row for row in certificate.requirements if row.where.startswith("frf:chirp") or row.plant == "frf:chirp"]
     assert {row.place for row in rows} == {("k", own)} and all(row.met for row in rows)
-    path.write_text(path.read_text().replace(f"{own}, 750000", "600000, 750000"))
+    apart = path.read_text().replace("delay_s = 0.001", "delay_s = 0.001\nparameters = { k = 750000 }")
+    path.write_text(apart)
+    problem = so.read_problem(path)
+    schedule = tune_problem(problem, problem.parameters)
+    assert [[one.name for one in each.measured] for each in schedule.controllers] == [[], ["frf:chirp"]]
+    path.write_text(apart.replace("\nparameters = { k = 750000 }", "").replace(f"{own}, 750000", "600000, 750000"))
     problem = so.read_problem(path)
     with pytest.raises(
         ControlError, match=r"taken at k = 655000, and no point is there; give points = \[600000, 655000"

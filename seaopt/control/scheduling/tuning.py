@@ -80,8 +80,8 @@ def tune_schedule(
     points : sequence of float
         Its values, ascending, SI; the ends are the range for which the schedule is made.
     robust_to : mapping of name to Plant, (Plant, ParameterSet) or MeasuredResponse, optional
-        As in `seaopt.tune`; those that have the variable are placed at each point. A measured response was taken at the
-        value that `params` have of the variable, which has to be a point: it counts there.
+        As in `seaopt.tune`; those that have the variable are placed at each point. A measured response counts at the
+        value at which it was taken, which has to be a point: its own (`MeasuredResponse.values`), or that of `params`.
     bandwidths_hz : sequence of float, optional
         One per point, in place of the specification's.
     draws : sequence of mappings, optional
@@ -125,9 +125,9 @@ def tune_schedule(
     placed: list[tuple[ParameterSet, RobustTo]] = [
         (place_variable(plant, values, over, value), place_plants(others, over, value)) for value in places.tolist()
     ]
-    if responses:
-        at = _find_point(over, places.tolist(), {"": (plant, values), **others}, values, next(iter(responses)))
-        placed[at] = placed[at][0], {**placed[at][1], **responses}
+    for name, response in responses.items():
+        at = _find_point(over, places.tolist(), name, find_response_place(over, name, response, values))
+        placed[at] = placed[at][0], {**placed[at][1], name: response}
     tasks = [
         make_task(plant, plant.complete(at_point), point_spec, at_points, draws)
         for (at_point, at_points), point_spec in zip(placed, _specify(spec, places, bandwidths_hz), strict=True)
@@ -169,11 +169,23 @@ def _pair_plants(robust_to: Mapping[str, Any], values: ParameterSet) -> Plants:
     return pairs
 
 
-def _find_point(over: str, points: Sequence[float], plants: Plants, values: ParameterSet, name: str) -> int:
-    """Return the point at which a measured response was taken: where the parameters have the variable."""
-    stated = [values[over].value] if over in values else []
-    stated += [plant.complete(params)[over].value for plant, params in plants.values() if over in plant.parameters]
-    place = stated[0] if stated else 0.0
+def find_response_place(over: str, name: str, response: MeasuredResponse, values: ParameterSet) -> float:
+    """Return the value of a scheduling variable at which a response was measured: the response's, else that of the
+    parameters, else the default of its plant. Raises ControlError: there is none.
+    """
+    if over in response.values:
+        return response.values[over]
+    for parameters in (values, response.plant.defaults):
+        if over in parameters:
+            return parameters[over].value
+    raise ControlError(
+        f"{name} is a measured response, which stands at one value of {over}, which is not given; give {over} among "
+        "the parameters"
+    )
+
+
+def _find_point(over: str, points: Sequence[float], name: str, place: float) -> int:
+    """Return the point at which a measured response was taken."""
     if place not in points:
         more = ", ".join(f"{value:g}" for value in sorted({*points, place}))
         raise ControlError(

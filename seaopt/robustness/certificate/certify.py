@@ -18,6 +18,7 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, ForceMPC, ScheduledController
+from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor
@@ -178,9 +179,9 @@ def certify(
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     measured : mapping of name to MeasuredResponse, optional
         Measured frequency responses on which stability, Ms, Mt and disk margin are required too, of every response in
-        the discs; of a schedule with the law where the parameters have its variable. Draws and simulations are of the
-        models. Of a controller designed on a measured response the first
-        is that one, on which all limits are required; nothing is drawn or simulated.
+        the discs; of a schedule with the law where each was taken. Draws and simulations are of the models. Of a
+        controller designed on a measured response the first is that one, on which all limits are required; nothing is
+        drawn or simulated.
     executor : concurrent.futures.Executor, optional
         Where parts of the work are done (`seaopt.executors`); here, if left out. The result is the same, bit for bit.
     progress : callable, optional
@@ -368,20 +369,15 @@ def _require_responses(
     parameters: Source,
     measured: Mapping[str, MeasuredResponse],
 ) -> list[Requirement]:
-    """Return the limits on measured responses, with the law where the parameters have the schedule's variable: each
-    response stands at one value of it.
-    """
-    if not measured:
-        return []
+    """Return the limits on measured responses, each with the law at the value at which it was taken."""
     fitted = parameters.parameters if isinstance(parameters, Fit) else parameters
     values, over = (others or ParameterSet()).with_parameters(*fitted.values()), schedule.over
-    if over not in values:
-        raise ControlError(
-            f"measured: a response stands at one value of {over}, which is not given; give {over} among the parameters"
-        )
-    law, place = schedule.at(values[over].value), (over, values[over].value)
-    rows = (row for name, response in measured.items() for row in measured_requirements(law, name, response))
-    return [replace(row, place=place) for row in rows]
+    rows: list[Requirement] = []
+    for name, response in measured.items():
+        place = find_response_place(over, name, response, values)
+        of_response = measured_requirements(schedule.at(place), name, response)
+        rows += [replace(row, place=(over, place)) for row in of_response]
+    return rows
 
 
 def _certify_schedule(

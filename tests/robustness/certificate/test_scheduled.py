@@ -229,7 +229,7 @@ def test_a_motion_slower_than_the_rate_asked_is_not_met():
 
 def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parameters_have():
     """A response measured without error, by the lever's equations: Ms is the largest of the measured points."""
-    stand, _, values = read_knee()
+    stand, swing, values = read_knee()
     schedule, there = tune_knee(), values.update(phi=0.2)
     v, f, ts = {name: values[name].value for name in values}, np.arange(0.5, 300.0, 0.5), 1e-3
     held = expm(np.array([[0.0, 1.0, 0.0], [-v["k"], -v["b"], 1.0], [0.0, 0.0, 0.0]]) / [[1.0], [v["M"]], [1.0]] * ts)
@@ -246,8 +246,11 @@ def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parame
     law = g["k_p"] + g["k_i"] * ts / 2 * (1.0 + q) / (1.0 - q) + g["k_d"] * slope
     assert rows["max_sensitivity"].place == ("phi", 0.2)
     assert rows["max_sensitivity"].value == pytest.approx(np.max(np.abs(1.0 / (1.0 + response * law * q))), rel=2e-3)
+    elsewhere = replace(measured, name="other", values={"phi": 0.4})
+    both = _require_responses(schedule, None, there, {"frf:other": elsewhere, "frf:chirp": measured})
+    assert [row.place for row in both if row.name == "max_sensitivity"] == [("phi", 0.4), ("phi", 0.2)]
     with pytest.raises(ControlError, match="one value of phi, which is not given"):
-        _require_responses(schedule, None, so.ParameterSet(), {"frf:chirp": measured})
+        _require_responses(schedule, None, so.ParameterSet(), {"frf:chirp": replace(measured, plant=swing)})
 
 
 def test_a_range_of_what_it_is_over_is_refused():
