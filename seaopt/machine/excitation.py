@@ -1,8 +1,8 @@
 r"""The reference of a stage: a periodic multisine whose command, readings and motions stay within their limits.
 
-The lines lie evenly over the logarithm of frequency, from a thirtieth of the bandwidth to five times it, and more
-closely about it. Up to where the command per reference, :math:`|C_r S|`, exceeds its value at the lowest line, all are
-equal; beyond, they fall as it rises, so that fast lines do not use up the command. Of several sets of random phases the
+The lines lie evenly over the logarithm of frequency, from a thirtieth of the bandwidth to five times it, or to where
+acceptance needs them, and more closely about it. Up to where the command per reference, :math:`|C_r S|`, exceeds its value at the lowest line, all are
+equal; beyond, they fall as its root rises, so that fast lines do not use up the command. Of several sets of random phases the
 one with the smallest peak of the command is taken, and all is scaled so that each peak stays within its share of its
 limit, on the design plant: the sum of sines is played through the model's response, line by line.
 """
@@ -17,16 +17,16 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.sampled_plant import sample
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, suggestion
+from seaopt.machine.response import NYQUIST, find_reach
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 LINES = 36
 LOWEST, HIGHEST = 1.0 / 30.0, 5.0  # of the bandwidth
 CLOSE = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the bandwidth: lines besides
-NYQUIST = 0.8  # of half the sample rate
 TRIES = 30  # sets of phases
-LONGEST_S = 4.0  # of a period
+LONGEST_S = 4.0  # of a period, but where lines have to lie lower
 
 
 @record(eq=False)
@@ -75,8 +75,9 @@ def design_excitation(
     """
     assert controller.design is not None
     band, rate = controller.spec.bandwidth_hz, 1.0 / controller.sample_time_s
-    period = round(rate * min(max(1.0 / (LOWEST * band), 1.0), LONGEST_S))
-    lines = _choose_lines(band, rate, period)
+    low, high = find_reach(controller)
+    period = round(rate * min(max(1.0 / (LOWEST * band), 1.0), max(LONGEST_S, 1.0 / low)))
+    lines = _choose_lines(band, high, rate, period)
     f = lines * rate / period
     loop = controller.close(*controller.design)
     names, responses = _list_responses(controller, f)
@@ -84,7 +85,7 @@ def design_excitation(
     per_reference = {controller.command.input: controller.per_effort * effort}
     per_reference |= {name: response * effort for name, response in zip(names, responses, strict=True)}
     size = np.abs(effort) / abs(effort[0])
-    shape = 1.0 / np.maximum(size, 1.0)
+    shape = 1.0 / np.sqrt(np.maximum(size, 1.0))
     rng, waves, peaks = np.random.default_rng(seed), list[Float[np.ndarray, " n"]](), dict[str, float]()
     for _ in range(phases):
         tried = [shape * np.exp(2j * np.pi * rng.uniform(size=lines.size)) for _ in range(TRIES)]
@@ -94,7 +95,10 @@ def design_excitation(
         for name, response in per_reference.items():
             peak = float(np.max(np.abs(_play(best * response, lines, period))))
             peaks[name] = max(peaks.get(name, 0.0), peak)
-    allowed = {name: value for name, value in limits.items() if name in per_reference}
+    for name in limits:
+        if name not in per_reference:
+            raise ControlError(f"limits names {name}; {suggestion(name, per_reference)}")
+    allowed = dict(limits)
     if controller.command_limit is not None:
         allowed[controller.command.input] = controller.command_limit
     if not allowed:
@@ -122,8 +126,8 @@ def design_excitation(
     )
 
 
-def _choose_lines(band: float, rate: float, period: int) -> Int[np.ndarray, " m"]:
-    top = min(HIGHEST * band, NYQUIST * 0.5 * rate)
+def _choose_lines(band: float, high: float, rate: float, period: int) -> Int[np.ndarray, " m"]:
+    top = max(min(HIGHEST * band, NYQUIST * 0.5 * rate), high)
     wanted = np.concatenate([np.geomspace(max(LOWEST * band, rate / period), top, LINES), band * np.array(CLOSE)])
     lines = np.unique(np.round(wanted * period / rate).astype(int))
     return lines[lines >= 1]

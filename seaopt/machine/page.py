@@ -11,7 +11,7 @@ from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences import Difference, Differences
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Cause, Replay
-from seaopt.machine.response import Judged, Measured, Response
+from seaopt.machine.response import CLOSEST, FEWEST_LINES, Judged, Measured, Response
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_parts, render_template
@@ -112,14 +112,24 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
 def _say_judged(row: Judged, response: Response) -> str:
     unit = unit_after(row.unit)
     if row.name == "stability":
-        return f"stability is {row.outcome}"
+        return f"stability is {row.outcome}{_say_lines(response)}"
     limit = f"{row.name} {row.sense} {format_number(row.limit)}{unit} is {row.outcome}"
     at = "" if row.where_hz is None else f" at {format_number(row.where_hz, 3)} Hz"
     found = f"{format_number(row.value, 3)} ({_show_interval(row)}){at}"
     if response.needs_phases:
         return f"{limit}: {found}; with dry friction record six sets of random phases"
     more = "" if row.periods is None else f"; {row.periods} periods in all would decide"
-    return f"{limit}: {found}{more}"
+    return f"{limit}: {found}{more}{_say_lines(response) if row.outcome == 'undecided' else ''}"
+
+
+def _say_lines(response: Response) -> str:
+    """Return which lines are to be played, where those of the log are too few."""
+    if response.needs_lines is None:
+        return ""
+    low, high = (format_number(edge, 3) for edge in response.needs_lines)
+    return (
+        f"; play at least {FEWEST_LINES} lines from {low} to {high} Hz, each at most {CLOSEST:g} times the one before"
+    )
 
 
 def _show_interval(row: Judged) -> str:
@@ -170,6 +180,8 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
     ]
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
+    if response.needs_lines is not None:
+        remarks.append(f"Nothing is confirmed{_say_lines(response)}.")
     remarks += [f"Left out: {text}" for text in left_out.values()]
     tables = (Table(head=head, rows=rows, align="<<>>>>>"),)
     return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks))

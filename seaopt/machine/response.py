@@ -12,7 +12,8 @@ With :math:`\hat L` of std s and the limit :math:`M_s`, at a risk :math:`\alpha`
 - *undecided* otherwise; the std falls with the root of the periods, which tells how many would decide.
 
 The other figures are judged by the discs in the same way: all lines at :math:`\alpha`, or one of them at
-:math:`\alpha/m`. Nothing is said between the lines, nor beyond them. With dry friction the response is that of the
+:math:`\alpha/m`. Nothing is said between the lines, nor beyond them; that lines keep a limit therefore confirms it only where
+they lie closely about the crossover. With dry friction the response is that of the
 amplitude and the phases that were played: blocks are the means over periods of one set of phases, of at least six.
 """
 
@@ -39,6 +40,11 @@ SAME_GAIN = 0.1  # relative, between two amplitudes
 GRACE = 0.05  # of each limit: a machine is not its model to the last digit
 SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
+REACH = 0.25, 2.0  # of the crossover: lines go from below the first to above the second
+CLOSEST = 1.5  # ratio of neighbouring lines, at most, from half the crossover on
+FEWEST_LINES = 8
+NYQUIST = 0.8  # of half the sample rate, above which no line has to lie
+ON_GRID = 0.05  # relative, by which the outermost lines may miss, which lie on multiples of the period's
 Outcome = Literal["confirmed", "refuted", "undecided"]
 
 
@@ -88,6 +94,7 @@ class Response:
     measured: tuple[Measured, ...]  # by amplitude
     at_amplitude_only: bool  # dry friction, and the gain is another one at another amplitude, or was seen at one only
     needs_phases: bool  # dry friction, and fewer than six sets of phases
+    needs_lines: tuple[float, float] | None = None  # Hz, from where to where lines are to lie, where they do not
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
@@ -97,6 +104,7 @@ class Response:
             "figures": self.judged,
             "at_amplitude_only": self.at_amplitude_only,
             "needs_phases": self.needs_phases,
+            "needs_lines_hz": self.needs_lines,
             "measured": [_describe_lines(part, 1.0 - self.confidence) for part in self.measured],
         }
 
@@ -162,6 +170,11 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
     ]
     if needs_phases:  # nothing is confirmed, for the discs do not hold the truth
         rows = [_leave_open(row) for row in rows]
+    low, high = find_reach(controller)
+    needs_lines = None if _covers(measured, low, high) else (low, high)
+    if needs_lines:  # a line that breaks a limit does so whatever lies beside it; turns are counted from line to line
+        open_ = [row.outcome == "confirmed" or row.name == "stability" for row in rows]
+        rows = [_leave_open(row) if each else row for row, each in zip(rows, open_, strict=True)]
     limited = [row for row in rows if row.limit is not None]
     return Response(
         met=all(row.outcome == "confirmed" for row in limited),
@@ -170,7 +183,24 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
         measured=measured,
         at_amplitude_only=dry and not _is_same_gain(measured),
         needs_phases=needs_phases,
+        needs_lines=needs_lines,
     )
+
+
+def find_reach(controller: Controller) -> tuple[float, float]:
+    """Return from where to where (Hz) lines are to lie: about the crossover, or the bandwidth where there is none."""
+    middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
+    return REACH[0] * middle, min(REACH[1] * middle, NYQUIST * 0.5 / controller.sample_time_s)
+
+
+def _covers(measured: Sequence[Measured], low: float, high: float) -> bool:
+    """Tell whether lines reach from below to above, and lie closely from twice the lower end on."""
+    f = np.unique(np.concatenate([part.f for part in measured]))
+    low, high = low * (1.0 + ON_GRID), high * (1.0 - ON_GRID)
+    if f.size < FEWEST_LINES or f[0] > low or f[-1] < high:
+        return False
+    first, last = np.searchsorted(f, 2.0 * low, side="right") - 1, np.searchsorted(f, high)
+    return bool(np.all(f[first + 1 : last + 1] <= CLOSEST * (1.0 + 1e-9) * f[first:last]))
 
 
 def _leave_open(row: Judged) -> Judged:

@@ -108,6 +108,7 @@ def test_what_cannot_be_played_is_refused(controller):
         ({"fractions": (1.5,)}, "between 0 and 1"),
         ({"share": 0.0}, "share = 0"),
         ({"fractions": (), "bias": 5000.0}, "bias = 5000"),
+        ({"fractions": (), "limits": {"f1": 900.0}}, "limits names f1; known: I, F1"),
     ):
         with pytest.raises(so.SeaoptError, match=says):
             so.bring_up(controller, **options, **wrong)
