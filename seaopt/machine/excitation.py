@@ -1,10 +1,11 @@
 r"""The reference of a stage: a periodic multisine whose command, readings and motions stay within their limits.
 
 The lines lie evenly over the logarithm of frequency, from a thirtieth of the bandwidth to five times it, or to where
-acceptance needs them, and more closely about it. Up to where the command per reference, :math:`|C_r S|`, exceeds its value at the lowest line, all are
-equal; beyond, they fall as its root rises, so that fast lines do not use up the command. Of several sets of random phases the
-one with the smallest peak of the command is taken, and all is scaled so that each peak stays within its share of its
-limit, on the design plant: the sum of sines is played through the model's response, line by line.
+acceptance needs them, and more closely about it. Up to where the command per reference, :math:`|C_r S|`, exceeds its
+value at the lowest line, all are equal; beyond, they fall as its root rises, so that fast lines do not use up the
+command. Of several sets of random phases the one with the smallest peak of the command is taken, and all is scaled so
+that each peak stays within its share of its limit, on the design plant: the sum of sines is played through the model's
+response, line by line.
 """
 
 from __future__ import annotations

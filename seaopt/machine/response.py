@@ -12,9 +12,9 @@ With :math:`\hat L` of std s and the limit :math:`M_s`, at a risk :math:`\alpha`
 - *undecided* otherwise; the std falls with the root of the periods, which tells how many would decide.
 
 The other figures are judged by the discs in the same way: all lines at :math:`\alpha`, or one of them at
-:math:`\alpha/m`. Nothing is said between the lines, nor beyond them; that lines keep a limit therefore confirms it only where
-they lie closely about the crossover. With dry friction the response is that of the
-amplitude and the phases that were played: blocks are the means over periods of one set of phases, of at least six.
+:math:`\alpha/m`. Nothing is said between the lines, nor beyond them; that lines keep a limit therefore confirms it
+only where they lie closely about the crossover. With dry friction the response is that of the amplitude and the phases
+that were played: blocks are the means over periods of one set of phases, of at least six.
 """
 
 from __future__ import annotations
