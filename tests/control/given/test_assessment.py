@@ -212,7 +212,7 @@ def test_files_say_the_same_law(tmp_path):
         (None, "", "pid"),
         (None, LAW_FILES["pid"] + LAW_FILES["space"], "pid"),
         (None, '[pid]\nform = "ideal"\nk_p = 1.0\n', "ideal form"),
-        (None, LAW_FILES["pid"] + "[compensation.friction]\nlevel = 1.0\n", "no compensation"),
+        (None, LAW_FILES["pid"] + "[terms.friction]\nlevel = 1.0\n", "no terms"),
         (None, "[reference]\nnum = [1.0]\nden = [1.0]\n", "both of reference and measurement"),
         (None, "[law]\nA = [[1.0]]\nB = [[2.0]]\nC = [[0.5]]\nD = [[2.5, -1.5]]\n", "law: B is not a matrix of 1 x 2"),
         (None, "[law]\nA = [[nan]]\nB = [[1.0, 1.0]]\nC = [[0.5]]\nD = [[2.5, -1.5]]\n", "finite"),
