@@ -20,6 +20,7 @@ from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
 from seaopt.machine import Acceptance, accept, bring_up, write_bring_up
+from seaopt.machine.acceptance import take_ranges
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
 from seaopt.problem import certify_problem, tune_problem
@@ -63,7 +64,7 @@ def accept_logs(
             read,
             others=_find_others(folder, path, controller),
             uncertainty=session.parameters(),
-            ranges=session.problem.ranges,
+            ranges=take_ranges(controller, session.problem.ranges),
         )
     content = write(result, session, logs)
     if json:
@@ -80,10 +81,16 @@ def accept_logs(
 
 def _take_controller(session: Session) -> Controller:
     law = session.law()
-    if not isinstance(law, Controller) or session.problem.mpc is not None:
+    if session.problem.mpc is not None:
         raise ProblemError(
-            f"{session.problem.source}: acceptance takes one law, and this problem has a schedule or predictive "
-            "control; freeze the place, and give that law's problem"
+            f"{session.problem.source}: predictive control is not replayed; try the machine with a law first, in a "
+            'problem file with structure = "pid" and without [mpc]'
+        )
+    if not isinstance(law, Controller):
+        raise ProblemError(
+            f"{session.problem.source}: a schedule is not replayed; keep {law.over} at a value, and in Python judge "
+            f"the law there: so.accept(schedule.at({law.points[0]:g}), [log]), bring_up likewise; schedule is what "
+            "so.tune_certified returns, its controller"
         )
     return law
 

@@ -9,7 +9,7 @@ from typing import Any
 from seaopt.codec import to_content
 from seaopt.control import Controller, draw
 from seaopt.control.laws.delay import find_drive
-from seaopt.errors import ControlError, LogError, require_number, require_type
+from seaopt.errors import LogError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.logs import Log
 from seaopt.machine.differences import Differences, compare
@@ -19,6 +19,7 @@ from seaopt.machine.response import Response, judge_response
 from seaopt.machine.ticks import take_ticks
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
+from seaopt.robustness import check_ranges
 
 DRAWS, SEED = 200, 1
 OTHER_LAW = "the logs are not of this law; mend that first, then record again"
@@ -117,6 +118,8 @@ def accept(
     ------
     LogError
         A channel is missing, or a log is too short.
+    ControlError
+        A range is empty, or names nothing that the design plant has.
 
     Notes
     -----
@@ -147,6 +150,8 @@ def accept(
         require_type(log, Log, "logs", "give logs of read_log or Log.from_arrays", LogError)
     if not 0.5 <= require_number(confidence, "confidence", LogError) < 1.0:
         raise LogError(f"confidence = {confidence:g} is not between 0.5 and 1; give 0.95")
+    if ranges and controller.design is not None:
+        check_ranges(ranges, {"design plant": controller.design[0]})
     rows = [take_ticks(controller, log, reference) for log in logs]
     replays = tuple(replay(controller, ticks, others) for ticks in rows)
     result = Acceptance(controller=controller, sources=tuple(log.source for log in logs), replays=replays)
@@ -166,19 +171,29 @@ def accept(
         return replace(result, left_out=left_out)
     response = judge_response(controller, join_blocks(blocks), confidence)
     whole = [ticks for ticks in rows if ticks.source not in left_out]
-    draws = _list_draws(controller, uncertainty, ranges)
+    draws = list_draws(controller, uncertainty, ranges, DRAWS, SEED)
     differences = compare(controller, response.measured, whole, draws, confidence)
     return replace(result, response=response, differences=differences, left_out=left_out)
 
 
-def _list_draws(
-    controller: Controller, uncertainty: Fit | ParameterSet | None, ranges: Mapping[str, tuple[float, float]] | None
+def list_draws(
+    controller: Controller,
+    uncertainty: Fit | ParameterSet | None,
+    ranges: Mapping[str, tuple[float, float]] | None,
+    count: int,
+    seed: int,
 ) -> list[dict[str, float]]:
     """Return draws of what the controller was certified for; none where nothing is uncertain."""
     if uncertainty is None or controller.design is None:
         return []
-    try:
-        drive = find_drive(controller.spec, controller.design[0], uncertainty)
-        return draw(uncertainty, DRAWS, SEED, ranges, drive)
-    except ControlError:
+    inside = take_ranges(controller, ranges or {})
+    if not inside and isinstance(uncertainty, ParameterSet) and all(p.prior_std is None for p in uncertainty.values()):
         return []
+    return draw(uncertainty, count, seed, inside, find_drive(controller.spec, controller.design[0], uncertainty))
+
+
+def take_ranges(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of what the design plant has, of those of all plants."""
+    plant, values = controller.design or (None, {})
+    names = {} if plant is None else {**plant.complete(values), **values}
+    return {name: ends for name, ends in ranges.items() if name in names}

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.codec import to_content
-from seaopt.control import Controller, ControllerSpec, draw
-from seaopt.control.laws.delay import find_drive
+from seaopt.control import Controller, ControllerSpec
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
+from seaopt.machine.acceptance import list_draws
 from seaopt.machine.excitation import Excitation, design_excitation
 from seaopt.machine.response import LEAST_PHASES, has_dry_friction
 from seaopt.parameters import ParameterSet
@@ -217,7 +217,7 @@ def bring_up(
 
     certifying, tuning = certify_stage or certify_one, tune_stage or tune_one
     options: dict[str, Any] = {"share": share, "bias": bias, "limits": dict(limits or {}), "seed": seed}
-    draws = _draw(controller, uncertainty, ranges, seed)
+    draws = list_draws(controller, uncertainty, ranges, DRAWS, seed)
     stages: list[Stage] = []
     count = len(fractions) + 1
     for number, fraction in enumerate(sorted(fractions), start=1):
@@ -229,16 +229,6 @@ def bring_up(
     judged = certifying(controller) if certificate is None else certificate
     stages.append(_make_stage("full", controller, judged, "", draws, options))
     return BringUp(stages=tuple(stages))
-
-
-def _draw(
-    controller: Controller, uncertainty: Fit | ParameterSet, ranges: Mapping[str, tuple[float, float]] | None, seed: int
-) -> list[dict[str, float]]:
-    assert controller.design is not None
-    try:
-        return draw(uncertainty, DRAWS, seed, ranges, find_drive(controller.spec, controller.design[0], uncertainty))
-    except ControlError:  # nothing is uncertain
-        return []
 
 
 def _find_stage(

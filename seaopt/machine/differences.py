@@ -39,6 +39,7 @@ from seaopt.records import record
 STEP = 0.02  # of a parameter, to see what it does
 ROUNDS = 4  # of Gauss and Newton
 MOST_LOG = 1.5  # of a factor: its logarithm goes no further
+MOST_SPREAD = 10.0  # of a factor's logarithm, above which the log does not tell the factor
 ALIKE = 0.05  # of what the best cause takes away: causes that are as good
 TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 FEWEST_FLAT = 10  # readings at the edge of a range, some in a row
@@ -285,7 +286,8 @@ def _try_parameters(
     for name in names:
         after = comparison.misfit(models[name])
         std = _find_std(comparison, slopes[name], after)
-        low, value, high = (math.exp(logs[name] + k * std) for k in (-1.96, 0.0, 1.96))
+        spread, value = 1.96 * std, math.exp(logs[name])
+        low, high = (value * math.exp(-spread), value * math.exp(spread)) if spread < MOST_SPREAD else (None, None)
         yield Difference(kind="parameter", name=name, value=value, low=low, high=high, unit="-", explains=0.0), after
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
 import seaopt as so
 from seaopt.cli.main import app
+from seaopt.cli.session import Session
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
@@ -70,3 +72,9 @@ def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
     content = json.loads((folder / "out" / "acceptance.json").read_text())
     assert [row["met"] for row in content["replay"]["logs"]] == [True, False]
     assert content["replay"]["logs"][1]["causes"][0]["kind"] == "factor"
+
+
+def test_a_schedule_is_refused_with_what_to_do_in_python(folder, monkeypatch, accept):
+    schedule = SimpleNamespace(over="I_p", points=(0.2, 0.6))
+    monkeypatch.setattr(Session, "law", lambda session: schedule)
+    assert "so.accept(schedule.at(0.2), [log])" in str(accept(folder / "good.csv").exception)

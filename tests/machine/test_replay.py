@@ -116,3 +116,22 @@ def test_what_a_log_lacks_is_said_with_what_to_record(controller, bench):
             so.accept(controller, [so.Log.from_arrays(**arrays)])
     with pytest.raises(so.SeaoptError, match="log at least 50 ticks"):
         so.accept(controller, [log.between(0.0, 0.02)])
+
+
+def test_a_law_with_gravity_compensation_is_replayed_from_the_middle_of_a_run_and_its_fault_is_named():
+    from seaopt.control import CompensateGravity, SampledLoop, add_compensation, run_loop, runnable
+
+    swing, values = so.plants.moving_output(), so.plants.thor().update(d=2.0)
+    spec = so.ControllerSpec(bandwidth_hz=20, current_limit_A=9.0, max_sensitivity=1.6)
+    law = so.tune(so.plants.high_impedance(), values, spec, {"swing": swing})
+    law = add_compensation(law, gravity=CompensateGravity(fraction=0.9), link=(swing, values))
+    reference = multisine(1000, LINES, 3, 20.0, 3)
+    loop = SampledLoop(plant=swing, law=runnable(law), measured="F1", delay_samples=1)
+    run = run_loop(loop, [swing.complete(values).drop_conditions()], reference)
+    late = slice(701, None)  # the command of a row is put out in the next one
+    columns = {name: run.outputs[name][0][700:-1] for name in ("F1", "x_2")}
+    columns |= {"time": 1e-3 * np.arange(reference.size - 701), "reference": reference[700:-1]}
+    log = so.Log.from_arrays(**columns, I=run.current[0][late])
+    assert so.accept(law, [log]).replayed
+    cause = cause_of(law, so.Log.from_arrays(**columns, I=0.5 * run.current[0][late]))
+    assert (cause.kind, cause.what) == ("factor", "I") and np.isclose(cause.value, 0.5)

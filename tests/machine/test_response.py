@@ -68,6 +68,22 @@ def test_another_machine_is_found_and_named(controller, bench, machine, kind, na
     assert first.kind == kind or first.alike
 
 
+def test_a_parameter_that_the_response_hardly_tells_has_no_interval(controller, bench):
+    stand, values = controller.design
+    blind = replace(controller, design=(stand, values.with_parameters(replace(values["b_r"], value=1e-12, min=0.0))))
+    result = so.accept(blind, [bench.log(replace(Machine(), stiffness=0.8 * Machine().stiffness), REFERENCE)])
+    assert result.differences is not None and repr(result)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "says"),
+    [({"kk": (6e5, 7e5)}, "no plant has it"), ({"k": (7e5, 6e5)}, "empty")],
+)
+def test_a_wrong_range_is_refused(controller, bench, ranges, says):
+    with pytest.raises(so.SeaoptError, match=says):
+        so.accept(controller, [bench.log(Machine(), REFERENCE)], uncertainty=so.plants.thor(), ranges=ranges)
+
+
 def test_a_sensor_at_its_range_is_named(controller, bench):
     log = bench.log(replace(Machine(), sensor_range=330.0), REFERENCE)
     result = so.accept(controller, [log])
