@@ -194,6 +194,8 @@ def list_draws(
 
 def take_ranges(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
     """Return the ranges of what the design plant has, of those of all plants."""
-    plant, values = controller.design or (None, {})
-    names = {} if plant is None else {**plant.complete(values), **values}
+    if controller.design is None:
+        return {}
+    plant, values = controller.design
+    names = {**plant.complete(values), **values}
     return {name: ends for name, ends in ranges.items() if name in names}
