@@ -15,7 +15,7 @@ CUTS = {"split", "rsplit", "partition", "rpartition", "startswith", "endswith", 
 READERS = {
     "cli/frontier.py": "an argument of the command line",
     "cli/inspect.py": "an argument of the command line",
-    "cli/main.py": "blanks of an error's text",
+    "cli/terminal.py": "blanks of an error's text",
     "control/laws/verdict.py": "active_constraints of controller.json are labels, NAME (PLANT)",
     "control/tuning/tuner.py": "labels of limits that are broken, as active_constraints",
     "errors.py": "blanks of an error's text",

@@ -193,7 +193,7 @@ def bring_up(
     >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
     >>> plan = so.bring_up(controller, {"stand": stand}, thor, samples=20, fractions=(0.5,))
     >>> [(stage.name, stage.controller.spec.bandwidth_hz) for stage in plan.stages]
-    [('stage_1', 15.0), ('full', 30.0)]
+    [('stage_1', 15.0), ('full', 30)]
     """
     require_type(controller, Controller, "controller", "give what tune returned", ControlError)
     if controller.design is None:

@@ -96,7 +96,6 @@ def _write_stage(stage: Stage, folder: Path) -> list[Path]:
 
 def _list_numbers(values: np.ndarray) -> str:
     texts = [f"{value:.9g}" for value in values.tolist()]
-    texts = [text if any(mark in text for mark in ".en") else f"{text}.0" for text in texts]
     return ",\n".join(", ".join(texts[k : k + PER_LINE]) for k in range(0, len(texts), PER_LINE))
 
 

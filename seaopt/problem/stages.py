@@ -429,7 +429,9 @@ def certify_problem(
     if isinstance(controller, Controller) and problem.designs_on_response:
         if not plants:
             return certify(controller, plants, source, seed=table.seed, measured=measured)
-        controller = replace(controller, design=(problem.design_plant, problem.values(source)))
+        controller = replace(
+            controller, design=(problem.design_plant, problem.values(source)), designed_on_response=True
+        )
     law = controller.controllers[0] if isinstance(controller, ScheduledController) else controller
     read = list_readings(law, plants)
     certificate = certify(

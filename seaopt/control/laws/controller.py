@@ -114,6 +114,8 @@ class Controller(LoopDelays, Result, Worded):
     share : float or None
         Of a schedule, frozen: how its integral winds up there, T_s/(T_t + T_s). An observer sees the limited command
         then (`seaopt.control.scheduling.step_order`).
+    designed_on_response : bool
+        The design plant is a measured response, and `design` is the plant that was measured.
     """
 
     plot = PlotAccessor()
@@ -143,6 +145,7 @@ class Controller(LoopDelays, Result, Worded):
     gate: PlausibilityGate | None = None
     derate: bool = False
     share: float | None = None
+    designed_on_response: bool = False
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -215,8 +218,8 @@ class Controller(LoopDelays, Result, Worded):
 
     @property
     def designs_on_response(self) -> bool:
-        """Whether it was designed on a measured response; `design`, where there is one, is then what was measured."""
-        return self.design is None or bool(self.measured and self.measured[0].name not in self.robust_to)
+        """Whether all limits are asked of a measured response."""
+        return self.design is None or self.designed_on_response
 
     @property
     def judged_on(self) -> str:

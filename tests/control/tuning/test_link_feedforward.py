@@ -16,7 +16,7 @@ from seaopt.control.loops.compensation.link_feedforward import model_link_path
 from seaopt.control.loops.loop import Loop
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.tuner import make_task
-from seaopt.errors import ControlError, FileError, SeaoptError
+from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.problem import read_problem
 from seaopt.robustness import Budget
@@ -329,15 +329,6 @@ def test_a_response_of_a_moving_link_is_refused(beside_discs, stand, swing, thor
         so.certify(controller, {"swing": swing}, thor, measured={"log": moving})
     with pytest.raises(ControlError, match="model of the design plant"):
         so.tune(response, thor, controller.spec, {"swing": swing})
-
-
-def test_a_schedule_of_it_is_refused(tmp_path):
-    plants = '[plant.stand]\nkind = "high_impedance"\n[plant.swing]\nkind = "moving_output"\n'
-    asked = '[controller]\nplant = "stand"\nrobust_to = ["swing"]\nbandwidth_hz = 30\nlink_feedforward = true\n'
-    schedule = '[controller.schedule]\nover = "I_p"\npoints = [0.3, 0.5]\n'
-    (tmp_path / "problem.toml").write_text(f"schema = 1\n{plants}{asked}{schedule}")
-    with pytest.raises(SeaoptError, match="leave one of them out"):
-        read_problem(tmp_path / "problem.toml")
 
 
 def test_the_path_has_the_inertia_and_the_damping_of_the_motor_on_the_link():

@@ -237,7 +237,7 @@ def test_beside_a_model_the_limits_hold_on_the_discs_too():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"structure": "pid_dob"}, "has a model"), ({"passive_band_hz": (1.0, 5.0)}, "passive_band_hz takes a model"),
+        ({"passive_band_hz": (1.0, 5.0)}, "passive_band_hz takes a model"),
         ({"measured": "F2"}, "measured at the output F1"), ({"min_friction_margin": 1.0}, "takes a model"),
     ],
 )  # fmt: skip
