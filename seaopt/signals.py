@@ -16,6 +16,8 @@ INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u", "v", "duty", "goal"})
 HOLDING_NAMES = frozenset({"duty", "goal"})  # of inputs that hold a value for as long as they like
 INPUT_UNITS = frozenset({"A", "V"})
 SAME_SIGN = ("f1", "f2")  # both forces of an actuator between two links
+REFERENCE = "reference"  # of a law, in a log that was taken under it
+REFERENCES = (REFERENCE, "ref")  # what its column is called where nobody says
 
 
 @record

@@ -19,15 +19,17 @@ from seaopt.control import Controller, ControllerSpec
 from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
-from seaopt.machine import Acceptance, accept, bring_up, write_bring_up
+from seaopt.machine import Acceptance, BringUp, accept, bring_up, write_bring_up
 from seaopt.machine.acceptance import take_ranges
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
+from seaopt.machine.ticks import list_further
 from seaopt.problem import certify_problem, tune_problem
-from seaopt.problem.loop_logs import REFERENCE, read_loop_log
+from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import list_plants
 from seaopt.reporting.sections import judge
 from seaopt.robustness import Certificate, JointTuning
+from seaopt.signals import REFERENCE
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
 BRING_UP = "bringup"  # the folder of the stages
@@ -67,6 +69,13 @@ def accept_logs(
             ranges=take_ranges(controller, session.problem.ranges),
         )
     content = write(result, session, logs)
+    return _show(result, content, [folder / FILE, folder / PAGE], json=json, amount=amount)
+
+
+def _show(
+    result: Acceptance | BringUp, content: dict[str, Any], files: Sequence[Path], *, json: bool, amount: Amount
+) -> bool:
+    """Print a result; return whether it is met. `files`: that were written of it."""
     if json:
         sys.stdout.write(to_json(content))
         return result.met
@@ -75,7 +84,7 @@ def accept_logs(
     show_verdicts(console, [] if verdict is None else [verdict], verbose=amount == "verbose")
     if amount != "quiet":
         show_sections(console, result, verbose=amount == "verbose")
-        console.list_files([folder / FILE, folder / PAGE])
+        console.list_files(files)
     return result.met
 
 
@@ -99,8 +108,7 @@ def _list_units(controller: Controller) -> dict[str, str]:
     """Return the channels that a log of a controller has, with their units."""
     command = controller.command
     outputs = {} if controller.design is None else dict(controller.see(controller.design[0]).outputs)
-    further = () if controller.compensation is None else controller.compensation.reads
-    names = (*controller.signals, *further)
+    names = (*controller.signals, *list_further(controller))
     read = {name: outputs.get(name, command.reference_unit) for name in names}
     return {REFERENCE: command.reference_unit, command.input: command.unit, **read}
 
@@ -170,16 +178,8 @@ def plan_bring_up(
         files=[Path(session.problem.source)],
         command=shlex.join(["seaopt", *sys.argv[1:]]),
     )
-    if json:
-        sys.stdout.write(to_json(plan.to_dict()))
-        return plan.met
-    console = Terminal()
-    verdict = judge(plan)
-    show_verdicts(console, [] if verdict is None else [verdict], verbose=amount == "verbose")
-    if amount != "quiet":
-        show_sections(console, plan, verbose=amount == "verbose")
-        console.list_files([target / "bringup.json", page, *(target / stage.name for stage in plan.stages)])
-    return plan.met
+    files = [target / "bringup.json", page, *(target / stage.name for stage in plan.stages)]
+    return _show(plan, plan.to_dict(), files, json=json, amount=amount)
 
 
 def _parse_limits(texts: Sequence[str]) -> dict[str, float]:

@@ -16,11 +16,14 @@ from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
 from seaopt.machine.excitation import Excitation, design_excitation
 from seaopt.machine.response import LEAST_PHASES, has_dry_friction
+from seaopt.machine.ticks import list_further
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import Certificate, certify, tune_certified
+from seaopt.robustness.uncertainty.worst import place_values
+from seaopt.signals import REFERENCE
 
 BRINGUP_SCHEMA = "seaopt/bringup/1"
 FRACTIONS = (0.25, 0.5)
@@ -79,9 +82,8 @@ class Stage:
     @property
     def channels(self) -> tuple[str, ...]:
         """What to log in each tick."""
-        terms = self.controller.compensation
-        further = () if terms is None else terms.reads
-        return ("reference", *self.controller.signals, *further, self.controller.command.input)
+        controller = self.controller
+        return (REFERENCE, *controller.signals, *list_further(controller), controller.command.input)
 
 
 @record(eq=False, repr=False)
@@ -284,11 +286,7 @@ def _make_stage(
     excitation = design_excitation(controller, phases=phases, periods=periods, **options)
     assert controller.design is not None
     plant, values = controller.design
-    complete = {**plant.complete(values), **values}
-    sets = [values]
-    for each in draws:
-        known = [replace(complete[key], value=value) for key, value in each.items() if key in complete]
-        sets.append(values.with_parameters(*known))
+    sets = [values, *(place_values(plant, values, each) for each in draws)]
     loops = [controller.close(plant, each) for each in sets]
     f = excitation.frequency_hz
     count = round(STEP_PERIODS / controller.spec.bandwidth_hz / controller.sample_time_s)

@@ -78,11 +78,10 @@ def _write_stage(stage: Stage, folder: Path) -> list[Path]:
     time = excitation.sample_time_s * np.arange(reference.size)
     log = Log.from_arrays(time=time, reference=reference, units={"reference": unit}, source=stage.name)
     period, phases = excitation.waves.shape[1], len(excitation.waves)
-    rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(period) / period)
     waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.waves)
     words = {"phases": phases, "period": period, "periods": excitation.periods, "ticks": reference.size, "unit": unit}
     header = HEADER.format(**words, rate=f"{1.0 / excitation.sample_time_s:.10g}")
-    source = SOURCE.format(**words, fade=_list_numbers(rise), waves=waves)
+    source = SOURCE.format(**words, fade=_list_numbers(excitation.fade), waves=waves)
     return [
         *export(stage.controller, folder, allow_infeasible=True),
         write_json(folder / "controller.json", stage.controller.to_dict()),

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.files import write_text
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup import Band, BringUp, Stage
 from seaopt.reporting.figures.panel import BAND, BLUE, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
-from seaopt.reporting.page.render import render_parts, render_template
+from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
 from seaopt.units import unit_after
 
@@ -166,16 +165,12 @@ def write_bring_up_page(
         {"heading": stage.name, "text": "", "charts": [make_chart(panel) for panel in _list_panels(stage)]}
         for stage in result.stages
     ]
-    html = render_template(
-        "page.html.jinja",
+    return write_result_page(
+        path,
         title=title,
         parts=PARTS,
-        verdicts=[judge(result, Commands())],
+        verdict=judge(result, Commands()),
         glance=summarise(result),
-        described=render_parts([*describe(result), describe_provenance((), files, command)], PARTS),
+        sections=[*describe(result), describe_provenance((), files, command)],
         plates={"stages": plates},
-        doubt="",
-        controller=None,
-        header=None,
     )
-    return write_text(Path(path), html)

@@ -35,6 +35,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
+from seaopt.robustness.uncertainty.worst import place_values
 
 STEP = 0.02  # of a parameter, to see what it does
 ROUNDS = 4  # of Gauss and Newton
@@ -172,7 +173,7 @@ def compare(
     plant, values = controller.design
     nominal = plant.complete(values)
     response, count = comparison.response, comparison.f.size
-    drawn = comparison.predict([values, *(_place(plant, values, draw) for draw in draws)])
+    drawn = comparison.predict([values, *(place_values(plant, values, draw) for draw in draws)])
     model, drawn = drawn[0], np.array(drawn[1:]).reshape(-1, count)
     before = comparison.misfit(model)
     reach = np.max(np.abs(drawn - model), axis=0, initial=0.0)
@@ -193,13 +194,6 @@ def compare(
         nearest={} if best is None else dict(draws[best]),
         nearest_misfit=None if best is None else misfits[best] / count,
     )
-
-
-def _place(plant: Plant, values: ParameterSet, draw: Values) -> ParameterSet:
-    """Return values with those of a draw that the plant, or its drive, has."""
-    complete = {**plant.complete(values), **values}
-    known = {name: value for name, value in draw.items() if name in complete}
-    return values.with_parameters(*(replace(complete[name], value=value) for name, value in known.items()))
 
 
 def _list_clipped(controller: Controller, logs: Sequence[Ticks]) -> Iterator[Difference]:

@@ -53,10 +53,16 @@ class Excitation:
         return float(np.max(np.abs(self.waves)))
 
     @property
+    def fade(self) -> Float[np.ndarray, " period"]:
+        """What a period that fades in is multiplied by."""
+        period = self.waves.shape[1]
+        return 0.5 - 0.5 * np.cos(np.pi * np.arange(period) / period)
+
+    @property
     def reference(self) -> Float[np.ndarray, " n"]:
         """All of it: a period that fades in, then every set of phases for its periods, then a period that fades out."""
         first, last = self.waves[0], self.waves[-1]
-        rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(first.size) / first.size)
+        rise = self.fade
         played = np.concatenate([np.tile(wave, self.periods) for wave in self.waves])
         return np.concatenate([rise * (self.bias + first), self.bias + played, rise[::-1] * (self.bias + last)])
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from seaopt.files import write_text
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences import Difference, Differences
@@ -14,7 +13,7 @@ from seaopt.machine.replay import Cause, Replay
 from seaopt.machine.response import CLOSEST, FEWEST_LINES, Judged, Measured, Response
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
-from seaopt.reporting.page.render import render_parts, render_template
+from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Mark, Reason, Section, Style, Table, Verdict, mark_met
 from seaopt.units import unit_after
 
@@ -302,19 +301,14 @@ def write_acceptance_page(
     FileError
         The folder cannot be written.
     """
-    verdict = judge(result, Commands())
-    html = render_template(
-        "page.html.jinja",
+    return write_result_page(
+        path,
         title=title,
         parts=PARTS,
-        verdicts=[verdict],
+        verdict=judge(result, Commands()),
         glance=summarise(result),
-        described=render_parts([*describe(result), describe_provenance((), files, command)], PARTS),
+        sections=[*describe(result), describe_provenance((), files, command)],
         plates={
             "response": [{"heading": "", "text": "", "charts": [make_chart(panel) for panel in list_panels(result)]}]
         },
-        doubt="",
-        controller=None,
-        header=None,
     )
-    return write_text(Path(path), html)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.errors import LogError
-from seaopt.machine.ticks import Ticks
+from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
 SHORTEST = 20  # ticks of a period
@@ -19,7 +19,6 @@ SAME = 1e-4  # of the reference's range: rows that are alike
 WEAKEST = 1e-2  # of the strongest line
 TRANSIENT = 1  # periods that are left out at the start of each stretch
 SAME_AMPLITUDE = 0.1  # relative
-AT_LIMIT = 1.0 - 1e-6
 
 
 @record(eq=False)

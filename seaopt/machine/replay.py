@@ -29,7 +29,7 @@ from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.errors import SeaoptError
 from seaopt.logs.quality.faults import find_quantisation
-from seaopt.machine.ticks import Ticks
+from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
 FLOOR = 1e-3  # of the command's variation: a mismatch below is none
@@ -53,7 +53,6 @@ UNITS = (
 )
 SAME_RATE = 0.02  # relative: of the log's clock and the law's
 SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
-AT_LIMIT = 1.0 - 1e-6
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 MOST_CAUSES = 6
 

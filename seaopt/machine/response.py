@@ -43,6 +43,7 @@ CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 REACH = 0.25, 2.0  # of the crossover: lines go from below the first to above the second
 CLOSEST = 1.5  # ratio of neighbouring lines, at most, from half the crossover on
 FEWEST_LINES = 8
+MOST_PERIODS = 1e6  # that are asked for
 NYQUIST = 0.8  # of half the sample rate, above which no line has to lie
 ON_GRID = 0.05  # relative, by which the outermost lines may miss, which lie on multiples of the period's
 Outcome = Literal["confirmed", "refuted", "undecided"]
@@ -281,8 +282,13 @@ def _judge_sensitivity(asked: float | None, measured: Sequence[Measured], alpha:
     outcome = _decide(confirmed, refuted) if limit is not None else "undecided"
     return Judged(
         name="Ms", limit=limit, sense="at most", value=value, low=low, high=high, unit="-", outcome=outcome,
-        where_hz=where, periods=math.ceil(needed) if outcome == "undecided" and 0.0 < needed < 1e6 else None,
+        where_hz=where, periods=_count_periods(outcome, needed),
     )  # fmt: skip
+
+
+def _count_periods(outcome: Outcome, needed: float) -> int | None:
+    """Return how many periods would decide; None where it is decided, or no number would."""
+    return math.ceil(needed) if outcome == "undecided" and 0.0 < needed < MOST_PERIODS else None
 
 
 def _decide(confirmed: bool, refuted: bool) -> Outcome:
@@ -344,7 +350,7 @@ def _judge_discs(name: str, asked: float | None, measured: Sequence[Measured], a
     return Judged(
         name=name, limit=limit, sense="at most", value=value, low=low, high=high if math.isfinite(high) else None,
         unit="-", outcome=outcome, where_hz=where,
-        periods=math.ceil(needed) if outcome == "undecided" and 0.0 < needed < 1e6 else None,
+        periods=_count_periods(outcome, needed),
     )  # fmt: skip
 
 
@@ -374,7 +380,7 @@ def _judge_bandwidth(controller: Controller, measured: Sequence[Measured], alpha
     return Judged(
         name="bandwidth", limit=limit if tracked else None, sense="at least", value=min(values), low=min(lows),
         high=high if math.isfinite(high) else None, unit="Hz", outcome=outcome, where_hz=where,
-        periods=math.ceil(needed) if outcome == "undecided" and 0.0 < needed < 1e6 else None,
+        periods=_count_periods(outcome, needed),
     )  # fmt: skip
 
 

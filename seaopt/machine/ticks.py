@@ -14,8 +14,9 @@ from seaopt.formatting import join_words
 from seaopt.logs import Log
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.records import record
+from seaopt.signals import REFERENCES
 
-REFERENCES = ("reference", "ref")  # what the reference's channel is called where nobody says
+AT_LIMIT = 1.0 - 1e-6  # of the command's limit, from which on it is there
 FEWEST = 50  # ticks that a replay takes at least
 
 

@@ -12,11 +12,10 @@ from seaopt.logs.formats import Field
 from seaopt.problem.bench_tables import ExperimentTable
 from seaopt.problem.columns import make_column
 from seaopt.problem.problem import Problem
+from seaopt.signals import REFERENCE, REFERENCES
 from seaopt.units import bare_name
 
-REFERENCE = "reference"
 MOST_NAMES = 20  # in a message
-REFERENCES = (REFERENCE, "ref")  # what its column is called where nobody says
 
 
 def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], reference: str | None = None) -> Log:

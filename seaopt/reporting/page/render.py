@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
+from seaopt.files import write_text
 from seaopt.formatting import format_number, printable
-from seaopt.reporting.sections.data import Section
+from seaopt.reporting.sections.data import KeyFigure, Section, Verdict
 from seaopt.reporting.sections.glossary import explain_terms
 from seaopt.reporting.sections.html import render_section
 
@@ -32,6 +34,32 @@ def render_parts(sections: Iterable[Section], headings: Mapping[str, str]) -> di
         html = render_section(section, title=bool(section.aside) or section.title != headings[section.part])
         parts.setdefault(section.part, []).append(Markup(html))  # noqa: S704 - escaped there
     return parts
+
+
+def write_result_page(
+    path: Path | str,
+    *,
+    title: str,
+    parts: Mapping[str, str],
+    verdict: Verdict | None,
+    glance: Sequence[KeyFigure],
+    sections: Iterable[Section],
+    plates: Mapping[str, Any],
+) -> Path:
+    """Write the page of a result that is no stage of a report; sections and plates stand in its `parts`."""
+    html = render_template(
+        "page.html.jinja",
+        title=title,
+        parts=parts,
+        verdicts=[verdict],
+        glance=glance,
+        described=render_parts(sections, parts),
+        plates=plates,
+        doubt="",
+        controller=None,
+        header=None,
+    )
+    return write_text(Path(path), html)
 
 
 @cache
