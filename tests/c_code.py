@@ -24,7 +24,12 @@ class LoadedLaw:
         assert done.returncode == 0, done.stderr
         real = ctypes.c_double if precision == "double" else ctypes.c_float
         order = int(re.search(r"_ORDER (\d+)", (folder / f"{name}.h").read_text())[1])
-        gate = (("refused", ctypes.c_ulong), ("measurement_N", real), ("known", ctypes.c_int))
+        gate = (
+            ("refused", ctypes.c_ulong),
+            ("measurement_N", real),
+            ("known", ctypes.c_int),
+            ("disagrees", ctypes.c_int),
+        )
 
         class Law(ctypes.Structure):
             _fields_ = (
@@ -58,8 +63,9 @@ class CompiledLaw(LoadedLaw):
 
     def __init__(self, compiler, folder, controller, precision, **options):
         export(controller, folder, precision=precision, name="law", **options)
-        gated = options.get("gate") is not None
-        super().__init__(compiler, folder, "law", controller.law.d.size, precision, gated)
+        gate = options.get("gate")
+        inputs = controller.law.d.size + (len(gate.reads) if gate else 0)
+        super().__init__(compiler, folder, "law", inputs, precision, gate is not None)
 
 
 class LoadedMPC:

@@ -12,9 +12,9 @@ from typing import Any, Literal
 from seaopt.cli.provenance import FILES, digest
 from seaopt.cli.session import OWN_LAW, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
-from seaopt.codec import to_content
+from seaopt.codec import from_content, to_content
 from seaopt.control.deploy.export import export, read_guard
-from seaopt.control.laws.plausibility import GateSpec, PlausibilityGate
+from seaopt.control.laws.plausibility import Agreement, GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.mpc.export import SOURCES, set_gate, set_heat, write_code
@@ -151,8 +151,13 @@ def choose_gate(
         )
     if limit is None:
         raise ProblemError("--gate: the command has no limit from which it goes to zero; type --current-limit")
+    agreement, source = _read_own_gate(content).get("agreement"), "controller.json: guards.gate.agreement"
     return PlausibilityGate(
-        range_N=(low, high), max_step_N=step, max_held=spec.max_held, ramp_A_per_s=limit / spec.ramp_s
+        range_N=(low, high),
+        max_step_N=step,
+        max_held=spec.max_held,
+        ramp_A_per_s=limit / spec.ramp_s,
+        agreement=agreement and from_content(Agreement, agreement, source, remedy="tune again"),
     )
 
 
@@ -160,7 +165,12 @@ def _find_own_step(content: Mapping[str, Any]) -> float | None:
     """Return how far a reading moves in a sample by the controller's own gate; None without one."""
     if "mpc" in content:
         return read_code(content["mpc"]["code"]).numbers.get("step")
-    return ((content.get("guards") or {}).get("gate") or {}).get("max_step_N")
+    return _read_own_gate(content).get("max_step_N")
+
+
+def _read_own_gate(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the controller's own gate, as it is written; empty without one."""
+    return (content.get("guards") or {}).get("gate") or {}
 
 
 def _find_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> float | None:

@@ -23,7 +23,6 @@ from seaopt.machine import Acceptance, BringUp, accept, bring_up, write_bring_up
 from seaopt.machine.acceptance import take_ranges
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
-from seaopt.machine.ticks import list_further
 from seaopt.problem import certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import list_plants
@@ -108,7 +107,7 @@ def _list_units(controller: Controller) -> dict[str, str]:
     """Return the channels that a log of a controller has, with their units."""
     command = controller.command
     outputs = {} if controller.design is None else dict(controller.see(controller.design[0]).outputs)
-    names = (*controller.signals, *list_further(controller))
+    names = (*controller.signals, *controller.further)
     read = {name: outputs.get(name, command.reference_unit) for name in names}
     return {REFERENCE: command.reference_unit, command.input: command.unit, **read}
 

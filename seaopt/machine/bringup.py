@@ -16,7 +16,6 @@ from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
 from seaopt.machine.excitation import Excitation, design_excitation
 from seaopt.machine.response import LEAST_PHASES, has_dry_friction
-from seaopt.machine.ticks import list_further
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
@@ -83,7 +82,7 @@ class Stage:
     def channels(self) -> tuple[str, ...]:
         """What to log in each tick."""
         controller = self.controller
-        return (REFERENCE, *controller.signals, *list_further(controller), controller.command.input)
+        return (REFERENCE, *controller.signals, *controller.further, controller.command.input)
 
 
 @record(eq=False, repr=False)

@@ -208,7 +208,7 @@ def _compensate(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"]
     if law.compensation is None:
         return ticks.reference, np.zeros(len(ticks))
     memory, rows = FORGOTTEN, np.empty((len(ticks), 2))
-    for k, readings in enumerate(ticks.further.tolist()):
+    for k, readings in enumerate(ticks.further[:, : len(law.compensation.reads)].tolist()):
         rows[k, 0], rows[k, 1], memory = law.compensation.step(memory, float(ticks.reference[k]), readings)
     return rows[:, 0], rows[:, 1]
 
@@ -428,7 +428,14 @@ def _fit_factors(setting: Setting) -> dict[str, float]:
 
 
 def _change_law(**changes: Any) -> Callable[[Setting], Setting]:
-    return lambda setting: replace(setting, law=replace(setting.law, **changes))
+    """Return what changes a law, with the columns of the log that it then reads."""
+
+    def change(setting: Setting) -> Setting:
+        law = replace(setting.law, **changes)
+        read = [setting.law.further.index(name) for name in law.further]
+        return replace(setting, law=law, ticks=replace(setting.ticks, further=setting.ticks.further[:, read]))
+
+    return change
 
 
 def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
@@ -450,8 +457,7 @@ def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
     terms = [] if added is None else [name for name in ("friction", "gravity", "ripple") if getattr(added, name)]
     for name in terms:
         without = replace(added, **{name: None}) if added is not None and len(terms) > 1 else None
-        change = _change_further(without)
-        yield Alternative(kind="compensation", what=name, change=change)
+        yield Alternative(kind="compensation", what=name, change=_change_law(compensation=without))
     if setting.controller.link is not None:
         change = _change_ticks(
             lambda rows: replace(rows, measured=rows.measured * _all_but_last(rows.measured.shape[1]))
@@ -461,18 +467,6 @@ def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
 
 def _all_but_last(n: int) -> Float[np.ndarray, " n"]:
     return np.append(np.ones(n - 1), 0.0)
-
-
-def _change_further(compensation: Any) -> Callable[[Setting], Setting]:
-    """Return what replaces the terms of a law, with the columns of the log that those left over read."""
-
-    def change(setting: Setting) -> Setting:
-        before = [] if setting.law.compensation is None else list(setting.law.compensation.reads)
-        read = [] if compensation is None else [before.index(name) for name in compensation.reads]
-        ticks = replace(setting.ticks, further=setting.ticks.further[:, read])
-        return replace(setting, law=replace(setting.law, compensation=compensation), ticks=ticks)
-
-    return change
 
 
 def _read_gains(controller: Controller) -> Gains | None:

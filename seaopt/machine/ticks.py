@@ -28,7 +28,7 @@ class Ticks:
     rate_hz: float  # by the log's own clock
     reference: Float[np.ndarray, " n"]
     measured: Float[np.ndarray, "n y"]
-    further: Float[np.ndarray, "n r"]  # what the terms of the law read besides
+    further: Float[np.ndarray, "n r"]  # what its terms and its gate read besides
     command: Float[np.ndarray, " n"]
     left_out: int = 0  # rows of the log that are in no such stretch
 
@@ -68,16 +68,11 @@ class Ticks:
         return find_quantisation(self.command)
 
 
-def list_further(controller: Controller) -> tuple[str, ...]:
-    """Return what the terms of a controller read besides its signals."""
-    return () if controller.compensation is None else tuple(controller.compensation.reads)
-
-
 def take_ticks(controller: Controller, log: Log, reference: str | None = None) -> Ticks:
     """Return the ticks of a log whose channels carry the names of the controller's signals, of the input that it
     commands, and of its reference. Raises LogError: a channel is missing, or no stretch is long enough.
     """
-    command, names = controller.command, (*controller.signals, *list_further(controller))
+    command, names = controller.command, (*controller.signals, *controller.further)
     called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
     if not called or called[0] not in log.signals:
         raise LogError(

@@ -150,7 +150,7 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
         )
     mpc = force_mpc(problem.design_plant, source, problem.mpc)
     heat = mpc.heat_guard if _derates(problem, mpc) else None
-    mpc = replace(mpc, gate=_make_gate(problem, mpc), heat=heat)
+    mpc = replace(mpc, gate=_make_gate(problem, mpc, source), heat=heat)
     if problem.table.impedance is None:
         return mpc
     (rendered,) = _add_impedance(problem, [(linear_controller(mpc), problem.values(source))])
@@ -258,7 +258,7 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     """
     values = problem.values(source)
     (controller,) = _add_impedance(problem, [(controller, values)])
-    controller, terms = _guard(problem, controller), _list_terms(problem, values)
+    controller, terms = _guard(problem, controller, source), _list_terms(problem, values)
     return add_compensation(controller, **terms) if terms else controller
 
 
@@ -289,9 +289,9 @@ def _list_terms(problem: Problem, values: ParameterSet) -> dict[str, Any]:
     return terms | ({"link": (problem.plants[link], values)} if link else {})
 
 
-def _guard(problem: Problem, controller: Controller) -> Controller:
+def _guard(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
     """Return a controller with the problem's gate and heat guard."""
-    return replace(controller, gate=_make_gate(problem, controller), derate=_derates(problem, controller))
+    return replace(controller, gate=_make_gate(problem, controller, source), derate=_derates(problem, controller))
 
 
 def _derates(problem: Problem, controller: Controller | ForceMPC) -> bool:
@@ -317,7 +317,7 @@ def complete_schedule(
     )
     placed = [place_variable(link, values, schedule.over, point) for point in schedule.points]
     laws = _add_impedance(problem, list(zip(schedule.controllers, placed, strict=True)))
-    guarded = [_guard(problem, controller) for controller in laws]
+    guarded = [_guard(problem, controller, source) for controller in laws]
     gates = [controller.gate for controller in guarded if controller.gate is not None]
     widest = max(gates, key=lambda gate: gate.max_step_N, default=None)
     guarded = replace(schedule, controllers=tuple(replace(each, gate=widest) for each in guarded))
@@ -325,15 +325,31 @@ def complete_schedule(
     return compensate_schedule(guarded, **terms) if terms else guarded
 
 
-def _make_gate(problem: Problem, controller: Controller | ForceMPC) -> PlausibilityGate | None:
+def _make_gate(
+    problem: Problem, controller: Controller | ForceMPC, source: Fit | ParameterSet
+) -> PlausibilityGate | None:
     """Return the gate that the file asks for; None where it asks for none."""
     table = problem.controller_table.gate
     if table is None:
         return None
     try:
-        return PlausibilityGate.of_controller(controller, **table.model_dump())
+        noise = _find_noise(problem, source) if table.agreement else None
+        return PlausibilityGate.of_controller(controller, noise=noise, **table.model_dump())
     except ControlError as error:
         raise ProblemError(f"{problem.source}: controller.gate: {error}") from error
+
+
+def _find_noise(problem: Problem, source: Fit | ParameterSet) -> dict[str, float]:
+    """Return the noise of sensors in the logs that have the regulated force, the largest of each; that of [robustness]
+    for what no such log has.
+    """
+    noise = dict(problem.robustness.sensors.noise_std)
+    regulated = list_names(problem.controller_table.measured)[0]
+    logs = [outputs for outputs in source.outputs.values() if regulated in outputs] if isinstance(source, Fit) else []
+    for name in {name for outputs in logs for name in outputs}:
+        scores = [outputs[name] for outputs in logs if name in outputs]
+        noise[name] = max(figure for score in scores for figure in (score.sigma, score.rms_residual))
+    return noise
 
 
 def list_plants(

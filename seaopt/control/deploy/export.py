@@ -46,6 +46,7 @@ from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, FileError, require_type
 from seaopt.files import check_folder, write_text
+from seaopt.formatting import join_words
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating
 from seaopt.units import mechanics_of
@@ -275,12 +276,23 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw | RunnableSchedule) ->
     }
 
 
-def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Callable[[float], str]) -> dict[str, str]:
+def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Callable[[float], str]) -> dict[str, Any]:
     """Return a gate's numbers, exact for the code and rounded for what is read."""
-    low, high = gate.range_N
+    (low, high), agreement = gate.range_N, gate.agreement
     exact = {"low": low, "high": high, "step": gate.max_step_N, "ramp": gate.ramp_A_per_s * sample_time_s}
+    encoders: list[dict[str, str]] = []
+    if agreement is not None:
+        exact |= {"apart": agreement.limit, "share": agreement.share, "percent": 100.0 * agreement.share}
+        encoders = [
+            {"NAME": identifier(name).upper(), "symbol": f"read_{identifier(name)}", "weight": number(weight)}
+            for name, weight in zip(agreement.reads, agreement.weights, strict=True)
+        ]
     return {name: number(value) for name, value in exact.items()} | {
-        f"shown_{name}": f"{value:.6g}" for name, value in exact.items()
+        **{f"shown_{name}": f"{value:.6g}" for name, value in exact.items()},
+        "encoders": encoders,
+        "taken": "".join(f", real {each['symbol']}" for each in encoders),
+        "passed": "".join(f", {each['symbol']}" for each in encoders),
+        "encoders_named": strip_markup(join_words(gate.reads)),
     }
 
 
@@ -321,7 +333,9 @@ def _write_numbers(
         "gravity": {} if added.gravity is None else _write_gravity(added.gravity, number),
         "ripple": {} if added.ripple is None else _write_ripple(added.ripple, number),
         "further": [
-            {"output": name, "symbol": f"read_{identifier(name)}"} for name in added.reads if name not in others
+            {"output": name, "symbol": f"read_{identifier(name)}", "used": name in added.reads}
+            for name in law.further
+            if name not in others
         ],
     }
 

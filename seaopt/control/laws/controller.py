@@ -153,6 +153,12 @@ class Controller(LoopDelays, Result, Worded):
         return self.reads or list_names(self.spec.measured)
 
     @property
+    def further(self) -> tuple[str, ...]:
+        """The outputs that its terms read besides, then those that its gate does."""
+        terms = () if self.compensation is None else self.compensation.reads
+        return tuple(dict.fromkeys((*terms, *(() if self.gate is None else self.gate.reads))))
+
+    @property
     def speed_loop(self) -> SpeedLoop | None:
         """The signal of a cascade's speed loop; None for another structure."""
         return self.spec.find_speed_loop(self.signals)

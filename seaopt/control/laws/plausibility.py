@@ -14,23 +14,47 @@ The most that a sampled plant can move between two samples while the effort stay
 
 reached by an effort that has the signs of these terms. A link that the world pushes moves further: `of_controller`
 takes a factor for that.
+
+Where the law is given the encoders on either side of the spring, too, a reading y may have to agree with what they say
+of it, :math:`\hat y = \sum_i w_i \theta_i`: for :math:`y = \hat y + T \dot{\hat y}` (T the spring's damping over its
+stiffness), all read at rest as zero, with Gaussian noise of std :math:`\sigma_y` and :math:`\sigma_i`,
+
+.. math:: |y - \hat y| \le z \sigma + \epsilon + T \dot y_{max} + \rho |\hat y| , \qquad
+          \sigma^2 = \sigma_y^2 + \sum_i (1 + \rho)^2 w_i^2 \sigma_i^2 ,
+
+fails in one sample of 1e8 at most, :math:`2 Q(z) = 10^{-8}`, z = 5.73, if the parameters are within z std of their
+values: :math:`\rho` is by how much :math:`\hat y` changes there, :math:`\epsilon` the bound of both zeros, and no
+believed reading moves faster than `max_step_N` a sample.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from statistics import NormalDist
+from typing import Annotated, Any
 
+import casadi as ca
 import numpy as np
+from jaxtyping import Float
 
+from seaopt.codec import Constraints
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError, require_number
+from seaopt.formatting import join_words
 from seaopt.options import check_options, option
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
 from seaopt.records import record
 
 SETTLED = 1e-12  # of the largest term: a response below it is over
 MOST_TERMS = 200_000
 LARGEST, MOST_HELD = 1e15, 1_000_000  # what float and unsigned long of every target hold, and what follows from it
+FALSE_ALARMS = 1e-8  # per sample, of a disagreement: of Gaussian noise, the model within its intervals
+SIGMAS = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARMS)
+MOST_SHARE = 0.5
+PLACES, LINEAR = 12, 1e-9  # random states that tell the weights of encoders; relative error of an effort that is linear
 
 
 def is_number(value: float) -> bool:
@@ -48,6 +72,7 @@ class GateState:
     measurement: float = math.nan
     held: int = 0
     fault: bool = False
+    disagrees: bool = False  # the last that was refused might have been true but for the encoders
 
     @property
     def status(self) -> str:
@@ -82,9 +107,171 @@ class GateSpec:
     margin: float = option(
         "Factor on the design plant's largest step, for what the world does to it.", default=3.0, above=0.0
     )
+    agreement: bool = option(
+        "Whether a reading must agree with the encoders through the spring; the law is given these, too.", default=False
+    )
+    zero: float = option(
+        "How far the reading may be from what the encoders say at rest: the bounds of both zeros.",
+        default=0.0,
+        least=0.0,
+    )
 
     def __post_init__(self) -> None:
         check_options(self, ControlError)
+
+
+@record
+class Agreement:
+    """What encoders on either side of the spring say of a reading, and how far it may be from that."""
+
+    reads: Annotated[tuple[str, ...], Constraints(min_length=1)]  # the outputs that the encoders are
+    weights: tuple[float, ...]  # of each, in the unit of the reading
+    limit: float  # of the difference, with nothing deflected
+    share: Annotated[float, Constraints(ge=0.0, le=MOST_SHARE)]  # of what the encoders say, besides
+
+    def __post_init__(self) -> None:
+        if len(self.weights) != len(self.reads):
+            raise ControlError("should have a weight of each encoder")
+        for value in (self.limit, *map(abs, self.weights)):
+            if not 1.0 / LARGEST < value < LARGEST:
+                raise ControlError(f"limit and weights should be between {1.0 / LARGEST:g} and {LARGEST:g}")
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """All of them, as the compiled loop takes them."""
+        return self.limit, self.share, *self.weights
+
+    def holds(self, measurement: float, encoders: Sequence[float]) -> bool:
+        """Tell whether a reading is near enough; an encoder that is no number disagrees."""
+        if not all(map(is_number, encoders)):
+            return False
+        through = sum(weight * reading for weight, reading in zip(self.weights, encoders, strict=True))
+        return abs(measurement - through) <= self.limit + self.share * abs(through)
+
+    def describe(self, unit: str) -> str:
+        """Return how far a reading may be from what."""
+        share = f"{100.0 * self.share:.2g} %"
+        return f"{self.limit:.4g} {unit} and {share} of what the spring carries by {join_words(self.reads)}"
+
+    @classmethod
+    def of_plant(
+        cls,
+        plant: Plant,
+        params: ParameterSet,
+        regulated: str,
+        noise: Mapping[str, float],
+        *,
+        rate: float = 0.0,
+        zero: float = 0.0,
+    ) -> Agreement:
+        """Return the check of a plant whose spring is linear.
+
+        Parameters
+        ----------
+        plant, params
+            As fitted: the std of its parameters count, of noise and of the model, or that of a prior.
+        regulated : str
+            The output that a force sensor reads.
+        noise : mapping of str to float
+            Std of its noise and of the encoders'.
+        rate : float
+            How fast it moves at most, per second; counts where the spring is damped.
+        zero : float
+            How far it may be from what the encoders say at rest.
+
+        Raises
+        ------
+        ControlError
+            The plant has no force sensor, or no encoders beside it, a noise is missing, the spring is not linear, or
+            its stiffness is hardly known.
+
+        Examples
+        --------
+        >>> import seaopt as so
+        >>> known = so.plants.thor().prior(k=3000.0)
+        >>> check = Agreement.of_plant(so.plants.high_impedance(), known, "F1", {"F1": 2.0, "q": 1e-6})
+        >>> print(f"{check.limit:.1f} N and {100 * check.share:.1f} %")
+        12.1 N and 2.6 %
+        """
+        names = find_encoders(plant, regulated)
+        if missing := [name for name in (regulated, *names) if name not in noise]:
+            raise ControlError(
+                f"agreement: the noise of {join_words(missing)} is not known; it takes a log with {regulated} and "
+                f"{join_words(names)}, or their noise_std in [robustness.sensors]"
+            )
+        weights, lag = _weigh(plant, params, regulated, names)
+        share, latest = 0.0, abs(lag)
+        for parameter in _list_uncertain(plant, params, (regulated, *names)):
+            std = parameter.prior_std if parameter.total_std is None else parameter.total_std
+            if not (std and math.isfinite(std)):
+                raise ControlError(f"agreement: {parameter.name} is not known; fit it, or give it a prior_std")
+            moved = replace(parameter, value=parameter.value + SIGMAS * std, min=-math.inf, max=math.inf)
+            others, late = _weigh(plant, params.with_parameters(moved), regulated, names)
+            part = float(others @ weights / (weights @ weights)) - 1.0
+            if np.max(np.abs(others - (1.0 + part) * weights)) > 1e-6 * np.max(np.abs(weights)):
+                raise ControlError(
+                    f"agreement: {parameter.name} has a std, and changes what one encoder says against the other; give "
+                    "its value"
+                )
+            share, latest = share + abs(part), latest + abs(late - lag)
+        if share >= MOST_SHARE:
+            raise ControlError(
+                f"agreement: the std of the spring is {100.0 * share / SIGMAS:.2g} % of it, with which hardly anything "
+                "disagrees; fit its stiffness, or give it a smaller prior_std"
+            )
+        spread = math.hypot(noise[regulated], *((1.0 + share) * weights * [noise[name] for name in names]))
+        limit = SIGMAS * spread + zero + latest * rate
+        rounded = tuple(float(f"{weight:.12g}") for weight in weights)  # the same on every machine
+        return cls(reads=names, weights=rounded, limit=limit, share=share)
+
+
+def find_encoders(plant: Plant, regulated: str) -> tuple[str, ...]:
+    """Return the outputs of a plant that are encoders on either side of its spring. Raises ControlError: it has none,
+    or the regulated output is made of them.
+    """
+    sensing = plant.sensing
+    named = () if sensing is None else (sensing.motor_position, sensing.link_position)
+    names = tuple(name for name in named if name is not None and name in plant.outputs)
+    if sensing is None or not names:
+        raise ControlError(f"agreement: {plant.name} has no encoder among its outputs beside {regulated}; leave it out")
+    if regulated in sensing.from_encoders:
+        raise ControlError(
+            f"agreement: {regulated} of {plant.name} is computed from the encoders, so that there is no force to "
+            "compare them with; leave it out, or measure a force"
+        )
+    return tuple(dict.fromkeys(names))
+
+
+def _list_uncertain(plant: Plant, params: ParameterSet, outputs: Sequence[str]) -> list[Parameter]:
+    """Return the parameters of some outputs that have a std, of a fit or of a prior."""
+    rows = plant.output[[list(plant.outputs).index(name) for name in outputs]]
+    names = [name for i, name in enumerate(plant.parameters) if ca.depends_on(rows, plant.p[i])]
+    every = [params[name] for name in names if name in params]
+    return [each for each in every if each.free or each.prior_std or each.total_std]
+
+
+def _weigh(
+    plant: Plant, params: ParameterSet, regulated: str, names: tuple[str, ...]
+) -> tuple[Float[np.ndarray, " e"], float]:
+    """Return how much the regulated output moves with each encoder, and by how many seconds it leads them."""
+    outputs = list(plant.outputs)
+    read = plant.output[[outputs.index(name) for name in names]]
+    rates = ca.jtimes(read, plant.x, plant.dynamics)
+    both = ca.vertcat(plant.output[outputs.index(regulated)], read, rates)
+    look = ca.Function("look", [plant.t, plant.x, plant.u, plant.p], [both])
+    p, rng, sizes = plant.complete(params).vector, np.random.default_rng(1), (len(plant.states), len(plant.inputs))
+    rows = [look(0.0, *(rng.normal(size=size) for size in sizes), p).full().ravel() for _ in range(PLACES)]
+    effort, told = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+    found = np.linalg.lstsq(told, effort, rcond=None)[0]
+    weights, damping = np.split(found, 2)
+    lag = float(damping @ weights / (weights @ weights)) if np.any(weights) else math.nan
+    error = np.max(np.abs(told @ np.concatenate([weights, lag * weights]) - effort))
+    if not error <= LINEAR * np.max(np.abs(effort)):
+        raise ControlError(
+            f"agreement: {regulated} of {plant.name} is no fixed multiple of {join_words(names)}: the spring is not "
+            "linear, something moves between it and a sensor, or a sensor lags; leave it out"
+        )
+    return weights, lag
 
 
 @record
@@ -101,6 +288,8 @@ class PlausibilityGate:
         Readings in a row that are bridged.
     ramp_A_per_s : float
         How fast the command goes to zero at a fault.
+    agreement : Agreement, optional
+        With which encoders a reading must agree.
 
     Raises
     ------
@@ -124,6 +313,7 @@ class PlausibilityGate:
     max_step_N: float
     max_held: int
     ramp_A_per_s: float
+    agreement: Agreement | None = None
 
     def __post_init__(self) -> None:
         ends: Any = self.range_N
@@ -153,16 +343,23 @@ class PlausibilityGate:
             )
         return GateState(measurement=measurement)
 
-    def screen(self, state: GateState, measurement: float) -> tuple[float, GateState]:
-        """Return the reading to use, and the next state; NaN where there was none yet."""
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The encoders that it reads."""
+        return () if self.agreement is None else self.agreement.reads
+
+    def screen(self, state: GateState, measurement: float, encoders: Sequence[float] = ()) -> tuple[float, GateState]:
+        """Return the reading to use, and the next state; NaN where there was none yet. `encoders`: of `reads`."""
         if state.fault:
             return state.measurement, state
         low, high = self.range_N
         moved = abs(measurement - state.measurement) if math.isfinite(state.measurement) else 0.0
-        if low <= measurement <= high and moved <= self.max_step_N * (state.held + 1):
+        near = low <= measurement <= high and moved <= self.max_step_N * (state.held + 1)
+        agrees = self.agreement is None or self.agreement.holds(measurement, encoders)
+        if near and agrees:
             return measurement, GateState(measurement=measurement)
         held = state.held + 1
-        return state.measurement, GateState(measurement=state.measurement, held=held, fault=held > self.max_held)
+        return state.measurement, replace(state, held=held, fault=held > self.max_held, disagrees=near)
 
     def ramp(self, current_A: float, sample_time_s: float) -> float:
         """Return the command a sample later, at a fault."""
@@ -170,20 +367,26 @@ class PlausibilityGate:
         return math.copysign(max(abs(current_A) - step, 0.0), current_A)
 
     @classmethod
-    def of_controller(cls, controller: Any, **asked: Any) -> PlausibilityGate:
+    def of_controller(
+        cls, controller: Any, *, noise: Mapping[str, float] | None = None, **asked: Any
+    ) -> PlausibilityGate:
         """Return a gate with the step that the design plant makes at most, times a margin for what the world does.
 
         Parameters
         ----------
         controller : Controller or ForceMPC
             With its design plant and a current limit.
+        noise : mapping of str to float, optional
+            Std of what is measured and of the encoders, for an agreement.
         **asked
-            Fields of `GateSpec`: range_N, and where they differ from its defaults max_step_N, max_held, ramp_s, margin.
+            Fields of `GateSpec`: range_N, and where they differ from its defaults max_step_N, max_held, ramp_s, margin,
+            agreement, zero.
 
         Raises
         ------
         ControlError
-            The controller has no current limit or no design plant, or the plant does not come to rest by itself.
+            The controller has no current limit or no design plant, or the plant does not come to rest by itself; or
+            there is no agreement to ask for (`Agreement.of_plant`).
 
         Examples
         --------
@@ -205,14 +408,28 @@ class PlausibilityGate:
                 raise ControlError("the controller has no design plant to compute the largest step of; give max_step_N")
             plant = controller.close(*controller.design).plant
             largest = spec.margin * largest_step(plant, limit / controller.per_effort)
-        return cls(range_N=spec.range_N, max_step_N=largest, max_held=spec.max_held, ramp_A_per_s=limit / spec.ramp_s)
+        agreement = None
+        if spec.agreement:
+            if controller.design is None or not hasattr(controller, "signals"):
+                raise ControlError("agreement: it is of a law that knows its design plant; leave it out")
+            plant, values = controller.design
+            rate = largest / controller.sample_time_s
+            agreement = Agreement.of_plant(plant, values, controller.signals[0], noise or {}, rate=rate, zero=spec.zero)
+        return cls(
+            range_N=spec.range_N,
+            max_step_N=largest,
+            max_held=spec.max_held,
+            ramp_A_per_s=limit / spec.ramp_s,
+            agreement=agreement,
+        )
 
     def describe(self, unit: str) -> str:
         """Return in one line which readings are believed."""
-        low, high = self.range_N
+        (low, high), agreement = self.range_N, self.agreement
+        near = "" if agreement is None else f" and are within {agreement.describe(unit)}"
         return (
-            f"Readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample are "
-            f"believed, {self.max_held} others in a row are bridged"
+            f"Readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample{near} "
+            f"are believed, {self.max_held} others in a row are bridged"
         )
 
 

@@ -46,6 +46,7 @@ from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
 from seaopt.control.loops.law import SLOW_LAG, Law
 from seaopt.errors import ControlError, require_number, require_type
+from seaopt.formatting import join_words
 from seaopt.plants.motor.heat_guard import COLD, HeatGuard
 from seaopt.records import record
 from seaopt.units import name_command, show_command
@@ -125,6 +126,12 @@ class Guarded:
         raise NotImplementedError
 
     @property
+    def further(self) -> tuple[str, ...]:
+        """The outputs that its terms read besides, then those that its gate does."""
+        terms = () if self.compensation is None else self.compensation.reads
+        return tuple(dict.fromkeys((*terms, *(() if self.gate is None else self.gate.reads))))
+
+    @property
     def force_limit_N(self) -> float:
         """The motor force at the limit."""
         return self.command_limit / self.per_effort
@@ -155,9 +162,24 @@ class Guarded:
             raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
         added = 0.0
         if self.compensation is not None:
-            reads = tuple(readings) or (0.0,) * len(self.compensation.reads)
+            reads = self._take_terms(readings) or (0.0,) * len(self.compensation.reads)
             reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads, numbers)
         return reference, measurement, current_A / self.per_effort - added, seen
+
+    def _take_terms(self, readings: Sequence[float]) -> tuple[float, ...]:
+        """Return the readings of the terms, of all."""
+        if self.gate is None or not self.gate.reads:
+            return tuple(readings)
+        return tuple(readings[: 0 if self.compensation is None else len(self.compensation.reads)])
+
+    def _take_encoders(self, readings: Sequence[float]) -> list[float]:
+        """Return the readings of the gate's encoders, of all. Raises ControlError: they are not as many."""
+        names = self.further
+        if self.gate is None or len(readings) != len(names):
+            raise ControlError(
+                f"readings: the law reads {join_words(names)} besides, and got {len(readings)}; give one of each"
+            )
+        return [readings[names.index(name)] for name in self.gate.reads]
 
     def _check_measurement(self, measurement: Reading | None) -> Reading:
         """Return what was measured at rest: zero where it is left out, else as many numbers as there are signals."""
@@ -186,7 +208,7 @@ class Guarded:
         A sample with a number that is not finite (or beyond 1e15), in its inputs or in what would follow, is not used:
         the last command is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and
         takes the command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
-        `readings` are of the outputs that the compensation reads, in their order. `advance` is the law: of reference,
+        `readings` are of the outputs `further`, in their order. `advance` is the law: of reference,
         measurement, what is added to the effort, and its limit, the effort, what is left of it, and the next x.
         `numbers` of the compensation, where they are not its own; `noted`: further fields of the next state.
         """
@@ -211,11 +233,13 @@ class Guarded:
         """Return the command within a limit, and the next state."""
         seen = state.gate
         if self.gate is not None:
-            regulated, seen = self.gate.screen(seen, float(np.ravel(measurement)[0]))
+            encoders = self._take_encoders(readings) if self.gate.reads else ()
+            regulated, seen = self.gate.screen(seen, float(np.ravel(measurement)[0]), encoders)
             measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
             if seen.fault:
                 current = self.gate.ramp(state.current_A, self.sample_time_s)
                 return current, replace(state, current_A=current, gate=seen, **noted)
+        readings = self._take_terms(readings)
         taken = all(map(is_number, (reference, *np.ravel(measurement), *readings)))
         added, memory = 0.0, state.memory
         with np.errstate(all="ignore"):
@@ -292,9 +316,9 @@ class RunnableLaw(Guarded):
 
         A law without an integrator cannot be set: its next command follows from the inputs alone. A measurement that is
         left out is zero, and a gate judges the first reading by its range; one that is given, by its jump from it.
-        `heat` is what is known of winding and case above the ambient (K); cold if left out. `readings` are of what the
-        compensation reads; zero if left out. Raises ControlError: an input is not finite or beyond 1e15, the
-        measurement is outside the gate's range, or the current is above the limit.
+        `heat` is what is known of winding and case above the ambient (K); cold if left out. `readings` are of
+        `further`; zero if left out. Raises ControlError: an input is not finite or beyond 1e15, the measurement is
+        outside the gate's range, or the current is above the limit.
         """
         reference, measurement, effort, seen = self.begin(reference, measurement, current_A, readings)
         per_reference, per_measurement = self.rest()

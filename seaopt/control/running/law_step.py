@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import reduce
+from operator import add, mul
 from typing import Any
 
 import casadi as ca
@@ -37,6 +38,7 @@ class LawShape:
     compensation: CompensationShape
     schedule: ScheduleShape | None = None
     holds: bool = True  # the last command where an input is not a number
+    encoders: tuple[str, ...] = ()  # that the gate reads
 
     @classmethod
     def of_law(cls, law: RunnableLaw | RunnableSchedule) -> LawShape:
@@ -50,7 +52,13 @@ class LawShape:
             heated=law.heat is not None,
             compensation=CompensationShape() if law.compensation is None else law.compensation.shape,
             schedule=schedule,
+            encoders=() if law.gate is None else law.gate.reads,
         )
+
+    @property
+    def further(self) -> tuple[str, ...]:
+        """The outputs that are read besides what is fed back."""
+        return tuple(dict.fromkeys((*self.compensation.reads, *self.encoders)))
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -66,7 +74,8 @@ class LawShape:
     @property
     def number_sizes(self) -> tuple[int, ...]:
         """How many numbers of each kind `list_numbers` gives: of the law by itself, limit, command, guards, terms."""
-        guards = GATE_NUMBERS * self.gated, HEAT_NUMBERS * self.heated
+        gate = GATE_NUMBERS * self.gated + (2 + len(self.encoders) if self.encoders else 0)
+        guards = gate, HEAT_NUMBERS * self.heated
         law = sum(self.matrix_sizes) if self.schedule is None else self.schedule.size
         return law, 1, 1, *guards, self.compensation.size if self.schedule is None else 0
 
@@ -83,6 +92,7 @@ def list_numbers(law: RunnableLaw | RunnableSchedule) -> Float[np.ndarray, " m"]
     numbers = [limit, law.per_effort]
     if gate is not None:
         numbers += [*gate.range_N, gate.max_step_N, gate.max_held, gate.ramp_A_per_s * law.sample_time_s]
+        numbers += [] if gate.agreement is None else gate.agreement.numbers
     numbers += [] if law.heat is None else law.heat.numbers
     if isinstance(law, RunnableSchedule):
         return np.concatenate([law.numbers, numbers])
@@ -126,16 +136,17 @@ def express_step(
     further: Sequence[Any],
     place: Any = None,
 ) -> tuple[Any, Any]:
-    """Return the command and what is kept after a sample; `further`: the readings of what the terms read; `place`: the
-    scheduling variable, where there is one.
+    """Return the command and what is kept after a sample; `further`: the readings of what the shape names so; `place`:
+    the scheduling variable, where there is one.
     """
     law, most, gain, gate, heat, added = ca.vertsplit(numbers, np.cumsum([0, *shape.number_sizes]).tolist())
     x, memory, seen, rises, at, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
     fault, known, measured, memory, rises = 0.0, 1.0, list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
     if shape.gated:
-        measured[0], seen, fault = _screen(ca.vertsplit(gate), ca.vertsplit(seen), measured[0])
+        encoders = [further[shape.further.index(name)] for name in shape.encoders]
+        measured[0], seen, fault = _screen(ca.vertsplit(gate), ca.vertsplit(seen), measured[0], encoders)
         known = seen[1]
-    limit = most * gain
+    further, limit = further[: len(shape.compensation.reads)], most * gain
     if shape.heated:
         cool = limit_current(ca.vertsplit(heat), rises, ca)
         limit = ca.fmin(limit, cool) if shape.limited else cool
@@ -160,7 +171,7 @@ def express_step(
         usable = ca.logic_and(ca.logic_and(usable, known), ca.logic_not(fault))
         command, moved = (ca.if_else(usable, *pair) for pair in ((command, last), (moved, ca.vertcat(x, *memory))))
     if shape.gated:
-        ramp = ca.vertsplit(gate)[-1]
+        ramp = gate[GATE_NUMBERS - 1]
         command = ca.if_else(fault, last - ca.fmin(ca.fmax(last, -ramp), ramp), command)
     if shape.heated:
         command = ca.fmin(ca.fmax(command, -limit), limit)
@@ -180,11 +191,18 @@ def _advance(
     return applied, after + windup * (applied - force)
 
 
-def _screen(numbers: Sequence[Any], seen: Sequence[Any], reading: Any) -> tuple[Any, list[Any], Any]:
+def _screen(
+    numbers: Sequence[Any], seen: Sequence[Any], reading: Any, encoders: Sequence[Any]
+) -> tuple[Any, list[Any], Any]:
     """Return the reading to use, what the gate has seen, and whether that is a fault: `PlausibilityGate.screen`."""
-    (low, high, step, longest, _), (last, known, refused) = numbers, seen
+    (low, high, step, longest, _, *agreement), (last, known, refused) = numbers, seen
     near = ca.logic_or(ca.logic_not(known), ca.fabs(reading - last) <= step * (refused + 1.0))
     believed = ca.logic_and(ca.logic_and(reading >= low, reading <= high), near)
+    if encoders:
+        limit, share, *weights = agreement
+        through = reduce(add, map(mul, weights, encoders))
+        agrees = ca.fabs(reading - through) <= limit + share * ca.fabs(through)
+        believed = reduce(ca.logic_and, map(_is_number, encoders), ca.logic_and(believed, agrees))
     believed = ca.logic_and(believed, refused <= longest)  # beyond that a fault, which lasts
     used = ca.if_else(believed, reading, last)
     after = ca.if_else(believed, 0.0, ca.if_else(refused <= longest, refused + 1.0, refused))

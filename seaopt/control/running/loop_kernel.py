@@ -155,7 +155,7 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
             if name in weights:
                 reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
         readings.append(device.read(reading, devices[:, column]))
-    further = [readings[structure.measured.index(name)] for name in law.compensation.reads]
+    further = [readings[structure.measured.index(name)] for name in law.further]
     place = w[-1] if structure.place is None else plant.x[list(plant.states).index(structure.place)]
     current, after = express_step(law, numbers, z[:kept], r, readings[: law.measured], further, place)
     if structure.rounds_current:

@@ -114,16 +114,17 @@ class SampledLoop:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The outputs that are read: what is fed back, and what the law's compensation reads besides."""
-        further = () if self.law.compensation is None else self.law.compensation.reads
-        return tuple(dict.fromkeys((*self.fed_back, *further)))
+        """The outputs that are read: what is fed back, and what the law's terms and its gate read besides."""
+        return tuple(dict.fromkeys((*self.fed_back, *self.law.further)))
 
     @property
     def standing(self) -> tuple[str, ...]:
         """What is read of a link that the plant holds: what the law is fed, and by which gravity is compensated."""
         gravity = None if self.law.compensation is None else self.law.compensation.gravity
         weighed = None if gravity is None or self.plant.moves else gravity.reads
-        named = dict.fromkeys((self.link, weighed))
+        gate = None if self.law.gate is None else self.law.gate.agreement
+        encoders = () if gate is None or self.plant.moves else gate.reads
+        named = dict.fromkeys((self.link, weighed, *encoders))
         return tuple(name for name in named if name is not None and name not in self.plant.outputs)
 
     @property

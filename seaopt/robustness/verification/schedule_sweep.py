@@ -271,7 +271,7 @@ class RestStart:
             place=self.schedule.over,
         )
         named = {self.schedule.over: value} | self.readings
-        further = [named.get(name, 0.0) for name in (() if law.compensation is None else law.compensation.reads)]
+        further = [named.get(name, 0.0) for name in law.further]
         reference = float(fed[0]) - _weigh(law, named, value)
         kept = list_kept(law, law.reset(reference, fed, value, self.command, readings=further))
         x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]

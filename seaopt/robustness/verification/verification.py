@@ -355,8 +355,7 @@ def check_plants(plants: Plants, draws: Mapping[str, Any], partners: Plants) -> 
 
 def list_readings(controller: Controller, plants: Plants) -> list[str]:
     """Return the signals whose sensors' errors are in the runs: what the law reads, and encoders that make it."""
-    compensation = controller.compensation
-    named = [*controller.signals, *(() if compensation is None else compensation.reads)]
+    named = [*controller.signals, *controller.further]
     seen = [controller.see(plant) for plant in plants.values()]
     encoders = (
         name for plant in seen for signal in named if signal in plant.outputs for name in weigh_encoders(plant, signal)

@@ -14,7 +14,7 @@ import seaopt as so
 from seaopt.control import GainTable, LinkPath
 from seaopt.control.deploy import export as export_module
 from seaopt.control.deploy.export import export
-from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.laws.plausibility import Agreement, PlausibilityGate
 from seaopt.control.laws.realisation import realise
 from seaopt.control.laws.structures import Nominal, SpeedLoop
 from seaopt.control.loops.compensation.ripple_term import RippleTerm
@@ -106,7 +106,12 @@ def draw_part(number, rng):
 
 def draw_guards(shape, rng):
     """Return a limit, and a gate and a heat guard or not."""
-    gate = PlausibilityGate(range_N=(-2e3, 2e3), max_step_N=300.0, max_held=int(rng.integers(0, 7)), ramp_A_per_s=90.0)
+    reads = ("q", "x")[: shape.integers(1, 3)]
+    agreement = Agreement(reads=reads, weights=(300.0, -200.0)[: len(reads)], limit=250.0, share=0.1)
+    gate = PlausibilityGate(
+        range_N=(-2e3, 2e3), max_step_N=300.0, max_held=int(rng.integers(0, 7)), ramp_A_per_s=90.0,
+        agreement=agreement if shape.random() < 0.5 else None,
+    )  # fmt: skip
     heat = HeatGuard(**HOT, resistance=0.6, slope=0.002, allowed_rise=rng.uniform(20, 90), share=0.02, ambient=21.0)
     return {
         "command_limit": shape.choice([None, 4.0, 9.0]), "gate": gate if shape.random() < 0.6 else None,
@@ -184,7 +189,7 @@ def export_all(compiler, parts, controller, folder, monkeypatch):
     command = replace(controller.command, per_effort=PER_EFFORT)
     for number, (source, law, outer) in enumerate(parts):
         name, scheduled = f"law{number}", isinstance(law, RunnableSchedule)
-        inputs = 1 + law.measured + len(reads_of(law)) + scheduled
+        inputs = 1 + law.measured + len(law.further) + scheduled
         stored = replace(
             controller, law=source or controller.law, design=None, compensation=law.compensation,
             reads=("F", "G", "H")[: law.measured], command=command, outer=outer,
@@ -218,10 +223,6 @@ def dict_of(controller):
     return {field.name: getattr(controller, field.name) for field in fields(controller)}
 
 
-def reads_of(law):
-    return () if law.compensation is None else law.compensation.reads
-
-
 @pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.slow)])
 def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tuned, tmp_path, monkeypatch):
     rng, plant = np.random.default_rng(count), make_plant()
@@ -245,7 +246,7 @@ def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tune
         monkeypatch.setattr(closed_loop, "_noise", lambda *_, noise=noise: np.array(noise).T[None].copy())
         run = run_loop(loop, [so.ParameterSet()], reference, places=np.nan if places is None else places)
         readings = {name: run.outputs[name][0] + signals[name] for name in loop.signals}
-        measured, further = ([readings[name] for name in part] for part in (fed_back, reads_of(law)))
+        measured, further = ([readings[name] for name in part] for part in (fed_back, law.further))
         commands, largest = play_python(law, reference, measured, further, places)
         scale = 1e-12 * largest
         np.testing.assert_allclose(run.current[0], commands, rtol=0, atol=scale, err_msg=f"compiled loop, law {number}")
