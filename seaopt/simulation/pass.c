@@ -202,44 +202,49 @@ INLINE void output(hot *q, double t, const double *u, const double *du, const do
     for (int o = 0; o < NY; o++) out[o][0] = y[o];
 }
 #else
-/* K = [f, f_x Z + f_p] at the state Z. */
-INLINE void slope(hot *q, double t, const double *u, const double *du, const double *c, const double (*restrict z)[NJP],
-                  double mode, double (*restrict k)[NJP], int wide) {
-    double x[NX], f[NX], fx[NNZ_FX + 1], fp[NNZ_FP + 1];
+/* The rate f at x, and K = f_x Z + f_p at the derivatives Z. */
+INLINE void slope(hot *q, double t, const double *x, const double *u, const double *du, const double *c,
+                  const double (*restrict z)[NJP], double mode, double *f, double (*restrict k)[NJP], int wide) {
+    double fx[NNZ_FX + 1], fp[NNZ_FP + 1];
     const double *arg[SZ_ARG + 1] = {&t, x, u, du, c, &mode};
     double *res[SZ_RES] = {f, DERIVED(wide) ? fx : 0, DERIVED(wide) ? fp : 0};
-    for (int i = 0; i < NX; i++) x[i] = z[i][0];
     seaopt_rate(arg, res, 0, q->work, 0);
     if (DERIVED(wide)) seaopt_rate_chain(fx, fp, z, k);
-    else for (int i = 0; i < NX; i++) ((vec *)k[i])[0] = (vec){0.0, 0.0, 0.0, 0.0};
-    for (int i = 0; i < NX; i++) k[i][0] = f[i];
 }
 
-/* A Runge-Kutta step of order four of the state and its derivatives; the delay moves h itself, by dh. */
+/* A Runge-Kutta step of order four of the state and its derivatives; the delay moves h itself, by dh. The state goes
+   through its four stages apart from its vectors of derivatives: a pass waits for nothing else. */
 INLINE void smooth_step(hot *q, double t, const line *in, const double *c, double mode, double h, double dh, int wide) {
     static const double reach[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
     hot_columns k, z, sum;
-    double u[NU], du[NU];
-    memcpy(z, q->z, sizeof z);
-    memcpy(sum, q->z, sizeof sum);
+    double u[NU], du[NU], x[NX], x0[NX], x1[NX], f[NX];
+    for (int i = 0; i < NX; i++) x[i] = x0[i] = x1[i] = q->z[i][0];
+    if (DERIVED(wide)) {
+        memcpy(z, q->z, sizeof z);
+        memcpy(sum, q->z, sizeof sum);
+    }
     for (int stage = 0; stage < 4; stage++) {
         const double part = reach[stage] * h;
-        if (stage)
-            for (int i = 0; i < NX; i++) {
-                for (int j = 0; j < wide; j++) ((vec *)z[i])[j] = ((vec *)q->z[i])[j] + part * ((vec *)k[i])[j];
-                if (DELAYED) z[i][1 + NQ] += reach[stage] * dh * k[i][0];
-            }
+        for (int i = 0; stage && i < NX; i++) {
+            x[i] = x0[i] + part * f[i];
+            for (int j = 0; DERIVED(wide) && j < wide; j++) ((vec *)z[i])[j] = ((vec *)q->z[i])[j] + part * ((vec *)k[i])[j];
+            if (DERIVED(wide) && DELAYED) z[i][1 + NQ] += reach[stage] * dh * f[i];
+        }
         for (int i = 0; i < NU; i++) {
             u[i] = in->u0[i] + reach[stage] * (in->u1[i] - in->u0[i]);
             du[i] = in->du0[i] + reach[stage] * (in->du1[i] - in->du0[i]);
         }
-        slope(q, t + part, u, du, c, (const double (*)[NJP])z, mode, k, wide);
+        slope(q, t + part, x, u, du, c, (const double (*)[NJP])z, mode, f, k, wide);
         for (int i = 0; i < NX; i++) {
-            for (int j = 0; j < wide; j++) ((vec *)sum[i])[j] += weight[stage] * h * ((vec *)k[i])[j];
-            if (DELAYED) sum[i][1 + NQ] += weight[stage] * dh * k[i][0];
+            x1[i] += weight[stage] * h * f[i];
+            for (int j = 0; DERIVED(wide) && j < wide; j++) ((vec *)sum[i])[j] += weight[stage] * h * ((vec *)k[i])[j];
+            if (DERIVED(wide) && DELAYED) sum[i][1 + NQ] += weight[stage] * dh * f[i];
         }
     }
-    memcpy(q->z, sum, sizeof sum);
+    for (int i = 0; i < NX; i++) {
+        if (DERIVED(wide)) memcpy(q->z[i], sum[i], sizeof sum[i]);
+        q->z[i][0] = x1[i];
+    }
 }
 
 #if JOINT
@@ -441,14 +446,16 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
     at(a, k, a->lag_b, ub);
     at(a, k, a->lag_c, uc);
     for (int part = 0; part < 2; part++) {
-        const double h = parts[part] / steps, dh = (part ? -1.0 : 1.0) / steps;
         if (parts[part] <= 0.0 && !DELAYED) continue;
-        for (long i = 0; i < steps; i++) {
+        /* A part of no length has no steps; how it grows with the delay takes one. */
+        const long count = parts[part] > 0.0 ? steps : 1;
+        const double h = parts[part] / count, dh = (part ? -1.0 : 1.0) / count;
+        for (long i = 0; i < count; i++) {
             line in;
             for (int c = 0; c < NU; c++) {
                 /* The older line ends at u_a, the newer one begins there. */
                 const double base = foh || part ? ua[c] : ub[c], slope = foh ? (part ? ub[c] - ua[c] : ua[c] - uc[c]) / m[1] : 0.0;
-                const long from = part ? i : i - steps;
+                const long from = part ? i : i - count;
                 in.u0[c] = base + slope * h * from;
                 in.u1[c] = base + slope * h * (from + 1);
                 in.du0[c] = slope * dh * from;
